@@ -1,0 +1,68 @@
+"""Safe maths and the named constants, each with its reason. Every guard is finite in value and gradient everywhere."""
+
+import jax
+import jax.numpy as jnp
+
+# Splatting semantics (Kerbl et al. 2023, diff-gaussian-rasterization; gsplat agrees). They define the image.
+BLUR_PX2 = 0.3
+"""added to the 2D covariance's diagonal, px^2: a splat is never thinner than about a pixel"""
+MAX_ALPHA = 0.99
+"""cap on a single alpha: keeps 1 - alpha, and so the gradient, away from 0"""
+MIN_ALPHA = 1.0 / 255.0
+"""alphas below what 8 bits can show are ignored; also bounds a splat's extent"""
+MIN_TRANSMITTANCE = 1e-4
+"""compositing stops before the Gaussian that would take T to this or below"""
+FRUSTUM_MARGIN = 1.3
+"""x/z and y/z are clamped to this multiple of the field of view inside the Jacobian only"""
+NEAR = 0.01
+"""near plane, world units (0.2 reproduces INRIA)"""
+
+
+def tiny(dtype) -> float:
+    """Smallest number whose square is still normal in `dtype`: below it a length counts as zero."""
+    return float(jnp.finfo(dtype).tiny) ** 0.5
+
+
+def safe_norm(x: jax.Array, axis: int = -1, keepdims: bool = False) -> jax.Array:
+    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at zero.
+
+    The vector is scaled by its largest entry first, so that squares neither overflow nor vanish; the entry is treated
+    as a constant, which leaves the gradient exact because the length is homogeneous.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
+    usable = (largest > 0) & jnp.isfinite(largest)
+    scale = jnp.where(usable, largest, 1.0)
+    scaled = jnp.where(usable, x / scale, 0.0)
+    squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
+    length = scale * jnp.sqrt(jnp.where(usable, squares, 1.0))
+    length = jnp.where(usable, length, jnp.where(largest > 0, largest, jnp.where(largest == 0, 0.0, jnp.nan)))
+    return length if keepdims else jnp.squeeze(length, axis)
+
+
+def normalize(x: jax.Array, axis: int = -1) -> jax.Array:
+    """x / |x| over `axis`; zero (with zero gradient) where x is zero, NaN where x is not finite."""
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
+    usable = (largest > 0) & jnp.isfinite(largest)
+    scaled = jnp.where(usable, x / jnp.where(usable, largest, 1.0), 0.0)
+    squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
+    unit = scaled / jnp.sqrt(jnp.where(usable, squares, 1.0))
+    # A scale that is a constant drops out of x / |x|, so the gradient through `scaled` is the exact one.
+    return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
+
+
+def cosine(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see STYLE trap 1 (jax 39103)."""
+    return jnp.sum(normalize(x) * normalize(y), axis=-1)
+
+
+def cosine_matrix(x: jax.Array, y: jax.Array) -> jax.Array:
+    """(N, d), (M, d) -> (N, M) cosines as one matrix product, the form that jax issue 39103 leaves right."""
+    return normalize(x) @ normalize(y).T
+
+
+def finite(*arrays: jax.Array) -> jax.Array:
+    """() bool: every number in every array is finite."""
+    result = jnp.asarray(True)
+    for array in arrays:
+        result &= jnp.all(jnp.isfinite(array))
+    return result

@@ -1,0 +1,222 @@
+"""The pytrees that flow through the pipeline: frozen dataclasses of arrays, one line a field (shape, unit, range, frame).
+
+Conventions, fixed here once: OpenCV camera axes (x right, y down, z forward); `world_to_camera` matrices; quaternions
+wxyz, normalised on use; pixel (row i, column j) is sampled at (x, y) = (j + 0.5, i + 0.5) and u = fx x/z + cx; metres
+where the data has them. Letters: N Gaussians, T frames, H x W pixels, R regions, E embedding, d code, D feature channels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array: TypeAlias = jax.Array | np.ndarray
+
+
+def _static(**kwargs) -> Any:
+    return dataclasses.field(metadata={"static": True}, **kwargs)
+
+
+def _record(cls):
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
+
+
+@_record
+class Gaussians:
+    """A scene of N anisotropic 3D Gaussians (Kerbl et al. 2023), stored before their activations."""
+
+    means: Array
+    """(N, 3) centres, world."""
+    log_scales: Array
+    """(N, 3) natural logarithm of the standard deviations along the Gaussian's own axes, world units."""
+    quaternions: Array
+    """(N, 4) wxyz rotation of the Gaussian's axes into the world; any length but zero."""
+    opacity_logits: Array
+    """(N,) logit of the opacity."""
+    sh: Array
+    """(N, K, 3) spherical harmonics of colour, K in {1, 4, 9, 16}, degree by degree; rgb = 0.5 + sum, clamped at 0."""
+
+    @property
+    def count(self) -> int:
+        return self.means.shape[0]
+
+
+@_record
+class Camera:
+    """A pinhole camera; leading axes batch every array alike. Width and height are static."""
+
+    world_to_camera: Array
+    """(..., 4, 4) rigid, OpenCV axes."""
+    fx: Array
+    """(...,) focal length in x, px."""
+    fy: Array
+    """(...,) focal length in y, px."""
+    cx: Array
+    """(...,) principal point, px, measured from the left edge of the first pixel."""
+    cy: Array
+    """(...,) principal point, px, measured from the upper edge of the first pixel."""
+    width: int = _static()
+    """px."""
+    height: int = _static()
+    """px."""
+
+    def __getitem__(self, index) -> Camera:
+        """The camera(s) at `index` of the leading axis."""
+        return jax.tree.map(lambda a: a[index], self)
+
+    @property
+    def centres(self) -> Array:
+        """(..., 3) camera centres in the world."""
+        rotation, translation = self.world_to_camera[..., :3, :3], self.world_to_camera[..., :3, 3]
+        return -(rotation * translation[..., :, None]).sum(-2)
+
+
+@_record
+class Capture:
+    """A posed set of frames, as every loader returns it. Arrays are NumPy on the host."""
+
+    frames: Array
+    """(T, H, W, 3) uint8 RGB."""
+    cameras: Camera
+    """batch of T."""
+    points: Array
+    """(P, 3) float32 sparse points, world; P may be 0."""
+    point_colors: Array
+    """(P, 3) uint8 RGB."""
+    held_out: Array
+    """(T,) bool: frames that nothing may be fitted to."""
+    depths: Array | None
+    """(T, H, W) float32 z-depth in world units, 0 = unknown; or None."""
+    to_source: Array
+    """(4, 4) similarity from this world to the files' own world (identity where nothing was normalised)."""
+    names: tuple[str, ...] = _static()
+    """T file names without folder or ending, in frame order."""
+    notes: tuple[str, ...] = _static(default=())
+    """What the loader left out or changed, a sentence each."""
+
+
+@_record
+class Rendering:
+    """One rendered view."""
+
+    features: Array
+    """(H, W, D) sum of alpha T f over the Gaussians (+ (1 - alpha) background where one is given)."""
+    alpha: Array
+    """(H, W) sum of alpha T, in [0, 1); 0 on pixels that no Gaussian covers."""
+    overflow: Array
+    """() int32: (tile, Gaussian) pairs that did not fit the capacity and were left out; 0 means the image is exact."""
+
+
+@_record
+class Votes:
+    """The weight that each region casts on each Gaussian: the K strongest regions of W^T onto one-hot labels."""
+
+    regions: Array
+    """(N, K) int32 region ids, strongest first, -1 = none."""
+    weights: Array
+    """(N, K) float32 sum of alpha T over the region's pixels in all views, 0 where none."""
+    labelled: Array
+    """(N,) sum of alpha T over labelled pixels, all regions."""
+    total: Array
+    """(N,) sum of alpha T over all pixels, labelled or not."""
+    peak: Array
+    """(N,) largest alpha T at any pixel of any view, in [0, 1)."""
+    views: Array
+    """(N,) int32 views in which the Gaussian has any weight; 0 = never seen: unknown."""
+    overflow: Array
+    """() int32 (tile, Gaussian) pairs left out for want of capacity, all views; 0 means exact."""
+    num_regions: int = _static()
+    """R."""
+
+    @property
+    def cut(self) -> Array:
+        """(N,) labelled weight that lies outside the K strongest regions."""
+        return jnp.maximum(self.labelled - self.weights.sum(-1), 0.0)
+
+    def dense(self) -> Array:
+        """(N, R) votes, zeros outside the K strongest."""
+        n, k = self.regions.shape
+        rows = jnp.broadcast_to(jnp.arange(n)[:, None], (n, k))
+        columns = jnp.where(self.regions >= 0, self.regions, self.num_regions)
+        return jnp.zeros((n, self.num_regions), self.weights.dtype).at[rows, columns].add(self.weights, mode="drop")
+
+
+@_record
+class Regions:
+    """What the masklets are: one row a region."""
+
+    embeddings: Array
+    """(R, E) unit length; pixel-weighted mean of the views' embeddings (paper: phi_bar); zero where never embedded."""
+    pixels: Array
+    """(R, T) int32 pixels of the region in each view; 0 where it is not seen."""
+
+    @property
+    def count(self) -> int:
+        return self.embeddings.shape[0]
+
+
+@_record
+class Autoencoder:
+    """Parameters of a trained autoencoder; `jsecon.language.autoencoder` has the layers."""
+
+    encoder: Any
+    """pytree of the encoder's parameters and batch statistics."""
+    decoder: Any
+    """pytree of the decoder's parameters."""
+
+    def encode(self, embeddings: Array) -> Array:
+        """(..., E) -> (..., d) unit codes."""
+        from jsecon.language.autoencoder import encode  # types is the ground: the layers live above it
+
+        return encode(self, embeddings)
+
+    def decode(self, codes: Array) -> Array:
+        """(..., d) -> (..., E) unit embeddings."""
+        from jsecon.language.autoencoder import decode
+
+        return decode(self, codes)
+
+
+@_record
+class LanguageField:
+    """Everything a query needs, in one file: the scene, its codes and votes, its regions, and where they came from."""
+
+    gaussians: Gaussians
+    codes: Array
+    """(N, d) unit codes; zero = unknown (never seen or never labelled)."""
+    votes: Votes
+    regions: Regions
+    region_codes: Array
+    """(R, d) unit codes of the regions."""
+    autoencoder: Autoencoder | None
+    """None where the codes are the embeddings themselves."""
+    cameras: Camera
+    """batch of T: the capture's views, for masks and for `--at`."""
+    canonical: Array
+    """(C, E) embeddings of the canonical phrases (LERF: object, things, stuff, texture) in the embedder's space."""
+    to_source: Array
+    """(4, 4) from the field's world to the capture files' world; undone on export."""
+    names: tuple[str, ...] = _static()
+    """T frame names."""
+    embedder: str = _static(default="")
+    """name of the embedder whose space the regions live in; texts must be embedded by the same."""
+    provenance: str = _static(default="{}")
+    """JSON: version, options, inputs' digests."""
+
+
+@_record
+class Selection:
+    """The answer to one query."""
+
+    mask: Array
+    """(N,) bool: the selected Gaussians."""
+    similarity: Array
+    """(N,) float: cosine, relevancy, or share of votes, as the query says; what the threshold was applied to."""
+    region: Array
+    """() int32 region that anchored the query; -1 = none (nothing retrieved, or a query without anchor)."""
+    score: Array
+    """() float: similarity of the text to that region; for queries without anchor the best similarity."""
