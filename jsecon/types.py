@@ -160,28 +160,6 @@ class Regions:
 
 
 @_record
-class Autoencoder:
-    """Parameters of a trained autoencoder; `jsecon.language.autoencoder` has the layers."""
-
-    encoder: Any
-    """pytree of the encoder's parameters and batch statistics."""
-    decoder: Any
-    """pytree of the decoder's parameters."""
-
-    def encode(self, embeddings: Array) -> Array:
-        """(..., E) -> (..., d) unit codes."""
-        from jsecon.language.autoencoder import encode  # types is the ground: the layers live above it
-
-        return encode(self, embeddings)
-
-    def decode(self, codes: Array) -> Array:
-        """(..., d) -> (..., E) unit embeddings."""
-        from jsecon.language.autoencoder import decode
-
-        return decode(self, codes)
-
-
-@_record
 class LanguageField:
     """Everything a query needs, in one file: the scene, its codes and votes, its regions, and where they came from."""
 
@@ -192,8 +170,8 @@ class LanguageField:
     regions: Regions
     region_codes: Array
     """(R, d) unit codes of the regions."""
-    autoencoder: Autoencoder | None
-    """None where the codes are the embeddings themselves."""
+    autoencoder: Any
+    """jsecon.language.autoencoder.Autoencoder, or None where the codes are the embeddings themselves."""
     cameras: Camera
     """batch of T: the capture's views, for masks and for `--at`."""
     canonical: Array
