@@ -1,0 +1,181 @@
+"""What a run has already computed: one file a stage, named by a digest of all that its content depends on.
+
+    OUT/cache/<stage>-<key>.npz
+
+The key covers the stage's options, its input files, the source of the rooms that compute it, and the keys of the
+stages it reads. So a stopped run goes on where it stopped, a changed option reruns only what depends on it, and no stale
+result can be taken for a fresh one. A file holds arrays and a JSON description of the tree they belong to: no pickle.
+"""
+
+import dataclasses
+import hashlib
+import importlib
+import json
+import os
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsecon.files import written_whole
+
+_TREE = "__tree__"
+_UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, ImportError, zipfile.BadZipFile)
+
+
+class CorruptCacheError(Exception):
+    """A cache file that cannot be read back; the stage must be computed again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """A stage's result, with how it came about."""
+
+    value: Any
+    """The result, every array a NumPy array."""
+    seconds: float
+    """Wall time of the computation, also where it happened in an earlier run."""
+    fresh: bool
+    """Computed now, rather than read from the cache."""
+
+
+def key_of(stage: str, parts: Mapping[str, Any]) -> str:
+    """16 hex digits that name a stage's result; `parts` holds plain values: None, bool, numbers, texts, lists, dicts."""
+    text = json.dumps([stage, parts], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
+    """Digest of files, and of all files beneath folders, by name, size and time of change. Hidden files and anything
+    beneath `leave_out` (the run's own output, where it lies inside the capture) don't count."""
+    entries = []
+    for root in paths:
+        for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
+            inside = path.relative_to(root) if path != root else Path(path.name)
+            if any(part.startswith(".") for part in inside.parts) or not path.is_file():
+                continue
+            if leave_out is not None and path.resolve().is_relative_to(leave_out.resolve()):
+                continue
+            stat = path.stat()
+            entries.append(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}")
+    return hashlib.blake2b("\n".join(entries).encode(), digest_size=8).hexdigest()
+
+
+def source_digest(rooms: Iterable[str]) -> str:
+    """Digest of the source of the named rooms (`"splat"`, `"language.masklets"`) and of the ground they stand on."""
+    home = Path(__file__).parent
+    digest = hashlib.blake2b(digest_size=8)
+    for room in sorted({*rooms, "types", "numerics"}):
+        place = home / room.replace(".", "/")
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]:
+            digest.update(path.relative_to(home).as_posix().encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def path_of(folder: Path, stage: str, key: str) -> Path:
+    """Where a stage's result lies."""
+    return folder / f"{stage}-{key}.npz"
+
+
+def fetch(
+    folder: Path, stage: str, key: str, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None
+) -> Kept:
+    """The stage's result: read where `folder` holds it, else computed and kept there.
+
+    A file that cannot be read is said through `note` and computed again. A fresh result is passed through the same
+    packing as a stored one, so that what follows sees the same arrays whether the run was stopped here or not.
+    """
+    path = path_of(folder, stage, key)
+    if path.exists():
+        try:
+            value, seconds = _read(path)
+            return Kept(value, seconds, fresh=False)
+        except CorruptCacheError as error:
+            if note is not None:
+                note(f"{path.name} cannot be read ({error}); {stage} is computed again")
+    started = time.monotonic()
+    value = compute()
+    jax.block_until_ready(value)
+    seconds = time.monotonic() - started
+    tree, arrays = pack(value)
+    _write(path, tree, arrays, seconds)
+    return Kept(unpack(tree, arrays), seconds, fresh=True)
+
+
+def save(path: Path, value: Any) -> None:
+    """Keeps `value` (a tree of plain values, arrays and jsecon's records) at `path`, whole or not at all."""
+    _write(path, *pack(value), seconds=0.0)
+
+
+def load(path: Path) -> Any:
+    """What `save` kept. Raises CorruptCacheError where the file cannot be read."""
+    return _read(path)[0]
+
+
+def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float) -> None:
+    description = np.frombuffer(json.dumps({"tree": tree, "seconds": seconds}).encode(), np.uint8)
+    with written_whole(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **{_TREE: description}, **arrays)
+        file.flush()
+        os.fsync(file.fileno())  # a rename may reach the disk before the content does
+
+
+def _read(path: Path) -> tuple[Any, float]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        description = json.loads(arrays.pop(_TREE).tobytes())
+        return unpack(description["tree"], arrays), description["seconds"]
+    except _UNREADABLE as error:
+        raise CorruptCacheError(f"{type(error).__name__}: {error}") from error
+
+
+def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """A JSON description of the tree, and its arrays by path. Raises TypeError on what is neither plain nor a record of
+    jsecon's."""
+    arrays: dict[str, np.ndarray] = {}
+
+    def describe(node: Any, path: str) -> Any:
+        if node is None or isinstance(node, (bool, int, float, str)):
+            return {"value": node}
+        if isinstance(node, (np.ndarray, np.generic, jax.Array)):
+            arrays[path] = np.asarray(node)
+            return {"array": path}
+        if isinstance(node, (list, tuple)) and type(node) in (list, tuple):
+            return {type(node).__name__: [describe(item, f"{path}.{i}") for i, item in enumerate(node)]}
+        if isinstance(node, Mapping) and all(isinstance(name, str) for name in node):
+            return {"dict": {name: describe(item, f"{path}.{name}") for name, item in node.items()}}
+        kind = type(node)
+        if dataclasses.is_dataclass(node) and kind.__module__.startswith("jsecon."):
+            fields = {f.name: describe(getattr(node, f.name), f"{path}.{f.name}") for f in dataclasses.fields(node)}
+            return {"record": f"{kind.__module__}:{kind.__qualname__}", "fields": fields}
+        raise TypeError(f"{path}: {kind.__module__}.{kind.__qualname__} cannot be kept in the cache")
+
+    return describe(value, "root"), arrays
+
+
+def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The value that `pack` took apart; arrays are NumPy arrays. Raises KeyError, TypeError or ValueError on a tree
+    that `pack` did not write."""
+    if "value" in tree:
+        return tree["value"]
+    if "array" in tree:
+        return arrays[tree["array"]]
+    if "list" in tree:
+        return [unpack(item, arrays) for item in tree["list"]]
+    if "tuple" in tree:
+        return tuple(unpack(item, arrays) for item in tree["tuple"])
+    if "dict" in tree:
+        return {name: unpack(item, arrays) for name, item in tree["dict"].items()}
+    module, _, name = tree["record"].partition(":")
+    if not module.startswith("jsecon."):
+        raise ValueError(f"{tree['record']} is no record of jsecon's")
+    kind = getattr(importlib.import_module(module), name)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise ValueError(f"{tree['record']} is no record of jsecon's")
+    return kind(**{field: unpack(item, arrays) for field, item in tree["fields"].items()})

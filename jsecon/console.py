@@ -1,0 +1,104 @@
+"""What a run says while it works: plan and figures on standard output, progress and time left on standard error."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import TextIO
+
+from tqdm import tqdm
+
+from jsecon.plan import Progress, Step
+
+QUIET_SECONDS = 2.0
+"""a step shorter than this shows no bar"""
+LINE_SECONDS = 15.0
+"""between two lines of progress where standard error is no terminal"""
+
+
+class Console:
+    """The reporter of the command line (see jsecon.plan.Reporter)."""
+
+    def __init__(self, out: TextIO | None = None, err: TextIO | None = None):
+        self._out, self._err = out or sys.stdout, err or sys.stderr
+
+    def plan(self, title: str, steps: Sequence[Step]) -> None:
+        """The whole plan, before any of it runs."""
+        self.say(title)
+        for step in steps:
+            self.step(step)
+
+    def step(self, step: Step) -> None:
+        """One line of the plan."""
+        self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
+
+    def done(self, name: str, seconds: float, fresh: bool) -> None:
+        """A stage has ended."""
+        if fresh:
+            self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
+
+    def say(self, text: str) -> None:
+        """A line on standard output."""
+        with tqdm.external_write_mode(file=self._out):
+            print(text, file=self._out, flush=True)
+
+    def note(self, text: str) -> None:
+        """Something the user should know about the input or the run."""
+        self.say(f"  note: {text}")
+
+    @contextlib.contextmanager
+    def progress(self, name: str) -> Iterator[Progress]:
+        """A callback `(done, total)` that draws a bar with the time left, or writes a line now and then."""
+        with _Bar(name, self._err) if self._err.isatty() else _Lines(name, self._err) as callback:
+            yield callback
+
+
+class _Bar:
+    """A tqdm bar that appears after two seconds and starts afresh when the total changes or the count falls back."""
+
+    def __init__(self, name: str, err: TextIO):
+        self._name, self._err, self._bar = name, err, None
+        self._started = time.monotonic()
+
+    def __enter__(self) -> Callable[[int, int], None]:
+        return self._update
+
+    def _update(self, done: int, total: int) -> None:
+        if self._bar is not None and (total != self._bar.total or done < self._bar.n):
+            self._bar.close()
+            self._bar = None
+        if self._bar is None:
+            self._bar = tqdm(total=total, desc=f"  {self._name}", file=self._err, leave=False, delay=QUIET_SECONDS,
+                             initial=done, dynamic_ncols=True)
+        self._bar.update(done - self._bar.n)
+
+    def __exit__(self, *_) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+
+class _Lines:
+    """A line every so many seconds, for logs."""
+
+    def __init__(self, name: str, err: TextIO):
+        self._name, self._err = name, err
+        self._begin(0, None)
+        self._last = self._started
+
+    def _begin(self, done: int, total: int | None) -> None:
+        self._started, self._first, self._total, self._done = time.monotonic(), done, total, done
+
+    def __enter__(self) -> Callable[[int, int], None]:
+        return self._update
+
+    def _update(self, done: int, total: int) -> None:
+        if total != self._total or done < self._done:
+            self._begin(done, total)
+        self._done, now = done, time.monotonic()
+        if done > self._first and now - self._last >= LINE_SECONDS:
+            left = (now - self._started) / (done - self._first) * (total - done)
+            print(f"  {self._name}: {done} of {total}, about {left:.0f} s left", file=self._err, flush=True)
+            self._last = now
+
+    def __exit__(self, *_) -> None:
+        pass
