@@ -1,0 +1,199 @@
+"""Sparse points for a capture that has poses but no points: SIFT matches between posed views, triangulated.
+
+The poses are known, so a match needs no robust estimation: it has to lie on its epipolar line, and a track of matches has to
+reproject within a few pixels from a point in front of every camera with enough parallax (Hartley and Zisserman, ch. 12).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from jsecon.errors import InputError
+from jsecon.types import Capture
+
+MIN_POINTS = 50
+"""fewer points than this are no start for a scene: the views do not overlap or have no texture"""
+
+
+class _Features(NamedTuple):
+    pixels: np.ndarray  # (F, 2) x, y in jsecon's convention (upper left corner of the image at 0, 0)
+    descriptors: np.ndarray  # (F, 128) float32, RootSIFT
+    colors: np.ndarray  # (F, 3) uint8
+
+
+def _detect(frame: np.ndarray, max_features: int, contrast: float) -> _Features:
+    sift = cv2.SIFT.create(nfeatures=max_features, contrastThreshold=contrast)  # type: ignore[attr-defined]
+    keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), None)
+    if not keypoints:
+        return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.uint8))
+    xy = np.array([k.pt for k in keypoints], np.float64)
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))  # Arandjelovic 2012
+    height, width = frame.shape[:2]
+    column = np.clip(np.rint(xy[:, 0]).astype(int), 0, width - 1)
+    row = np.clip(np.rint(xy[:, 1]).astype(int), 0, height - 1)
+    return _Features(xy + 0.5, descriptors.astype(np.float32), frame[row, column])  # OpenCV's pixel centres are integers
+
+
+def view_pairs(world_to_camera: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
+    """Each view with the `neighbours` that look most alike: near in place (in units of the median spacing) and direction."""
+    rotation = world_to_camera[:, :3, :3]
+    centres = -np.einsum("tji,tj->ti", rotation, world_to_camera[:, :3, 3])
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    apart = distance[distance > 0]
+    spread = float(np.median(apart)) if apart.size else 1.0
+    angle = np.arccos(np.clip(rotation[:, 2] @ rotation[:, 2].T, -1, 1))
+    cost = distance / spread + angle + 1e9 * np.eye(len(rotation))
+    nearest = np.argsort(cost, axis=1, kind="stable")[:, : min(neighbours, len(rotation) - 1)]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i in range(len(rotation)) for j in nearest[i]})
+
+
+def _fundamental(world_to_camera, intrinsics, i: int, j: int) -> np.ndarray:
+    """(3, 3) F with x_j^T F x_i = 0 in pixels (Hartley and Zisserman, eq. 9.1 for known poses)."""
+    relative = world_to_camera[j] @ np.linalg.inv(world_to_camera[i])
+    x, y, z = relative[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.linalg.inv(intrinsics[j]).T @ cross @ relative[:3, :3] @ np.linalg.inv(intrinsics[i])
+
+
+def _match(a: _Features, b: _Features, fundamental: np.ndarray, ratio: float, epipolar_px: float) -> np.ndarray:
+    """(M, 2) indices of mutual nearest descriptors that pass Lowe's ratio and lie on each other's epipolar lines."""
+    if len(a.pixels) < 2 or len(b.pixels) < 2:
+        return np.zeros((0, 2), int)
+    similarity = a.descriptors @ b.descriptors.T
+    forward, backward = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    rows = np.arange(len(forward))
+    best = similarity[rows, forward]
+    similarity[rows, forward] = -1
+    second = similarity.max(axis=1)
+    # Unit vectors: squared distance is 2 - 2 cos, so the ratio of distances compares these.
+    keep = (backward[forward] == rows) & (1 - best < ratio**2 * (1 - second))
+    pairs = np.stack([rows[keep], forward[keep]], axis=1)
+    x_i = np.concatenate([a.pixels[pairs[:, 0]], np.ones((len(pairs), 1))], axis=1)
+    x_j = np.concatenate([b.pixels[pairs[:, 1]], np.ones((len(pairs), 1))], axis=1)
+    line_j, line_i = x_i @ fundamental.T, x_j @ fundamental
+    off = np.abs((x_j * line_j).sum(axis=1))
+    distance = np.maximum(off / np.linalg.norm(line_j[:, :2], axis=1), off / np.linalg.norm(line_i[:, :2], axis=1))
+    return pairs[distance < epipolar_px]
+
+
+def _tracks(counts: list[int], matches: dict[tuple[int, int], np.ndarray]) -> list[np.ndarray]:
+    """Connected features, as arrays of (view, feature); a component with two features of one view is dropped."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    edges = [np.stack([offsets[i] + m[:, 0], offsets[j] + m[:, 1]]) for (i, j), m in matches.items() if len(m)]
+    if not edges:
+        return []
+    start, end = np.concatenate(edges, axis=1)
+    total = int(offsets[-1])
+    _, component = connected_components(coo_array((np.ones(len(start), bool), (start, end)), shape=(total, total)),
+                                        directed=False)
+    order = np.argsort(component, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(component[order])) + 1)
+    tracks = []
+    for nodes in groups:
+        if len(nodes) < 2:
+            continue
+        views = np.searchsorted(offsets, nodes, side="right") - 1
+        if len(np.unique(views)) == len(views):
+            tracks.append(np.stack([views, nodes - offsets[views]], axis=1))
+    return tracks
+
+
+def triangulate_tracks(
+    world_to_camera: np.ndarray, intrinsics: np.ndarray, views: np.ndarray, pixels: np.ndarray, seen: np.ndarray,
+    *, iterations: int = 5,
+):
+    """Points from padded tracks: views (P, V), pixels (P, V, 2), seen (P, V) bool -> points (P, 3), largest error px (P,),
+    smallest depth (P,), largest angle between two rays in radians (P,). Linear start, then Gauss-Newton on the reprojection.
+    """
+    projection = intrinsics @ world_to_camera[:, :3]
+    p = projection[views]
+    weight = seen.astype(np.float64)[..., None]
+    # The linear system A (x, y, z, 1) = 0 (Hartley and Zisserman, 12.2), each row scaled to unit length.
+    rows = np.concatenate([pixels[..., :1] * p[:, :, 2] - p[:, :, 0], pixels[..., 1:] * p[:, :, 2] - p[:, :, 1]], axis=1)
+    rows /= np.maximum(np.linalg.norm(rows[..., :3], axis=-1, keepdims=True), 1e-12)
+    rows *= np.concatenate([weight, weight], axis=1)
+    normal = np.einsum("pra,prb->pab", rows[..., :3], rows[..., :3]) + 1e-12 * np.eye(3)
+    points = np.linalg.solve(normal, -np.einsum("pra,pr->pa", rows[..., :3], rows[..., 3])[..., None])[..., 0]
+
+    def project(points):
+        homogeneous = np.einsum("pvab,pb->pva", p[..., :3], points) + p[..., 3]
+        depth = np.where(np.abs(homogeneous[..., 2]) < 1e-9, 1e-9, homogeneous[..., 2])
+        return homogeneous[..., :2] / depth[..., None], depth
+
+    for _ in range(iterations):
+        projected, depth = project(points)
+        residual = (pixels - projected) * weight
+        jacobian = (p[:, :, :2, :3] - projected[..., None] * p[:, :, 2:, :3]) / depth[..., None, None] * weight[..., None]
+        gram = np.einsum("pvka,pvkb->pab", jacobian, jacobian)
+        damping = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-30
+        step = np.einsum("pvka,pvk->pa", jacobian, residual)
+        points = points + np.linalg.solve(gram + damping * np.eye(3), step[..., None])[..., 0]
+    projected, depth = project(points)
+    error = np.where(seen, np.linalg.norm(pixels - projected, axis=-1), 0).max(axis=1)
+    centres = -np.einsum("tji,tj->ti", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
+    rays = points[:, None] - centres[views]
+    rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
+    cosine = np.where(seen[:, :, None] & seen[:, None], np.einsum("pva,pwa->pvw", rays, rays), 1)
+    return points, error, np.where(seen, depth, np.inf).min(axis=1), np.arccos(np.clip(cosine.min(axis=(1, 2)), -1, 1))
+
+
+def triangulated_points(
+    capture: Capture,
+    *,
+    neighbours: int = 6,
+    max_features: int = 6000,
+    contrast: float = 0.015,
+    ratio: float = 0.85,
+    error_px: float = 2.0,
+    min_angle_deg: float = 2.0,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sparse points (P, 3) float32 and their colours (P, 3) uint8 from the frames that are not held out.
+
+    `contrast` is SIFT's threshold (its own default is 0.04; lower gives more points), `ratio` Lowe's, `error_px` bounds both
+    the distance to the epipolar line and the reprojection error, `min_angle_deg` the parallax. Deterministic. Raises
+    InputError where fewer than MIN_POINTS points remain: the views do not overlap, or the poses do not belong to them.
+    """
+    used = np.flatnonzero(~np.asarray(capture.held_out))
+    cameras = capture.cameras[used]
+    poses = np.asarray(cameras.world_to_camera, np.float64)
+    intrinsics = np.zeros((len(used), 3, 3))
+    for row, column, value in ((0, 0, cameras.fx), (1, 1, cameras.fy), (0, 2, cameras.cx), (1, 2, cameras.cy), (2, 2, 1.0)):
+        intrinsics[:, row, column] = value
+    pairs = view_pairs(poses, neighbours)
+    total = len(used) + len(pairs)
+    features, matches = [], {}
+    for n, t in enumerate(used):
+        features.append(_detect(np.ascontiguousarray(capture.frames[t]), max_features, contrast))
+        if progress:
+            progress(n + 1, total)
+    for n, (i, j) in enumerate(pairs):
+        matches[i, j] = _match(features[i], features[j], _fundamental(poses, intrinsics, i, j), ratio, error_px)
+        if progress:
+            progress(len(used) + n + 1, total)
+    tracks = _tracks([len(f.pixels) for f in features], matches)
+    points, colors = np.zeros((0, 3)), np.zeros((0, 3))
+    if tracks:
+        longest = max(len(track) for track in tracks)
+        views = np.zeros((len(tracks), longest), int)
+        pixels = np.zeros((len(tracks), longest, 2))
+        shade = np.zeros((len(tracks), longest, 3))
+        seen = np.arange(longest) < np.array([len(track) for track in tracks])[:, None]
+        for n, track in enumerate(tracks):
+            views[n, : len(track)] = track[:, 0]
+            pixels[n, : len(track)] = [features[v].pixels[f] for v, f in track]
+            shade[n, : len(track)] = [features[v].colors[f] for v, f in track]
+        points, error, depth, angle = triangulate_tracks(poses, intrinsics, views, pixels, seen)
+        good = (error < error_px) & (depth > 0) & (angle > np.deg2rad(min_angle_deg)) & np.isfinite(points).all(axis=1)
+        points, colors = points[good], (shade.sum(axis=1) / seen.sum(axis=1, keepdims=True))[good]
+    if len(points) < MIN_POINTS:
+        raise InputError("capture", found=f"{len(points)} points from {len(used)} views by matching their features",
+                         expected=f"at least {MIN_POINTS}",
+                         remedy="The views need to overlap and to have texture, and the poses to belong to them; or give "
+                                "Gaussians (--gaussians PLY) or a capture with points.")
+    return points.astype(np.float32), np.rint(colors).astype(np.uint8)

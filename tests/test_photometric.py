@@ -1,0 +1,97 @@
+"""Losses against slow readable twins and finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jsecon.fit.photometric import gaussian_blur, l1, photometric_loss, psnr, ssim, ssim_map
+
+
+def images(shape=(13, 17, 3), seed=0, dtype=np.float32):
+    rng = np.random.default_rng(seed)
+    target = rng.random(shape)
+    return np.clip(target + 0.1 * rng.standard_normal(shape), 0, 1).astype(dtype), target.astype(dtype)
+
+
+def window():
+    weights = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    return np.outer(weights, weights) / np.outer(weights, weights).sum()
+
+
+def blur_twin(image):
+    """The definition: an 11 x 11 weighted sum at every pixel, zeros outside."""
+    padded = np.pad(image.astype(np.float64), [(5, 5), (5, 5), (0, 0)])
+    result = np.zeros(image.shape)
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            result[i, j] = np.einsum("ab,abc->c", window(), padded[i : i + 11, j : j + 11])
+    return result
+
+
+def ssim_twin(x, y):
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    mx, my = blur_twin(x), blur_twin(y)
+    vx, vy, cov = blur_twin(x * x) - mx**2, blur_twin(y * y) - my**2, blur_twin(x * y) - mx * my
+    return (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+
+
+def test_blur_and_ssim_equal_their_definitions():
+    image, target = images()
+    np.testing.assert_allclose(jax.jit(gaussian_blur)(image), blur_twin(image), atol=1e-6)
+    np.testing.assert_allclose(jax.jit(ssim_map)(image, target), ssim_twin(image, target), atol=2e-4)
+    with jax.enable_x64(True):
+        image, target = images(dtype=np.float64)
+        np.testing.assert_allclose(ssim_map(jnp.asarray(image), jnp.asarray(target)), ssim_twin(image, target), atol=1e-12)
+
+
+def test_ssim_of_an_image_with_itself_is_one_and_falls_with_noise():
+    image, target = images()
+    assert float(ssim(target, target)) == pytest.approx(1, abs=1e-6)
+    worse = np.clip(image + 0.3 * np.random.default_rng(1).standard_normal(image.shape), 0, 1).astype(np.float32)
+    assert float(ssim(worse, target)) < float(ssim(image, target)) < 1
+    assert float(ssim(1 - target, target)) < 0
+
+
+def test_loss_is_the_stated_mixture():
+    image, target = images()
+    absolute = np.abs(image.astype(np.float64) - target).mean()
+    expected = 0.8 * absolute + 0.2 * (1 - ssim_twin(image, target).mean())
+    assert float(photometric_loss(image, target)) == pytest.approx(expected, abs=1e-5)
+    assert float(photometric_loss(image, target, ssim_weight=0.0)) == pytest.approx(absolute, rel=1e-5)
+    assert float(l1(image, target)) == pytest.approx(absolute, rel=1e-5)
+
+
+def test_gradients_equal_central_differences_in_both_images():
+    with jax.enable_x64(True):
+        image, target = (jnp.asarray(a) for a in images((7, 6, 2), dtype=np.float64))
+        check_grads(jax.jit(photometric_loss), (image, target), order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
+        check_grads(jax.jit(gaussian_blur), (image,), order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_flat_images_have_finite_values_and_gradients(value):
+    flat = jnp.full((12, 12, 3), value)
+    loss, gradient = jax.value_and_grad(photometric_loss)(flat, flat)
+    assert float(loss) == pytest.approx(0, abs=1e-5)
+    assert bool(jnp.isfinite(gradient).all())
+
+
+def test_vmap_equals_a_loop_on_an_image_of_many_pixels():
+    batch = np.stack([images((182, 181, 3), seed=s)[0] for s in range(3)])  # 32,942 pixels each: STYLE trap 1's window
+    target = images((182, 181, 3))[1]
+    together = jax.jit(jax.vmap(photometric_loss, in_axes=(0, None)))(batch, target)
+    np.testing.assert_allclose(together, [photometric_loss(b, target) for b in batch], rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(l1)(batch[0], target), np.abs(batch[0].astype(np.float64) - target).mean(), rtol=1e-5)
+
+
+def test_psnr():
+    target = np.zeros((4, 4, 3), np.float32)
+    assert float(psnr(target + 0.1, target)) == pytest.approx(20, abs=1e-4)
+    assert float(psnr(target, target)) == np.inf
+
+
+def test_different_shapes_are_refused():
+    with pytest.raises(ValueError, match="same"):
+        l1(np.zeros((4, 4, 3), np.float32), np.zeros((4, 5, 3), np.float32))
