@@ -1,0 +1,85 @@
+"""What every test shares: type checks at run time, a float64 switch, a small scene, and where the real captures lie.
+
+Two host devices and the import hook must be settled before jax makes its first array and before jsecon is imported.
+"""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+HOME = Path(__file__).resolve().parent.parent
+_UNCHECKED = {"types", "__init__", "__main__"}
+
+# jsecon.types is left out: pytrees are also built from tracers, shapes and None while jax transforms them.
+install_import_hook(
+    sorted({f"jsecon.{path.stem}" for path in (HOME / "jsecon").iterdir()
+            if path.stem not in _UNCHECKED and (path.suffix == ".py" or (path / "__init__.py").exists())}),
+    "beartype.beartype",
+)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+import numpy as np
+
+from jsecon.types import Camera, Gaussians
+
+
+@pytest.fixture
+def x64():
+    """float64 for the time of one test: gradients against central differences need it."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def scene() -> Gaussians:
+    """64 Gaussians of many sizes, turns and opacities in a unit ball at the origin, SH degree 1, float32 NumPy."""
+    rng = np.random.default_rng(0)
+    count = 64
+    return Gaussians(
+        means=rng.uniform(-0.6, 0.6, (count, 3)).astype(np.float32),
+        log_scales=np.log(rng.uniform(0.02, 0.2, (count, 3))).astype(np.float32),
+        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
+        opacity_logits=rng.uniform(-2.0, 4.0, count).astype(np.float32),
+        sh=(0.3 * rng.normal(size=(count, 4, 3))).astype(np.float32),
+    )
+
+
+def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0)) -> np.ndarray:
+    """(4, 4) float32 world_to_camera, OpenCV axes, of a camera at `centre` that looks at `target`."""
+    centre, target, up = (np.asarray(v, np.float64) for v in (centre, target, up))
+    z = (target - centre) / np.linalg.norm(target - centre)
+    x = np.cross(-up, z) / np.linalg.norm(np.cross(up, z))
+    y = np.cross(z, x)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([x, y, z])
+    matrix[:3, 3] = -matrix[:3, :3] @ centre
+    return matrix.astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def cameras() -> Camera:
+    """Four cameras of 48x40 on a ring of radius 2.5 about the scene, principal point off the middle; a batch."""
+    poses = np.stack([look_at((2.5 * np.sin(a), -0.7, -2.5 * np.cos(a))) for a in (0.0, 1.4, 3.0, 4.7)])
+    ones = np.ones(4, np.float32)
+    return Camera(poses, 45 * ones, 43 * ones, 25.5 * ones, 19.0 * ones, width=48, height=40)
+
+
+@pytest.fixture(scope="session")
+def camera(cameras) -> Camera:
+    """The first of the four."""
+    return cameras[0]
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real captures beside the checkout; a test that asks for it is skipped where there is none."""
+    folder = HOME.parent / "shared"
+    if not (folder / "captures").is_dir():
+        pytest.skip("no real captures beside the checkout")
+    return folder
