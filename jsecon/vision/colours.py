@@ -1,0 +1,225 @@
+"""The default embedder, without any weights: regions and texts in one space of named colours.
+
+Both sides become a distribution over points of CIELAB: a region through its pixels, a text through its colour words. A
+smooth kernel between colours turns a distribution into a vector (its kernel mean, expressed at the prototypes of a
+fixed palette), so that the cosine of two vectors is 1 for like distributions and falls with the distance of the
+colours. The palette's names are the basic colour terms (Berlin & Kay 1969), each dark, plain and light, and the common
+mixed names.
+"""
+
+import re
+
+import cv2
+import numpy as np
+
+from jsecon.errors import InputError, require
+
+# name -> sRGB of a typical matt object of that name. A name of two words is a variant of the basic term in it.
+PALETTE: dict[str, tuple[int, int, int]] = {
+    "black": (22, 22, 24), "dark grey": (72, 72, 74), "grey": (128, 128, 128), "light grey": (190, 190, 190),
+    "white": (242, 242, 240),
+    "dark red": (115, 18, 22), "red": (205, 32, 36), "light red": (236, 120, 116),
+    "dark orange": (190, 88, 14), "orange": (242, 132, 28), "light orange": (250, 186, 122),
+    "dark brown": (66, 40, 22), "brown": (120, 74, 40), "light brown": (172, 126, 84),
+    "dark yellow": (178, 150, 22), "yellow": (244, 214, 40), "light yellow": (250, 238, 150),
+    "dark green": (18, 78, 34), "green": (40, 148, 60), "light green": (142, 214, 142),
+    "dark blue": (20, 36, 110), "blue": (36, 84, 196), "light blue": (140, 190, 238),
+    "dark purple": (66, 22, 96), "purple": (126, 52, 160), "light purple": (192, 160, 226),
+    "dark pink": (206, 52, 122), "pink": (242, 142, 178), "light pink": (250, 200, 214),
+    "maroon": (100, 16, 40), "crimson": (180, 20, 56), "salmon": (246, 144, 116), "coral": (250, 116, 84),
+    "peach": (252, 200, 160), "beige": (222, 206, 174), "cream": (250, 242, 210), "tan": (204, 172, 124),
+    "gold": (210, 168, 50), "mustard": (206, 166, 36), "olive": (112, 114, 36), "khaki": (180, 170, 110),
+    "lime": (160, 222, 40), "mint": (166, 232, 200), "teal": (14, 124, 124), "dark teal": (8, 74, 78),
+    "turquoise": (54, 196, 186), "cyan": (40, 210, 230), "sky": (130, 196, 240), "navy": (16, 26, 76),
+    "indigo": (62, 30, 130), "violet": (140, 70, 210), "lavender": (198, 180, 234), "lilac": (204, 164, 208),
+    "magenta": (216, 36, 168), "burgundy": (112, 18, 46), "rose": (236, 96, 136), "bronze": (150, 106, 46),
+    "copper": (184, 106, 62), "silver": (192, 194, 198), "ivory": (246, 240, 222), "charcoal": (52, 54, 58),
+}
+_SYNONYMS = {"gray": "grey", "azure": "sky", "scarlet": "red", "aqua": "cyan", "fuchsia": "magenta", "golden": "gold",
+             "silvery": "silver", "aquamarine": "turquoise", "amber": "gold", "chocolate": "dark brown", "mauve": "lilac",
+             "plum": "dark purple", "ochre": "mustard", "rust": "dark orange", "emerald": "green", "ruby": "dark red",
+             "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy"}
+_DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
+_PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
+_NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
+# Words of what surrounds the things in a room; they turn the extent's coordinate towards large regions.
+_SURROUNDINGS = {"wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "sky", "table",
+                 "tabletop", "tablecloth", "curtain", "curtains", "desk", "counter", "countertop", "lawn"}
+_NOUN_SKY = "sky"
+
+KERNEL_WIDTH = 22.0
+"""CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or light"""
+LIGHTNESS_WEIGHT = 0.8
+"""of L beside a and b in the kernel's distance: lighting changes L, and names depend on it all the same"""
+EXTENT_WEIGHT = 0.12
+"""share of the cosine that says how much of the frame a region fills: `white plate` is not the white wall"""
+EXTENT_FULL = 0.25
+"""share of the frame from which a region counts as surroundings and not as a thing"""
+
+
+def lab_of(rgb: np.ndarray) -> np.ndarray:
+    """(n, 3) sRGB 0..255 -> (n, 3) float32 CIELAB (D65)."""
+    pixels = np.asarray(rgb, np.float32).reshape(-1, 1, 3) / 255.0
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(-1, 3)
+
+
+class ColourEmbedder:
+    """Embedder (jsecon.vision.protocols) over named colours; see the module for the space.
+
+    What it understands of a text: colour names, their dark and light variants, `-ish` and compound forms (`bluish-green`),
+    several colours of one thing (`red and white striped box`: each counts alike), and whether the thing is part of the
+    surroundings (wall, floor, table ...). Nouns otherwise carry no meaning, shapes and materials neither.
+
+    An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
+    coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
+
+    `canonical` holds what a colour query must beat in LERF's relevancy, in the role of object / things / stuff /
+    texture: the palette's mean (any colour), mid grey, and a pale and a dark neutral (walls, shadow).
+    """
+
+    name = "colours-1"
+
+    def __init__(self):
+        self.names = tuple(PALETTE)
+        self._points = lab_of(np.asarray(list(PALETTE.values())))
+        self._by_name = dict(zip(self.names, self._points))
+        gram = _kernel(self._points, self._points)
+        # k(x, .) is projected on the span of the prototypes' features: phi(x) = K^(-1/2) k(x). Small eigenvalues carry
+        # nothing but rounding and are left out.
+        values, vectors = np.linalg.eigh(gram.astype(np.float64))
+        kept = values > 1e-3 * values[-1]
+        self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
+        self.dim = int(kept.sum()) + 2
+        neutral = lab_of(np.asarray([(128, 128, 128), (214, 206, 194), (58, 56, 54)]))
+        colours = [self._mean(self._points, np.ones(len(self._points)))]
+        colours += [self._mean(point[None], np.ones(1)) for point in neutral]
+        self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
+
+    def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
+        """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
+        require(masks.ndim == 3 and masks.shape[1:] == frame.shape[:2], "masks", got=masks.shape,
+                expected=f"(M, {frame.shape[0]}, {frame.shape[1]})", remedy="Give masks of the frame's own size.")
+        lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+        out = np.zeros((len(masks), self.dim), np.float32)
+        for row, mask in zip(out, masks.astype(bool)):
+            pixels = lab[_inside(mask)]
+            if len(pixels):
+                pixels = _without_shadow_and_shine(pixels)
+                row[:] = _joined(self._mean(pixels, np.ones(len(pixels))), mask.mean() / EXTENT_FULL)
+        return out
+
+    def embed_text(self, texts: list[str]) -> np.ndarray:
+        """Q texts -> (Q, E) float32 unit. Raises InputError for a text without a colour word, or with a negation."""
+        out = np.zeros((len(texts), self.dim), np.float32)
+        for row, text in zip(out, texts):
+            points = np.concatenate([self._colour(phrase) for phrase in self._phrases(text)])
+            weights = np.concatenate([np.full(3, 1.0) * (0.7, 0.15, 0.15)] * (len(points) // 3))
+            surroundings = bool(_SURROUNDINGS & set(_words(text)) - ({_NOUN_SKY} if _NOUN_SKY in text else set()))
+            row[:] = _joined(self._mean(points, weights), float(surroundings))
+        return out
+
+    def _mean(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Unit kernel mean of weighted CIELAB points (n, 3), in the span of the palette."""
+        likeness = _kernel(points, self._points)
+        mean = (weights.astype(np.float32) @ likeness / weights.sum()) @ self._projection
+        return mean / max(float(np.linalg.norm(mean)), 1e-12)
+
+    def _phrases(self, text: str) -> list[list[str]]:
+        """Splits a text into runs of modifiers and colour words, one run a colour."""
+        words = _words(text)
+        if _NEGATION & set(words):
+            raise InputError(f"query {text!r}", found="a negation", expected="the colours that the thing has",
+                             remedy="Say what colour it is, instead of what it is not.")
+        phrases: list[list[str]] = []
+        modifiers: list[str] = []
+        run_open = False
+        for word in words:
+            base, _ = self._base(word)
+            if base is not None:
+                if run_open:
+                    phrases[-1] += [*modifiers, word]
+                else:
+                    phrases.append([*modifiers, word])
+                modifiers, run_open = [], True
+            elif word in _DARK | _LIGHT | _PLAIN:
+                if run_open:
+                    run_open = False
+                modifiers.append(word)
+            else:
+                modifiers, run_open = [], False
+        if not phrases:
+            raise InputError(
+                f"query {text!r}", found="no colour word",
+                expected="a text that names a colour, such as 'dark green bottle' or 'red and white box'",
+                remedy="The embedder in use knows things by their colours only (" + ", ".join(
+                    sorted({n for n in self.names if " " not in n})) + "; dark, light, -ish). Name the thing's colour, "
+                "or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights.")
+        return phrases
+
+    def _base(self, word: str) -> tuple[str | None, bool]:
+        """The palette name behind a word, and whether it came as `-ish` (reddish, bluish, greyish)."""
+        word = _SYNONYMS.get(word, word)
+        if word in self._by_name:
+            return word, False
+        if word.endswith(("ish", "y")):
+            stem = word[:-3] if word.endswith("ish") else word[:-1]
+            for candidate in (stem, stem + "e", stem[:-1], stem[:-1] + "e"):  # reddish, bluish, ...
+                candidate = _SYNONYMS.get(candidate, candidate)
+                if candidate in self._by_name and len(stem) >= 3:
+                    return candidate, True
+        return None, False
+
+    def _colour(self, phrase: list[str]) -> np.ndarray:
+        """A run like [dark, bluish, green] -> (3, 3) CIELAB: the colour and a darker and a lighter neighbour."""
+        found = [self._base(word) for word in phrase]
+        names = [(base, ish) for base, ish in found if base is not None]
+        dark, light = bool(_DARK & set(phrase)), bool(_LIGHT & set(phrase))
+        prefix = "dark " if dark and not light else "light " if light and not dark else ""
+        points, weights = [], []
+        for base, ish in names:
+            shaded = self._by_name.get(prefix + base)
+            if shaded is None:
+                shaded = self._by_name[base] + np.float32([-22.0 if dark else 22.0 if light else 0.0, 0.0, 0.0])
+            points.append(shaded)
+            weights.append(0.5 if ish else 1.0)
+        weight = np.asarray(weights, np.float32)[:, None]
+        mixed = (np.stack(points) * weight).sum(0) / weight.sum()
+        if all(ish for _, ish in names):
+            mixed = mixed * np.float32([1.0, 0.7, 0.7])  # 'greenish' is greener than grey, not green
+        spread = np.float32([[0, 0, 0], [-10, 0, 0], [10, 0, 0]])
+        return np.clip(mixed + spread, [0, -128, -128], [100, 128, 128]).astype(np.float32)
+
+
+def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(n, 3), (m, 3) CIELAB -> (n, m) Gaussian likeness, 1 for equal colours."""
+    scale = np.float32([LIGHTNESS_WEIGHT, 1.0, 1.0]) / KERNEL_WIDTH
+    x, y = x * scale, y * scale
+    squared = (x * x).sum(-1)[:, None] + (y * y).sum(-1) - 2.0 * (x @ y.T)
+    return np.exp(-0.5 * np.maximum(squared, 0.0))
+
+
+def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
+    """Unit colour vector and extent (0 thing .. 1 surroundings) -> unit vector of the joint space."""
+    angle = 0.5 * np.pi * min(max(float(extent), 0.0), 1.0)
+    both = np.concatenate([np.sqrt(1.0 - EXTENT_WEIGHT) * colour,
+                           np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])])
+    return both.astype(np.float32)
+
+
+def _inside(mask: np.ndarray) -> np.ndarray:
+    """The mask without its one-pixel rim, whose colours mix with the neighbours'; the mask itself where nothing is left."""
+    core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE).astype(bool)
+    return core if core.sum() >= 0.3 * mask.sum() else mask
+
+
+def _without_shadow_and_shine(lab: np.ndarray) -> np.ndarray:
+    """(n, 3) CIELAB pixels -> those between the 30th and the 95th percentile of lightness.
+
+    The lit side of a thing carries its name; the shadow side is cut more than the highlights, which are few.
+    """
+    low, high = np.percentile(lab[:, 0], [30.0, 95.0])
+    return lab[(lab[:, 0] >= low) & (lab[:, 0] <= high)]
+
+
+def _words(text: str) -> list[str]:
+    return [w for w in re.split(r"[^a-z]+", text.lower().replace("'", "")) if w]

@@ -1,0 +1,163 @@
+"""A tracker without any weights: masks followed through the scene's own Gaussians.
+
+With the geometry frozen, a frame's image is linear in the Gaussians' features: a pixel is sum_i w_ip f_i with
+w = alpha T, occlusion included. So one pass over each frame, which sums w over the pixels of small image regions
+("atoms": superpixels cut by the frame's proposals), holds all that tracking needs: lifting a mask to the Gaussians and
+rendering it into another frame are then products with that frame's sparse matrix V (N Gaussians x A atoms), and no
+prompt costs a render. Masks come out cut along atoms, which follow the image's edges.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+import scipy.sparse as sparse
+
+from jsecon.errors import require
+from jsecon.language.votes import region_votes
+from jsecon.types import Camera, Gaussians
+
+_CHUNK = 64
+"""atoms are counted in multiples of this, so that few shapes are compiled"""
+
+
+@dataclasses.dataclass(frozen=True)
+class _View:
+    """What one frame says about the Gaussians."""
+
+    atoms: np.ndarray
+    """(H, W) int32 atom of each pixel, 0 .. A-1."""
+    votes: sparse.csr_matrix
+    """(N, A) sum of alpha T over the atom's pixels."""
+    to_atoms: sparse.csr_matrix
+    """(A, N) the same, transposed."""
+    proposals: np.ndarray
+    """(M, A) float32 share of each atom that lies in each proposal."""
+
+
+class GeometricTracker:
+    """Tracker (jsecon.vision.protocols) through the Gaussians of the scene itself.
+
+    gaussians: the scene. cameras: batch of T, one a frame. proposals: a function of a frame's index, or a sequence with
+    one entry a frame, giving masks (M, H, W) bool; they may overlap.
+
+    From the prompts' frame the track goes outward, t+1, t-1, t+2, ..., and every frame adds what it shows: evidence
+    e_ib (weight that Gaussian i casts on masks of prompt b) over the weight s_ib that it casts at all in the frames where
+    b was found; ownership q = e / s. In the next frame a proposal goes to the prompt that owns the largest part of its
+    known weight, if that is at least `proposal_share`; an atom of it is cut off where the known ownership contradicts
+    (below `contradiction`), and an atom that no proposal brings goes to a prompt that owns at least `atom_share` of it.
+    A frame in which a prompt finds nothing leaves its evidence as it is (occluded, outside the view, or lost).
+    """
+
+    def __init__(self, gaussians: Gaussians, cameras: Camera, proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
+                 *, atoms_per_frame: int = 256, proposal_share: float = 0.5, atom_share: float = 0.6,
+                 contradiction: float = 0.2, known_share: float = 0.3, capacity: int | None = None):
+        require(0 < atoms_per_frame, "atoms_per_frame", got=atoms_per_frame, expected="at least 1",
+                remedy="Use about 200 for small frames.")
+        self.gaussians, self.cameras, self.capacity = gaussians, cameras, capacity
+        self.proposal_share, self.atom_share = proposal_share, atom_share
+        self.contradiction, self.known_share = contradiction, known_share
+        self.atoms_per_frame = atoms_per_frame
+        self._propose = proposals if callable(proposals) else proposals.__getitem__
+        self._views: dict[int, _View] = {}
+
+    def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
+        """frames (T, H, W, 3) uint8, masks `prompts` (B, H, W) bool of frame `index` -> labels (T, H, W) int16.
+
+        The labels at `index` are the prompts themselves (the earlier one where they overlap).
+        """
+        count, height, width = frames.shape[:3]
+        require(prompts.ndim == 3 and prompts.shape[1:] == (height, width), "prompts", got=prompts.shape,
+                expected=f"(B, {height}, {width})", remedy="Give masks of the frame's own size.")
+        labels = np.full((count, height, width), -1, np.int16)
+        for b in reversed(range(len(prompts))):
+            labels[index][prompts[b]] = b
+        if not len(prompts):
+            return labels
+        start = self.view(frames, index)
+        mine = labels[index][None] == np.arange(len(prompts), dtype=np.int16)[:, None, None]
+        evidence = start.votes @ _coverage(start.atoms, mine, start.votes.shape[1]).T
+        seen = np.repeat(np.asarray(start.votes.sum(1), np.float32), len(prompts), axis=1)
+        for t in sorted((t for t in range(count) if t != index), key=lambda t: (abs(t - index), t < index)):
+            view = self.view(frames, t)
+            owner = self._match(view, evidence, seen)
+            labels[t] = owner[view.atoms]
+            onehot = (owner[:, None] == np.arange(len(prompts))).astype(np.float32)
+            evidence += view.votes @ onehot
+            seen += np.asarray(view.votes.sum(1), np.float32) * (onehot.sum(0) > 0)
+        return labels
+
+    def view(self, frames: np.ndarray, t: int) -> _View:
+        """The frame's atoms and votes; computed once."""
+        if t not in self._views:
+            masks = np.asarray(self._propose(t), bool)
+            atoms = image_atoms(frames[t], masks, count=self.atoms_per_frame)
+            number = int(atoms.max()) + 1
+            padded = -(-number // _CHUNK) * _CHUNK
+            votes = region_votes(self.gaussians, self.cameras[t:t + 1], atoms[None].astype(np.int32), padded,
+                                 top=12, capacity=self.capacity)
+            matrix = _sparse(np.asarray(votes.regions), np.asarray(votes.weights), number)
+            self._views[t] = _View(atoms, matrix, matrix.T.tocsr(), _coverage(atoms, masks, number))
+        return self._views[t]
+
+    def _match(self, view: _View, evidence: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        """The prompt (A,) int16 that owns each atom of a view, -1 = none."""
+        known = seen > 1e-3
+        owned = np.where(known, evidence / np.where(known, seen, 1.0), 0.0)
+        mass, known_mass = view.to_atoms @ owned, view.to_atoms @ known.astype(np.float32)  # (A, B)
+        total = np.asarray(view.to_atoms.sum(1), np.float32)  # (A, 1)
+        atom_share = mass / np.maximum(known_mass, 1e-6)
+        atom_known = known_mass / np.maximum(total, 1e-6)
+
+        share = (view.proposals @ mass) / np.maximum(view.proposals @ known_mass, 1e-6)
+        certain = (view.proposals @ known_mass) / np.maximum(view.proposals @ total, 1e-6)
+        share = np.where(certain >= self.known_share, share, 0.0)  # (M, B)
+        winner = share.argmax(1) if len(share) else np.zeros(0, np.int64)
+        score = np.where((atom_share >= self.atom_share) & (atom_known >= self.known_share), atom_share, 0.0)
+        for m, b in enumerate(winner):
+            if share[m, b] < self.proposal_share:
+                continue
+            against = (atom_share[:, b] < self.contradiction) & (atom_known[:, b] >= self.known_share)
+            inside = (view.proposals[m] > 0.5) & ~against
+            score[inside, b] = np.maximum(score[inside, b], share[m, b])
+        best = score.argmax(1)
+        return np.where(score[np.arange(len(best)), best] > 0, best, -1).astype(np.int16)
+
+
+def image_atoms(frame: np.ndarray, masks: np.ndarray, *, count: int, smallest: int = 12) -> np.ndarray:
+    """About `count` superpixels (SLICO, Achanta et al. 2012) of a frame, cut by the masks' outlines.
+
+    frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under `smallest` pixels go to the
+    nearest other piece.
+    """
+    lab = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2LAB)
+    size = max(int(round(np.sqrt(frame.shape[0] * frame.shape[1] / count))), 4)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLICO, size)
+    slic.iterate(6)
+    pieces = np.asarray(slic.getLabels(), np.int64)
+    for mask in masks:
+        pieces = np.unique(pieces * 2 + mask, return_inverse=True)[1].reshape(mask.shape)
+    areas = np.bincount(pieces.reshape(-1))
+    small = areas[pieces] < smallest
+    if small.any() and not small.all():
+        _, nearest = cv2.distanceTransformWithLabels(small.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        table = np.zeros(int(nearest.max()) + 1, np.int64)
+        table[nearest[~small]] = pieces[~small]
+        pieces = np.where(small, table[nearest], pieces)
+    return np.unique(pieces, return_inverse=True)[1].reshape(pieces.shape).astype(np.int32)
+
+
+def _coverage(atoms: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:
+    """(M, A) float32 share of each atom's pixels that lie in each mask."""
+    area = np.bincount(atoms.reshape(-1), minlength=count)
+    inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
+    return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
+
+
+def _sparse(regions: np.ndarray, weights: np.ndarray, columns: int, *, negligible: float = 0.005) -> sparse.csr_matrix:
+    """(N, K) strongest regions and weights -> (N, columns), without what is a negligible share of its row."""
+    keep = (regions >= 0) & (weights > negligible * weights.sum(1, keepdims=True))
+    rows, slots = np.nonzero(keep)
+    entries = weights[rows, slots].astype(np.float32)
+    return sparse.csr_matrix((entries, (rows, regions[rows, slots])), shape=(len(regions), columns))

@@ -1,0 +1,49 @@
+"""What looks at pixels, behind three small protocols, so that OpenCV, SAM, SAM 2, CLIP or files from disk can take each place.
+
+Everything here lives on the host: NumPy in, NumPy out. Frames are uint8 RGB.
+"""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Proposes regions of one frame."""
+
+    def __call__(self, frame: np.ndarray, index: int) -> np.ndarray:
+        """frame (H, W, 3) uint8 RGB, its index in the capture -> masks (M, H, W) bool, best first; they may overlap."""
+        ...
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """Follows regions of one frame through all frames."""
+
+    def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
+        """frames (T, H, W, 3) uint8, frame `index`, its masks `prompts` (B, H, W) bool -> labels (T, H, W) int16.
+
+        A label is the index of a prompt, or -1 for none: prompts that overlap are resolved by the tracker.
+        """
+        ...
+
+
+@runtime_checkable
+class Embedder(Protocol):
+    """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity."""
+
+    name: str
+    """identifies the space: fields and texts must come from the same"""
+    dim: int
+    """E"""
+    canonical: np.ndarray
+    """(C, E) float32 unit: what a query must beat (LERF: object, things, stuff, texture)"""
+
+    def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
+        """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
+        ...
+
+    def embed_text(self, texts: list[str]) -> np.ndarray:
+        """Q texts -> (Q, E) float32 unit. Raises InputError on a text that this space has no words for."""
+        ...
