@@ -1,0 +1,121 @@
+"""Rendering: D-channel features, colour, depth, of one view; differentiable in every array."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from jsecon.errors import require
+from jsecon.numerics import NEAR
+from jsecon.splat.composite import Splats, composite, composite_features_vjp, composite_vjp
+from jsecon.splat.project import check_shapes, project
+from jsecon.splat.sh import colours_from_sh
+from jsecon.splat.tiles import TileLists, plan_capacity, tile_lists
+from jsecon.types import Array, Camera, Gaussians, Rendering
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _splat(splats: Splats, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
+    return composite(splats, lists, width, height)
+
+
+def _splat_forward(splats, lists, width, height):
+    # symbolic_zeros: each leaf says whether anybody asked for its gradient, so that a field distilled into frozen
+    # Gaussians never pays for the gradient of their geometry.
+    wants_geometry = splats.attributes.perturbed
+    values = Splats(splats.attributes.value, splats.features.value)
+    lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
+    image, transmittance = composite(values, lists, width, height)
+    saved = (image, transmittance) if wants_geometry else None
+    return (image, transmittance), (values, lists, saved)
+
+
+def _splat_backward(width, height, residual, cotangents):
+    splats, lists, saved = residual
+    like = ((height, width, splats.features.shape[1]), (height, width))
+    dtype = splats.attributes.dtype
+    image_bar, transmittance_bar = (
+        jnp.zeros(shape, dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar
+        for bar, shape in zip(cotangents, like, strict=True)
+    )
+    if saved is None:
+        gradient = Splats(jnp.zeros_like(splats.attributes), composite_features_vjp(splats, lists, image_bar))
+    else:
+        gradient = composite_vjp(splats, lists, *saved, image_bar, transmittance_bar)
+    return gradient, None
+
+
+_splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
+
+
+def default_capacity(gaussians: Gaussians, camera: Camera) -> int:
+    """(tile, Gaussian) pairs to allow for: planned from the data; under a trace, where there is none, it must be given."""
+    leaves = jax.tree.leaves((gaussians, camera))
+    require(not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves), "capacity", got=None,
+            expected="a static int inside jit, grad or vmap",
+            remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras), and check Rendering.overflow == 0.")
+    return plan_capacity(gaussians, camera, margin=1.0)
+
+
+def render(gaussians: Gaussians, camera: Camera, features: Float[Array, "n d"], *, background: Array | None = None,
+           capacity: int | None = None, near: float = NEAR) -> Rendering:
+    """Renders per-Gaussian `features` (N, D) into one view: sum over the depth-sorted Gaussians of alpha T f.
+
+    Exact by definition (DESIGN section 5): equal to the brute-force sum over all Gaussians, whatever the tiling.
+    Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. Outside a trace the
+    capacity is planned from the data; inside one pass the static `capacity` (see `plan_capacity`): pairs that do not fit
+    are counted in `.overflow`, never dropped unsaid.
+
+    `background` (D,) is added with weight 1 - alpha. Raises ValueError on shapes that disagree.
+    """
+    check_shapes(gaussians, camera)
+    require(features.ndim == 2 and features.shape[0] == gaussians.means.shape[0], "features", got=features.shape,
+            expected=f"({gaussians.means.shape[0]}, D)", remedy="Give one row of features a Gaussian.")
+    if capacity is None:
+        capacity = default_capacity(gaussians, camera)
+        return _render_compiled(gaussians, camera, features, background, capacity, near)
+    return _render(gaussians, camera, features, background, capacity, near)
+
+
+def _render(gaussians, camera, features, background, capacity, near) -> Rendering:
+    projection = project(gaussians, camera, near=near)
+    lists = tile_lists(projection, camera.width, camera.height, capacity=capacity)
+    attributes = jnp.concatenate([projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]], 1)
+    # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
+    attributes = jnp.where(projection.visible[:, None], attributes, 0.0)
+    image, transmittance = _splat(Splats(attributes, features.astype(attributes.dtype)), lists, camera.width, camera.height)
+    if background is not None:
+        image = image + transmittance[..., None] * background
+    return Rendering(image, 1 - transmittance, lists.overflow)
+
+
+_render_compiled = jax.jit(_render, static_argnums=(4, 5))
+
+
+def render_rgb(gaussians: Gaussians, camera: Camera, *, background: Array | None = None, capacity: int | None = None,
+               near: float = NEAR) -> Rendering:
+    """Renders colour from spherical harmonics: features (H, W, 3), not clamped above 1. See `render`."""
+    check_shapes(gaussians, camera)
+    if capacity is None:
+        capacity = default_capacity(gaussians, camera)
+        return _render_rgb_compiled(gaussians, camera, background, capacity, near)
+    return _render_rgb(gaussians, camera, background, capacity, near)
+
+
+def _render_rgb(gaussians, camera, background, capacity, near):
+    return _render(gaussians, camera, colours_from_sh(gaussians, camera), background, capacity, near)
+
+
+_render_rgb_compiled = jax.jit(_render_rgb, static_argnums=(3, 4))
+
+
+def render_depth(gaussians: Gaussians, camera: Camera, *, capacity: int | None = None,
+                 near: float = NEAR) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """Expected z-depth (H, W) = sum(w z) / sum(w), world units, 0 where nothing is covered; and alpha (H, W)."""
+    depths = project(gaussians, camera, near=near).depths
+    depths = jnp.where(jnp.isfinite(depths), depths, 0.0)
+    rendering = render(gaussians, camera, depths[:, None], capacity=capacity, near=near)
+    covered = rendering.alpha > 0
+    return jnp.where(covered, rendering.features[..., 0] / jnp.where(covered, rendering.alpha, 1.0), 0.0), rendering.alpha

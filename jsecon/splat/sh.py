@@ -1,0 +1,47 @@
+"""Real spherical harmonics of colour, degrees 0 to 3, in the order and signs of the INRIA layout (REFERENCE A.4)."""
+
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from jsecon.errors import require
+from jsecon.numerics import normalize
+from jsecon.types import Array, Camera, Gaussians
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
+      1.445305721320277, -0.5900435899266435)  # fmt: skip
+
+
+def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]:
+    """The first `bands` (1, 4, 9 or 16) basis functions at unit `directions`."""
+    require(bands in (1, 4, 9, 16), "bands", got=bands, expected="1, 4, 9 or 16", remedy="Pad sh to a whole degree.")
+    x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    basis = [jnp.full_like(x, C0)]
+    if bands > 1:
+        basis += [-C1 * y, C1 * z, -C1 * x]
+    if bands > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)]
+    if bands > 9:
+        basis += [C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy),
+                  C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[4] * x * (4 * zz - xx - yy), C3[5] * z * (xx - yy),
+                  C3[6] * x * (xx - 3 * yy)]  # fmt: skip
+    return jnp.stack(basis, axis=-1)
+
+
+def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
+    """RGB of each Gaussian as `camera` sees it: 0.5 + sum of bands, clamped at 0 (gradient masked there), not above."""
+    bands = gaussians.sh.shape[1]
+    if bands == 1:
+        rgb = C0 * gaussians.sh[:, 0]
+    else:
+        basis = sh_basis(normalize(gaussians.means - camera.centres), bands)
+        rgb = (basis[:, :, None] * gaussians.sh).sum(1)
+    return jnp.maximum(rgb + 0.5, 0.0)
+
+
+def sh_from_rgb(rgb: Float[Array, "n 3"]) -> Float[Array, "n 1 3"]:
+    """The degree-0 coefficients that show `rgb` from every side."""
+    return ((rgb - 0.5) / C0)[:, None, :]
