@@ -1,0 +1,368 @@
+"""Pictures of the demo room by ray casting in NumPy: colour, instance and depth.
+
+Depth and instance are those of the ray through the pixel's centre, exact to float32; colour averages 2 x 2 rays. Light:
+a square lamp (soft shadows by rays to points on it) and a sky that is a little brighter from above, with the darkening of
+corners and contacts. The large flat surfaces are baked once, so their shadows are the same in every view by construction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, Float32, Int16, UInt8
+
+from jsecon.data.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Room, Texture, linear
+from jsecon.data.solids import blocks, first_hit, normals
+from jsecon.types import Array, Camera
+
+SKY, LAMP = 0.8, 0.45
+"""radiance of a white surface under the whole sky, and facing the whole lamp: a lit surface keeps its colour's lightness"""
+_OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+_LAMP_SIDE = 6
+"""the lamp is a grid of 6 x 6 points"""
+_LIFT = np.float32(1e-3)
+"""shadow rays start this far off their surface, m"""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plane:
+    """A flat surface baked into a picture: radiance[v, u] at origin + u texel first + v texel second."""
+
+    origin: Array
+    first: Array
+    second: Array
+    texel: float
+    radiance: Array
+
+    def look_up(self, points):
+        height, width = self.radiance.shape[:2]
+        u = np.clip(((self.first @ points) - self.first @ self.origin) / self.texel, 0, width - 1).astype(np.int32)
+        v = np.clip(((self.second @ points) - self.second @ self.origin) / self.texel, 0, height - 1).astype(np.int32)
+        return self.radiance.reshape(-1, 3)[v * width + u]
+
+
+@dataclasses.dataclass(frozen=True)
+class BakedRoom:
+    """A room made ready for rendering: its flat surfaces with their light."""
+
+    room: Room
+    walls: tuple[_Plane, ...]
+    """x-, x+, y-, y+, floor, ceiling."""
+    table: _Plane
+
+
+def pattern(texture: Texture, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+    """The texture's s in [-1, 1] at points in its object's frame, (3, n) m."""
+    p = (points + texture.phase[:, None]) / np.float32(texture.scale)
+    if texture.kind == "checks":
+        return (2 * (np.floor(p).sum(0) % 2) - 1).astype(np.float32)
+    if texture.kind == "stripes":
+        return np.clip(3 * np.sin(2 * np.pi * (p[2] + 0.35 * p[0])), -1, 1).astype(np.float32)
+    if texture.kind == "marble":
+        fold = np.sin(2.1 * p[0] + 1.3 * p[1]) + np.sin(2.7 * p[2] - 1.1 * p[0]) + np.sin(1.7 * p[1] + 2.3 * p[2])
+        return np.sin(1.4 * fold + 1.2 * p.sum(0)).astype(np.float32)
+    if texture.kind == "wood":
+        bend = 0.25 * np.sin(0.9 * p[0]) + 0.08 * np.sin(3.1 * p[0] + 2.0 * np.sin(1.3 * p[1]))
+        grain = np.sin(2 * np.pi * (p[1] + bend)) * 0.6 + 0.4 * np.sin(2 * np.pi * (4.3 * p[1] + 2 * bend + 0.1 * p[0]))
+        return grain.astype(np.float32)
+    return np.zeros(points.shape[1], np.float32)
+
+
+def _lamp_points(room):
+    ticks = ((np.arange(_LAMP_SIDE) + 0.5) / _LAMP_SIDE * 2 - 1) * room.light_half
+    x, y = np.meshgrid(ticks, ticks)
+    return (room.light[:, None] + np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])).astype(np.float32)
+
+
+def lamp_visibility(room: Room, points: Float[np.ndarray, "3 n"], *, lamps: Float[np.ndarray, "3 m"],
+                    skip_furniture: bool = False) -> Float[np.ndarray, " n"]:
+    """The share of the lamp's points that each point sees, 0 to 1."""
+    count = lamps.shape[1]
+    blocked = np.zeros((count, points.shape[1]), bool)
+    for part in _shading_parts(room, points, skip_furniture):
+        near = np.flatnonzero(_may_shade(room, part.solid.bound, points))
+        if len(near):
+            origin = np.tile(points[:, near], count)
+            target = np.repeat(lamps, len(near), 1)
+            blocked[:, near] |= blocks(part.solid, part.hollow, origin, target - origin).reshape(count, -1)
+    return 1 - blocked.mean(0, dtype=np.float32)
+
+
+def _shading_parts(room, points, skip_furniture):
+    """The parts that may shade any of the points: those that reach into the cone from a sphere around them to the lamp."""
+    middle = 0.5 * (points.min(1) + points.max(1))
+    spread = np.sqrt(((points - middle[:, None]) ** 2).sum(0).max()) if points.shape[1] else np.float32(0)
+    for part in room.parts:
+        if part.owner < 0 and skip_furniture:
+            continue
+        wider = part.solid.bound + np.array([0, 0, 0, spread], np.float32)
+        if _may_shade(room, wider, middle[:, None])[0]:
+            yield part
+
+
+def _may_shade(room, bound, points):
+    """Whether the bounding sphere reaches into the cone from a point to the lamp."""
+    to_lamp, to_bound = room.light[:, None] - points, bound[:3, None] - points
+    length2 = (to_lamp * to_lamp).sum(0)
+    along = np.clip((to_lamp * to_bound).sum(0) / length2, 0, 1)
+    off = to_bound - along * to_lamp
+    reach = bound[3] + along * np.float32(room.light_half * np.sqrt(2))
+    return (off * off).sum(0) < reach * reach
+
+
+def _direct(room, points, normal):
+    """Cosine to the lamp's middle, clamped."""
+    to_lamp = room.light[:, None] - points
+    return np.maximum((normal * to_lamp).sum(0) / np.sqrt((to_lamp * to_lamp).sum(0)), 0)
+
+
+def _contact(room, points, normal):
+    """The share of the sky left by the objects standing near: each part as a sphere of its bound's volume at most."""
+    left = np.ones(points.shape[1], np.float32)
+    for part in room.parts:
+        if part.owner < 0:
+            continue
+        to = part.solid.bound[:3, None] - points
+        distance = np.sqrt((to * to).sum(0))
+        radius = np.minimum(0.8 * part.solid.bound[3], 0.95 * distance)
+        cosine = np.clip((normal * to).sum(0) / np.maximum(distance, 1e-6), 0, 1)
+        left *= 1 - 0.6 * cosine * (radius / np.maximum(distance, 1e-6)) ** 2
+    return left
+
+
+def bake(room: Room) -> BakedRoom:
+    """Paints and lights the room's flat surfaces: noise, tiles, panels and wood in colours that no object has."""
+    x, y = (float(v) for v in room.half)
+    floor, ceiling = -TABLE_HEIGHT, room.ceiling
+    right, back, up = np.eye(3, dtype=np.float32)
+    draw = np.random.default_rng([room.seed, 3])
+    tall = ceiling - floor
+    walls = [_wall(room, draw, np.array(origin, np.float32), first, up, span, tall, normal) for origin, first, span, normal in
+             [((-x, -y, floor), back, 2 * y, right), ((x, -y, floor), back, 2 * y, -right),
+              ((-x, -y, floor), right, 2 * x, back), ((-x, y, floor), right, 2 * x, -back)]]
+    ground = _flat(room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006, 0.03, _tiles)
+    above = _flat(room, draw, np.array([-x, -y, ceiling], np.float32), 2 * x, 2 * y, -up, 0.02, None, _plaster)
+    tx, ty = TABLE_HALF
+    table = _flat(room, draw, np.array([-tx, -ty, 0], np.float32), 2 * tx, 2 * ty, up, 0.0025, 0.005, _planks)
+    return BakedRoom(room, (*walls, ground, above), table)
+
+
+def _grid(origin, first, second, width, height, texel):
+    u, v = (np.arange(max(round(span / texel), 1), dtype=np.float32) for span in (width, height))
+    u, v = np.meshgrid((u + 0.5) * texel, (v + 0.5) * texel)
+    points = origin[:, None] + first[:, None] * u.ravel() + second[:, None] * v.ravel()
+    return points.astype(np.float32), u, v
+
+
+def _noise(draw, shape, cells):
+    """Smooth random picture in [-1, 1]: bilinear between random values, three octaves from `cells` a side."""
+    total = np.zeros(shape, np.float32)
+    for octave in range(3):
+        n = cells * 2**octave
+        lattice = draw.uniform(-1, 1, (n + 2, n + 2)).astype(np.float32)
+        total += _stretch(lattice, shape, n) * np.float32(0.5**octave)
+    return total / np.float32(1.75)
+
+
+def _stretch(picture, shape, cells=None):
+    """Bilinear enlargement of a picture (h, w) to `shape`, corner to corner (or over its first `cells` cells)."""
+    rows = np.linspace(0, (cells or picture.shape[0] - 1) - 1e-3, shape[0], dtype=np.float32)
+    columns = np.linspace(0, (cells or picture.shape[1] - 1) - 1e-3, shape[1], dtype=np.float32)
+    i, j = rows.astype(np.int32), columns.astype(np.int32)
+    a, b = (rows - i)[:, None], (columns - j)[None]
+    top = picture[i][:, j] * (1 - b) + picture[i][:, j + 1] * b
+    return top * (1 - a) + picture[i + 1][:, j] * a * (1 - b) + picture[i + 1][:, j + 1] * a * b
+
+
+def _tiles(draw, u, v):
+    tone = 0.15 * ((np.floor(u / 0.35) + np.floor(v / 0.35)) % 2) + 0.1 * _noise(draw, u.shape, 40)
+    joint = (np.minimum(u % 0.35, v % 0.35) < 0.012) * 0.12
+    return linear((128, 126, 128)) * (0.95 + tone - joint)[..., None]
+
+
+def _plaster(draw, u, v):
+    return linear((172, 168, 162)) * (1 + 0.04 * _noise(draw, u.shape, 30))[..., None]
+
+
+def _planks(draw, u, v):
+    wood = Texture("wood", 0.07, 1.0, draw.uniform(-1, 1, 3).astype(np.float32))
+    board = np.floor(v / 0.16)
+    flat = np.stack([u.ravel() + 0.37 * board.ravel(), v.ravel() + 0.11 * board.ravel(), 0 * u.ravel()]).astype(np.float32)
+    grain = pattern(wood, flat).reshape(u.shape)
+    tone = 0.1 * grain + 0.05 * _noise(draw, u.shape, 24) + 0.05 * ((board * 7) % 3 - 1) - 0.2 * ((v % 0.16) < 0.004)
+    return linear(TABLE_WOOD) * (1 + tone)[..., None]
+
+
+def _flat(room, draw, origin, width, depth, normal, texel, shadow_texel, paint):
+    right, back, _ = np.eye(3, dtype=np.float32)
+    points, u, v = _grid(origin, right, back, width, depth, texel)
+    turn = np.broadcast_to(normal[:, None], points.shape)
+    light = np.full(u.shape, SKY * (1.0 if normal[2] > 0 else 1.05), np.float32)
+    if shadow_texel is not None:
+        coarse, cu, _ = _grid(origin, right, back, width, depth, shadow_texel)
+        on_table = abs(origin[2]) < 1e-6
+        lifted = coarse + _LIFT * normal[:, None]
+        seen = lamp_visibility(room, lifted, lamps=_lamp_points(room), skip_furniture=on_table).reshape(cu.shape)
+        contact = _contact(room, coarse, np.broadcast_to(normal[:, None], coarse.shape)).reshape(cu.shape) if on_table else None
+        light *= _stretch(contact, u.shape) if contact is not None else _under_table(points).reshape(u.shape)
+        light += LAMP * _direct(room, points, turn).reshape(u.shape) * _stretch(seen, u.shape)
+    return _Plane(origin, right, back, texel, (paint(draw, u, v) * light[..., None]).astype(np.float32))
+
+
+def _under_table(points):
+    """The share of the sky that the floor sees beside and below the table."""
+    beyond = np.maximum(np.abs(points[:2]) - np.array(TABLE_HALF, np.float32)[:, None], -0.3)
+    return np.clip(0.75 + 0.4 * beyond.max(0), 0.6, 1)
+
+
+def _wall(room, draw, origin, first, up, span, tall, normal):
+    points, u, v = _grid(origin, first, up, span, tall, 0.008)
+    tone = 0.05 * _noise(draw, u.shape, 36) + 0.035 * np.sign(np.sin(2 * np.pi * u / 0.24))
+    low = v < 0.95
+    tone -= 0.28 * low + 0.15 * ((v > 0.95) & (v < 0.99)) + 0.2 * (v < 0.1)
+    tone = np.where(low & (u % 0.5 < 0.012), tone - 0.12, tone)
+    paint = linear((178, 169, 153)) * (1 + tone)[..., None]
+    for k in range(3):
+        _hang_picture(draw, paint, u, v, span * (k + 0.5) / 3 + draw.uniform(-0.15, 0.15))
+    turn = np.broadcast_to(normal[:, None], points.shape)
+    light = SKY * (0.82 + 0.18 * np.clip(v / 0.5, 0, 1)) + 0.6 * LAMP * _direct(room, points, turn).reshape(u.shape)
+    return _Plane(origin, first, up, 0.008, (paint * light[..., None]).astype(np.float32))
+
+
+def _hang_picture(draw, paint, u, v, middle):
+    """A framed picture in greys, for walls that a camera can be located by."""
+    half_w, half_h, height = draw.uniform(0.2, 0.3), draw.uniform(0.18, 0.26), draw.uniform(1.42, 1.55)
+    inside = np.maximum(np.abs(u - middle) - half_w, np.abs(v - height) - half_h)
+    blot = np.sign(_noise(draw, u.shape, 20))[..., None]
+    paint[inside < 0.03] = linear((98, 94, 90))
+    paint[inside < 0] = (linear((150, 150, 152)) * (1 + 0.25 * blot))[inside < 0]
+
+
+def _rays(camera, dx, dy):
+    """World origin (3,) and directions (3, H * W) with a camera z of 1, so that a ray's parameter is its z-depth."""
+    pose = np.asarray(camera.world_to_camera, np.float32)
+    x = (np.arange(camera.width, dtype=np.float32) + np.float32(0.5 + dx) - float(camera.cx)) / float(camera.fx)
+    y = (np.arange(camera.height, dtype=np.float32) + np.float32(0.5 + dy) - float(camera.cy)) / float(camera.fy)
+    x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+    local = np.stack([x.ravel(), y.ravel(), np.ones(x.size, np.float32)])
+    return -pose[:3, :3].T @ pose[:3, 3], pose[:3, :3].T @ local
+
+
+def _window(camera, bound):
+    """Rows and columns of the pixels that may see the sphere: its exact silhouette's box, one pixel wider."""
+    pose = np.asarray(camera.world_to_camera, np.float64)
+    x, y, z = pose[:3, :3] @ bound[:3] + pose[:3, 3]
+    r = float(bound[3])
+    if z + r <= 0:
+        return slice(0, 0), slice(0, 0)
+    if z <= 1.01 * r:
+        return slice(0, camera.height), slice(0, camera.width)
+    spans = []
+    for side, focal, middle, size in [(y, camera.fy, camera.cy, camera.height), (x, camera.fx, camera.cx, camera.width)]:
+        swing = r * np.sqrt(side * side + z * z - r * r)
+        low, high = ((side * z + sign * swing) / (z * z - r * r) * float(focal) + float(middle) for sign in (-1, 1))
+        spans.append(slice(int(np.clip(np.floor(low) - 1, 0, size)), int(np.clip(np.ceil(high) + 1, 0, size))))
+    return spans[0], spans[1]
+
+
+def trace(room: Room, camera: Camera, *, dx: float = 0.0, dy: float = 0.0,
+          ) -> tuple[Float32[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]:
+    """z-depth and index into `room.parts` (-1 = a wall, the floor or the ceiling) of the rays through the pixels' centres
+    shifted by (dx, dy) px. The camera must stand in the room and outside of every part."""
+    origin, direction = _rays(camera, dx, dy)
+    shape = (camera.height, camera.width)
+    corner = np.array([*room.half, room.ceiling], np.float32)[:, None]
+    low = np.array([*-room.half, -TABLE_HEIGHT], np.float32)[:, None]
+    with np.errstate(divide="ignore"):
+        depth = (np.where(direction > 0, corner, low) - origin[:, None]) / direction
+    depth = np.where(direction == 0, np.inf, depth).min(0).astype(np.float32).reshape(shape)
+    index = np.full(shape, -1, np.int16)
+    direction = direction.reshape(3, *shape)
+    for k, part in enumerate(room.parts):
+        rows, columns = _window(camera, part.solid.bound)
+        rays = direction[:, rows, columns]
+        if not rays.size:
+            continue
+        t = first_hit(part.solid, part.hollow, origin[:, None], np.ascontiguousarray(rays.reshape(3, -1))).reshape(rays.shape[1:])
+        nearer = t < depth[rows, columns]
+        depth[rows, columns][nearer] = t[nearer]
+        index[rows, columns][nearer] = k
+    return depth, index
+
+
+def _shade(baked, points, index, lamps):
+    """Linear RGB (n, 3) of surface points (3, n)."""
+    room = baked.room
+    colour = np.empty((points.shape[1], 3), np.float32)
+    background = np.flatnonzero(index < 0)
+    p = points[:, background]
+    gaps = np.stack([room.half[0] + p[0], room.half[0] - p[0], room.half[1] + p[1], room.half[1] - p[1],
+                     p[2] + np.float32(TABLE_HEIGHT), np.float32(room.ceiling) - p[2]])
+    nearest = gaps.argmin(0)
+    for side, plane in enumerate(baked.walls):
+        on = nearest == side
+        colour[background[on]] = plane.look_up(p[:, on])
+    owners = np.array([part.owner for part in room.parts] + [-2], np.int16)[index]
+    for owner in np.unique(owners[index >= 0]):
+        chosen = np.flatnonzero(owners == owner)
+        shade = _shade_furniture if owner < 0 else _shade_object
+        colour[chosen] = shade(baked, int(owner), points[:, chosen], index[chosen], lamps)
+    return colour
+
+
+def _shade_furniture(baked, owner, p, index, lamps):
+    del owner, lamps
+    room = baked.room
+    top = (index == 0) & (p[2] > -1e-3)
+    side = room.furniture[0].albedo * np.where(index == 0, SKY * 0.75, SKY * 0.6)[:, None]
+    colour = side.astype(np.float32)
+    colour[top] = baked.table.look_up(p[:, top])
+    return colour
+
+
+def _shade_object(baked, owner, p, index, lamps):
+    room, item = baked.room, baked.room.objects[owner]
+    normal, albedo = np.empty_like(p), np.empty((p.shape[1], 3), np.float32)
+    for k in np.unique(index):
+        on = index == k
+        normal[:, on] = normals(room.parts[k].solid, room.parts[k].hollow, p[:, on])
+        albedo[on] = room.parts[k].albedo
+    light = SKY * (0.86 + 0.14 * normal[2]) * (0.8 + 0.2 * np.clip(p[2] / 0.06, 0, 1))
+    direct = LAMP * _direct(room, p, normal)
+    facing = np.flatnonzero(direct > 0)
+    lifted = p[:, facing] + _LIFT * normal[:, facing]
+    light[facing] += direct[facing] * lamp_visibility(room, lifted, lamps=lamps, skip_furniture=True)
+    tone = 1 + np.float32(item.texture.depth) * pattern(item.texture, item.axes.T @ (p - item.centre[:, None]))
+    return albedo * (tone * light)[:, None]
+
+
+def srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"]:
+    """Linear RGB, clipped to 0..1, to 8-bit sRGB (IEC 61966-2-1)."""
+    c = np.clip(rgb, 0, 1)
+    return np.round(255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
+
+
+def render_views(room: Room, cameras: Camera, *, progress: Callable[[int, int], None] | None = None,
+                 ) -> tuple[UInt8[np.ndarray, "t h w 3"], Int16[np.ndarray, "t h w"], Float32[np.ndarray, "t h w"]]:
+    """Frames, instances (index of the object, -1 = background) and z-depths (m) of a batch of cameras in the room."""
+    baked = bake(room)
+    lamps = _lamp_points(room)
+    owners = np.array([part.owner for part in room.parts] + [-1], np.int16)
+    count = int(np.asarray(cameras.fx).shape[0])
+    frames, instances, depths = [], [], []
+    for view in range(count):
+        camera = cameras[view]
+        depth, index = trace(room, camera)
+        total = np.zeros((depth.size, 3), np.float32)
+        for k, (dx, dy) in enumerate(_OFFSETS):
+            t, hit = trace(room, camera, dx=dx, dy=dy)
+            origin, direction = _rays(camera, dx, dy)
+            total += _shade(baked, origin[:, None] + t.ravel() * direction, hit.ravel(), lamps[:, k::len(_OFFSETS)])
+        frames.append(srgb(total / len(_OFFSETS)).reshape(*depth.shape, 3))
+        instances.append(owners[index])
+        depths.append(depth)
+        if progress is not None:
+            progress(view + 1, count)
+    return np.stack(frames), np.stack(instances), np.stack(depths)
