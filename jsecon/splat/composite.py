@@ -39,7 +39,7 @@ class Splats:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Batches:
+class Batches:
     """Tiles sorted by list length, in batches of BATCH; the last is filled up with empty tiles."""
 
     tiles: Array
@@ -58,7 +58,7 @@ class _Batches:
         return x.astype(dtype), y.astype(dtype)
 
 
-def _batches(lists: TileLists, width: int, height: int) -> _Batches:
+def make_batches(lists: TileLists, width: int, height: int) -> Batches:
     across, down = grid(width, height, lists.tile)
     number = across * down
     lengths = lists.starts[1:] - lists.starts[:-1]
@@ -66,11 +66,11 @@ def _batches(lists: TileLists, width: int, height: int) -> _Batches:
     count = -(-number // BATCH)
     order = jnp.concatenate([order, jnp.full(count * BATCH - number, number, jnp.int32)]).reshape(count, BATCH)
     empty = jnp.zeros(1, jnp.int32)
-    return _Batches(order, jnp.concatenate([lists.starts[:-1], empty]), jnp.concatenate([lengths, empty]), across, number,
+    return Batches(order, jnp.concatenate([lists.starts[:-1], empty]), jnp.concatenate([lengths, empty]), across, number,
                     lists.tile)
 
 
-def _alphas(attributes: Array, x: Array, y: Array):
+def alphas(attributes: Array, x: Array, y: Array):
     """Alpha of one Gaussian a tile (BATCH, 6) at the tiles' pixels (BATCH, P), and what its gradient needs."""
     a = attributes[:, :, None]
     dx, dy = x - a[:, 0], y - a[:, 1]
@@ -80,7 +80,7 @@ def _alphas(attributes: Array, x: Array, y: Array):
     return alpha, unclamped
 
 
-def _advance(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
+def advance(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
     """(weight, next transmittance). A pixel that has stopped keeps its final transmittance with a minus sign."""
     weight = alpha * jnp.maximum(transmittance, 0.0)
     left = transmittance - weight
@@ -88,17 +88,17 @@ def _advance(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
     return jnp.where(stop, 0.0, weight), jnp.where(stop, -jnp.abs(transmittance), left)
 
 
-def _chunk(splats: Splats, lists: TileLists, start: Array, length: Array, first: Array):
+def chunk(table: Array, lists: TileLists, start: Array, length: Array, first: Array):
     """Ids (CHUNK, BATCH), attributes (CHUNK, BATCH, 6) of the next CHUNK Gaussians; opacity 0 past a list's end."""
     index = first + jnp.arange(CHUNK)[:, None]
     inside = index < length[None]
     ids = lists.gaussians[jnp.minimum(start[None] + index, lists.gaussians.shape[0] - 1)]
-    attributes = splats.attributes[ids]
+    attributes = table[ids]
     opacity = jnp.where(inside, attributes[..., 5], 0.0)
     return ids, jnp.concatenate([attributes[..., :5], opacity[..., None]], axis=-1)
 
 
-def _walk(body, state, length: Array, transmittance_of):
+def walk(body, state, length: Array, transmittance_of):
     """Applies `body(first, state)` chunk by chunk until the longest list ends or every pixel has stopped."""
     longest = length.max()
 
@@ -113,7 +113,7 @@ def _walk(body, state, length: Array, transmittance_of):
     return lax.while_loop(unfinished, step, (jnp.int32(0), state))[1]
 
 
-def _to_image(batched: Array, batches: _Batches, width: int, height: int) -> Array:
+def _to_image(batched: Array, batches: Batches, width: int, height: int) -> Array:
     """(batches, BATCH, P, D) -> (H, W, D)."""
     down = batches.number // batches.across
     tile, channels = batches.tile, batched.shape[-1]
@@ -136,7 +136,7 @@ def to_tiles(image: Array, tile: int) -> Array:
 
 def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
     """Features (H, W, D) = sum of alpha T f, and final transmittance (H, W)."""
-    batches = _batches(lists, width, height)
+    batches = make_batches(lists, width, height)
     channels, dtype = splats.features.shape[1], splats.attributes.dtype
     narrow = channels < WIDE
 
@@ -145,28 +145,28 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tupl
         x, y = batches.pixels(tiles, dtype)
 
         def body(first, state):
-            ids, attributes = _chunk(splats, lists, start, length, first)
+            ids, attributes = chunk(splats.attributes, lists, start, length, first)
             features = splats.features[ids]
             if narrow:
 
                 def step(carry, item):
                     transmittance, total = carry
-                    alpha, _ = _alphas(item[0], x, y)
-                    weight, transmittance = _advance(transmittance, alpha)
+                    alpha, _ = alphas(item[0], x, y)
+                    weight, transmittance = advance(transmittance, alpha)
                     return (transmittance, total + weight[None] * item[1].T[:, :, None]), None
 
                 return lax.scan(step, state, (attributes, features), unroll=UNROLL)[0]
 
             def step(transmittance, item):
-                alpha, _ = _alphas(item, x, y)
-                weight, transmittance = _advance(transmittance, alpha)
+                alpha, _ = alphas(item, x, y)
+                weight, transmittance = advance(transmittance, alpha)
                 return transmittance, weight
 
             transmittance, weights = lax.scan(step, state[0], attributes, unroll=UNROLL)
             return transmittance, state[1] + jnp.einsum("cbp,cbd->dbp", weights, features)
 
         initial = (jnp.ones_like(x), jnp.zeros((channels, *x.shape), dtype))
-        transmittance, total = _walk(body, initial, length, lambda state: state[0])
+        transmittance, total = walk(body, initial, length, lambda state: state[0])
         return jnp.concatenate([jnp.moveaxis(total, 0, -1), jnp.abs(transmittance)[..., None]], axis=-1)
 
     image = _to_image(lax.map(one_batch, batches.tiles), batches, width, height)
@@ -176,7 +176,7 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tupl
 def composite_features_vjp(splats: Splats, lists: TileLists, cotangent: Float[Array, "h w d"]) -> Float[Array, "n d"]:
     """Gradient with respect to the features alone: W^T cotangent. No gradient of the geometry is computed."""
     height, width, channels = cotangent.shape
-    batches = _batches(lists, width, height)
+    batches = make_batches(lists, width, height)
     cotangents = to_tiles(cotangent, lists.tile)
     dtype = splats.attributes.dtype
 
@@ -187,17 +187,17 @@ def composite_features_vjp(splats: Splats, lists: TileLists, cotangent: Float[Ar
 
         def body(first, state):
             transmittance, gradient = state
-            ids, attributes = _chunk(splats, lists, start, length, first)
+            ids, attributes = chunk(splats.attributes, lists, start, length, first)
 
             def step(transmittance, item):
-                alpha, _ = _alphas(item, x, y)
-                weight, transmittance = _advance(transmittance, alpha)
+                alpha, _ = alphas(item, x, y)
+                weight, transmittance = advance(transmittance, alpha)
                 return transmittance, weight
 
             transmittance, weights = lax.scan(step, transmittance, attributes, unroll=UNROLL)
             return transmittance, gradient.at[ids].add(jnp.einsum("cbp,bpd->cbd", weights, local))
 
-        state = _walk(body, (jnp.ones_like(x), gradient), length, lambda state: state[0])
+        state = walk(body, (jnp.ones_like(x), gradient), length, lambda state: state[0])
         return state[1], None
 
     return lax.scan(one_batch, jnp.zeros((splats.features.shape[0], channels), dtype), batches.tiles)[0]
@@ -210,7 +210,7 @@ def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"]
     The transmittance is 1 - sum of w, so its cotangent joins the others as minus a channel of constant feature 1.
     """
     height, width, channels = cotangent.shape
-    batches = _batches(lists, width, height)
+    batches = make_batches(lists, width, height)
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
     packed = to_tiles(jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1), lists.tile)
     dtype = splats.attributes.dtype
@@ -228,14 +228,14 @@ def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"]
 
         def body(first, state):
             transmittance, before, gradient = state
-            ids, attributes = _chunk(splats, lists, start, length, first)
+            ids, attributes = chunk(splats.attributes, lists, start, length, first)
             features = splats.features[ids]
             along = jnp.einsum("cbd,bpd->cbp", features, local) - along_transmittance
 
             def step(carry, item):
                 transmittance, before = carry
-                alpha, unclamped = _alphas(item[0], x, y)
-                weight, after = _advance(transmittance, alpha)
+                alpha, unclamped = alphas(item[0], x, y)
+                weight, after = advance(transmittance, alpha)
                 live = (weight > 0) & (unclamped <= MAX_ALPHA)
                 before = before + weight * item[1]
                 slope = jnp.maximum(transmittance, 0.0) * item[1] - (final - before) / (1 - alpha)
@@ -246,7 +246,7 @@ def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"]
             by_attribute = _attribute_gradient(jnp.einsum("cbp,pk->cbk", h, moments), attributes, centre_x, centre_y)
             return transmittance, before, gradient.at[ids].add(jnp.concatenate([by_attribute, by_feature], axis=-1))
 
-        state = _walk(body, (jnp.ones_like(x), jnp.zeros_like(x), gradient), length, lambda state: state[0])
+        state = walk(body, (jnp.ones_like(x), jnp.zeros_like(x), gradient), length, lambda state: state[0])
         return state[2], None
 
     gradient = lax.scan(one_batch, jnp.zeros((splats.features.shape[0], 6 + channels), dtype), batches.tiles)[0]

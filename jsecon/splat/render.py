@@ -1,7 +1,6 @@
 """Rendering: D-channel features, colour, depth, of one view; differentiable in every array."""
 
 import functools
-import math
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,8 @@ from jsecon.numerics import NEAR
 from jsecon.splat.composite import Splats, composite, composite_features_vjp, composite_vjp
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.sh import colours_from_sh
-from jsecon.splat.tiles import TileLists, plan_capacity, tile_lists
+from jsecon.splat.splats import splats_of
+from jsecon.splat.tiles import TileLists, plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
 
@@ -50,10 +50,14 @@ def _splat_backward(width, height, residual, cotangents):
 _splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
 
 
+def is_traced(tree) -> bool:
+    """Whether any leaf of `tree` is being traced (jit, grad, vmap)."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def default_capacity(gaussians: Gaussians, camera: Camera) -> int:
     """(tile, Gaussian) pairs to allow for: planned from the data; under a trace, where there is none, it must be given."""
-    leaves = jax.tree.leaves((gaussians, camera))
-    require(not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves), "capacity", got=None,
+    require(not is_traced((gaussians, camera)), "capacity", got=None,
             expected="a static int inside jit, grad or vmap",
             remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras), and check Rendering.overflow == 0.")
     return plan_capacity(gaussians, camera, margin=1.0)
@@ -80,11 +84,7 @@ def render(gaussians: Gaussians, camera: Camera, features: Float[Array, "n d"], 
 
 
 def _render(gaussians, camera, features, background, capacity, near) -> Rendering:
-    projection = project(gaussians, camera, near=near)
-    lists = tile_lists(projection, camera.width, camera.height, capacity=capacity)
-    attributes = jnp.concatenate([projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]], 1)
-    # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
-    attributes = jnp.where(projection.visible[:, None], attributes, 0.0)
+    attributes, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
     image, transmittance = _splat(Splats(attributes, features.astype(attributes.dtype)), lists, camera.width, camera.height)
     if background is not None:
         image = image + transmittance[..., None] * background

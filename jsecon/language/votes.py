@@ -1,0 +1,158 @@
+"""Votes: the weight that each region casts on each Gaussian, W^T onto one-hot labels, in one pass over the views.
+
+With the geometry frozen, rendering is linear in the features (image = W f, W the alpha T weights), and the masklet
+targets take only R values. The N x R votes therefore hold all that distillation needs (DESIGN section 3; REFERENCE I.1).
+"""
+
+import functools
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float, Int
+
+from jsecon.errors import require
+from jsecon.numerics import NEAR
+from jsecon.parallel import spread_over_devices
+from jsecon.splat.composite import UNROLL, advance, alphas, chunk, make_batches, to_tiles, walk
+from jsecon.splat.render import is_traced
+from jsecon.splat.splats import splats_of
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Array, Camera, Gaussians, Votes
+
+# A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
+_SLOTS = 4
+_NOBODY = -2  # a slot that no label equals
+_DENSE_BYTES = 1 << 30
+"""the dense N x R block that is accumulated at once; more regions take more passes over the views"""
+
+
+def region_votes(gaussians: Gaussians, cameras: Camera, labels: Int[Array, "t h w"], num_regions: int, *, top: int = 8,
+                 capacity: int | None = None, near: float = NEAR,
+                 progress: Callable[[int, int], None] | None = None) -> Votes:
+    """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
+
+    Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). Outside a trace the views are
+    spread over jax's local devices and `progress(done, total)` is called after each; inside one the views are scanned
+    and `capacity` must be given. Raises ValueError on shapes that disagree.
+    """
+    views = cameras.world_to_camera.shape[0]
+    require(cameras.world_to_camera.ndim == 3, "cameras", got=cameras.world_to_camera.shape, expected="a batch (T, 4, 4)",
+            remedy="Add a leading axis to every array of a single camera.")
+    require(labels.shape == (views, cameras.height, cameras.width), "labels", got=labels.shape,
+            expected=f"({views}, {cameras.height}, {cameras.width})", remedy="Give one label image of the camera's size a view.")
+    require(num_regions >= 0, "num_regions", got=num_regions, expected=">= 0", remedy="Count the regions.")
+    traced = is_traced((gaussians, cameras, labels))
+    if capacity is None:
+        require(not traced, "capacity", got=None, expected="a static int inside jit",
+                remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras).")
+        capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    count = gaussians.means.shape[0]
+    block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
+    blocks = math.ceil(max(num_regions, 1) / block)
+    step = functools.partial(_add_view, capacity=capacity, near=near)
+    kept = (jnp.full((count, 0), -1, jnp.int32), jnp.zeros((count, 0), gaussians.means.dtype))
+    for b in range(blocks):
+        inside = _labels_of_block(labels, b * block, block)
+        start = _empty(count, block, gaussians.means.dtype)
+        if traced:
+            state = lax.scan(lambda s, view: (step(s, gaussians, *view), None), start, (cameras, inside))[0]
+        else:
+            report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
+            state = spread_over_devices(_add_view_compiled, start, _merge, gaussians, (cameras, inside),
+                                        static=(capacity, near), progress=report)
+        kept = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
+        labelled = state["votes"].sum(-1) if b == 0 else labelled + state["votes"].sum(-1)
+    return Votes(kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions)
+
+
+def _labels_of_block(labels: Array, first: int, block: int) -> Array:
+    """Labels counted from `first`, -1 outside the block of regions."""
+    local = jnp.asarray(labels, jnp.int32) - first
+    return jnp.where((local >= 0) & (local < block), local, -1)
+
+
+def _empty(count: int, regions: int, dtype) -> dict[str, Array]:
+    return {"votes": jnp.zeros((count, regions), dtype), "total": jnp.zeros(count, dtype), "peak": jnp.zeros(count, dtype),
+            "views": jnp.zeros(count, jnp.int32), "overflow": jnp.zeros((), jnp.int32)}
+
+
+def _merge(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
+    return {key: jnp.maximum(a[key], b[key]) if key == "peak" else a[key] + b[key] for key in a}
+
+
+@functools.partial(jax.jit, static_argnums=(3,))
+def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int, top: int) -> tuple[Array, Array]:
+    """Merges a dense block of votes into the strongest ones kept so far."""
+    ids = jnp.broadcast_to(first + jnp.arange(votes.shape[1], dtype=jnp.int32), votes.shape)
+    ids, weights = jnp.concatenate([kept[0], ids], 1), jnp.concatenate([kept[1], votes], 1)
+    weights, place = lax.top_k(weights, min(top, weights.shape[1]))
+    return jnp.where(weights > 0, jnp.take_along_axis(ids, place, axis=1), -1), weights
+
+
+def _add_view(state: dict[str, Array], gaussians: Gaussians, camera: Camera, labels: Array, *, capacity: int,
+              near: float) -> dict[str, Array]:
+    """Adds one view's votes to the dense accumulators."""
+    splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
+    batches = make_batches(lists, camera.width, camera.height)
+    tiles = to_tiles(labels + 1, lists.tile) - 1
+    distinct = _distinct(tiles)
+    dtype = splats.dtype
+    in_image = to_tiles(jnp.ones(labels.shape, dtype), lists.tile)
+
+    def one_batch(carry, ids_of_tiles):
+        start, length = batches.starts[ids_of_tiles], batches.lengths[ids_of_tiles]
+        x, y = batches.pixels(ids_of_tiles, dtype)
+        local, names, covered = tiles[ids_of_tiles], distinct[ids_of_tiles], in_image[ids_of_tiles]
+        # how many slots this batch needs: empty slots are -2 or -1 (pixels without label)
+        needed = (names >= 0).sum(1).max()
+
+        def one_pass(carry):
+            done, votes, total, peak = carry
+            slots = lax.dynamic_slice_in_dim(names, done, _SLOTS, axis=1)
+            is_slot = jnp.where(slots[:, None, :] >= 0, local[:, :, None] == slots[:, None, :], False).astype(dtype)
+            first_pass = done == 0
+
+            def body(first, inner):
+                transmittance, votes, total, peak = inner
+                ids, attributes = chunk(splats, lists, start, length, first)
+
+                def step(transmittance, item):
+                    alpha, _ = alphas(item, x, y)
+                    weight, transmittance = advance(transmittance, alpha)
+                    return transmittance, weight
+
+                transmittance, weights = lax.scan(step, transmittance, attributes, unroll=UNROLL)
+                weights = weights * covered
+                cast = jnp.einsum("cbp,bps->cbs", weights, is_slot)
+                target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped
+                votes = votes.at[ids[:, :, None], target[None]].add(cast, mode="drop")
+                total = total.at[ids].add(jnp.where(first_pass, weights.sum(-1), 0.0))
+                peak = peak.at[ids].max(weights.max(-1))
+                return transmittance, votes, total, peak
+
+            inner = walk(body, (jnp.ones_like(x), votes, total, peak), length, lambda state: state[0])
+            return done + _SLOTS, *inner[1:]
+
+        carry = lax.while_loop(lambda c: (c[0] == 0) | (c[0] < needed), one_pass, (jnp.int32(0), *carry))
+        return carry[1:], None
+
+    fresh = jnp.zeros_like(state["total"])
+    (votes, total, peak), _ = lax.scan(one_batch, (state["votes"], fresh, state["peak"]), batches.tiles)
+    return {"votes": votes, "total": state["total"] + total, "peak": peak,
+            "views": state["views"] + (total > 0).astype(jnp.int32), "overflow": state["overflow"] + lists.overflow}
+
+
+_add_view_compiled = jax.jit(lambda state, gaussians, view, capacity, near: _add_view(
+    state, gaussians, *view, capacity=capacity, near=near), static_argnums=(3, 4), donate_argnums=(0,))  # fmt: skip
+
+
+def _distinct(tiles: Int[Array, "n p"]) -> Int[Array, "n q"]:
+    """Each tile's distinct labels, ascending and to the left; _NOBODY after them, padded by a pass's slots."""
+    ordered = jnp.sort(tiles, axis=1)
+    new = jnp.concatenate([jnp.ones_like(ordered[:, :1], bool), ordered[:, 1:] != ordered[:, :-1]], axis=1) & (ordered >= 0)
+    place = jnp.where(new, jnp.cumsum(new, axis=1) - 1, tiles.shape[1] + _SLOTS)
+    table = jnp.full((tiles.shape[0], tiles.shape[1] + _SLOTS), _NOBODY, tiles.dtype)
+    return table.at[jnp.arange(tiles.shape[0])[:, None], place].set(ordered, mode="drop")
