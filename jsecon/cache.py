@@ -3,8 +3,8 @@
     OUT/cache/<stage>-<key>.npz
 
 The key covers the stage's options, its input files, the source of the rooms that compute it, and the keys of the
-stages it reads. So a stopped run goes on where it stopped, a changed option reruns only what depends on it, and no stale
-result can be taken for a fresh one. A file holds arrays and a JSON description of the tree they belong to: no pickle.
+stages it reads. So a stopped run goes on where it stopped, a changed option reruns only what depends on it, and no
+stale result can be taken for a fresh one. A file holds arrays and a JSON description of their tree: no pickle.
 """
 
 import dataclasses
@@ -21,9 +21,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.files import written_whole
+from jsecon.files import write_text, written_whole
 
 _TREE = "__tree__"
+STALE_SECONDS = 600.0
+"""a half-written file that has not grown for this long has no writer any more"""
 _UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, ImportError, zipfile.BadZipFile)
 
 
@@ -44,7 +46,7 @@ class Kept:
 
 
 def key_of(stage: str, parts: Mapping[str, Any]) -> str:
-    """16 hex digits that name a stage's result; `parts` holds plain values: None, bool, numbers, texts, lists, dicts."""
+    """16 hex digits that name a stage's result; `parts` holds plain values: numbers, texts, None, lists, dicts."""
     text = json.dumps([stage, parts], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
@@ -80,6 +82,16 @@ def source_digest(rooms: Iterable[str]) -> str:
 def path_of(folder: Path, stage: str, key: str) -> Path:
     """Where a stage's result lies."""
     return folder / f"{stage}-{key}.npz"
+
+
+def prepare(folder: Path) -> None:
+    """Makes the folder, marks it as a cache for backup programs, and removes what writers that were killed left behind."""
+    tag = folder / "CACHEDIR.TAG"
+    if not tag.exists():
+        write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
+    for partial in folder.glob(".*.partial.npz"):
+        if time.time() - partial.stat().st_mtime > STALE_SECONDS:
+            partial.unlink(missing_ok=True)
 
 
 def fetch(

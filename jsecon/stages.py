@@ -1,0 +1,251 @@
+"""The steps of a run, each a function of the options and of what came before it; nothing here caches, times or prints.
+
+A step returns an Outcome: its result, and what it found it could leave out. Frames that are held out are never read
+by any step after the loading, the final measurement apart.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.errors import InputError, require
+from jsecon.plan import Progress
+from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
+
+DEPTH_POINTS = 120_000
+"""Gaussians that a capture with depth starts from"""
+ENOUGH_POINTS = 500
+"""a capture with fewer sparse points starts from points triangulated from its frames"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """All that the result of a run depends on, but for the files themselves."""
+
+    capture: Path
+    """folder: COLMAP (images/, sparse/0) or nerfstudio / instant-ngp (transforms.json)."""
+    gaussians: Path | None = None
+    """.ply (INRIA layout) of the scene; None: Gaussians are fitted to the frames."""
+    masks: Path | None = None
+    """folder of instance masks, one integer PNG a frame or LangSplat's `_s.npy`; None: found in the frames."""
+    downscale: float | None = None
+    """frames are made this many times smaller; None: so that the longer side is at most `long_side`."""
+    long_side: int = 480
+    """px."""
+    frames: int | None = None
+    """at most this many frames, evenly spaced; None: all."""
+    holdout: int = 8
+    """every so manieth frame is kept for measuring only; 0 = none."""
+    steps: int = 3000
+    """of the photometric fit."""
+    sh_degree: int = 1
+    """of the fitted colours, 0 to 3."""
+    iou_threshold: float = 0.5
+    """a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
+    weighting: str = "pixels"
+    """of the views in a region's embedding: pixels or uniform."""
+    latent: int = 16
+    """most numbers a code may have; 3 reproduces the paper."""
+    reduce: str = "mode"
+    """of a Gaussian's votes to its code: mode, median or mean."""
+    top: int = 8
+    """regions whose votes a Gaussian keeps."""
+    seed: int = 0
+    """of whatever is drawn at random."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a step made."""
+
+    value: Any
+    """the result, a tree of arrays and records."""
+    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    """part that was not needed -> why."""
+    notes: tuple[str, ...] = ()
+    """what the user should know, a sentence each."""
+
+
+def training_frames(capture: Capture) -> np.ndarray:
+    """Indices of the frames that may be fitted to. Raises InputError where there are fewer than two."""
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    if len(train) < 2:
+        raise InputError("frames", found=f"{len(train)} of {len(capture.names)} frames to work with",
+                         expected="at least 2", remedy="Hold out fewer frames (--holdout), or use more (--frames).")
+    return train
+
+
+def load_frames(options: Options, progress: Progress) -> Outcome:
+    """The capture, at the size that the options ask for."""
+    from jsecon.data.capture import load_capture
+
+    downscale = options.downscale
+    if downscale is None:
+        size = load_capture(options.capture, frames=1, holdout=0).cameras
+        downscale = max(max(size.width, size.height) / options.long_side, 1.0)
+    capture = load_capture(options.capture, downscale=downscale, frames=options.frames, holdout=options.holdout,
+                           progress=progress)
+    return checked(capture, f"{downscale:.3g} times smaller" if downscale > 1 else "at full size")
+
+
+def checked(capture: Capture, size: str) -> Outcome:
+    """The capture as an Outcome that says what it is. Raises InputError where its views cannot be used together."""
+    from jsecon.data.capture import check_views_overlap
+
+    train = training_frames(capture)
+    check_views_overlap(capture)
+    count, height, width = capture.frames.shape[:3]
+    told = (f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out, "
+            f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}")
+    return Outcome(capture, notes=(told, *capture.notes))
+
+
+def given_gaussians(options: Options, capture: Capture) -> Outcome:
+    """The Gaussians of the .ply, in the capture's world."""
+    from jsecon.data.ply import load_ply
+
+    require(options.gaussians is not None, "gaussians", got=None, expected="the path of a .ply", remedy="Give one.")
+    gaussians = load_ply(options.gaussians)
+    check_overlap(gaussians, capture.cameras[training_frames(capture)], str(options.gaussians))
+    return Outcome(gaussians)
+
+
+def fitted_gaussians(
+    options: Options, capture: Capture, progress: Progress, state: Any | None, on_checkpoint: Callable[[Any], None]
+) -> Outcome:
+    """Gaussians fitted to the training frames, from depth, from the sparse points or from triangulated ones.
+
+    `state` is the last one that `on_checkpoint` was given by a fit that was stopped, or None.
+    """
+    from jsecon.fit.optimise import fit_gaussians
+
+    start, notes = (None, ()) if state is not None else _start(options, capture, progress)
+    if start is not None:
+        check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
+    gaussians, _ = fit_gaussians(capture, steps=options.steps, key=jax.random.key(options.seed), start=start, state=state,
+                                 on_checkpoint=on_checkpoint, progress=progress)
+    return Outcome(gaussians, notes=notes)
+
+
+def _start(options: Options, capture: Capture, progress: Progress) -> tuple[Gaussians, tuple[str, ...]]:
+    from jsecon.fit.initialise import gaussians_from_points, points_from_depth
+    from jsecon.fit.triangulate import triangulated_points
+
+    notes, opacity = (), 0.1
+    if capture.depths is not None:
+        found = points_from_depth(capture, max_points=DEPTH_POINTS)
+        points, colors, opacity = found.points, found.colors, 0.9
+    elif len(capture.points) >= ENOUGH_POINTS:
+        points, colors = capture.points, capture.point_colors
+    else:
+        points, colors = triangulated_points(capture, progress=progress)
+        notes = (f"the capture has {len(capture.points)} sparse points; {len(points)} were triangulated from the frames",)
+    return gaussians_from_points(points, colors, opacity=opacity, sh_degree=options.sh_degree), notes
+
+
+def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: float = 0.01) -> None:
+    """Raises InputError where fewer than `least` of the Gaussians lie in the view of at least two cameras."""
+    from jsecon.splat.project import project
+
+    seen = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
+    share = float(jnp.mean(seen.sum(0) >= 2)) if gaussians.count else 0.0
+    if share < least:
+        raise InputError(where, found=f"{share:.1%} of {gaussians.count} points in the view of two or more of the "
+                         f"{len(seen)} frames", expected="views that overlap, and a scene in the world of their poses",
+                         remedy="Check that the poses belong to these frames, and the .ply to this capture.")
+
+
+def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
+    """labels (T, H, W) int16 of the training frames: proposals of each, followed through the scene's own Gaussians."""
+    from jsecon.language.masklets import masklets
+    from jsecon.vision.classical import ClassicalSegmenter
+    from jsecon.vision.geometric import GeometricTracker
+
+    train = training_frames(capture)
+    frames, cameras = capture.frames[train], capture.cameras[train]
+    segmenter = ClassicalSegmenter(depths=None if capture.depths is None else capture.depths[train])
+    proposals = functools.cache(lambda t: segmenter(frames[t], t))
+    tracker = GeometricTracker(gaussians, jax.tree.map(jnp.asarray, cameras), proposals)
+    labels = masklets(frames, lambda frame, t: proposals(t), tracker, iou_threshold=options.iou_threshold,
+                      progress=progress)
+    _require_regions(labels, str(options.capture))
+    return Outcome(labels)
+
+
+def masklets_from_disk(options: Options, capture: Capture) -> Outcome:
+    """labels (T, H, W) int16 of the training frames, as the mask files have them."""
+    from jsecon.data.labels import load_labels
+
+    train = training_frames(capture)
+    names = tuple(capture.names[t] for t in train)
+    labels, _ = load_labels(options.masks, names, capture.frames.shape[1:3])
+    _require_regions(labels, str(options.masks))
+    return Outcome(np.asarray(labels, np.int16))
+
+
+def _require_regions(labels: np.ndarray, where: str) -> None:
+    if labels.max(initial=-1) < 0:
+        raise InputError(where, found="no region in any frame", expected="at least one",
+                         remedy="Give masks (--masks DIR), or frames with more contrast.")
+
+
+def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: Any, progress: Progress) -> Outcome:
+    """One embedding a region."""
+    from jsecon.language.regions import region_embeddings
+
+    frames = capture.frames[training_frames(capture)]
+    return Outcome(region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting,
+                                     progress=progress))
+
+
+def codes(options: Options, found: Regions, progress: Progress) -> Outcome:
+    """(codes (R, d), coder): the regions' embeddings, compressed only where they don't fit as they are."""
+    from jsecon.language.autoencoder import Autoencoder, region_codes
+
+    table, coder, why = region_codes(found.embeddings, latent=options.latent, key=jax.random.key(options.seed),
+                                     progress=progress)
+    trained = isinstance(coder, Autoencoder)
+    return Outcome((table, coder), {} if trained else {"autoencoder": why}, (why,) if trained else ())
+
+
+def votes(options: Options, capture: Capture, gaussians: Gaussians, labels: np.ndarray, num_regions: int,
+          progress: Progress) -> Outcome:
+    """The weight that each region casts on each Gaussian over the training frames."""
+    from jsecon.language.votes import region_votes
+
+    cameras = jax.tree.map(jnp.asarray, capture.cameras[training_frames(capture)])
+    cast = region_votes(gaussians, cameras, labels, num_regions, top=options.top, progress=progress)
+    unseen = int(jnp.sum(cast.views == 0))
+    left = {"unseen Gaussians": f"{unseen} of {gaussians.count} that no frame sees get no code"} if unseen else {}
+    return Outcome(cast, left)
+
+
+def distil(options: Options, cast: Votes, table: np.ndarray) -> Outcome:
+    """codes (N, d) of the Gaussians, from their votes."""
+    from jsecon.language.distill import distill_votes
+
+    return Outcome(distill_votes(cast, jnp.asarray(table), reduce=options.reduce))
+
+
+def assemble(capture: Capture, gaussians: Gaussians, found: Regions, table: np.ndarray, coder: Any, cast: Votes,
+             point_codes: np.ndarray, embedder: Any, provenance: str) -> LanguageField:
+    """The field: everything that a query needs."""
+    return LanguageField(
+        gaussians=gaussians, codes=point_codes, votes=cast, regions=found, region_codes=table, autoencoder=coder,
+        cameras=capture.cameras[training_frames(capture)], canonical=np.asarray(embedder.canonical, np.float32),
+        to_source=np.asarray(capture.to_source),
+        names=tuple(capture.names[t] for t in training_frames(capture)), embedder=embedder.name, provenance=provenance,
+    )
+
+
+def held_out_psnr(capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
+    """(frames held out,) PSNR in dB of the rendered colours against the photographs."""
+    from jsecon.fit.optimise import evaluate_psnr
+
+    return Outcome(evaluate_psnr(gaussians, capture, progress=progress))
