@@ -1,0 +1,111 @@
+"""Captures of any known format, and whether their views can be used together."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+
+from jsecon.data.colmap import find_model, load_colmap
+from jsecon.data.frames import Progress
+from jsecon.data.nerfstudio import load_nerfstudio
+from jsecon.errors import InputError
+from jsecon.types import Camera, Capture
+
+POINTS_AT_ONCE = 65536
+
+
+def load_capture(
+    path: str | Path,
+    *,
+    downscale: float | None = None,
+    frames: int | None = None,
+    holdout: int | None = 8,
+    progress: Progress = None,
+) -> Capture:
+    """Loads a capture folder: COLMAP (sparse/0 and images/), or nerfstudio / instant-ngp (transforms.json, or such a file).
+
+    Frames come in name order. `downscale` (>= 1) divides width and height; None keeps them. `frames`: at most so many, evenly
+    spaced. `holdout` = k holds out the frames 0, k, 2k, ... of those taken; 0 or None none. What was left out or changed is
+    in Capture.notes. A folder that holds both formats is read as COLMAP, which has the points.
+    Raises InputError where the path holds neither, or what it holds is damaged.
+    """
+    path = Path(path)
+    options = {"downscale": downscale, "frames": frames, "holdout": holdout, "progress": progress}
+    if path.is_dir() and find_model(path) is not None:
+        return load_colmap(path, **options)
+    if (path / "transforms.json").is_file() or (path.is_file() and path.suffix == ".json"):
+        return load_nerfstudio(path, **options)
+    found = "nothing there" if not path.exists() else "a file" if path.is_file() else "neither of them"
+    raise InputError(
+        path,
+        found=found,
+        expected="a folder with sparse/0 (COLMAP) and images, or with transforms.json",
+        remedy="Give the capture's own folder; a transforms file of another name can be given itself.",
+    )
+
+
+def check_views_overlap(capture: Capture) -> None:
+    """Raises InputError where no two views can see a thing in common, so that nothing could be followed or fitted.
+
+    With sparse points: no point lies in two views' frusta. Without: no two frusta (unbounded pyramids) meet. Either is
+    necessary for an overlap and ignores occlusion, so what it refuses has none; what passes may still have too little.
+    A single view passes where it has depth.
+    """
+    count = len(capture.names)
+    if count < 2 and capture.depths is not None:
+        return
+    if count < 2:
+        found = "a single view"
+    elif len(capture.points):
+        if _share_points(capture.cameras, capture.points):
+            return
+        found = f"{count} views, no two of which see the same of {len(capture.points)} sparse points"
+    else:
+        if any(
+            _frusta_meet(capture.cameras[a], capture.cameras[b]) for a, b in itertools.combinations(range(count), 2)
+        ):
+            return
+        found = f"{count} views that look apart from each other"
+    raise InputError(
+        f"capture of {capture.names[0]} ...",
+        found=found,
+        expected="at least two views of the same things",
+        remedy="Check the poses and their axes (world-to-camera, OpenCV), and take views that overlap.",
+    )
+
+
+def _share_points(cameras: Camera, points: np.ndarray) -> bool:
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        chunk = np.asarray(points[start : start + POINTS_AT_ONCE], np.float64)
+        views = np.zeros(len(chunk), np.int32)
+        for index in range(len(cameras.fx)):
+            pose = np.asarray(cameras.world_to_camera[index], np.float64)
+            x, y, z = pose[:3, :3] @ chunk.T + pose[:3, 3:]
+            z = np.where(z > 0, z, np.nan)
+            u, v = cameras.fx[index] * x / z + cameras.cx[index], cameras.fy[index] * y / z + cameras.cy[index]
+            views += (u >= 0) & (u <= cameras.width) & (v >= 0) & (v <= cameras.height)
+            if (views > 1).any():
+                return True
+    return False
+
+
+def _corner_rays(camera: Camera) -> np.ndarray:
+    """(4, 3) directions of the image's corners, world."""
+    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], np.float64)
+    x, y = (corners[:, 0] - camera.cx) / camera.fx, (corners[:, 1] - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones(4)], axis=-1) @ np.asarray(camera.world_to_camera, np.float64)[:3, :3]
+
+
+def _frusta_meet(a: Camera, b: Camera) -> bool:
+    """Whether the two pyramids have a point in common.
+
+    They do exactly where b's apex - a's apex = (a ray of a) - (a ray of b), that is where it lies in the cone of a's corner
+    rays and b's negated ones; by Caratheodory then in the cone of some three of these eight.
+    """
+    rays = np.concatenate([_corner_rays(a), -_corner_rays(b)])
+    gap = np.asarray(b.centres, np.float64) - np.asarray(a.centres, np.float64)
+    triples = np.array(list(itertools.combinations(range(8), 3)))
+    bases = rays[triples].transpose(0, 2, 1)
+    bases = bases[np.abs(np.linalg.det(bases)) > 1e-9]
+    weights = np.linalg.solve(bases, np.broadcast_to(gap[:, None], (len(bases), 3, 1)))[..., 0]
+    return bool((weights >= -1e-9 * max(1.0, np.abs(gap).max())).all(-1).any())

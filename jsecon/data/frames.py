@@ -1,0 +1,254 @@
+"""From posed image files to a Capture: the part of loading that every capture format shares."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jsecon.data.images import image_size, read_depth, read_image
+from jsecon.data.lens import Lens, undistorted, undistortion_maps
+from jsecon.errors import InputError
+from jsecon.types import Array, Camera, Capture
+
+Progress = Callable[[int, int], None] | None
+RIGID_TOLERANCE = 1e-3
+"""largest entry of R R^T - I still taken for rounding in a text file; the rotation is then made exact"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """One image file and where it was taken."""
+
+    name: str
+    """path as the capture names it, with "/": frames are ordered by it."""
+    image: Path
+    lens: Lens
+    """of the image; rescaled where the file has another size of the same aspect."""
+    world_to_camera: np.ndarray
+    """(4, 4) float64, OpenCV axes."""
+    depth: Path | None = None
+    depth_unit: float = 0.001
+    """world units of one count in the depth file."""
+
+
+def rigid(pose: Float[Array, "4 4"], where: object, name: str) -> Float[Array, "4 4"]:
+    """The pose with its rotation made exactly orthonormal; InputError where it is not finite or not rigid at all."""
+    pose = np.asarray(pose, np.float64)
+    remedy = "Estimate the poses again, or take this frame out of the capture."
+    if not np.isfinite(pose).all():
+        raise InputError(
+            where, found=f"a pose of {name} with NaN or infinite numbers", expected="finite poses", remedy=remedy
+        )
+    rotation = pose[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
+        raise InputError(
+            where,
+            found=f"a pose of {name} that is not rigid (R R^T is off by {error:.2g}, "
+            f"determinant {np.linalg.det(rotation):.3g})",
+            expected="a rotation and a translation, without scale, shear or mirror",
+            remedy=remedy,
+        )
+    left, _, right = np.linalg.svd(rotation)
+    result = pose.copy()
+    result[:3, :3] = left @ right
+    return result
+
+
+def check_options(downscale: float | None, frames: int | None, holdout: int | None) -> None:
+    """Raises InputError on options that no capture can be loaded with."""
+    if downscale is not None and not (np.isfinite(downscale) and downscale >= 1):
+        raise InputError(
+            "downscale", found=str(downscale), expected="a number of at least 1", remedy="2 halves width and height."
+        )
+    if frames is not None and frames < 1:
+        raise InputError("frames", found=str(frames), expected="at least 1", remedy="Leave it out to take every frame.")
+    if holdout is not None and (holdout < 0 or holdout == 1):
+        raise InputError(
+            "holdout",
+            found=str(holdout),
+            expected="0 (none), or 2 and more (every second, ...)",
+            remedy="8 is the custom; at 1 no frame would be left to fit to.",
+        )
+
+
+def spread(count: int, wanted: int | None) -> np.ndarray:
+    """Indices of at most `wanted` of `count` frames, evenly spaced, the first and the last among them."""
+    if wanted is None or wanted >= count:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, wanted).round().astype(int))
+
+
+def held_out(count: int, every: int | None) -> Bool[Array, "t"]:
+    """The frames 0, k, 2k, ... in name order, as in Mip-NeRF 360 and INRIA's split; none for 0 or None."""
+    return np.arange(count) % every == 0 if every else np.zeros(count, bool)
+
+
+def _short_names(shots: Sequence[Shot], where: object) -> tuple[str, ...]:
+    """File names without folder or ending; with their folders ("a_0001") where two would be the same."""
+    paths = [PurePosixPath(shot.name) for shot in shots]
+    for names in ([path.stem for path in paths], ["_".join(path.with_suffix("").parts) for path in paths]):
+        if len(set(names)) == len(names):
+            return tuple(names)
+    twice = collections.Counter(names).most_common(1)[0][0]
+    raise InputError(
+        where,
+        found=f"two frames called {twice!r}",
+        expected="names that differ in more than their endings",
+        remedy="Rename the images, or take one of the two out.",
+    )
+
+
+def _true_lens(shot: Shot) -> Lens:
+    """The lens at the size that the file really has (a folder of smaller images is common)."""
+    width, height = image_size(shot.image)
+    lens = shot.lens
+    if (width, height) == (lens.width, lens.height):
+        return lens
+    if min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) > 1:
+        raise InputError(
+            shot.image,
+            found=f"an image of {width}x{height}",
+            expected=f"{lens.width}x{lens.height}, or that aspect",
+            remedy="Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them.",
+        )
+    return lens.resized(width, height)
+
+
+def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    if image.shape[:2] == (height, width):
+        return image
+    shrinks = width <= image.shape[1] and height <= image.shape[0]
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def assemble(
+    shots: Sequence[Shot],
+    points: Float[Array, "p 3"],
+    point_colors: UInt8[Array, "p 3"],
+    *,
+    where: object,
+    downscale: float | None = None,
+    frames: int | None = None,
+    holdout: int | None = 8,
+    to_source: Float[Array, "4 4"] | None = None,
+    notes: Sequence[str] = (),
+    progress: Progress = None,
+) -> Capture:
+    """Reads the images and makes the Capture: name order, lenses undistorted, one size, some frames held out.
+
+    Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by `downscale`
+    (area average). Where the sizes differ, the commonest is taken and the others are resized to it, focal lengths with
+    them. `where` names the capture in errors. Raises InputError on images that are missing, damaged or of another aspect,
+    and on poses that are not finite and rigid.
+    """
+    check_options(downscale, frames, holdout)
+    if not shots:
+        raise InputError(
+            where, found="no frame", expected="at least one posed image", remedy="Estimate the poses again."
+        )
+    shots = sorted(shots, key=lambda shot: shot.name)
+    poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
+    names = _short_names(shots, where)
+    notes = list(notes)
+    chosen = spread(len(shots), frames)
+    if len(chosen) < len(shots):
+        notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
+    shots, poses, names = [shots[i] for i in chosen], poses[chosen], tuple(names[i] for i in chosen)
+
+    lenses = [_true_lens(shot) for shot in shots]
+    rescaled = sum(lens != shot.lens for lens, shot in zip(lenses, shots))
+    if rescaled:
+        notes.append(
+            f"{rescaled} images have another size than their camera model; its intrinsics were scaled to them."
+        )
+    pinholes = {lens: undistorted(lens, where) for lens in set(lenses)}
+    bent = sum(lens.distorted for lens in lenses)
+    if bent:
+        notes.append(f"{bent} images were undistorted; masks and labels must be of the undistorted images.")
+
+    width, height = collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
+    odd = sum((lens.width, lens.height) != (width, height) for lens in lenses)
+    if odd:
+        notes.append(
+            f"{odd} images were resized to {width}x{height}, the commonest size, and their intrinsics with them."
+        )
+    if downscale is not None:
+        width, height = (max(1, round(size / downscale)) for size in (width, height))
+    final = [pinholes[lens].resized(width, height) for lens in lenses]
+
+    result = np.empty((len(shots), height, width, 3), np.uint8)
+    depths = np.zeros((len(shots), height, width), np.float32) if any(shot.depth for shot in shots) else None
+    maps = functools.lru_cache(maxsize=4)(undistortion_maps)
+
+    def read(index: int) -> bool:
+        shot, lens = shots[index], lenses[index]
+        image, transparent = read_image(shot.image)
+        if lens.distorted:
+            image = cv2.remap(image, *maps(lens, pinholes[lens]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        result[index] = _resize(image, width, height)
+        if shot.depth is not None and depths is not None:
+            depth = read_depth(shot.depth, shot.depth_unit)
+            if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
+                raise InputError(
+                    shot.depth,
+                    found=f"a depth map of {depth.shape[1]}x{depth.shape[0]}",
+                    expected=f"the aspect of its image, {lens.width}x{lens.height}",
+                    remedy="Register it to the image.",
+                )
+            # Nearest throughout: the mean of two depths lies on neither surface.
+            if lens.distorted:
+                depth = cv2.resize(depth, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST_EXACT)
+                depth = cv2.remap(depth, *maps(lens, pinholes[lens]), cv2.INTER_NEAREST)
+            depths[index] = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        return transparent
+
+    transparent = 0
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for done, see_through in enumerate(pool.map(read, range(len(shots))), start=1):
+                transparent += see_through
+                if progress is not None:
+                    progress(done, len(shots))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    if transparent:
+        notes.append(f"{transparent} images have transparent pixels; they were laid over black.")
+    out = held_out(len(shots), holdout)
+    if out.all():
+        out[:] = False
+        notes.append("No frame was held out, since there is only one.")
+
+    def each(field: str) -> np.ndarray:
+        return np.array([getattr(lens, field) for lens in final], np.float32)
+
+    cameras = Camera(
+        world_to_camera=poses.astype(np.float32),
+        fx=each("fx"),
+        fy=each("fy"),
+        cx=each("cx"),
+        cy=each("cy"),
+        width=width,
+        height=height,
+    )
+    return Capture(
+        frames=result,
+        cameras=cameras,
+        points=np.asarray(points, np.float32),
+        point_colors=np.asarray(point_colors, np.uint8),
+        held_out=out,
+        depths=depths,
+        to_source=np.eye(4) if to_source is None else np.asarray(to_source, np.float64),
+        names=names,
+        notes=tuple(notes),
+    )

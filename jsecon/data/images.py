@@ -1,0 +1,226 @@
+"""Image files, read whole or not at all: RGB frames, integer label images, depth maps."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int32, UInt8
+
+from jsecon.errors import InputError
+from jsecon.files import written_whole
+from jsecon.types import Array
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
+"""endings tried, in this order, where a capture names an image without one"""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_START_OF_SCAN = 0xDA
+_READ_AGAIN = "Copy or export the file again."
+
+
+def _unreadable(path: Path, found: str) -> InputError:
+    return InputError(
+        path, found=found, expected="a whole PNG, JPEG or other image that OpenCV reads", remedy=_READ_AGAIN
+    )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise _unreadable(path, error.strerror or "an error on reading") from error
+    if not data:
+        raise _unreadable(path, "an empty file")
+    return data
+
+
+def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """(type, body) of each chunk, checked: OpenCV shows a PNG that was cut short as if its rest were black."""
+    offset = len(_PNG)
+    while True:
+        if offset + 12 > len(data):
+            raise _unreadable(path, f"a PNG that breaks off after {len(data)} bytes")
+        (length,), kind = struct.unpack_from(">I", data, offset), data[offset + 4 : offset + 8]
+        end = offset + 8 + length
+        if end + 4 > len(data):
+            raise _unreadable(path, f"a PNG that breaks off after {len(data)} bytes")
+        if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise _unreadable(path, f"a PNG whose chunk {kind.decode('latin1')} at byte {offset} fails its checksum")
+        yield kind, data[offset + 8 : end]
+        if kind == b"IEND":
+            return
+        offset = end + 4
+
+
+def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
+    """Width and height; raises where the end marker is missing (OpenCV fills the rest of such a file with grey)."""
+    offset, size = 2, None
+    while offset + 4 <= len(data) and data[offset] == 0xFF:
+        marker = data[offset + 1]
+        if marker == 0xFF:  # fill byte
+            offset += 1
+            continue
+        if marker in _FRAME_MARKERS and offset + 9 <= len(data):
+            height, width = struct.unpack_from(">HH", data, offset + 5)
+            size = width, height
+        if marker == _START_OF_SCAN:
+            break
+        offset += 2 + struct.unpack_from(">H", data, offset + 2)[0]
+    else:
+        raise _unreadable(path, f"a JPEG that breaks off in its header, after {len(data)} bytes")
+    # A thumbnail within the header has an end marker too: look behind the start of the scan only.
+    if size is None or data.rfind(b"\xff\xd9") < offset:
+        raise _unreadable(path, f"a JPEG that breaks off after {len(data)} bytes")
+    return size
+
+
+def _decode(path: Path, data: bytes) -> np.ndarray:
+    """Pixels as stored (BGR order, EXIF orientation ignored: poses are estimated on the stored pixels)."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise _unreadable(path, f"what OpenCV refuses ({error.err})") from error
+    if image is None:
+        raise _unreadable(path, f"{len(data)} bytes that are no image")
+    return image
+
+
+def _checked_bytes(path: Path) -> bytes:
+    data = _read_bytes(path)
+    if data.startswith(_PNG):
+        for _ in _png_chunks(path, data):
+            pass
+    elif data.startswith(_JPEG):
+        _jpeg_size(path, data)
+    return data
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """(width, height) in pixels, from the header where it is a PNG or JPEG. Raises InputError on a cut or empty file."""
+    path = Path(path)
+    data = _read_bytes(path)
+    if data.startswith(_PNG):
+        kind, body = next(_png_chunks(path, data))
+        if kind != b"IHDR" or len(body) != 13:
+            raise _unreadable(path, "a PNG without header")
+        return struct.unpack_from(">II", body)
+    if data.startswith(_JPEG):
+        return _jpeg_size(path, data)
+    height, width = _decode(path, data).shape[:2]
+    return width, height
+
+
+def read_image(path: str | Path) -> tuple[UInt8[Array, "h w 3"], bool]:
+    """RGB, and whether any pixel was transparent. Such pixels are laid over black, as splats render what nothing covers.
+
+    Grey becomes RGB, 16 bits become 8. EXIF orientation is ignored, as by COLMAP and nerfstudio. Raises InputError where
+    the file is missing, empty, cut short, or no image.
+    """
+    path = Path(path)
+    image = _decode(path, _checked_bytes(path))
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise InputError(
+            path,
+            found=f"pixels of type {image.dtype}",
+            expected="8 or 16 bits a channel",
+            remedy="Convert the image to PNG or JPEG.",
+        )
+    if image.ndim == 2:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), False
+    if image.shape[2] == 3:
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), False
+    alpha = image[..., 3:]
+    rgb = cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
+    if (alpha == 255).all():
+        return rgb, False
+    return ((rgb.astype(np.uint16) * alpha + 127) // 255).astype(np.uint8), True
+
+
+def write_image(path: str | Path, image: UInt8[Array, "h w 3"], *, jpeg_quality: int = 95) -> None:
+    """Writes RGB to `path`, whole or not at all; its ending says the format."""
+    path = Path(path)
+    done, data = cv2.imencode(
+        path.suffix, cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
+    )
+    if not done:
+        raise InputError(
+            path, found=f"ending {path.suffix!r}", expected="one of .png .jpg", remedy="Choose another format."
+        )
+    with written_whole(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def read_ids(path: str | Path) -> tuple[Int32[Array, "h w"], bool]:
+    """A label PNG as integers, and whether they are colours.
+
+    Grey of 1 to 16 bits: the values. A palette: the indices into it, never its colours. RGB of 8 bits: R*65536 + G*256 + B,
+    with True beside it. Raises InputError where it is none of these, or damaged.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    expected = "a PNG of integers: grey (1 to 16 bits), palette, or RGB of 8 bits a channel"
+    remedy = "Write one id a pixel as an 8 or 16 bit grey PNG (lossless, no transparency)."
+    if not data.startswith(_PNG):
+        raise InputError(path, found="a file that is no PNG", expected=expected, remedy=remedy)
+    chunks = list(_png_chunks(path, data))
+    bits, colour_type = chunks[0][1][8], chunks[0][1][9]
+    if colour_type == 3:
+        # The same indices under a header that calls them grey: OpenCV would look up their colours otherwise.
+        data = _as_grey(chunks)
+    image = _decode(path, data)
+    if colour_type in (0, 3) and image.ndim == 2:
+        step = 255 // (2**bits - 1) if bits < 8 else 1  # fewer than 8 bits come stretched to 0..255
+        return image.astype(np.int32) // step, False
+    if colour_type == 2 and image.dtype == np.uint8 and image.shape[2] == 3:
+        blue, green, red = (image[..., channel].astype(np.int32) for channel in range(3))
+        return red * 65536 + green * 256 + blue, True
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    raise InputError(
+        path,
+        found=f"a PNG of {channels} channels, {bits} bits, colour type {colour_type}",
+        expected=expected,
+        remedy=remedy,
+    )
+
+
+def _as_grey(chunks: list[tuple[bytes, bytes]]) -> bytes:
+    pieces = [_PNG]
+    for kind, body in chunks:
+        if kind in (b"PLTE", b"tRNS", b"sBIT", b"hIST", b"bKGD"):
+            continue
+        if kind == b"IHDR":
+            body = body[:9] + b"\0" + body[10:]
+        pieces.append(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)))
+    return b"".join(pieces)
+
+
+def read_depth(path: str | Path, unit: float) -> Float[Array, "h w"]:
+    """A depth map times `unit` (nerfstudio: 0.001, from millimetres), float32, 0 = unknown. A PNG of 16 bits, or .npy.
+
+    Raises InputError where the file is damaged or of another kind.
+    """
+    path = Path(path)
+    expected, remedy = (
+        "one channel of 16 bits (PNG), or a .npy of shape (H, W)",
+        "Write the depth in millimetres as a 16 bit PNG.",
+    )
+    if path.suffix == ".npy":
+        try:
+            depth = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(path, found=str(error), expected=expected, remedy=remedy) from error
+        depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
+        if depth.ndim != 2:
+            raise InputError(path, found=f"shape {depth.shape}", expected=expected, remedy=remedy)
+    else:
+        depth = _decode(path, _checked_bytes(path))
+        if depth.dtype != np.uint16 or depth.ndim != 2:
+            raise InputError(path, found=f"shape {depth.shape} of {depth.dtype}", expected=expected, remedy=remedy)
+    depth = depth.astype(np.float32) * np.float32(unit)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

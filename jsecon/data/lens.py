@@ -1,0 +1,126 @@
+"""Lenses as captures state them, and the pinhole lens that stands in for a distorted one.
+
+Pixels are counted as everywhere here (and in COLMAP): the centre of the first pixel is at (0.5, 0.5). OpenCV puts it at
+(0, 0), hence the half pixels below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from jsecon.errors import InputError
+from jsecon.types import Array
+
+WIDEST, NARROWEST = 0.5, 8.0
+"""zooms searched for a pinhole lens without empty pixels: below the one the centre would lose over half its resolution,
+above the other the coefficients are nonsense"""
+RAY_STEPS, BORDER_STEPS = 64, 48
+"""samples along a ray from the principal point, and along each edge of the image, in that search"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """The intrinsics of one image file."""
+
+    width: int
+    """px."""
+    height: int
+    """px."""
+    fx: float
+    """px."""
+    fy: float
+    """px."""
+    cx: float
+    """px, from the left edge of the first pixel."""
+    cy: float
+    """px, from the upper edge of the first pixel."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 where `fisheye`; empty = pinhole."""
+    fisheye: bool = False
+    """equidistant model (Kannala and Brandt) instead of the polynomial one (Brown)."""
+
+    @property
+    def distorted(self) -> bool:
+        return self.fisheye or any(k != 0 for k in self.distortion)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The lens of the same image at another size."""
+        x, y = width / self.width, height / self.height
+        return dataclasses.replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+
+def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+    size = 4 if lens.fisheye else max(4, len(lens.distortion))
+    return matrix, np.pad(np.array(lens.distortion, np.float64), (0, size - len(lens.distortion)))
+
+
+def distort(lens: Lens, directions: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
+    """(x/z, y/z) of directions in the camera's frame -> pixels of the distorted image (the first one's centre at 0.5)."""
+    matrix, coefficients = _opencv(lens)
+    points = np.ascontiguousarray(directions, np.float64)
+    if lens.fisheye:
+        pixels = cv2.fisheye.distortPoints(points[None], matrix, coefficients)
+    else:
+        spatial = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+        pixels, _ = cv2.projectPoints(spatial, np.zeros(3), np.zeros(3), matrix, coefficients)
+    return pixels.reshape(-1, 2) + 0.5
+
+
+def _covered(lens: Lens, zoom: float) -> bool:
+    """Whether a pinhole lens of this zoom sees only what the distorted image holds, where its model is one to one.
+
+    Looks along rays from the principal point to the border: the distorted radius must grow all the way (a polynomial
+    folds back beyond its range, which would show the same pixels twice) and end inside the image.
+    """
+    across, down = np.linspace(0, lens.width, BORDER_STEPS), np.linspace(0, lens.height, BORDER_STEPS)
+    edges = [(across, 0 * across), (across, 0 * across + lens.height), (0 * down, down), (0 * down + lens.width, down)]
+    border = np.concatenate([np.stack(edge, -1) for edge in edges])
+    ends = (border - [lens.cx, lens.cy]) / [lens.fx * zoom, lens.fy * zoom]
+    rays = ends[:, None] * np.linspace(0, 1, RAY_STEPS + 1)[:, None]
+    pixels = distort(lens, rays.reshape(-1, 2)).reshape(rays.shape)
+    if not np.isfinite(pixels).all():
+        return False
+    radius = np.linalg.norm((pixels - pixels[:, :1]) / [lens.fx, lens.fy], axis=-1)
+    reached = pixels[:, -1]
+    inside = (reached >= 0).all() and (reached[:, 0] <= lens.width).all() and (reached[:, 1] <= lens.height).all()
+    return bool(inside and (np.diff(radius, axis=1) > 0).all())
+
+
+def undistorted(lens: Lens, where: object) -> Lens:
+    """The widest pinhole lens, same size and principal point, each of whose pixels the distorted image holds.
+
+    No empty border is made, since nothing could tell it from black things. `where` names the file in the InputError that is
+    raised where no such lens exists (the principal point outside the image, or absurd coefficients).
+    """
+    if not lens.distorted:
+        return dataclasses.replace(lens, distortion=(), fisheye=False)
+    # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
+    low, high = WIDEST, NARROWEST
+    if not _covered(lens, high):
+        raise InputError(
+            where,
+            found=f"distortion {lens.distortion} that leaves no undistorted image",
+            expected="coefficients under which the image is one to one around its principal point",
+            remedy="Calibrate again, or undistort the images first (colmap image_undistorter).",
+        )
+    if _covered(lens, low):
+        high = low
+    while high - low > 1e-4:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if _covered(lens, middle) else (middle, high)
+    return dataclasses.replace(lens, fx=lens.fx * high, fy=lens.fy * high, distortion=(), fisheye=False)
+
+
+def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """For each pixel of the pinhole image, where it lies in the distorted one: two tables for cv2.remap."""
+    matrix, coefficients = _opencv(lens)
+    target, _ = _opencv(pinhole)
+    make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    return make(matrix, coefficients, np.eye(3), target, (pinhole.width, pinhole.height), cv2.CV_32FC1)

@@ -1,0 +1,274 @@
+"""nerfstudio and instant-ngp captures: transforms.json and the images it names.
+
+Format: nerfstudio docs/quickstart/data_conventions.md, instant-ngp scripts/colmap2nerf.py. transform_matrix is camera-to-world in
+OpenGL camera axes (x right, y up, looking along -z): its columns 1 and 2 are negated for OpenCV axes. The world stays the
+file's own; what made it from the source's world (applied_transform, applied_scale) is undone by Capture.to_source.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jsecon.data.frames import Progress, Shot, assemble, check_options, rigid
+from jsecon.data.images import IMAGE_ENDINGS, image_size
+from jsecon.data.lens import Lens
+from jsecon.data.ply import load_points_ply
+from jsecon.errors import InputError
+from jsecon.types import Array, Capture
+
+MILLIMETRE = 0.001
+"""nerfstudio's default depth unit, metres"""
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
+_FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
+
+
+def load_nerfstudio(
+    path: str | Path,
+    *,
+    downscale: float | None = None,
+    frames: int | None = None,
+    holdout: int | None = 8,
+    progress: Progress = None,
+) -> Capture:
+    """A capture with transforms.json (`path`: its folder, or the file). Options as in `jsecon.data.capture.load_capture`.
+
+    Entries whose image is not there are left out and counted in the notes. Depth maps (depth_file_path) and sparse points
+    (ply_file_path) come with it where named. Raises InputError on a file that is no JSON or lacks a key, on camera models that are
+    neither perspective nor fisheye, and where no image is left.
+    """
+    check_options(downscale, frames, holdout)
+    file = Path(path)
+    file = file / "transforms.json" if file.is_dir() else file
+    scene = _parse(file)
+    entries = _key(file, scene, "frames", "the file", list)
+    notes, shots, missing = [], [], []
+    scale = _number(file, scene, "applied_scale", 1.0)
+    for index, entry in enumerate(entries):
+        where = f"frame {index}"
+        if not isinstance(entry, dict):
+            raise InputError(
+                file,
+                found=f"{where} that is no object",
+                expected="frames with file_path and transform_matrix",
+                remedy=_REMEDY,
+            )
+        name = _key(file, entry, "file_path", where, str)
+        pose = _matrix(
+            file, _key(file, entry, "transform_matrix", f"{where} ({name})", list), f"transform_matrix of {name}"
+        )
+        image = _find_image(file.parent, name)
+        if image is None:
+            missing.append(name)
+            continue
+        depth = entry.get("depth_file_path")
+        if depth is not None and not (file.parent / depth).is_file():
+            raise InputError(
+                file.parent / depth,
+                found="no such depth map",
+                expected=f"the depth_file_path of {name}",
+                remedy=_REMEDY,
+            )
+        unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
+        shots.append(
+            Shot(
+                _order_name(name),
+                image,
+                _lens(file, scene, entry, name, image),
+                _world_to_camera(file, pose, name),
+                None if depth is None else file.parent / depth,
+                unit,
+            )
+        )
+    if missing:
+        notes.append(
+            f"{len(missing)} of {len(entries)} frames of {file.name} were left out, since their images are missing "
+            f"(the first: {missing[0]})."
+        )
+    if not shots:
+        raise InputError(
+            file,
+            found=f"{len(entries)} frames, none of which has its image"
+            + (f" (the first: {missing[0]})" if missing else ""),
+            expected="images where file_path says, relative to this file",
+            remedy="Copy the images beside it.",
+        )
+    if any("mask_path" in entry for entry in entries):
+        notes.append("The masks named by mask_path (pixels to ignore) were not used.")
+    points, colours = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    if scene.get("ply_file_path"):
+        points, colours = load_points_ply(file.parent / str(scene["ply_file_path"]))
+    return assemble(
+        shots,
+        points,
+        colours,
+        where=file,
+        downscale=downscale,
+        frames=frames,
+        holdout=holdout,
+        to_source=_to_source(file, scene, scale),
+        notes=notes,
+        progress=progress,
+    )
+
+
+def _parse(file: Path) -> dict[str, Any]:
+    try:
+        scene = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            file, found=error.strerror or "an error on reading", expected="a transforms.json", remedy="Check the path."
+        ) from error
+    except ValueError as error:
+        raise InputError(
+            file, found=f"text that is no JSON ({error})", expected="a transforms.json", remedy=_REMEDY
+        ) from error
+    if not isinstance(scene, dict):
+        raise InputError(file, found="JSON without keys", expected="an object with frames", remedy=_REMEDY)
+    return scene
+
+
+def _key(file: Path, record: dict[str, Any], key: str, where: str, kind: type) -> Any:
+    if key not in record:
+        raise InputError(file, found=f"no key {key!r} in {where}", expected=f"{key!r} there", remedy=_REMEDY)
+    if not isinstance(record[key], kind):
+        raise InputError(
+            file,
+            found=f"{key!r} of type {type(record[key]).__name__} in {where}",
+            expected=kind.__name__,
+            remedy=_REMEDY,
+        )
+    return record[key]
+
+
+def _number(file: Path, record: dict[str, Any], key: str, default: float) -> float:
+    value = record.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(file, found=f"{key} = {value!r}", expected="a finite number", remedy=_REMEDY)
+    return float(value)
+
+
+def _matrix(file: Path, rows: list, what: str) -> Float[Array, "4 4"]:
+    """From 4 or 3 rows of 4 numbers."""
+    try:
+        matrix = np.array(rows, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            file, found=f"{what} that holds more than numbers", expected="4 rows of 4 numbers", remedy=_REMEDY
+        ) from error
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(file, found=f"{what} of shape {matrix.shape}", expected="4 rows of 4 numbers", remedy=_REMEDY)
+    return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0, 0, 0, 1]]])
+
+
+def _world_to_camera(file: Path, camera_to_world: np.ndarray, name: str) -> np.ndarray:
+    pose = rigid(camera_to_world * [1, -1, -1, 1], file, name)
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return result
+
+
+def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
+    """world = applied_scale * (applied_transform source), inverted."""
+    transform = np.eye(4)
+    if "applied_transform" in scene:
+        transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
+    scaled = np.diag([scale, scale, scale, 1.0]) @ transform
+    if not np.isfinite(scaled).all() or abs(np.linalg.det(scaled)) < 1e-12:
+        raise InputError(
+            file,
+            found="an applied_transform or applied_scale that cannot be inverted",
+            expected="a similarity",
+            remedy=_REMEDY,
+        )
+    return np.linalg.inv(scaled)
+
+
+def _order_name(name: str) -> str:
+    return name.replace("\\", "/").removeprefix("./")
+
+
+def _find_image(folder: Path, name: str) -> Path | None:
+    """The image as named, with "\\" as a separator where a Windows program wrote the file, or with an ending added."""
+    for base in dict.fromkeys((name, name.replace("\\", "/"))):
+        for ending in ("", *IMAGE_ENDINGS):
+            if (candidate := folder / (base + ending)).is_file():
+                return candidate
+    return None
+
+
+def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, image: Path) -> Lens:
+    """Intrinsics of one frame: its own keys before the file's."""
+    keys = {**scene, **entry}
+    model = str(keys.get("camera_model", "OPENCV")).upper()
+    if model not in _PERSPECTIVE | _FISHEYE or keys.get("is_fisheye") is True and model == "PERSPECTIVE":
+        raise InputError(
+            file,
+            found=f"camera_model {model}",
+            expected="one of " + ", ".join(sorted(_PERSPECTIVE | _FISHEYE)),
+            remedy="Undistort the images first.",
+        )
+    fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
+    width, height = (keys.get("w"), keys.get("h"))
+    if width is None or height is None:
+        width, height = image_size(image)
+    width, height = (round(_number(file, {key: value}, key, 0.0)) for key, value in (("w", width), ("h", height)))
+    fx = _focal(file, keys, "fl_x", "camera_angle_x", width)
+    fy = _focal(file, keys, "fl_y", "camera_angle_y", height)
+    if fx is None and fy is None:
+        raise InputError(
+            file,
+            found=f"no focal length for {name}",
+            expected="fl_x or camera_angle_x, in the file or the frame",
+            remedy=_REMEDY,
+        )
+    fx, fy = fx or fy, fy or fx
+    assert fx is not None and fy is not None
+    if not (width > 0 and height > 0 and fx > 0 and fy > 0):
+        raise InputError(
+            file,
+            found=f"{width}x{height} px and focal length {fx:g}, {fy:g} for {name}",
+            expected="positive numbers",
+            remedy=_REMEDY,
+        )
+    order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    distortion = [_number(file, keys, key, 0.0) for key in order]
+    if not fisheye and "k4" in keys and any(distortion[5:]) and model == "OPENCV":
+        # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
+        raise InputError(
+            file,
+            found=f"k4 = {keys['k4']} with camera_model OPENCV",
+            expected="k1 k2 p1 p2 k3, or FULL_OPENCV",
+            remedy="Undistort the images first.",
+        )
+    while distortion and distortion[-1] == 0:
+        distortion.pop()
+    padded = tuple(distortion) + (0.0,) * (next((n for n in (0, 4, 5, 8) if n >= len(distortion)), 8) - len(distortion))
+    return Lens(
+        width,
+        height,
+        fx,
+        fy,
+        _number(file, keys, "cx", width / 2),
+        _number(file, keys, "cy", height / 2),
+        padded,
+        fisheye,
+    )
+
+
+def _focal(file: Path, keys: dict[str, Any], direct: str, angle: str, size: int) -> float | None:
+    if direct in keys:
+        return _number(file, keys, direct, 0.0)
+    if angle in keys:
+        value = _number(file, keys, angle, 0.0)
+        if not 0 < value < math.pi:
+            raise InputError(
+                file, found=f"{angle} = {value}", expected="an angle between 0 and pi (radians)", remedy=_REMEDY
+            )
+        return 0.5 * size / math.tan(0.5 * value)
+    return None
