@@ -22,7 +22,6 @@ install_import_hook(
             if path.stem not in _UNCHECKED and (path.suffix == ".py" or (path / "__init__.py").exists())}),
     "beartype.beartype",
 )
-jax.config.update("jax_numpy_rank_promotion", "raise")
 
 import numpy as np
 

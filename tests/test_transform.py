@@ -1,0 +1,72 @@
+"""Gaussians carried into another world: a camera that is carried along sees the same image."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from jsecon.splat.render import render_rgb
+from jsecon.splat.transform import quaternion_of, transform_gaussians
+from jsecon.types import Gaussians
+
+ANGLES = np.radians([20.0, -70.0, 130.0])
+
+
+def _rotation(angles):
+    (a, b, c), turn = angles, np.eye(3)
+    for i, j, angle in ((0, 1, a), (1, 2, b), (0, 2, c)):
+        step = np.eye(3)
+        step[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+        turn = turn @ step
+    return turn
+
+
+def _similarity(scale=2.5):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = scale * _rotation(ANGLES), (0.3, -4.0, 1.5)
+    return matrix
+
+
+@pytest.mark.parametrize("bands", [1, 4, 16])
+def test_a_camera_carried_along_sees_the_same_image(scene, camera, bands):
+    sh = (0.2 * np.random.default_rng(1).normal(size=(scene.count, bands, 3))).astype(np.float32)
+    scene = Gaussians(scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, sh)
+    matrix, scale = _similarity(), 2.5
+    pose = np.asarray(camera.world_to_camera, np.float64) @ np.linalg.inv(matrix)
+    pose[:3] *= scale  # camera coordinates grow with the world, the rotation stays a rotation
+    moved = dataclasses.replace(camera, world_to_camera=pose.astype(np.float32))
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)
+    want = render_rgb(scene, camera)
+    have = render_rgb(transform_gaussians(scene, matrix), moved)
+    # A pixel may differ where an alpha sits on the 1/255 border: compare all but a few in a thousand exactly.
+    assert np.quantile(np.abs(np.asarray(have.features) - np.asarray(want.features)), 0.995) < 1e-4
+    assert float(np.abs(np.asarray(have.alpha) - np.asarray(want.alpha)).max()) < 0.01
+
+
+def test_there_and_back_is_where_it_began(scene):
+    matrix = _similarity()
+    back = transform_gaussians(transform_gaussians(scene, matrix), np.linalg.inv(matrix))
+    np.testing.assert_allclose(back.means, scene.means, atol=1e-5)
+    np.testing.assert_allclose(back.log_scales, scene.log_scales, atol=1e-5)
+    np.testing.assert_allclose(back.sh, scene.sh, atol=1e-5)
+    sign = np.sign(np.sum(np.asarray(back.quaternions) * scene.quaternions, axis=1, keepdims=True))
+    np.testing.assert_allclose(sign * back.quaternions, scene.quaternions, atol=1e-5)
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (3.1, 0.2, -3.0)])
+def test_quaternions_are_right_at_every_angle(angles):
+    rotation = _rotation(angles)
+    w, x, y, z = quaternion_of(rotation)
+    back = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    np.testing.assert_allclose(back, rotation, atol=1e-12)
+
+
+def test_the_identity_changes_nothing(scene):
+    assert transform_gaussians(scene, np.eye(4)) is scene
+
+
+@pytest.mark.parametrize("matrix", [np.diag([1.0, 2.0, 1.0, 1.0]), np.diag([-1.0, 1.0, 1.0, 1.0]), np.zeros((4, 4))])
+def test_what_is_no_similarity_is_refused(scene, matrix):
+    with pytest.raises(ValueError, match="rotation, one positive scale"):
+        transform_gaussians(scene, matrix)
