@@ -1,0 +1,1 @@
+"""Metrics and protocols; each number says in its name or its docstring how it was measured."""

@@ -1,0 +1,305 @@
+"""Region embeddings to small codes: LangSplat's autoencoder, and the rotation that takes its place where nothing is lost.
+
+`region_codes` chooses: the embeddings themselves where they are no longer than the code, a rotation into the regions' own
+span where that span fits, else the autoencoder. What it returns beside the codes has `.encode` and `.decode` for texts.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from jaxtyping import Float, PRNGKeyArray, UInt32
+
+from jsecon.errors import require
+from jsecon.numerics import cosine, normalize
+from jsecon.types import Array
+
+ENCODER_WIDTHS = (256, 128, 64, 32)
+DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
+"""LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it, so that no layer is a bottleneck."""
+MIN_STEPS = 1_000
+"""LangSplat's 100 epochs run over tens of thousands of crops; a few masklets need more epochs to see as many steps."""
+MAX_COSINE_LOSS = 1e-4
+"""a rotation counts as lossless when no cosine between two regions moves by more than this"""
+
+Key = PRNGKeyArray | UInt32[Array, "2"]
+Coder = Any
+"""Autoencoder, Rotation, or None (codes are the embeddings): whatever `encode` below takes."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Autoencoder:
+    """Parameters of one scene's autoencoder. The layers' sizes are read off the arrays, so the arrays are all there is."""
+
+    encoder: Any
+    """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
+    decoder: Any
+    """{"params"}: nested dicts of arrays."""
+
+    @property
+    def latent(self) -> int:
+        return _widths(self.encoder["params"])[-1]
+
+    @property
+    def dim(self) -> int:
+        return self.encoder["params"]["Dense_0"]["kernel"].shape[0]
+
+    def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+        """(..., E) embeddings of any length -> (..., d) unit codes; a zero embedding stays a zero (unknown) code."""
+        require(embeddings.shape[-1] == self.dim, "Autoencoder.encode", got=f"embeddings of size {embeddings.shape[-1]}",
+                expected=f"size {self.dim}", remedy="Encode embeddings of the embedder that the autoencoder was trained on.")
+        units = normalize(jnp.asarray(embeddings))
+        rows = units.reshape(-1, self.dim)
+        codes = _Encoder(_widths(self.encoder["params"])).apply(self.encoder, rows, train=False)
+        codes = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
+        return codes.reshape(*units.shape[:-1], self.latent)
+
+    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
+        """(..., d) codes -> (..., E) unit embeddings."""
+        require(codes.shape[-1] == self.latent, "Autoencoder.decode", got=f"codes of size {codes.shape[-1]}",
+                expected=f"size {self.latent}", remedy="Decode codes of this autoencoder.")
+        codes = jnp.asarray(codes)
+        rows = _Decoder(_widths(self.decoder["params"])).apply(self.decoder, codes.reshape(-1, self.latent))
+        return rows.reshape(*codes.shape[:-1], self.dim)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rotation:
+    """Codes as coordinates in an orthonormal basis: cosines between vectors of the basis's span are kept as they are."""
+
+    basis: Array
+    """(E, d) orthonormal columns, or zero columns where the span has fewer than d dimensions."""
+
+    def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+        """(..., E) -> (..., d) unit codes: the part of the embedding inside the span, brought to unit length."""
+        return normalize(normalize(jnp.asarray(embeddings)) @ self.basis)
+
+    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
+        """(..., d) -> (..., E) unit embeddings inside the span."""
+        return normalize(jnp.asarray(codes) @ jnp.asarray(self.basis).T)
+
+
+def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+    """Codes of embeddings (of a text, say) under a field's coder; with None the codes are the unit embeddings."""
+    return normalize(jnp.asarray(embeddings)) if coder is None else coder.encode(embeddings)
+
+
+def train_autoencoder(
+    embeddings: Float[Array, "r e"],
+    *,
+    latent: int,
+    key: Key,
+    epochs: int | None = None,
+    batch: int = 64,
+    learning_rate: float = 7e-4,
+    cosine_weight: float = 0.001,
+    cosine_over: str = "features",
+    progress: Callable[[int, int], None] | None = None,
+) -> Autoencoder:
+    """Trains LangSplat's autoencoder (REFERENCE B.5) on the regions' embeddings; the same key gives the same parameters.
+
+    embeddings: (R, E), R >= 1, brought to unit length first; zero rows (never embedded) are left out.
+    epochs: passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
+    batch: largest batch. The regions are dealt into batches of like size, so that no batch is a remnant of one or two,
+        from which batch normalisation would learn nothing.
+    cosine_over: "features" for the cosine of each region with its reconstruction; "batch" for LangSplat's own form, which
+        takes it along the batch.
+    The parameters returned are the best, by the loss in evaluation mode, of the last twentieth of the epochs.
+    Raises ValueError for no usable row, numbers that are not finite, or options out of range.
+    """
+    require(latent >= 1, "train_autoencoder", got=f"latent={latent}", expected="at least 1", remedy="3 is LangSplat's.")
+    require(batch >= 1 and (epochs is None or epochs >= 1), "train_autoencoder", got=f"batch={batch}, epochs={epochs}",
+            expected="both at least 1", remedy="Leave epochs out to have it chosen.")
+    require(cosine_over in ("features", "batch"), "train_autoencoder", got=f"cosine_over={cosine_over!r}",
+            expected="'features' or 'batch'", remedy="'batch' reproduces LangSplat.")
+    rows = np.asarray(embeddings)
+    require(bool(np.isfinite(rows).all()), "train_autoencoder", got="embeddings that are not finite", expected="finite numbers",
+            remedy="Find the regions whose crops gave NaN and leave them out.")
+    rows = rows[np.any(rows != 0, axis=1)]
+    require(len(rows) >= 1, "train_autoencoder", got=f"{embeddings.shape[0]} rows, all zero or none",
+            expected="at least one embedding", remedy="Embed the regions first.")
+
+    units = normalize(jnp.asarray(rows))
+    count, dim = units.shape
+    batches = -(-count // batch)
+    total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
+    plan = _Plan((*(max(w, latent) for w in ENCODER_WIDTHS), latent), (*(max(w, latent) for w in DECODER_WIDTHS), dim),
+                 batches, learning_rate, cosine_weight, cosine_over)
+    init_key, shuffle_key = jax.random.split(key)
+    carry = _start(units, init_key, plan)
+    stretch = total if progress is None else max(1, -(-total // 50))
+    for start in range(0, total, stretch):
+        stop = min(start + stretch, total)
+        carry = _epochs(carry, units, shuffle_key, start, stop, total - -(-total // 20), plan)
+        if progress is not None:
+            jax.block_until_ready(carry)
+            progress(stop, total)
+    _, params, stats = carry[1]
+    return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
+
+
+class _Plan(NamedTuple):
+    """What a training run is compiled for."""
+
+    encoder_widths: tuple[int, ...]
+    decoder_widths: tuple[int, ...]
+    batches: int
+    learning_rate: float
+    cosine_weight: float
+    cosine_over: str
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def _start(units: Array, key: Key, plan: _Plan) -> Any:
+    """((params, batch statistics, Adam's moments), best so far: (loss, params, batch statistics))."""
+    codes = jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
+    # eval_shape: the modules' own initialisers never run, as one draw for all layers compiles several times faster.
+    first = jax.eval_shape(lambda: _Encoder(plan.encoder_widths).init(key, units[:1], train=False))
+    second = jax.eval_shape(lambda: _Decoder(plan.decoder_widths).init(key, codes))
+    shapes = {"encoder": first["params"], "decoder": second["params"]}
+    draws = jax.random.uniform(key, (sum(leaf.size for leaf in jax.tree.leaves(shapes)),), units.dtype, -1.0, 1.0)
+
+    def layers(shapes, used=0):
+        params = {}
+        for name, layer in shapes.items():
+            params[name] = {}
+            for part, leaf in layer.items():
+                if name.startswith("BatchNorm"):
+                    params[name][part] = jnp.full(leaf.shape, part == "scale", leaf.dtype)
+                    continue
+                # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
+                inputs = layer["kernel"].shape[0]
+                params[name][part] = draws[used : used + leaf.size].reshape(leaf.shape) * inputs**-0.5
+                used += leaf.size
+        return params, used
+
+    params = {}
+    params["encoder"], used = layers(shapes["encoder"])
+    params["decoder"], _ = layers(shapes["decoder"], used)
+    stats = {name: {"mean": jnp.zeros_like(norm["bias"]), "var": jnp.ones_like(norm["scale"])}
+             for name, norm in params["encoder"].items() if name.startswith("BatchNorm")}  # fmt: skip
+    moments = _optimizer(plan).init(params)
+    return (params, stats, moments), (jnp.asarray(jnp.inf, units.dtype), params, stats)
+
+
+def _optimizer(plan: _Plan) -> optax.GradientTransformation:
+    return optax.flatten(optax.adam(plan.learning_rate))  # one long vector: compiles faster than Adam layer by layer
+
+
+# The bounds are arguments: one compiled loop serves every stretch between two calls of `progress`.
+@functools.partial(jax.jit, static_argnames="plan")
+def _epochs(carry: Any, units: Array, key: Key, start: Array | int, stop: Array | int, judged_from: Array | int,
+            plan: _Plan) -> Any:
+    count = units.shape[0]
+    size = -(-count // plan.batches)
+    encoder, decoder = _Encoder(plan.encoder_widths), _Decoder(plan.decoder_widths)
+    optimizer = _optimizer(plan)
+
+    def difference(params, codes, x, weight):
+        out = decoder.apply({"params": params["decoder"]}, codes)
+        alike = cosine(out, x) if plan.cosine_over == "features" else cosine(out.T, x.T)
+        return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(alike))
+
+    def loss(params, stats, x):
+        variables = {"params": params["encoder"], "batch_stats": stats}
+        codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
+        return difference(params, codes, x, plan.cosine_weight), changed["batch_stats"]
+
+    def step(state, x):
+        params, stats, moments = state
+        gradient, stats = jax.grad(loss, has_aux=True)(params, stats, x)
+        updates, moments = optimizer.update(gradient, moments)
+        return (optax.apply_updates(params, updates), stats, moments), None
+
+    def epoch(index, carry):
+        state, best = carry
+        order = jax.random.permutation(jax.random.fold_in(key, index), count)
+        order = jnp.resize(order, (plan.batches, size))  # the last batch is filled up from the front of the order
+        state, _ = jax.lax.scan(lambda s, rows: step(s, units[rows]), state, order)
+
+        def judge(best):
+            params, stats, _ = state
+            codes = encoder.apply({"params": params["encoder"], "batch_stats": stats}, units, train=False)
+            # LangSplat trains with the cosine term at 0.001 and chooses its checkpoint with it at full weight.
+            value = difference(params, codes, units, 1.0)
+            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, params, stats), best)
+
+        return state, jax.lax.cond(index >= judged_from, judge, lambda best: best, best)
+
+    return jax.lax.fori_loop(start, stop, epoch, carry)
+
+
+def region_codes(
+    embeddings: Float[Array, "r e"], *, latent: int, key: Key, **training: Any
+) -> tuple[Float[Array, "r d"], Coder, str]:
+    """The cheapest code of at most `latent` numbers a region that keeps the regions' cosines, and why that one.
+
+    embeddings: (R, E); a zero row (never embedded) gets a zero code. `training` goes to `train_autoencoder`.
+    Returns (codes (R, d) of unit length, coder, reason), d = min(latent, E):
+    E <= latent: the unit embeddings, coder None; regions whose span has at most `latent` dimensions: coordinates in it,
+    a `Rotation`, no cosine moved by more than 1e-4; else the codes of an `Autoencoder` trained on them.
+    Raises ValueError for numbers that are not finite.
+    """
+    require(latent >= 1, "region_codes", got=f"latent={latent}", expected="at least 1", remedy="3 is LangSplat's.")
+    require(bool(np.isfinite(np.asarray(embeddings)).all()), "region_codes", got="embeddings that are not finite",
+            expected="finite numbers", remedy="Find the regions whose crops gave NaN and leave them out.")
+    units = normalize(jnp.asarray(embeddings))
+    count, dim = units.shape
+    if dim <= latent:
+        return units, None, f"left out: the embeddings have {dim} numbers, no more than the {latent} of a code"
+    rotation, loss = _rotation(units, latent)
+    if loss <= MAX_COSINE_LOSS:
+        return rotation.encode(units), rotation, f"left out: {count} regions fit in {latent} dimensions without loss"
+    coder = train_autoencoder(units, latent=latent, key=key, **training)
+    return coder.encode(units), coder, f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}"
+
+
+def _rotation(units: Array, latent: int) -> tuple[Rotation, float]:
+    """The principal directions (not centred: cosines, not distances, are to be kept) and the largest cosine error."""
+    exact = np.asarray(units, np.float64)
+    _, sizes, directions = np.linalg.svd(exact, full_matrices=False)
+    rank = int(np.sum(sizes > 1e-6 * max(sizes.max(initial=0.0), 1e-300)))
+    basis = np.zeros((exact.shape[1], latent))
+    kept = directions[: min(rank, latent)].T
+    signs = np.sign(kept[np.abs(kept).argmax(0), np.arange(kept.shape[1])])  # an SVD's signs are arbitrary: fix them
+    basis[:, : kept.shape[1]] = kept * signs
+    codes = exact @ basis
+    lengths = np.linalg.norm(codes, axis=1, keepdims=True)
+    codes = np.divide(codes, lengths, out=np.zeros_like(codes), where=lengths > 0)
+    loss = float(np.abs(codes @ codes.T - exact @ exact.T).max(initial=0.0))
+    return Rotation(jnp.asarray(basis, units.dtype)), loss
+
+
+def _widths(params: Any) -> tuple[int, ...]:
+    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(sum(name.startswith("Dense_") for name in params)))
+
+
+class _Encoder(nn.Module):
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x, train: bool):
+        x = nn.Dense(self.widths[0], param_dtype=x.dtype)(x)
+        for width in self.widths[1:]:
+            norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
+            x = nn.relu(norm(x))
+            x = nn.Dense(width, param_dtype=x.dtype)(x)
+        return normalize(x)
+
+
+class _Decoder(nn.Module):
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x):
+        for index, width in enumerate(self.widths):
+            x = nn.Dense(width, param_dtype=x.dtype)(nn.relu(x) if index else x)
+        return normalize(x)

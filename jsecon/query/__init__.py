@@ -1,0 +1,1 @@
+"""From a text or a pixel to Gaussians: one-step, canonical and anchored queries; outliers; masks of a selection."""

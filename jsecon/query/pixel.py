@@ -1,0 +1,74 @@
+"""Which region lies under a pixel of a frame: the votes of the Gaussians that make up that pixel, by their weights."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jsecon.errors import InputError
+from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from jsecon.splat.project import project
+from jsecon.types import Array, Camera, Gaussians, LanguageField
+
+MIN_SHARE = 0.05
+"""a region that makes up less of a pixel than this is no answer to what lies there: the pixel is background"""
+
+
+def pixel_weights(gaussians: Gaussians, camera: Camera, x: int, y: int) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Ids (M,) front to back and weights alpha T (M,) of the Gaussians that make up pixel (column x, row y) of a view.
+
+    By the definition of the image (DESIGN section 5), without tiles: O(N) for one pixel, where a render is O(N) too
+    and would have to carry every region as a channel. Host code.
+    """
+    alpha, depths = (np.asarray(a) for a in _alphas(gaussians, camera, x + 0.5, y + 0.5))
+    ids = np.flatnonzero(alpha)
+    ids = ids[np.argsort(depths[ids], kind="stable")]  # ties in depth keep index order
+    after = np.cumprod(1.0 - alpha[ids].astype(np.float64))
+    ids = ids[after > MIN_TRANSMITTANCE]
+    before = np.concatenate([[1.0], after])[: len(ids)]
+    return ids, alpha[ids] * before
+
+
+@jax.jit
+def _alphas(gaussians: Gaussians, camera: Camera, x: Array | float, y: Array | float) -> tuple[Array, Array]:
+    splats = project(gaussians, camera)
+    dx, dy = x - splats.means_px[:, 0], y - splats.means_px[:, 1]
+    u, v = splats.whitening[:, 0] * dx + splats.whitening[:, 1] * dy, splats.whitening[:, 2] * dy
+    alpha = splats.opacities * jnp.exp(-0.5 * (u * u + v * v))
+    counts = splats.visible & (alpha >= MIN_ALPHA)
+    return jnp.where(counts, jnp.minimum(alpha, MAX_ALPHA), 0.0), splats.depths
+
+
+def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[np.ndarray, " r"]:
+    """(R,) how much of pixel (column x, row y) of frame `frame` each region makes up: the rendered shares of votes.
+
+    They sum to at most the pixel's alpha; what is missing is unlabelled, beyond the strongest votes, or background.
+    Raises InputError for a frame or a pixel that the field does not have.
+    """
+    frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
+    if not 0 <= frame < frames:
+        raise InputError("frame", found=str(frame), expected=f"0 to {frames - 1}", remedy="Frames are numbered in the order of their names.")
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError("pixel", found=f"({x}, {y})", expected=f"column 0 to {width - 1}, row 0 to {height - 1}",
+                         remedy=f"Give x and y in the frames as the run used them, {width}x{height}.")
+    gaussians, camera = jax.tree.map(jnp.asarray, (field.gaussians, _view(field.cameras, frame)))
+    ids, weights = pixel_weights(gaussians, camera, x, y)
+    regions, votes = np.asarray(field.votes.regions)[ids], np.asarray(field.votes.weights)[ids].astype(np.float64)
+    total = np.asarray(field.votes.total)[ids].astype(np.float64)
+    share = np.where(np.isfinite(votes) & (regions >= 0) & (total[:, None] > 0), votes, 0.0) / np.where(total > 0, total, 1.0)[:, None]
+    shares = np.zeros(field.regions.count)
+    np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
+    return shares
+
+
+def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: float = MIN_SHARE) -> int:
+    """The region that makes up most of pixel (column x, row y) of frame `frame`; -1 where none makes up `min_share`.
+
+    See `region_shares_at`, also for what it raises.
+    """
+    shares = region_shares_at(field, frame, x, y)
+    return int(shares.argmax()) if shares.size and shares.max() >= min_share else -1
+
+
+def _view(cameras: Camera, frame: int) -> Camera:
+    return jax.tree.map(lambda a: jnp.asarray(a)[frame], cameras)
