@@ -1,13 +1,15 @@
 """A selection as a 2D mask: render the selected Gaussians alone, threshold their alpha (OpenGaussian's protocol)."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.splat.render import render
+from jsecon.splat.render import is_traced, render
+from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
 ALPHA_THRESHOLD = 0.7
@@ -35,5 +37,12 @@ def render_selection(gaussians: Gaussians, camera: Camera, mask: Bool[Array, " n
             remedy="Pass one truth value a Gaussian.")
     logits = jnp.where(mask, gaussians.opacity_logits, _HIDDEN_LOGIT)
     features = jnp.where(mask, jnp.ones_like(logits) if similarity is None else similarity, 0.0)
-    hidden = dataclasses.replace(gaussians, opacity_logits=logits)
-    return render(jax.tree.map(jnp.asarray, hidden), camera, features[:, None], capacity=capacity)
+    hidden = jax.tree.map(jnp.asarray, dataclasses.replace(gaussians, opacity_logits=logits))
+    if capacity is None and not is_traced((hidden, camera)):
+        # Selections differ in size: in steps of four, a handful of compilations serves them all.
+        capacity = 4 ** math.ceil(math.log(plan_capacity(hidden, camera, margin=1.0), 4))
+    return _render(hidden, camera, features[:, None], capacity)
+
+
+_render = jax.jit(lambda gaussians, camera, features, capacity: render(gaussians, camera, features, capacity=capacity),
+                  static_argnums=3)  # fmt: skip

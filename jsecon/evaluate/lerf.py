@@ -1,0 +1,147 @@
+"""OpenGaussian's protocol on LERF-style labels, "point level, rendered": select Gaussians by the text, render them alone.
+
+For every labelled frame and every category labelled in it: the Gaussians selected for the category (once a scene, not a
+frame) are rendered without all others at the size of the labels, alpha > 0.7 is the mask, its IoU with the labelled mask
+is the pair's. mIoU and mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0 (REFERENCE C, D.5).
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.data.lerf import LabelledFrame
+from jsecon.errors import InputError
+from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
+from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
+from jsecon.types import Camera, Gaussians, Selection
+
+VALA_THRESHOLD = 10 / 255
+"""VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
+LERF_PAIRS = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
+"""(frame, query) pairs of each LERF-OVS scene (REFERENCE 0.2): a run with others does not measure the same thing"""
+LOCALISATION_WINDOW = 0.04
+"""side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px at about 730"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One (frame, query) pair."""
+
+    frame: str
+    """name of the labelled frame."""
+    query: str
+    """category."""
+    iou: float
+    """of the rendered selection's mask with the labelled one; 0 for a missing prediction."""
+    located: bool
+    """whether `point` lies in a labelled box."""
+    point: tuple[int, int] | None
+    """x, y px of the localisation maximum; None for a missing prediction."""
+    selected: int
+    """Gaussians selected."""
+    region: int
+    """that anchored the query, -1 = none."""
+    score: float
+    """of the query."""
+    mask: np.ndarray = dataclasses.field(repr=False, compare=False)
+    """(H, W) bool the rendered selection's mask, for pictures."""
+
+
+def evaluate_point_level_rendered(
+    gaussians: Gaussians,
+    cameras: Mapping[str, Camera],
+    labels: Sequence[LabelledFrame],
+    select: Callable[[str], Selection | None],
+    *,
+    alpha_threshold: float = ALPHA_THRESHOLD,
+    expected_pairs: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[Row], dict]:
+    """Rows, one for each labelled (frame, query) pair, and their summary, under the module's protocol.
+
+    cameras: by frame name, of any size with the labels' aspect; they are brought to the labels' size.
+    select: category -> Selection over the Gaussians; None (no answer to this text) counts as missing.
+    expected_pairs: the protocol's denominator where it is known (`LERF_PAIRS`), checked.
+
+    Localisation, summary["loc_acc"]: the point of maximum of the selected Gaussians' similarity, composited by
+    sum alpha T s over them alone and smoothed by a mean over a window of 4 % of the image's height, lies in a labelled
+    box of the category, edges included. Raises InputError for a labelled frame without a camera or of another aspect, for labels without pairs,
+    and where the number of pairs is not the expected one.
+    """
+    pairs = [(frame, category) for frame in labels for category in frame.objects]
+    for frame in labels:
+        _check(frame, cameras)
+    if not pairs or (expected_pairs is not None and len(pairs) != expected_pairs):
+        raise InputError("labels", found=f"{len(pairs)} (frame, query) pairs", expected=f"{expected_pairs or 'at least one'}",
+                         remedy="Evaluate on the very label files of the protocol, all of them.")  # fmt: skip
+    answers: dict[str, Selection | None] = {}
+    rows = []
+    for done, (frame, category) in enumerate(pairs, start=1):
+        if category not in answers:
+            answers[category] = select(category)
+        rows.append(_row(gaussians, resized(cameras[frame.name], frame.width, frame.height), frame, category,
+                         answers[category], alpha_threshold))  # fmt: skip
+        if progress is not None:
+            progress(done, len(pairs))
+    return rows, summary(rows, alpha_threshold)
+
+
+def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> dict:
+    """{"protocol", "pairs", "frames", "queries", "missing", "miou", "macc", "acc_50", "loc_acc"} of rows of one scene."""
+    ious = [row.iou for row in rows]
+    return {
+        "protocol": f"point level, rendered: selected Gaussians alone, alpha > {alpha_threshold:.3g}; mean over (frame, query) pairs",
+        "pairs": len(rows),
+        "frames": len({row.frame for row in rows}),
+        "queries": len({row.query for row in rows}),
+        "missing": sum(row.point is None for row in rows),
+        "miou": mean_iou(ious),
+        "macc": accuracy_at(ious, 0.25),
+        "acc_50": accuracy_at(ious, 0.5),
+        "loc_acc": float(np.mean([row.located for row in rows])) if rows else float("nan"),
+    }
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """The same view at another size, px: focal lengths and principal point scaled."""
+    x, y = width / camera.width, height / camera.height
+    return dataclasses.replace(camera, fx=camera.fx * x, cx=camera.cx * x, fy=camera.fy * y, cy=camera.cy * y, width=width, height=height)
+
+
+def _row(gaussians: Gaussians, camera: Camera, frame: LabelledFrame, category: str, selection: Selection | None, threshold: float) -> Row:
+    true, boxes = frame.objects[category]
+    if selection is None or not np.asarray(selection.mask).any():
+        region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
+        return Row(frame.name, category, 0.0, False, None, 0, region, score, np.zeros(true.shape, bool))
+    rendering = render_selection(gaussians, jax.tree.map(jnp.asarray, camera), selection.mask, selection.similarity)
+    mask = np.asarray(rendering.alpha) > threshold
+    point = _maximum(np.asarray(rendering.features[..., 0]))
+    return Row(frame.name, category, float(iou(mask, true)) if true.any() else 0.0, point is not None and inside_any(point, boxes), point,
+               int(np.asarray(selection.mask).sum()), int(selection.region), float(selection.score), mask)  # fmt: skip
+
+
+def _maximum(similarity: np.ndarray) -> tuple[int, int] | None:
+    """x, y of the smoothed map's maximum (the middle of where it is attained); None where nothing was rendered."""
+    if not similarity.max() > 0:
+        return None
+    window = 2 * round(LOCALISATION_WINDOW * similarity.shape[0] / 2) + 1
+    smooth = cv2.blur(similarity.astype(np.float64), (window, window), borderType=cv2.BORDER_REFLECT_101)
+    y, x = np.nonzero(smooth >= smooth.max() * (1 - 1e-6))
+    middle = np.argmin((x - x.mean()) ** 2 + (y - y.mean()) ** 2)
+    return int(x[middle]), int(y[middle])
+
+
+def _check(frame: LabelledFrame, cameras: Mapping[str, Camera]) -> None:
+    if frame.name not in cameras:
+        some = ", ".join(sorted(cameras)[:3])
+        raise InputError(f"labels of {frame.name}", found="no frame of that name in the capture", expected=f"one of {some}, ...",
+                         remedy="Evaluate with the capture that was labelled, and leave none of its labelled frames out.")  # fmt: skip
+    camera = cameras[frame.name]
+    if abs(frame.width / camera.width - frame.height / camera.height) > 0.02 * frame.width / camera.width:
+        raise InputError(f"labels of {frame.name}", found=f"{frame.width}x{frame.height}",
+                         expected=f"the aspect of the frame, {camera.width}x{camera.height}",
+                         remedy="Label the undistorted frames, or scale the labels to them.")  # fmt: skip

@@ -1,0 +1,80 @@
+"""Metrics, each with its protocol in its name or docstring. A missing prediction counts as 0, never as left out."""
+
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jsecon.errors import require
+from jsecon.types import Array
+
+
+def iou(predicted: Bool[Array, "*shape"], true: Bool[Array, "*shape"]) -> Float[Array, ""]:
+    """Intersection over union of two masks of one shape (pixels or points); 1 where both are empty. Jit-safe."""
+    require(predicted.shape == true.shape, "iou", got=f"{predicted.shape} and {true.shape}", expected="one shape",
+            remedy="Render the prediction at the size of the truth.")
+    both, either = jnp.sum(predicted & true), jnp.sum(predicted | true)
+    return jnp.where(either > 0, both / jnp.maximum(either, 1), 1.0)
+
+
+def mean_iou(ious: Iterable[float | None]) -> float:
+    """Plain mean over (frame, query) pairs of their IoU; None or NaN, a missing prediction, counts as 0.
+
+    The denominator is the number of pairs (REFERENCE 0.2): pass every pair. NaN for none at all.
+    """
+    values = _values(ious)
+    return float(values.mean()) if values.size else float("nan")
+
+
+def accuracy_at(ious: Iterable[float | None], threshold: float = 0.25) -> float:
+    """Share of (frame, query) pairs with an IoU strictly above `threshold`; mAcc in the papers is that at 0.25.
+
+    None or NaN, a missing prediction, counts as a failure. NaN for no pairs at all.
+    """
+    values = _values(ious)
+    return float((values > threshold).mean()) if values.size else float("nan")
+
+
+def localization_accuracy(points: Iterable[tuple[float, float] | None], boxes: Iterable[Float[Array, "b 4"]]) -> float:
+    """Share of (frame, query) pairs whose point (x, y) lies inside, edges included, any of the pair's boxes x1 y1 x2 y2.
+
+    None, a missing prediction, counts as a failure. What the point is, is the caller's definition: say it beside the
+    number, as published ones mean different things (REFERENCE 0.3). NaN for no pairs at all.
+    """
+    hits = [point is not None and inside_any(point, box) for point, box in zip(points, boxes, strict=True)]
+    return float(np.mean(hits)) if hits else float("nan")
+
+
+def inside_any(point: tuple[float, float], boxes: Float[Array, "b 4"]) -> bool:
+    """Whether (x, y) lies inside any of the boxes x1 y1 x2 y2, edges included."""
+    x, y = point
+    boxes = np.asarray(boxes)
+    return bool(((boxes[:, 0] <= x) & (x <= boxes[:, 2]) & (boxes[:, 1] <= y) & (y <= boxes[:, 3])).any())
+
+
+def point_accuracy(predicted: Int[Array, " n"], true: Int[Array, " n"], *, ignore: int = -1) -> float:
+    """Share of the points with a true label (not `ignore`) whose predicted label equals it. NaN for none."""
+    predicted, true = np.asarray(predicted), np.asarray(true)
+    counted = true != ignore
+    return float((predicted == true)[counted].mean()) if counted.any() else float("nan")
+
+
+def point_class_means(predicted: Int[Array, " n"], true: Int[Array, " n"], *, ignore: int = -1) -> tuple[float, float]:
+    """(mIoU, mAcc) at the level of points: means over the classes that occur in the truth of IoU and of recall.
+
+    OpenGaussian's ScanNet script, and the likely meaning of mAcc on Replica (REFERENCE D.7, 0.2), not "IoU > 0.25".
+    Points of true label `ignore` are left out of both sides. NaN where no point has a label.
+    """
+    predicted, true = np.asarray(predicted), np.asarray(true)
+    predicted, true = predicted[true != ignore], true[true != ignore]
+    ious, recalls = [], []
+    for label in np.unique(true):
+        both = np.sum((predicted == label) & (true == label))
+        ious.append(both / np.sum((predicted == label) | (true == label)))
+        recalls.append(both / np.sum(true == label))
+    return (float(np.mean(ious)), float(np.mean(recalls))) if ious else (float("nan"), float("nan"))
+
+
+def _values(ious: Iterable[float | None]) -> np.ndarray:
+    return np.nan_to_num(np.array([np.nan if value is None else float(value) for value in ious]), nan=0.0)
