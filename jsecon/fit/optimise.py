@@ -1,0 +1,209 @@
+"""Fits Gaussians to a capture's frames: Adam on the photometric loss with the INRIA learning rates (REFERENCE A.6).
+
+The number of Gaussians stays what it was at the start. The state between chunks of steps is a record of arrays, so a
+fit can be stopped after any chunk and gone on with, to the same result.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Float, Int, PRNGKeyArray, UInt8
+
+from jsecon.errors import InputError, require
+from jsecon.fit.photometric import photometric_loss, psnr
+from jsecon.numerics import finite
+from jsecon.splat.render import render_rgb
+from jsecon.splat.tiles import plan_capacity, round_capacity
+from jsecon.types import Array, Camera, Capture, Gaussians
+
+CAPACITY_MARGIN = 1.5
+"""room for Gaussians that grow or move within a fit; what still does not fit is rerun with more, never left out"""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class LearningRates:
+    """Step sizes of Adam per group. Positions are in units of the cameras' extent and decay log-linearly over the fit."""
+
+    means: Any = 1.6e-4
+    """at the first step, times the extent"""
+    means_last: Any = 1.6e-6
+    """at the last step, times the extent"""
+    log_scales: Any = 5e-3
+    quaternions: Any = 1e-3
+    opacity_logits: Any = 5e-2
+    colors: Any = 2.5e-3
+    """of the constant band of the spherical harmonics; the higher bands take a twentieth"""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class FitState:
+    """All that a fit needs to go on."""
+
+    gaussians: Gaussians
+    """as fitted so far"""
+    first_moment: Gaussians
+    """Adam's running mean of the gradient"""
+    second_moment: Gaussians
+    """Adam's running mean of its square"""
+    step: Array
+    """() int32 steps done"""
+    losses: Array
+    """(steps,) float32 loss of each step's view before the step; NaN where it has not been taken"""
+
+
+def cameras_extent(cameras: Camera) -> float:
+    """1.1 times the largest distance of a camera's centre from their mean, world units (INRIA's `spatial_lr_scale`)."""
+    pose = np.asarray(cameras.world_to_camera, np.float64)
+    centres = -np.einsum("tji,tj->ti", pose[:, :3, :3], pose[:, :3, 3])
+    return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+
+def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
+    """The views of steps first..last-1: each round of `views` steps takes every view once, in an order drawn by `key`."""
+    rounds = range(first // views, -(-last // views))
+    order = [np.asarray(jax.random.permutation(jax.random.fold_in(key, r), views)) for r in rounds]
+    start = first - (first // views) * views
+    joined = np.concatenate(order) if order else np.zeros(0, np.int64)
+    return joined[start : start + last - first].astype(np.int64)
+
+
+def start_state(gaussians: Gaussians, steps: int) -> FitState:
+    """The state before the first of `steps` steps."""
+    gaussians = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), gaussians)
+    zeros = jax.tree.map(jnp.zeros_like, gaussians)
+    return FitState(gaussians, zeros, zeros, jnp.int32(0), jnp.full(steps, jnp.nan, jnp.float32))
+
+
+_ADAM = optax.scale_by_adam(eps=1e-15)
+
+
+def _rates(gaussians: Gaussians, rates: LearningRates, extent: float, progress, step, band_every: int) -> Gaussians:
+    """One rate an array (one a band for sh), in the shape of Gaussians."""
+    bands = gaussians.sh.shape[1]
+    degree = np.floor(np.sqrt(np.arange(bands))).astype(np.int32)
+    active = degree <= step // band_every
+    sh = jnp.where(active, jnp.where(degree == 0, rates.colors, rates.colors / 20), 0.0)
+    # Log-linear; written so that a rate of 0 (frozen positions) stays 0.
+    decay = jnp.where(rates.means > 0, rates.means_last / jnp.where(rates.means > 0, rates.means, 1.0), 0.0)
+    means = extent * rates.means * decay**progress
+    return Gaussians(means, rates.log_scales, rates.quaternions, rates.opacity_logits, sh[None, :, None])
+
+
+@functools.partial(jax.jit, static_argnames=("ssim_weight", "capacity"))
+def _step(
+    state: FitState, camera: Camera, frame: UInt8[Array, "h w 3"], background: Float[Array, "3"], extent: Array,
+    rates: LearningRates, band_every: Array, *, ssim_weight: float, capacity: int,
+):
+    """One Adam step on one view. Returns the state and the pairs that overflowed."""
+    target = frame.astype(jnp.float32) / 255.0
+
+    def loss(gaussians):
+        rendering = render_rgb(gaussians, camera, background=background, capacity=capacity)
+        return photometric_loss(rendering.features, target, ssim_weight=ssim_weight), rendering.overflow
+
+    (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.gaussians)
+    moments = optax.ScaleByAdamState(count=state.step, mu=state.first_moment, nu=state.second_moment)
+    update, moments = _ADAM.update(gradient, moments)
+    rate = _rates(state.gaussians, rates, extent, state.step / state.losses.shape[0], state.step, band_every)
+    gaussians = jax.tree.map(lambda p, u, r: p - r * u, state.gaussians, update, rate)
+    losses = state.losses.at[state.step].set(value)
+    return FitState(gaussians, moments.mu, moments.nu, state.step + 1, losses), overflow
+
+
+def _chunks(first: int, steps: int, chunk: int) -> Iterator[tuple[int, int]]:
+    """Ranges that end at multiples of `chunk`, so that a fit gone on with takes the same chunks."""
+    while first < steps:
+        last = min((first // chunk + 1) * chunk, steps)
+        yield first, last
+        first = last
+
+
+def fit_gaussians(
+    capture: Capture,
+    *,
+    steps: int,
+    key: PRNGKeyArray,
+    start: Gaussians | None = None,
+    state: FitState | None = None,
+    rates: LearningRates = LearningRates(),  # noqa: B008 - frozen
+    ssim_weight: float = 0.2,
+    background: Float[Array, "3"] | None = None,
+    band_every: int = 1000,
+    chunk: int = 50,
+    on_checkpoint: Callable[[FitState], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Gaussians, Float[np.ndarray, " steps"]]:
+    """Fits `start` (or goes on from `state`) to the frames that are not held out; returns the Gaussians and the losses.
+
+    One view a step, all views once before any comes again, in an order drawn by `key`. The degree of the spherical
+    harmonics grows by one every `band_every` steps up to what `start.sh` holds. `background` (3,) rgb in [0, 1], black by
+    default. After every `chunk` steps `on_checkpoint` is given the state. A chunk in which a view overflowed its tile
+    lists is taken again with more room, so the result does not depend on the capacity. Raises ValueError where not exactly
+    one of `start` and `state` is given or the state is of another number of steps, InputError where every frame is held
+    out or the numbers stop being finite.
+    """
+    require((start is None) != (state is None), "start, state", got=(start is not None, state is not None),
+            expected="exactly one of the two", remedy="Give start for a new fit, state to go on with one.")
+    used = np.flatnonzero(~np.asarray(capture.held_out))
+    if not len(used):
+        raise InputError("capture", found="every frame held out", expected="frames to fit to",
+                         remedy="Hold out fewer frames.")
+    if state is None:
+        assert start is not None
+        state = start_state(start, steps)
+    require(state.losses.shape == (steps,), "state", got=f"a fit of {state.losses.shape[0]} steps", expected=f"{steps} steps",
+            remedy="Go on with the options that the fit was started with.")
+    state = jax.tree.map(jnp.asarray, state)
+    cameras = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), capture.cameras[used])
+    extent = jnp.float32(cameras_extent(cameras))
+    backdrop = jnp.zeros(3) if background is None else jnp.asarray(background, jnp.float32)
+    capacity = plan_capacity(state.gaussians, cameras, margin=CAPACITY_MARGIN) if int(state.step) < steps else 0
+    for first, last in _chunks(int(state.step), steps, chunk):
+        order = view_order(key, len(used), first, last)
+        while True:
+            after, overflow = state, jnp.int32(0)
+            for view in order:
+                after, missing = _step(after, cameras[int(view)], capture.frames[used[view]], backdrop, extent, rates,
+                                       band_every, ssim_weight=float(ssim_weight), capacity=capacity)
+                overflow = jnp.maximum(overflow, missing)
+            if int(overflow) == 0:
+                break
+            capacity = round_capacity(int(CAPACITY_MARGIN * (capacity + int(overflow))))
+        state = after
+        # A Gaussian that is not finite is invisible, so the loss alone would not tell.
+        if not bool(finite(state.losses[last - 1], *jax.tree.leaves(state.gaussians))):
+            raise InputError("fit", found=f"numbers that are not finite after step {last}", expected="a fit that converges",
+                             remedy="Check the start, the poses and the intrinsics, or lower the learning rates.")
+        if on_checkpoint:
+            on_checkpoint(state)
+        if progress:
+            progress(last, steps)
+    return state.gaussians, np.asarray(state.losses)
+
+
+def evaluate_psnr(
+    gaussians: Gaussians,
+    capture: Capture,
+    *,
+    frames: Int[np.ndarray, " f"] | None = None,
+    background: Float[Array, "3"] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Float[np.ndarray, " f"]:
+    """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to [0, 1]."""
+    chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
+    values = []
+    for n, t in enumerate(chosen):
+        backdrop = jnp.zeros(3) if background is None else background
+        image = render_rgb(gaussians, jax.tree.map(jnp.asarray, capture.cameras[int(t)]), background=backdrop).features
+        values.append(float(psnr(jnp.clip(image, 0, 1), jnp.asarray(capture.frames[t], jnp.float32) / 255.0)))
+        if progress:
+            progress(n + 1, len(chosen))
+    return np.array(values)

@@ -1,0 +1,164 @@
+"""The fit: it converges, never sees held-out frames, goes on where it stopped, and never leaves a Gaussian out."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.errors import InputError
+from jsecon.fit import optimise
+from jsecon.fit.optimise import LearningRates, cameras_extent, evaluate_psnr, fit_gaussians, start_state, view_order
+from jsecon.splat.render import render_rgb
+from jsecon.types import Camera, Capture, Gaussians
+from tests.conftest import look_at
+
+KEY = jax.random.key(0)
+RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
+VIEWS, STEPS = 5, 40
+
+
+@pytest.fixture(scope="module")
+def truth():
+    rng = np.random.default_rng(0)
+    count = 40
+    return Gaussians(
+        rng.uniform(-0.7, 0.7, (count, 3)).astype(np.float32), np.log(rng.uniform(0.1, 0.25, (count, 3))).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32), rng.uniform(0, 3, count).astype(np.float32),
+        rng.uniform(-1.5, 1.5, (count, 1, 3)).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def capture(truth):
+    """Photographs of `truth`, 8 bits, the last of the five held out."""
+    poses = np.stack([look_at((2.2 * np.sin(a), -0.6, -2.2 * np.cos(a))) for a in np.linspace(-0.8, 0.8, VIEWS)])
+    cameras = Camera(poses, *(np.full(VIEWS, v, np.float32) for v in (30, 30, 16, 12)), width=32, height=24)
+    images = [render_rgb(truth, jax.tree.map(jnp.asarray, cameras[t])).features for t in range(VIEWS)]
+    frames = np.stack([np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in images])
+    return Capture(frames, cameras, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8),
+                   np.arange(VIEWS) == 2, None, np.eye(4), tuple("abcde"))
+
+
+@pytest.fixture(scope="module")
+def start(truth):
+    rng = np.random.default_rng(1)
+    return dataclasses.replace(
+        truth, means=truth.means + 0.03 * rng.normal(size=truth.means.shape).astype(np.float32),
+        log_scales=np.full_like(truth.log_scales, np.log(0.12)), quaternions=np.eye(4, dtype=np.float32)[np.zeros(40, int)],
+        opacity_logits=np.zeros(40, np.float32), sh=0.5 * truth.sh)
+
+
+@pytest.fixture(scope="module")
+def fitted(capture, start):
+    states = []
+    gaussians, losses = fit_gaussians(capture, steps=STEPS, key=KEY, start=start, rates=RATES, chunk=10,
+                                      on_checkpoint=states.append)
+    return gaussians, losses, states
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_fit_brings_the_held_out_view_closer(capture, start, truth, fitted):
+    gaussians, losses, _ = fitted
+    before, after = evaluate_psnr(start, capture), evaluate_psnr(gaussians, capture)
+    assert before.shape == after.shape == (1,)
+    assert after[0] > before[0] + 4
+    assert np.isfinite(losses).all()
+    assert losses[-8:].mean() < 0.5 * losses[:8].mean()
+    assert evaluate_psnr(truth, capture)[0] > 50  # the photographs are 8-bit copies of it
+    assert evaluate_psnr(gaussians, capture, frames=np.array([0, 1])).shape == (2,)
+
+
+def test_held_out_frames_are_never_fitted_to(capture, start, fitted):
+    frames = capture.frames.copy()
+    frames[2] = 255 - frames[2]
+    again, losses = fit_gaussians(dataclasses.replace(capture, frames=frames), steps=STEPS, key=KEY, start=start,
+                                  rates=RATES, chunk=10)
+    assert same(again, fitted[0])
+    np.testing.assert_array_equal(losses, fitted[1])
+
+
+def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
+    stopped = jax.tree.map(np.asarray, fitted[2][1])
+    assert int(stopped.step) == 20
+    assert np.isnan(stopped.losses[20:]).all()
+    seen = []
+    again, losses = fit_gaussians(capture, steps=STEPS, key=KEY, state=stopped, rates=RATES, chunk=10,
+                                  progress=lambda done, total: seen.append((done, total)))
+    assert same(again, fitted[0])
+    np.testing.assert_array_equal(losses, fitted[1])
+    assert seen == [(30, 40), (40, 40)]
+    whole, _ = fit_gaussians(capture, steps=STEPS, key=KEY, state=fitted[2][-1], rates=RATES)
+    assert same(whole, fitted[0])
+
+
+def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitted, monkeypatch):
+    asked = []
+
+    def narrow(gaussians, cameras, *, margin):
+        return 64
+
+    inner = optimise._step
+
+    def counted(*args, capacity, **options):
+        asked.append(capacity)
+        return inner(*args, capacity=capacity, **options)
+
+    monkeypatch.setattr(optimise, "plan_capacity", narrow)
+    monkeypatch.setattr(optimise, "_step", counted)
+    gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10)
+    assert asked[0] == 64
+    assert asked[-1] > 64
+    assert asked.count(asked[-1]) == 20
+    assert np.isfinite(losses).all()
+    # The schedule of the positions depends on the number of steps, so the twin is a fit of 20 steps with room enough.
+    monkeypatch.undo()
+    twin, _ = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10)
+    for a, b in zip(jax.tree.leaves(gaussians), jax.tree.leaves(twin), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_view_order_takes_every_view_once_a_round_and_can_be_entered_anywhere():
+    order = view_order(KEY, 5, 0, 23)
+    assert order.shape == (23,)
+    for r in range(4):
+        assert sorted(order[5 * r : 5 * r + 5]) == list(range(5))
+    assert not np.array_equal(order[:5], order[5:10])
+    np.testing.assert_array_equal(view_order(KEY, 5, 7, 19), order[7:19])
+    assert view_order(KEY, 5, 7, 7).shape == (0,)
+
+
+def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
+    """Adam's first update is rate * sign(gradient), whatever the gradient's size: this pins each group's rate."""
+    spherical = dataclasses.replace(start, sh=np.concatenate([start.sh, np.zeros((40, 3, 3), np.float32)], axis=1))
+    rates, extent = LearningRates(), cameras_extent(capture.cameras[np.array([0, 1, 3, 4])])
+    after, _ = fit_gaussians(capture, steps=1, key=KEY, start=spherical, rates=rates)
+    moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), after, start_state(spherical, 1).gaussians)
+    assert float(moved.means) == pytest.approx(1.6e-4 * extent, rel=1e-2)
+    assert float(moved.log_scales) == pytest.approx(5e-3, rel=1e-2)
+    assert float(moved.quaternions) == pytest.approx(1e-3, rel=1e-2)
+    assert float(moved.opacity_logits) == pytest.approx(5e-2, rel=1e-2)
+    assert np.abs(after.sh[:, 0] - spherical.sh[:, 0]).max() == pytest.approx(2.5e-3, rel=1e-2)
+    assert not np.asarray(after.sh[:, 1:]).any()  # degree 1 waits for its turn
+    opened, _ = fit_gaussians(capture, steps=2, key=KEY, start=spherical, band_every=1)
+    assert np.abs(opened.sh[:, 1:]).max() == pytest.approx(2.5e-3 / 20, rel=0.1)
+
+
+def test_extent_is_inrias():
+    assert cameras_extent(Camera(np.stack([look_at((x, 0, -2)) for x in (-1.0, 0.0, 1.0)]), *(np.ones(3),) * 4, 4, 4)) \
+        == pytest.approx(1.1)
+
+
+def test_wrong_fits_are_refused(capture, start):
+    with pytest.raises(ValueError, match="exactly one"):
+        fit_gaussians(capture, steps=1, key=KEY)
+    with pytest.raises(ValueError, match="steps"):
+        fit_gaussians(capture, steps=2, key=KEY, state=start_state(start, 1))
+    with pytest.raises(InputError, match="held out"):
+        fit_gaussians(dataclasses.replace(capture, held_out=np.ones(VIEWS, bool)), steps=1, key=KEY, start=start)
+    astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
+    with pytest.raises(InputError, match="not finite"):
+        fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, chunk=1)

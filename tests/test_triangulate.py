@@ -1,0 +1,116 @@
+"""Triangulation against exact tracks, and on pictures of a textured scene whose geometry is known."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from jsecon.errors import InputError
+from jsecon.fit.start import starting_gaussians
+from jsecon.fit.triangulate import triangulate_tracks, triangulated_points, view_pairs
+from jsecon.types import Camera, Capture
+
+WIDTH, HEIGHT, FOCAL = 240, 180, 200.0
+
+
+def look_at(centre, target):
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross([0.0, 1, 0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return pose
+
+
+def poses(count):
+    return np.array([look_at(np.array([0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)]), np.zeros(3))
+                     for a in np.linspace(-0.5, 0.5, count)])
+
+
+INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+
+
+def picture(pose, seed=0):
+    """A noise-textured unit plane z = 0 as the camera sees it, drawn through its homography."""
+    rng = np.random.default_rng(seed)
+    texture = cv2.GaussianBlur(rng.integers(0, 256, (400, 400, 3)).astype(np.float32), (0, 0), 2.5)
+    texture = np.clip((texture - texture.mean()) * 5 + 128, 0, 255).astype(np.uint8)
+    # Texture pixel centres (u, v) are integers: x = (u + 0.5) / 200 - 1; image pixel centres lie at +0.5.
+    to_world = np.array([[1 / 200, 0, 0.5 / 200 - 1], [0, 1 / 200, 0.5 / 200 - 1], [0, 0, 0], [0, 0, 1]])
+    homography = INTRINSICS @ pose[:3] @ to_world
+    shift = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    return cv2.warpPerspective(texture, shift @ homography, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
+
+
+def plane_capture(count=5, textured=True):
+    pose = poses(count)
+    frames = np.array([picture(p) if textured else np.full((HEIGHT, WIDTH, 3), 90, np.uint8) for p in pose])
+    held_out = np.zeros(count, bool)
+    held_out[2] = True
+    camera = Camera(pose, *(np.full(count, v) for v in (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)), WIDTH, HEIGHT)
+    return Capture(frames, camera, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), held_out, None, np.eye(4),
+                   tuple(map(str, range(count))))
+
+
+def test_exact_tracks_give_exact_points():
+    rng = np.random.default_rng(0)
+    pose, truth = poses(4), rng.uniform(-0.5, 0.5, (50, 3))
+    camera = np.einsum("tab,pb->pta", pose[:, :3, :3], truth) + pose[:, :3, 3]
+    pixels = FOCAL * camera[..., :2] / camera[..., 2:] + [WIDTH / 2, HEIGHT / 2]
+    seen = rng.random((50, 4)) < 0.6
+    seen[:, :2] = True
+    pixels[~seen] = 0
+    views = np.broadcast_to(np.arange(4), (50, 4))
+    points, error, depth, angle = triangulate_tracks(pose, np.broadcast_to(INTRINSICS, (4, 3, 3)), views, pixels, seen)
+    np.testing.assert_allclose(points, truth, atol=1e-8)
+    assert error.max() < 1e-6
+    np.testing.assert_allclose(depth, np.where(seen, camera[..., 2], np.inf).min(axis=1), atol=1e-8)
+    assert (angle > 0.1).all()
+    points, error, _, _ = triangulate_tracks(pose, np.broadcast_to(INTRINSICS, (4, 3, 3)), views,
+                                             pixels + 3 * seen[..., None] * rng.standard_normal(pixels.shape), seen)
+    assert error[seen.sum(1) > 2].min() > 0.1  # a track that fits no point says so
+
+
+def test_neighbouring_views_are_paired():
+    pairs = view_pairs(poses(6), 2)
+    assert set(pairs) == {(i, j) for i in range(6) for j in range(i + 1, 6) if j - i == 1} | {(0, 2), (3, 5)}
+    assert view_pairs(poses(1), 4) == []
+
+
+def test_points_of_a_textured_plane_lie_on_it():
+    capture = plane_capture()
+    points, colors = triangulated_points(capture)
+    assert len(points) > 150
+    assert colors.dtype == np.uint8
+    off = np.abs(points[:, 2])
+    assert np.median(off) < 0.01
+    assert np.quantile(off, 0.95) < 0.05
+    assert np.abs(points[:, :2]).max() < 1.1
+    again, _ = triangulated_points(capture)
+    np.testing.assert_array_equal(points, again)
+
+
+def test_held_out_frames_are_not_looked_at():
+    capture = plane_capture()
+    points, _ = triangulated_points(capture)
+    capture.frames[2] = 0
+    np.testing.assert_array_equal(points, triangulated_points(capture)[0])
+
+
+def test_a_capture_without_points_starts_from_triangulated_ones():
+    gaussians, sentence = starting_gaussians(plane_capture())
+    assert gaussians.count > 150
+    assert "triangulated" in sentence
+
+
+def test_views_without_texture_or_with_foreign_poses_are_refused():
+    with pytest.raises(InputError, match="overlap"):
+        triangulated_points(plane_capture(textured=False))
+    capture = plane_capture(3)  # two views and a held-out one
+    turned = np.array(capture.cameras.world_to_camera)
+    turned[1] = np.diag([-1.0, 1, -1, 1]) @ turned[1]
+    wrong = dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=turned))
+    with pytest.raises(InputError, match="poses"):
+        triangulated_points(wrong)
