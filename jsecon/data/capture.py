@@ -22,11 +22,13 @@ def load_capture(
     holdout: int | None = 8,
     progress: Progress = None,
 ) -> Capture:
-    """Loads a capture folder: COLMAP (sparse/0 and images/), or nerfstudio / instant-ngp (transforms.json, or such a file).
+    """Loads a capture folder: COLMAP (sparse/0 and images/), or nerfstudio / instant-ngp (transforms.json; also that
+    file itself, under any name).
 
-    Frames come in name order. `downscale` (>= 1) divides width and height; None keeps them. `frames`: at most so many, evenly
-    spaced. `holdout` = k holds out the frames 0, k, 2k, ... of those taken; 0 or None none. What was left out or changed is
-    in Capture.notes. A folder that holds both formats is read as COLMAP, which has the points.
+    Frames come in name order. `downscale` (>= 1) divides width and height; None keeps them. `frames`: at most so many,
+    evenly spaced. `holdout` = k holds out the frames 0, k, 2k, ... of those taken; 0 or None none. What was left out or
+    changed is in Capture.notes. A folder that holds both formats is read as COLMAP, which has the points.
+    `progress(done, total)` counts frames.
     Raises InputError where the path holds neither, or what it holds is damaged.
     """
     path = Path(path)
@@ -57,7 +59,7 @@ def check_views_overlap(capture: Capture) -> None:
     if count < 2:
         found = "a single view"
     elif len(capture.points):
-        if _share_points(capture.cameras, capture.points):
+        if _share_points(capture.cameras, np.asarray(capture.points)):
             return
         found = f"{count} views, no two of which see the same of {len(capture.points)} sparse points"
     else:
@@ -99,8 +101,8 @@ def _corner_rays(camera: Camera) -> np.ndarray:
 def _frusta_meet(a: Camera, b: Camera) -> bool:
     """Whether the two pyramids have a point in common.
 
-    They do exactly where b's apex - a's apex = (a ray of a) - (a ray of b), that is where it lies in the cone of a's corner
-    rays and b's negated ones; by Caratheodory then in the cone of some three of these eight.
+    They do exactly where b's apex - a's apex = (a ray of a) - (a ray of b), that is where it lies in the cone of a's
+    corner rays and b's negated ones; by Caratheodory then in the cone of some three of these eight.
     """
     rays = np.concatenate([_corner_rays(a), -_corner_rays(b)])
     gap = np.asarray(b.centres, np.float64) - np.asarray(a.centres, np.float64)

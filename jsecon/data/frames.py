@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.data.images import image_size, read_depth, read_image
 from jsecon.data.lens import Lens, undistorted, undistortion_maps
 from jsecon.errors import InputError
-from jsecon.types import Array, Camera, Capture
+from jsecon.types import Camera, Capture
 
 Progress = Callable[[int, int], None] | None
 RIGID_TOLERANCE = 1e-3
@@ -40,7 +40,7 @@ class Shot:
     """world units of one count in the depth file."""
 
 
-def rigid(pose: Float[Array, "4 4"], where: object, name: str) -> Float[Array, "4 4"]:
+def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
     """The pose with its rotation made exactly orthonormal; InputError where it is not finite or not rigid at all."""
     pose = np.asarray(pose, np.float64)
     remedy = "Estimate the poses again, or take this frame out of the capture."
@@ -88,7 +88,7 @@ def spread(count: int, wanted: int | None) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, wanted).round().astype(int))
 
 
-def held_out(count: int, every: int | None) -> Bool[Array, "t"]:
+def held_out(count: int, every: int | None) -> Bool[np.ndarray, " t"]:
     """The frames 0, k, 2k, ... in name order, as in Mip-NeRF 360 and INRIA's split; none for 0 or None."""
     return np.arange(count) % every == 0 if every else np.zeros(count, bool)
 
@@ -133,23 +133,23 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def assemble(
     shots: Sequence[Shot],
-    points: Float[Array, "p 3"],
-    point_colors: UInt8[Array, "p 3"],
+    points: Float[np.ndarray, "p 3"],
+    point_colors: UInt8[np.ndarray, "p 3"],
     *,
     where: object,
     downscale: float | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
-    to_source: Float[Array, "4 4"] | None = None,
+    to_source: Float[np.ndarray, "4 4"] | None = None,
     notes: Sequence[str] = (),
     progress: Progress = None,
 ) -> Capture:
     """Reads the images and makes the Capture: name order, lenses undistorted, one size, some frames held out.
 
-    Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by `downscale`
-    (area average). Where the sizes differ, the commonest is taken and the others are resized to it, focal lengths with
-    them. `where` names the capture in errors. Raises InputError on images that are missing, damaged or of another aspect,
-    and on poses that are not finite and rigid.
+    Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by
+    `downscale` (area average). Where the sizes differ, the commonest is taken and the others are resized to it, focal
+    lengths with them. `where` names the capture in errors. Raises InputError on images that are missing, damaged or of
+    another aspect, and on poses that are not finite and rigid.
     """
     check_options(downscale, frames, holdout)
     if not shots:

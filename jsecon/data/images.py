@@ -11,7 +11,6 @@ from jaxtyping import Float, Int32, UInt8
 
 from jsecon.errors import InputError
 from jsecon.files import written_whole
-from jsecon.types import Array
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
 """endings tried, in this order, where a capture names an image without one"""
@@ -100,7 +99,7 @@ def _checked_bytes(path: Path) -> bytes:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """(width, height) in pixels, from the header where it is a PNG or JPEG. Raises InputError on a cut or empty file."""
+    """(width, height) in pixels, from the header of a PNG or JPEG. Raises InputError on a cut or empty file."""
     path = Path(path)
     data = _read_bytes(path)
     if data.startswith(_PNG):
@@ -114,11 +113,11 @@ def image_size(path: str | Path) -> tuple[int, int]:
     return width, height
 
 
-def read_image(path: str | Path) -> tuple[UInt8[Array, "h w 3"], bool]:
-    """RGB, and whether any pixel was transparent. Such pixels are laid over black, as splats render what nothing covers.
+def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
+    """RGB, and whether any pixel was transparent: such pixels are laid over black, as in a render of nothing.
 
-    Grey becomes RGB, 16 bits become 8. EXIF orientation is ignored, as by COLMAP and nerfstudio. Raises InputError where
-    the file is missing, empty, cut short, or no image.
+    Grey becomes RGB, 16 bits become 8. EXIF orientation is ignored, as by COLMAP and nerfstudio. Raises InputError
+    where the file is missing, empty, cut short, or no image.
     """
     path = Path(path)
     image = _decode(path, _checked_bytes(path))
@@ -142,12 +141,15 @@ def read_image(path: str | Path) -> tuple[UInt8[Array, "h w 3"], bool]:
     return ((rgb.astype(np.uint16) * alpha + 127) // 255).astype(np.uint8), True
 
 
-def write_image(path: str | Path, image: UInt8[Array, "h w 3"], *, jpeg_quality: int = 95) -> None:
+def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"], *, jpeg_quality: int = 95) -> None:
     """Writes RGB to `path`, whole or not at all; its ending says the format."""
     path = Path(path)
-    done, data = cv2.imencode(
-        path.suffix, cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
-    )
+    bgr = cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if path.suffix.lower() in (".jpg", ".jpeg") else []
+    try:
+        done, data = cv2.imencode(path.suffix, bgr, options)
+    except cv2.error:
+        done = False
     if not done:
         raise InputError(
             path, found=f"ending {path.suffix!r}", expected="one of .png .jpg", remedy="Choose another format."
@@ -156,11 +158,11 @@ def write_image(path: str | Path, image: UInt8[Array, "h w 3"], *, jpeg_quality:
         temporary.write_bytes(data.tobytes())
 
 
-def read_ids(path: str | Path) -> tuple[Int32[Array, "h w"], bool]:
+def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
     """A label PNG as integers, and whether they are colours.
 
-    Grey of 1 to 16 bits: the values. A palette: the indices into it, never its colours. RGB of 8 bits: R*65536 + G*256 + B,
-    with True beside it. Raises InputError where it is none of these, or damaged.
+    Grey of 1 to 16 bits: the values. A palette: the indices into it, never its colours. RGB of 8 bits:
+    R*65536 + G*256 + B, with True beside it. Raises InputError where it is none of these, or damaged.
     """
     path = Path(path)
     data = _read_bytes(path)
@@ -200,7 +202,7 @@ def _as_grey(chunks: list[tuple[bytes, bytes]]) -> bytes:
     return b"".join(pieces)
 
 
-def read_depth(path: str | Path, unit: float) -> Float[Array, "h w"]:
+def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
     """A depth map times `unit` (nerfstudio: 0.001, from millimetres), float32, 0 = unknown. A PNG of 16 bits, or .npy.
 
     Raises InputError where the file is damaged or of another kind.

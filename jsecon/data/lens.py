@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import InputError
-from jsecon.types import Array
 
 WIDEST, NARROWEST = 0.5, 8.0
 """zooms searched for a pinhole lens without empty pixels: below the one the centre would lose over half its resolution,
@@ -61,8 +60,8 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return matrix, np.pad(np.array(lens.distortion, np.float64), (0, size - len(lens.distortion)))
 
 
-def distort(lens: Lens, directions: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
-    """(x/z, y/z) of directions in the camera's frame -> pixels of the distorted image (the first one's centre at 0.5)."""
+def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """(x/z, y/z) of directions in the camera's frame -> pixels of the distorted image."""
     matrix, coefficients = _opencv(lens)
     points = np.ascontiguousarray(directions, np.float64)
     if lens.fisheye:
@@ -96,8 +95,8 @@ def _covered(lens: Lens, zoom: float) -> bool:
 def undistorted(lens: Lens, where: object) -> Lens:
     """The widest pinhole lens, same size and principal point, each of whose pixels the distorted image holds.
 
-    No empty border is made, since nothing could tell it from black things. `where` names the file in the InputError that is
-    raised where no such lens exists (the principal point outside the image, or absurd coefficients).
+    No empty border is made, since nothing could tell it from black things. `where` names the file in the InputError
+    that is raised where no such lens exists (principal point outside the image, or absurd coefficients).
     """
     if not lens.distorted:
         return dataclasses.replace(lens, distortion=(), fisheye=False)

@@ -1,8 +1,8 @@
 """nerfstudio and instant-ngp captures: transforms.json and the images it names.
 
-Format: nerfstudio docs/quickstart/data_conventions.md, instant-ngp scripts/colmap2nerf.py. transform_matrix is camera-to-world in
-OpenGL camera axes (x right, y up, looking along -z): its columns 1 and 2 are negated for OpenCV axes. The world stays the
-file's own; what made it from the source's world (applied_transform, applied_scale) is undone by Capture.to_source.
+Format: nerfstudio docs/quickstart/data_conventions.md, instant-ngp scripts/colmap2nerf.py. transform_matrix is
+camera-to-world in OpenGL camera axes (x right, y up, looking along -z): columns 1 and 2 are negated for OpenCV axes.
+The world stays the file's own; Capture.to_source undoes what made it of the source's (applied_transform, _scale).
 """
 
 import json
@@ -18,7 +18,7 @@ from jsecon.data.images import IMAGE_ENDINGS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
 from jsecon.errors import InputError
-from jsecon.types import Array, Capture
+from jsecon.types import Capture
 
 MILLIMETRE = 0.001
 """nerfstudio's default depth unit, metres"""
@@ -35,11 +35,11 @@ def load_nerfstudio(
     holdout: int | None = 8,
     progress: Progress = None,
 ) -> Capture:
-    """A capture with transforms.json (`path`: its folder, or the file). Options as in `jsecon.data.capture.load_capture`.
+    """A capture with transforms.json (`path`: its folder, or the file). Options as in `load_capture`.
 
-    Entries whose image is not there are left out and counted in the notes. Depth maps (depth_file_path) and sparse points
-    (ply_file_path) come with it where named. Raises InputError on a file that is no JSON or lacks a key, on camera models that are
-    neither perspective nor fisheye, and where no image is left.
+    Entries whose image is not there are left out and counted in the notes. Depth maps (depth_file_path) and sparse
+    points (ply_file_path) come with it where named. Raises InputError on a file that is no JSON or lacks a key, on
+    camera models that are neither perspective nor fisheye, and where no image is left.
     """
     check_options(downscale, frames, holdout)
     file = Path(path)
@@ -152,7 +152,7 @@ def _number(file: Path, record: dict[str, Any], key: str, default: float) -> flo
     return float(value)
 
 
-def _matrix(file: Path, rows: list, what: str) -> Float[Array, "4 4"]:
+def _matrix(file: Path, rows: list, what: str) -> Float[np.ndarray, "4 4"]:
     """From 4 or 3 rows of 4 numbers."""
     try:
         matrix = np.array(rows, np.float64)
@@ -206,7 +206,7 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     """Intrinsics of one frame: its own keys before the file's."""
     keys = {**scene, **entry}
     model = str(keys.get("camera_model", "OPENCV")).upper()
-    if model not in _PERSPECTIVE | _FISHEYE or keys.get("is_fisheye") is True and model == "PERSPECTIVE":
+    if model not in _PERSPECTIVE | _FISHEYE:
         raise InputError(
             file,
             found=f"camera_model {model}",
@@ -227,18 +227,17 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
             expected="fl_x or camera_angle_x, in the file or the frame",
             remedy=_REMEDY,
         )
-    fx, fy = fx or fy, fy or fx
-    assert fx is not None and fy is not None
-    if not (width > 0 and height > 0 and fx > 0 and fy > 0):
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None or min(width, height, fx, fy) <= 0:
         raise InputError(
             file,
-            found=f"{width}x{height} px and focal length {fx:g}, {fy:g} for {name}",
+            found=f"{width}x{height} px and focal lengths {fx}, {fy} for {name}",
             expected="positive numbers",
             remedy=_REMEDY,
         )
     order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    distortion = [_number(file, keys, key, 0.0) for key in order]
-    if not fisheye and "k4" in keys and any(distortion[5:]) and model == "OPENCV":
+    distortion = tuple(_number(file, keys, key, 0.0) for key in order)
+    if model == "OPENCV" and not fisheye and distortion[5] != 0:
         # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
         raise InputError(
             file,
@@ -246,19 +245,8 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
             expected="k1 k2 p1 p2 k3, or FULL_OPENCV",
             remedy="Undistort the images first.",
         )
-    while distortion and distortion[-1] == 0:
-        distortion.pop()
-    padded = tuple(distortion) + (0.0,) * (next((n for n in (0, 4, 5, 8) if n >= len(distortion)), 8) - len(distortion))
-    return Lens(
-        width,
-        height,
-        fx,
-        fy,
-        _number(file, keys, "cx", width / 2),
-        _number(file, keys, "cy", height / 2),
-        padded,
-        fisheye,
-    )
+    cx, cy = _number(file, keys, "cx", width / 2), _number(file, keys, "cy", height / 2)
+    return Lens(width, height, fx, fy, cx, cy, distortion, fisheye)
 
 
 def _focal(file: Path, keys: dict[str, Any], direct: str, angle: str, size: int) -> float | None:

@@ -1,0 +1,174 @@
+"""LERF-style labels in LangSplat's annotation: frame_XXXXX.json with polygons and boxes by category.
+
+Reading follows LangSplat's eval/utils.py: polygon corners cut to integers, filled with cv2.fillPoly (corners and edges
+belong to the mask), the objects of a category OR-ed, their boxes side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jsecon.errors import InputError, require
+from jsecon.files import write_text
+
+_REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels have it)."
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelledFrame:
+    """What was annotated in one frame."""
+
+    name: str
+    """the frame's name without ending, as in Capture.names."""
+    width: int
+    """px."""
+    height: int
+    """px."""
+    objects: dict[str, tuple[np.ndarray, np.ndarray]]
+    """category -> mask bool (H, W), boxes float32 (B, 4) x1 y1 x2 y2 in px, ends included."""
+
+
+def load_lerf_labels(folder: str | Path) -> list[LabelledFrame]:
+    """Every `*.json` in `folder`, in name order. Raises InputError where there is none, or one is damaged.
+
+    `iscrowd` is not used. Polygons may lie partly outside the image. Objects of one category with the same box count as
+    one box.
+    """
+    folder = Path(folder)
+    files = sorted(folder.glob("*.json"))
+    if not files:
+        raise InputError(folder, found="no .json file", expected="frame_XXXXX.json labels", remedy="Check the path.")
+    return [_read(file) for file in files]
+
+
+def _bad(file: Path, found: str, expected: str) -> InputError:
+    return InputError(file, found=found, expected=expected, remedy=_REMEDY)
+
+
+def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
+    if not isinstance(record, dict) or not isinstance(record.get(key), kind):
+        raise _bad(
+            file,
+            f"no usable {key!r} in {where}",
+            "info (name, width, height) and objects (category, segmentation, bbox)",
+        )
+    return record[key]
+
+
+def _read(file: Path) -> LabelledFrame:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise _bad(file, f"text that is no JSON ({error})", "a label file") from error
+    info = _get(file, content, "info", dict, "the file")
+    name = Path(_get(file, info, "name", str, "info")).stem
+    width, height = (_get(file, info, key, int, "info") for key in ("width", "height"))
+    if width < 1 or height < 1:
+        raise _bad(file, f"an image of {width}x{height}", "a positive size")
+    objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for index, entry in enumerate(_get(file, content, "objects", list, "the file")):
+        where = f"object {index}"
+        category = _get(file, entry, "category", str, where)
+        polygon = _numbers(file, _get(file, entry, "segmentation", list, where), (-1, 2), f"segmentation of {where}")
+        box = _numbers(file, _get(file, entry, "bbox", list, where), (1, 4), f"bbox of {where}").astype(np.float32)
+        mask = polygon_mask(polygon, width, height)
+        if category in objects:
+            before, boxes = objects[category]
+            mask = mask | before
+            box = boxes if (boxes == box).all(1).any() else np.concatenate([boxes, box])
+        objects[category] = mask, box
+    return LabelledFrame(name, width, height, objects)
+
+
+def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.ndarray:
+    try:
+        array = np.array(values, np.float64).reshape(shape)
+    except (TypeError, ValueError) as error:
+        raise _bad(
+            file, f"{what} that is no list of {shape[1]} numbers each", "[x, y] corners, and x1 y1 x2 y2"
+        ) from error
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
+        raise _bad(file, f"{what} that is empty or out of all range", "pixels")
+    return array
+
+
+def polygon_mask(corners: Float[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
+    """The pixels of a polygon, its edges included; corners are cut to integers (see the module's docstring)."""
+    canvas = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(canvas, [np.asarray(corners).astype(np.int32)], 1)
+    return canvas.astype(bool)
+
+
+def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, image_ending: str = ".png") -> None:
+    """Writes `<name>.json` of each frame; `load_lerf_labels` gives the same masks and boxes back.
+
+    Polygons can hold neither several pieces nor holes, so a mask is written as several objects of its category: one
+    for each connected piece, and a piece with holes is cut along pixel rows until none has any. Each carries that box
+    of the category's which it fits best. Raises ValueError on a category without pixels or boxes, InputError where the
+    folder cannot be written.
+    """
+    for frame in frames:
+        objects = []
+        for group, (category, (mask, boxes)) in enumerate(frame.objects.items(), start=1):
+            require(
+                mask.shape == (frame.height, frame.width) and bool(mask.any()) and len(boxes) > 0,
+                f"{frame.name}: {category}",
+                got=f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes",
+                expected=f"({frame.height}, {frame.width}), with pixels and a box",
+                remedy="Leave out what the frame does not show.",
+            )
+            for polygon, box in _with_boxes(mask_polygons(mask), np.asarray(boxes, np.float64)):
+                objects.append(
+                    {
+                        "category": category,
+                        "group": group,
+                        "segmentation": polygon.astype(float).tolist(),
+                        "area": float(mask.sum()),
+                        "layer": 1.0,
+                        "bbox": box.tolist(),
+                        "iscrowd": 0,
+                        "note": "",
+                    }
+                )
+        info = {"name": frame.name + image_ending, "width": frame.width, "height": frame.height, "depth": 3, "note": ""}
+        write_text(Path(folder) / f"{frame.name}.json", json.dumps({"info": info, "objects": objects}))
+
+
+def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
+    """Polygons (K, 2), integer x y, without holes, whose `polygon_mask`s OR-ed are the mask exactly."""
+    polygons = []
+    contours, tree = cv2.findContours(np.asarray(mask, np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    for contour, (_, _, hole, parent) in zip(contours, tree[0] if tree is not None else ()):
+        if parent >= 0:
+            continue
+        outline = contour[:, 0]
+        if hole < 0:
+            polygons.append(outline)
+            continue
+        # Cut through the first hole, above and below its middle row: it opens into a notch of either part.
+        piece = polygon_mask(outline, mask.shape[1], mask.shape[0]) & mask
+        cut = int(contours[hole][:, 0, 1].min() + contours[hole][:, 0, 1].max() + 1) // 2
+        for part in (np.arange(len(mask)) < cut, np.arange(len(mask)) >= cut):
+            polygons += mask_polygons(piece & part[:, None])
+    return polygons
+
+
+def _with_boxes(polygons: list[np.ndarray], boxes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Each polygon with the box that shares most with it; boxes left over go with the first polygon again."""
+    pairs, unused = [], set(range(len(boxes)))
+    for polygon in polygons:
+        low, high = polygon.min(0), polygon.max(0) + 1
+        shared = (np.minimum(boxes[:, 2:], high) - np.maximum(boxes[:, :2], low)).clip(0).prod(1)
+        area = (boxes[:, 2:] - boxes[:, :2]).clip(0).prod(1)
+        best = int(np.lexsort((area, -shared))[0])
+        pairs.append((polygon, boxes[best]))
+        unused.discard(best)
+    return pairs + [(polygons[0], boxes[index]) for index in sorted(unused)]

@@ -1,0 +1,138 @@
+"""The element vertex of a .ply file (ascii or binary), whatever its properties.
+
+Format: http://paulbourke.net/dataformats/ply. SuperSplat's compressed variant is told apart and refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from jsecon.errors import InputError
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclasses.dataclass
+class _Element:
+    name: str
+    count: int
+    fields: list[tuple[str, str]]
+    """(name, NumPy type); "list" for a list property."""
+
+    @property
+    def fixed(self) -> bool:
+        return all(kind != "list" for _, kind in self.fields)
+
+    def dtype(self, order: str) -> np.dtype:
+        return np.dtype([(name, order + kind) for name, kind in self.fields])
+
+
+def bad_ply(
+    path: Path, found: str, expected: str = "a whole .ply file", remedy: str = "Export the file again."
+) -> InputError:
+    return InputError(path, found=found, expected=expected, remedy=remedy)
+
+
+def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    """(format, elements, offset of the first byte behind the header)."""
+    end = data.find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise bad_ply(
+            path, "an empty file" if not data else "no .ply header", "a file that starts with 'ply' and a header"
+        )
+    after = data.find(b"\n", end)
+    after = len(data) if after < 0 else after + 1
+    form, elements = "", []
+    for line in data[:end].decode("ascii", "replace").splitlines()[1:]:
+        words = line.split()
+        try:
+            if not words or words[0] in ("comment", "obj_info"):
+                continue
+            if words[0] == "format":
+                form = words[1]
+            elif words[0] == "element":
+                elements.append(_Element(words[1], int(words[2]), []))
+            elif words[0] == "property":
+                kind = "list" if words[1] == "list" else _TYPES[words[1]]
+                elements[-1].fields.append((words[-1], kind))
+            else:
+                raise ValueError(words[0])
+        except (IndexError, KeyError, ValueError) as error:
+            raise bad_ply(path, f"the header line {line.strip()!r}", "a valid .ply header") from error
+    if form not in _ORDERS:
+        raise bad_ply(path, f"format {form!r}", f"one of {', '.join(_ORDERS)}")
+    return form, elements, after
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """The vertex element as a structured array."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise bad_ply(path, error.strerror or "an error on reading", "a .ply file", "Check the path.") from error
+    form, elements, offset = _header(path, data)
+    names = [element.name for element in elements]
+    if "chunk" in names or any(name == "packed_position" for element in elements for name, _ in element.fields):
+        raise bad_ply(
+            path,
+            "a compressed .ply (SuperSplat's packed chunks)",
+            "an uncompressed .ply",
+            "Export it from SuperSplat as an uncompressed PLY, or convert it with splat-transform.",
+        )
+    if "vertex" not in names:
+        raise bad_ply(path, f"elements {', '.join(names) or 'none'}", "an element vertex")
+    before = elements[: names.index("vertex")]
+    vertex = elements[names.index("vertex")]
+    if not all(element.fixed for element in [*before, vertex]):
+        raise bad_ply(
+            path, "list properties before or in the element vertex", "numbers only", "Export the points alone."
+        )
+    if len({name for name, _ in vertex.fields}) < len(vertex.fields):
+        raise bad_ply(path, "a vertex property that is there twice", "distinct names")
+    if form == "ascii":
+        return _ascii_vertices(path, data[offset:], sum(element.count for element in before), vertex)
+    offset += sum(element.count * element.dtype(_ORDERS[form]).itemsize for element in before)
+    dtype = vertex.dtype(_ORDERS[form])
+    if offset + vertex.count * dtype.itemsize > len(data):
+        raise bad_ply(
+            path,
+            f"{max(0, len(data) - offset) // max(1, dtype.itemsize)} of {vertex.count} vertices: the file is cut short",
+        )
+    return np.frombuffer(data, dtype, vertex.count, offset)
+
+
+def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndarray:
+    lines = body.split(b"\n")[skip : skip + vertex.count]
+    result = np.empty(vertex.count, vertex.dtype("="))
+    try:
+        numbers = np.array([line.split() for line in lines], np.float64).reshape(len(lines), len(vertex.fields))
+    except ValueError as error:
+        raise bad_ply(
+            path, f"vertex lines without {len(vertex.fields)} numbers each (or a file that is cut short)"
+        ) from error
+    if len(lines) < vertex.count:
+        raise bad_ply(path, f"{len(lines)} of {vertex.count} vertices: the file is cut short")
+    for column, (name, _) in enumerate(vertex.fields):
+        result[name] = numbers[:, column]
+    return result
