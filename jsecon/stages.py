@@ -18,12 +18,6 @@ from jsecon.errors import InputError, require
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
 
-DEPTH_POINTS = 120_000
-"""Gaussians that a capture with depth starts from"""
-ENOUGH_POINTS = 500
-"""a capture with fewer sparse points starts from points triangulated from its frames"""
-
-
 @dataclasses.dataclass(frozen=True)
 class Options:
     """All that the result of a run depends on, but for the files themselves."""
@@ -124,29 +118,16 @@ def fitted_gaussians(
     `state` is the last one that `on_checkpoint` was given by a fit that was stopped, or None.
     """
     from jsecon.fit.optimise import fit_gaussians
+    from jsecon.fit.start import starting_gaussians
 
-    start, notes = (None, ()) if state is not None else _start(options, capture, progress)
-    if start is not None:
+    start, notes = None, ()
+    if state is None:
+        start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
         check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
-    gaussians, _ = fit_gaussians(capture, steps=options.steps, key=jax.random.key(options.seed), start=start, state=state,
-                                 on_checkpoint=on_checkpoint, progress=progress)
+        notes = (f"the fit starts from {whence}",)
+    gaussians, _ = fit_gaussians(capture, steps=options.steps, key=jax.random.key(options.seed), start=start,
+                                 state=state, on_checkpoint=on_checkpoint, progress=progress)
     return Outcome(gaussians, notes=notes)
-
-
-def _start(options: Options, capture: Capture, progress: Progress) -> tuple[Gaussians, tuple[str, ...]]:
-    from jsecon.fit.initialise import gaussians_from_points, points_from_depth
-    from jsecon.fit.triangulate import triangulated_points
-
-    notes, opacity = (), 0.1
-    if capture.depths is not None:
-        found = points_from_depth(capture, max_points=DEPTH_POINTS)
-        points, colors, opacity = found.points, found.colors, 0.9
-    elif len(capture.points) >= ENOUGH_POINTS:
-        points, colors = capture.points, capture.point_colors
-    else:
-        points, colors = triangulated_points(capture, progress=progress)
-        notes = (f"the capture has {len(capture.points)} sparse points; {len(points)} were triangulated from the frames",)
-    return gaussians_from_points(points, colors, opacity=opacity, sh_degree=options.sh_degree), notes
 
 
 def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: float = 0.01) -> None:
@@ -184,9 +165,9 @@ def masklets_from_disk(options: Options, capture: Capture) -> Outcome:
 
     train = training_frames(capture)
     names = tuple(capture.names[t] for t in train)
-    labels, _ = load_labels(options.masks, names, capture.frames.shape[1:3])
-    _require_regions(labels, str(options.masks))
-    return Outcome(np.asarray(labels, np.int16))
+    masks = load_labels(options.masks, names, capture.frames.shape[1:3])
+    _require_regions(masks.labels, str(options.masks))
+    return Outcome(masks.labels, notes=masks.notes)
 
 
 def _require_regions(labels: np.ndarray, where: str) -> None:
