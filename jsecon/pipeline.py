@@ -64,12 +64,13 @@ class _Stage:
     """(the results so far by stage, progress) -> Outcome."""
 
 
-def embedder_named(name: str) -> Any:
-    """The embedder whose space a field lives in. Raises InputError for one that this version does not have."""
+def embedder_named(name: str | None = None) -> Any:
+    """The embedder whose space a field lives in; the default one without a name. Raises InputError for one that this
+    version does not have."""
     from jsecon.vision.colours import ColourEmbedder
 
     embedder = ColourEmbedder()
-    if name != embedder.name:
+    if name not in (None, embedder.name):
         raise InputError("field", found=f"regions embedded by {name!r}", expected=f"{embedder.name!r}",
                          remedy="Run the capture again with this version.")
     return embedder
@@ -97,7 +98,7 @@ def run(
     """
     reporter = reporter or Silent()
     folder = cache_folder or out / "cache"
-    embedder = embedder_named("colours")
+    embedder = embedder_named()
     require_writable(out)
     cache.prepare(folder)
     plan = _stages(options, out, folder, embedder, load)

@@ -192,7 +192,7 @@ def codes(options: Options, found: Regions, progress: Progress) -> Outcome:
     table, coder, why = region_codes(found.embeddings, latent=options.latent, key=jax.random.key(options.seed),
                                      progress=progress)
     trained = isinstance(coder, Autoencoder)
-    return Outcome((table, coder), {} if trained else {"autoencoder": why}, (why,) if trained else ())
+    return Outcome((table, coder), {} if trained else {"autoencoder": why}, (f"autoencoder: {why}",) if trained else ())
 
 
 def votes(options: Options, capture: Capture, gaussians: Gaussians, labels: np.ndarray, num_regions: int,
