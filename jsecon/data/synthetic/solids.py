@@ -38,8 +38,14 @@ class Solid:
 
 def _solid(quadric, planes, radius: float, middle=(0.0, 0.0, 0.0), nappe: float = 0.0) -> Solid:
     bound = np.array([*middle, radius], np.float32)
-    return Solid(np.asarray(quadric, np.float32), np.asarray(planes, np.float32).reshape(-1, 4),
-                 np.eye(3, dtype=np.float32), np.zeros(3, np.float32), bound, float(nappe))
+    return Solid(
+        np.asarray(quadric, np.float32),
+        np.asarray(planes, np.float32).reshape(-1, 4),
+        np.eye(3, dtype=np.float32),
+        np.zeros(3, np.float32),
+        bound,
+        float(nappe),
+    )
 
 
 def ellipsoid(rx: float, ry: float, rz: float, *, below: float | None = None, above: float | None = None) -> Solid:
@@ -50,17 +56,28 @@ def ellipsoid(rx: float, ry: float, rz: float, *, below: float | None = None, ab
 
 
 def frustum(bottom: float, top: float, height: float) -> Solid:
-    """Upright cone section from radius `bottom` at z = 0 to radius `top` at z = `height`; a cylinder where they agree."""
+    """Upright cone section, radius `bottom` at z = 0 and `top` at z = `height`; a cylinder where they agree."""
     slope = (top - bottom) / height
     planes = [(0, 0, 1, height), (0, 0, -1, 0.0)]
-    return _solid((1.0, 1.0, -(slope**2), -bottom * slope, -(bottom**2)), planes,
-                  float(np.hypot(height / 2, max(bottom, top))), (0, 0, height / 2), slope)
+    return _solid(
+        (1.0, 1.0, -(slope**2), -bottom * slope, -(bottom**2)),
+        planes,
+        float(np.hypot(height / 2, max(bottom, top))),
+        (0, 0, height / 2),
+        slope,
+    )
 
 
 def box(width: float, depth: float, height: float) -> Solid:
     """Upright box standing on z = 0, centred in x and y."""
-    planes = [(1, 0, 0, width / 2), (-1, 0, 0, width / 2), (0, 1, 0, depth / 2), (0, -1, 0, depth / 2),
-              (0, 0, 1, height), (0, 0, -1, 0.0)]
+    planes = [
+        (1, 0, 0, width / 2),
+        (-1, 0, 0, width / 2),
+        (0, 1, 0, depth / 2),
+        (0, -1, 0, depth / 2),
+        (0, 0, 1, height),
+        (0, 0, -1, 0.0),
+    ]
     radius = 0.5 * float(np.sqrt(width**2 + depth**2 + height**2))
     return _solid((0, 0, 0, 0, -1.0), planes, radius, (0, 0, height / 2))
 
@@ -93,8 +110,11 @@ def contains(solid: Solid, points: Float[np.ndarray, "3 n"], *, margin: float = 
     return _nearest_surface(solid, points)[0] <= margin
 
 
-def interval(solid: Solid, origin: Float[np.ndarray, "3 #n"], direction: Float[np.ndarray, "3 n"],
-             ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def interval(
+    solid: Solid,
+    origin: Float[np.ndarray, "3 _"],
+    direction: Float[np.ndarray, "3 n"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Ray parameters between which origin + t direction lies in the solid; enter >= leave where it misses."""
     d = solid.axes.T @ direction
     o = solid.axes.T @ (origin - solid.centre[:, None])
@@ -130,8 +150,8 @@ def _quadric_interval(solid, o, d):
     s = -(b + np.copysign(root, b))
     first, second = s / a, c / np.where(np.abs(s) < _TINY, _TINY, s)
     low, high = np.minimum(first, second), np.maximum(first, second)
-    # a > 0: inside between the roots. a < 0: a ray inside the opening angle of a cone; inside beyond the roots, and only
-    # one of these half-lines is in the nappe that exists (towards growing radius).
+    # a > 0: inside between the roots. a < 0: a ray within the opening angle of a cone is inside beyond the roots, and
+    # only one of these half-lines is in the nappe that exists (towards growing radius).
     outward = solid.nappe * d[2] > 0
     enter = np.where(a > 0, low, np.where(outward, high, -_NEVER))
     leave = np.where(a > 0, high, np.where(outward, _NEVER, low))
@@ -139,8 +159,9 @@ def _quadric_interval(solid, o, d):
     return np.where(missed, _NEVER, enter), np.where(missed, -_NEVER, leave)
 
 
-def first_hit(solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 #n"],
-              direction: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+def first_hit(
+    solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
+) -> Float[np.ndarray, " n"]:
     """Ray parameter of the first surface in front of an origin outside of `solid` (less `hollow`); inf where missed."""
     enter, leave = interval(solid, origin, direction)
     hit = (enter < leave) & (enter > 0)
@@ -152,8 +173,9 @@ def first_hit(solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 #
     return np.where(hit, enter, np.float32(np.inf))
 
 
-def blocks(solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 #n"],
-           direction: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
+def blocks(
+    solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
+) -> Bool[np.ndarray, " n"]:
     """Whether the solid (less its hollow) meets the segment from origin to origin + direction."""
     enter, leave = interval(solid, origin, direction)
     enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)

@@ -1,0 +1,200 @@
+"""The demo room as a capture, in memory or on disk as an ordinary COLMAP folder with instance masks and LERF labels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Int16, UInt8
+
+from jsecon.data.colmap import write_colmap
+from jsecon.data.frames import check_options, held_out
+from jsecon.data.lerf import LabelledFrame, write_lerf_labels
+from jsecon.data.synthetic.raycast import render_views
+from jsecon.data.synthetic.room import Room, make_room
+from jsecon.errors import require
+from jsecon.files import write_text, written_whole
+from jsecon.types import Camera, Capture
+
+
+def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int = 240) -> Camera:
+    """`views` cameras on a walk once around the table, at changing height, looking at it; 60 degrees across."""
+    draw = np.random.default_rng([room.seed, 5])
+    turn = 2 * np.pi * (np.arange(views) / views) + draw.uniform(0, 2 * np.pi) + draw.normal(0, 0.03, views)
+    wave = np.sin(3 * turn + draw.uniform(0, 2 * np.pi))
+    radius = 1.5 + 0.1 * np.sin(2 * turn + draw.uniform(0, 2 * np.pi)) + draw.normal(0, 0.02, views)
+    height_m = 0.78 + 0.3 * wave + draw.normal(0, 0.02, views)
+    centres = np.stack([radius * np.cos(turn), radius * np.sin(turn), height_m], -1)
+    targets = np.array([0, 0, 0.03]) + draw.normal(0, 0.03, (views, 3))
+    focal = 0.5 * width / np.tan(np.radians(30))
+    poses = np.stack([_look_at(centre, target) for centre, target in zip(centres, targets)])
+    focal_px, cx, cy = (np.full(views, value, np.float32) for value in (focal, width / 2, height / 2))
+    return Camera(poses, focal_px, focal_px, cx, cy, width, height)
+
+
+def _look_at(centre, target):
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, -turn @ centre
+    return pose.astype(np.float32)
+
+
+def room_capture(
+    seed: int,
+    *,
+    views: int = 30,
+    width: int = 320,
+    height: int = 240,
+    holdout: int = 5,
+    points: int = 6000,
+    num_objects: int = 12,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Capture, Int16[np.ndarray, "t h w"], tuple[str, ...]]:
+    """The room of `seed` as a capture, its instances (index into the names, -1 = background) and the objects' names.
+
+    Every `holdout`-th frame from the first on is held out (0: none); the sparse points come from the others alone.
+    Raises InputError or ValueError on options that leave fewer than two frames.
+    """
+    check_options(None, views, holdout)
+    out = held_out(views, holdout)
+    require(
+        int((~out).sum()) >= 2,
+        "views",
+        got=f"{views} with every {holdout}. held out",
+        expected="2 that are not held out",
+        remedy="Sparse points are those that two views see: take more views.",
+    )
+    room = make_room(seed, num_objects=num_objects)
+    cameras = room_cameras(room, views=views, width=width, height=height)
+    frames, instances, depths = render_views(room, cameras, progress=progress)
+    cloud, colours = _sparse_points(np.random.default_rng([seed, 7]), frames, depths, cameras, out, points)
+    names = tuple(f"frame_{view + 1:05d}" for view in range(views))
+    capture = Capture(frames, cameras, cloud, colours, out, None, np.eye(4, dtype=np.float32), names)
+    return capture, instances, room.names
+
+
+def _sparse_points(draw, frames, depths, cameras, out, count):
+    """Points as structure from motion would leave them: on corners and texture first, in at least two of the views that
+    are not held out, off by the 0.4 px of a matched feature."""
+    kept = np.flatnonzero(~out)
+    width = frames.shape[2]
+    focal, middle = float(cameras.fx[0]), (float(cameras.cx[0]), float(cameras.cy[0]))
+    clouds, colours = [], []
+    for view in kept:
+        grey = frames[view].astype(np.float32).mean(-1)
+        down, across = np.gradient(grey)
+        weight = np.hypot(down, across).ravel()
+        weight = weight + weight.mean() + 1e-3
+        share = min(2 * count // len(kept) + 1, weight.size)
+        pixels = draw.choice(weight.size, share, replace=False, p=weight / weight.sum())
+        z = depths[view].ravel()[pixels]
+        x, y = (pixels % width + 0.5 - middle[0]) / focal, (pixels // width + 0.5 - middle[1]) / focal
+        local = np.stack([x * z, y * z, z], -1)
+        pose = cameras.world_to_camera[view]
+        world = (local - pose[:3, 3]) @ pose[:3, :3]
+        seen = sum(_sees(cameras.world_to_camera[other], depths[other], focal, middle, world) for other in kept)
+        world = world + draw.normal(0, 0.4, world.shape) * (z / focal)[:, None]
+        clouds.append(world[seen >= 2])
+        colours.append(frames[view].reshape(-1, 3)[pixels][seen >= 2])
+    cloud, colour = np.concatenate(clouds).astype(np.float32), np.concatenate(colours)
+    chosen = draw.permutation(len(cloud))[:count]
+    return cloud[chosen], colour[chosen]
+
+
+def _sees(pose, depth, focal, middle, world):
+    """Whether the view sees each point: inside of the picture, and at the depth of its pixel's surface."""
+    height, width = depth.shape
+    local = world @ pose[:3, :3].T + pose[:3, 3]
+    z = np.maximum(local[:, 2], 1e-6)
+    x = np.floor(local[:, 0] / z * focal + middle[0]).astype(np.int64)
+    y = np.floor(local[:, 1] / z * focal + middle[1]).astype(np.int64)
+    inside = (local[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    surface = depth[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+    return inside & (np.abs(surface - local[:, 2]) < 0.02 * z)
+
+
+def write_room(
+    folder: str | Path,
+    seed: int,
+    *,
+    views: int = 30,
+    width: int = 320,
+    height: int = 240,
+    holdout: int = 5,
+    points: int = 6000,
+    num_objects: int = 12,
+    label_pixels: int = 40,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Writes the room of `seed` to `folder` as a COLMAP capture (images/, sparse/0/), and its ground truth beside it.
+
+    masks/<frame>.png: 8-bit integers, 0 = none, else the object's id from 1. label/<frame>.json: LangSplat's layout of
+    LERF labels, for the held-out frames, of the objects with at least `label_pixels` visible pixels there. scene.json,
+    written last: seed, options, objects by id. Returns the folder; raises InputError where it cannot be written.
+    """
+    folder = Path(folder)
+    _clear(folder)
+    capture, instances, names = room_capture(
+        seed,
+        views=views,
+        width=width,
+        height=height,
+        holdout=holdout,
+        points=points,
+        num_objects=num_objects,
+        progress=progress,
+    )
+    write_colmap(capture, folder)
+    for name, instance in zip(capture.names, instances):
+        _write_ids(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
+    write_lerf_labels(
+        folder / "label",
+        [_labelled(capture.names[t], instances[t], names, label_pixels) for t in np.flatnonzero(capture.held_out)],
+    )
+    scene = {
+        "seed": seed,
+        "views": views,
+        "width": width,
+        "height": height,
+        "holdout": holdout,
+        "points": len(capture.points),
+        "held_out": [name for name, out in zip(capture.names, capture.held_out) if out],
+        "objects": {str(k + 1): name for k, name in enumerate(names)},
+    }
+    write_text(folder / "scene.json", json.dumps(scene, indent=2) + "\n")
+    return folder
+
+
+def _clear(folder):
+    """Removes what an earlier room in `folder` may have more of than this one; its other files are written over."""
+    if (folder / "scene.json").is_file():
+        stale = [
+            *folder.glob("label/frame_*.json"),
+            *folder.glob("masks/frame_*.png"),
+            *folder.glob("images/frame_*.png"),
+        ]
+        for file in [folder / "scene.json", *stale]:
+            file.unlink()
+
+
+def _labelled(frame, instance, names, label_pixels):
+    """The label of a frame: its objects' masks and boxes."""
+    objects = {}
+    for k, name in enumerate(names):
+        mask = instance == k
+        if mask.sum() >= label_pixels:
+            rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+            box = np.array([[columns[0], rows[0], columns[-1], rows[-1]]], np.float32)
+            objects[name] = mask, box
+    return LabelledFrame(frame, instance.shape[1], instance.shape[0], objects)
+
+
+def _write_ids(path: Path, ids: UInt8[np.ndarray, "h w"]) -> None:
+    with written_whole(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())

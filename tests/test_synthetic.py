@@ -1,0 +1,395 @@
+"""The demo room: exact geometry, true names, and files that read back as an ordinary capture."""
+
+import dataclasses
+import json
+from collections import Counter
+
+import cv2
+import numpy as np
+import pytest
+from conftest import look_at
+
+from jsecon.data.capture import load_capture
+from jsecon.data.labels import load_labels
+from jsecon.data.lerf import load_lerf_labels
+from jsecon.data.synthetic import make_room, render_views, room_cameras, room_capture, write_room
+from jsecon.data.synthetic.light import lamp_points, lamp_visibility
+from jsecon.data.synthetic.raycast import trace
+from jsecon.data.synthetic.room import PALETTE, TABLE_HALF, TABLE_HEIGHT, Part
+from jsecon.data.synthetic.shapes import SHAPES, reach
+from jsecon.data.synthetic.solids import (
+    blocks,
+    box,
+    contains,
+    cut,
+    ellipsoid,
+    first_hit,
+    frustum,
+    interval,
+    normals,
+    place,
+    rotation,
+)
+from jsecon.data.synthetic.surfaces import pattern
+from jsecon.errors import InputError
+from jsecon.types import Camera
+
+SEEDS = range(5)
+
+
+def alone(solid, hollow=None):
+    """A room with nothing in it but one part."""
+    room = make_room(0, num_objects=2)
+    item = dataclasses.replace(room.objects[0], parts=(Part(solid, hollow, 0, np.full(3, 0.5, np.float32)),))
+    return dataclasses.replace(room, objects=(item,), furniture=())
+
+
+def pinhole(pose, focal=200.0, size=81):
+    return Camera(np.asarray(pose, np.float32), focal, focal, size / 2, size / 2, size, size)
+
+
+@pytest.fixture(scope="module")
+def small():
+    """(capture, instances, names) of 10 views of 96x72, every fifth held out."""
+    return room_capture(0, views=10, width=96, height=72, points=400)
+
+
+@pytest.fixture(scope="module")
+def depths():
+    room = make_room(0)
+    cameras = room_cameras(room, views=10, width=96, height=72)
+    return np.stack([trace(room, cameras[k])[0] for k in range(10)])
+
+
+# Solids against their own definitions, written out, sampled densely along random rays.
+
+TURN = rotation(0.4, -0.7, 1.1)
+SOLIDS = {
+    "ellipsoid": (ellipsoid(0.3, 0.2, 0.4), lambda x, y, z: (x / 0.3) ** 2 + (y / 0.2) ** 2 + (z / 0.4) ** 2 <= 1),
+    "bowl": (ellipsoid(0.3, 0.3, 0.2, below=0.05, above=-0.1),
+             lambda x, y, z: ((x**2 + y**2) / 0.09 + z**2 / 0.04 <= 1) & (z <= 0.05) & (z >= -0.1)),
+    "cylinder": (frustum(0.2, 0.2, 0.4), lambda x, y, z: (np.hypot(x, y) <= 0.2) & (z >= 0) & (z <= 0.4)),
+    "widening": (frustum(0.1, 0.35, 0.3), lambda x, y, z: (np.hypot(x, y) <= 0.1 + z / 1.2) & (z >= 0) & (z <= 0.3)),
+    "cone": (frustum(0.3, 0.0, 0.3), lambda x, y, z: (np.hypot(x, y) <= 0.3 - z) & (z >= 0) & (z <= 0.3)),
+    "box": (box(0.4, 0.2, 0.3), lambda x, y, z: (abs(x) <= 0.2) & (abs(y) <= 0.1) & (z >= 0) & (z <= 0.3)),
+    "half": (cut(ellipsoid(0.3, 0.3, 0.3), (0.6, 0.8, 0.0), 0.1),
+             lambda x, y, z: (x**2 + y**2 + z**2 <= 0.09) & (0.6 * x + 0.8 * y <= 0.1)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("turned", [False, True])
+def test_interval_is_the_definition_along_a_ray(name, turned):
+    solid, inside = SOLIDS[name]
+    centre = np.array([0.3, -0.2, 0.5]) if turned else np.zeros(3)
+    axes = TURN if turned else np.eye(3)
+    rng = np.random.default_rng(3)
+    rays = 400
+    origin = (rng.normal(size=(3, rays)) * 1.5).astype(np.float32)
+    direction = (centre[:, None] + rng.uniform(-0.3, 0.3, (3, rays)) - origin).astype(np.float32)
+    direction[:, :40] = np.eye(3)[:, rng.integers(0, 3, 40)]  # along the axes: the degenerate cases of slabs and cones
+    origin[:, :40] = rng.uniform(-0.3, 0.3, (3, 40)) + centre[:, None]
+    enter, leave = interval(place(solid, centre, axes), origin, direction)
+    t = np.linspace(-1.0, 2.5, 1501)
+    points = origin[..., None].astype(np.float64) + direction[..., None].astype(np.float64) * t
+    local = np.einsum("ji,jrt->irt", np.asarray(axes, np.float64), points - centre[:, None, None])
+    truth = inside(*local)
+    got = (t >= enter[:, None]) & (t <= leave[:, None])
+    clear = (np.abs(t - enter[:, None]) > 2e-4) & (np.abs(t - leave[:, None]) > 2e-4)
+    assert truth.any(1).sum() > 100
+    np.testing.assert_array_equal(got[clear], truth[clear])
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_normals_point_out_of_the_solid(name):
+    solid = place(SOLIDS[name][0], (0.1, 0.0, -0.2), TURN)
+    rng = np.random.default_rng(1)
+    origin = 2.0 * rng.normal(size=(3, 500)).astype(np.float32)
+    origin /= np.linalg.norm(origin, axis=0)
+    direction = solid.bound[:3, None] + rng.uniform(-0.1, 0.1, (3, 500)).astype(np.float32) - origin
+    t = first_hit(solid, None, origin, direction)
+    hit = np.isfinite(t)
+    points, rays = (origin + t * direction)[:, hit], direction[:, hit]
+    normal = normals(solid, None, points)
+    assert hit.sum() > 200
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=0), 1, atol=1e-5)
+    assert ((normal * rays).sum(0) < 1e-3).all()
+    assert not contains(solid, points + 1e-3 * normal).any()
+    assert contains(solid, points - 1e-3 * normal, margin=1e-4).mean() > 0.98  # all but the sharpest edges
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_bounding_spheres_and_reach_hold_the_shape(shape):
+    parts = SHAPES[shape](np.random.default_rng(4))
+    radius = max(reach(solid) for solid, _, _ in parts)
+    assert 0.04 < radius < 0.2
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 61)] * 2, np.linspace(-0.05, 0.4, 46))).reshape(3, -1)
+    grid = grid.astype(np.float32)
+    for solid, _, _ in parts:
+        inside = grid[:, contains(solid, grid)]
+        assert (np.linalg.norm(inside - solid.bound[:3, None], axis=0) <= solid.bound[3] + 1e-5).all()
+        assert (np.hypot(inside[0], inside[1]) <= radius + 1e-5).all()
+        assert (inside[2] > -2e-3).all()  # nothing sinks into the table
+
+
+def test_sphere_has_its_exact_depth_and_silhouette():
+    centre, r = np.array([0.1, 0.05, 0.3]), 0.2
+    eye = np.array([1.4, -0.3, 0.6])
+    camera = pinhole(look_at(eye, centre, up=(0, 0, 1)))
+    room = alone(place(ellipsoid(r, r, r), centre))
+    depth, index = trace(room, camera)
+    distance = np.linalg.norm(centre - eye)
+    assert depth[40, 40] == pytest.approx(distance - r, abs=2e-6)
+    y, x = np.mgrid[:81, :81] + 0.5
+    rays = np.stack([(x - 40.5) / 200, (y - 40.5) / 200, np.ones_like(x)])
+    angle = np.arctan2(np.hypot(rays[0], rays[1]), 1)
+    edge = np.arcsin(r / distance)
+    sure = np.abs(angle - edge) > 1e-5
+    np.testing.assert_array_equal((index == 0)[sure], (angle < edge)[sure])
+    # The depth of every ray of the ball, from the sphere's equation in float64.
+    d = rays / np.linalg.norm(rays, axis=0)
+    along = distance * d[2] - np.sqrt(np.maximum(r**2 - distance**2 * (1 - d[2] ** 2), 0))
+    inner = angle < 0.97 * edge
+    np.testing.assert_allclose(depth[inner], (along * d[2])[inner], atol=5e-6)
+
+
+def test_room_walls_floor_and_ceiling_are_where_they_should_be():
+    room = alone(place(ellipsoid(0.01, 0.01, 0.01), (2.0, 2.0, 1.8)))
+    eye = np.array([0.2, 0.1, 0.4])
+    for target, up, expected in [
+        ((1.2, 0.1, 0.4), (0, 0, 1), room.half[0] - 0.2),
+        ((0.2, -0.9, 0.4), (0, 0, 1), room.half[1] + 0.1),
+        ((0.2, 0.1, -0.6), (1, 0, 0), TABLE_HEIGHT + 0.4),
+        ((0.2, 0.1, 1.4), (1, 0, 0), room.ceiling - 0.4),
+    ]:
+        depth, index = trace(room, pinhole(look_at(eye, target, up), focal=400.0))
+        assert (index == -1).all()
+        np.testing.assert_allclose(depth, expected, atol=2e-6)
+
+
+def test_a_hollow_is_seen_into_and_lit_from_above_only():
+    outer, hollow = frustum(0.1, 0.1, 0.2), place(frustum(0.09, 0.09, 0.21), (0, 0, 0.01))
+    down = pinhole(look_at((0.0, 0.0, 1.0), (0, 0, 0), up=(1, 0, 0)))
+    depth, _ = trace(alone(outer, hollow), down)
+    assert depth[40, 40] == pytest.approx(0.99, abs=2e-6)  # the cup's floor, not its rim
+    side = pinhole(look_at((1.0, 0.0, 0.1), (0, 0, 0.1), up=(0, 0, 1)))
+    depth, _ = trace(alone(outer, hollow), side)
+    assert depth[40, 40] == pytest.approx(0.9, abs=2e-6)
+    floor = np.array([[0.0], [0.0], [0.011]], np.float32)
+    assert not blocks(outer, hollow, floor, np.array([[0.0], [0.0], [1.0]], np.float32))[0]
+    assert blocks(outer, hollow, floor, np.array([[1.0], [0.0], [0.1]], np.float32))[0]
+    assert not blocks(outer, hollow, floor, np.array([[0.05], [0.0], [0.1]], np.float32))[0]  # ends before the wall
+    normal = normals(outer, hollow, np.array([[0.0, 0.09, 0.1], [0, 0, 0], [0.01, 0.1, 0.1]], np.float32))
+    np.testing.assert_allclose(normal.T, [[0, 0, 1], [-1, 0, 0], [1, 0, 0]], atol=1e-5)
+
+
+def test_lamp_visibility_equals_all_rays_to_all_parts():
+    room = make_room(1)
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(-0.68, 0.68, 600), rng.uniform(-0.56, 0.56, 600), np.full(600, 1e-3)])
+    points = points.astype(np.float32)
+    lamps = lamp_points(room)
+    blocked = np.zeros((lamps.shape[1], 600), bool)
+    for part in room.parts:
+        for k in range(lamps.shape[1]):
+            blocked[k] |= blocks(part.solid, part.hollow, points, lamps[:, k, None] - points)
+    seen = lamp_visibility(room, points, lamps=lamps)
+    np.testing.assert_allclose(seen, 1 - blocked.mean(0), atol=1e-6)
+    assert (seen == 0).any()
+    assert (seen == 1).any()
+    assert ((seen > 0.1) & (seen < 0.9)).any()  # a penumbra: the shadows are soft
+
+
+def test_patterns_stay_in_their_range_and_vary():
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (3, 4000)).astype(np.float32)
+    texture = make_room(0).objects[0].texture
+    for kind in ("checks", "stripes", "marble", "wood"):
+        value = pattern(dataclasses.replace(texture, kind=kind), points)
+        assert np.abs(value).max() <= 1.0 + 1e-6
+        assert value.std() > 0.3
+    assert not pattern(dataclasses.replace(texture, kind="plain"), points).any()
+
+
+# The recipe.
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_names_are_unique_and_shapes_repeat(seed):
+    room = make_room(seed)
+    assert len(room.names) == len(set(room.names)) == 12
+    assert {"dark green", "light green", "dark blue", "light blue"} <= {item.colour for item in room.objects}
+    assert len({item.colour for item in room.objects}) == 12
+    assert all(item.name == f"{item.colour} {item.shape}" for item in room.objects)
+    assert sum(count >= 2 for count in Counter(item.shape for item in room.objects).values()) >= 3
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_objects_stand_free_on_the_table(seed):
+    room = make_room(seed)
+    for k, item in enumerate(room.objects):
+        assert (np.abs(item.centre[:2]) + item.radius < TABLE_HALF).all()
+        for other in room.objects[:k]:
+            assert np.linalg.norm(item.centre - other.centre) > item.radius + other.radius
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_object_is_seen_often(seed):
+    """At least 60 px at 320x240 in 8 of 30 views, two held-out ones among them; counted at a quarter of the pixels."""
+    room = make_room(seed)
+    cameras = room_cameras(room, width=160, height=120)
+    owners = np.array([part.owner for part in room.parts] + [-1])
+    pixels = np.zeros((30, 12), int)
+    for view in range(30):
+        owner = owners[trace(room, cameras[view])[1]]
+        pixels[view] = np.bincount(owner[owner >= 0], minlength=12)
+    often = pixels >= 15
+    assert often.sum(0).min() >= 8
+    assert often[::5].sum(0).min() >= 2
+    assert (pixels.min(0) < 0.5 * np.median(pixels, 0)).any()  # and some are hidden now and then
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_colours_are_true_to_their_names(seed):
+    """The mean colour of an object's pixels is nearest, in CIELAB, to the palette's colour of its own name."""
+    room = make_room(seed)
+    frames, instances, _ = render_views(room, room_cameras(room, views=4, width=160, height=120))
+    lab = cv2.cvtColor(frames.astype(np.float32).reshape(-1, 1, 3) / 255, cv2.COLOR_RGB2LAB).reshape(*frames.shape)
+    names = list(PALETTE)
+    palette = cv2.cvtColor(np.float32(list(PALETTE.values()))[:, None] / 255, cv2.COLOR_RGB2LAB)[:, 0]
+    for k, item in enumerate(room.objects):
+        mean = lab[instances == k].mean(0)
+        distance = np.linalg.norm(palette - mean, axis=1)
+        assert names[distance.argmin()] == item.colour
+        assert distance.min() < 25
+    background = lab[instances < 0]
+    assert np.percentile(np.hypot(background[:, 1], background[:, 2]), 99) < 25  # the room itself is near grey
+    assert np.percentile(background[:, 0], 99) < 85
+
+
+def test_seed_decides_everything():
+    again = room_capture(3, views=3, width=32, height=24, points=50)
+    first = room_capture(3, views=3, width=32, height=24, points=50)
+    other = room_capture(4, views=3, width=32, height=24, points=50)
+    for name in ("frames", "points", "point_colors"):
+        np.testing.assert_array_equal(getattr(again[0], name), getattr(first[0], name))
+    np.testing.assert_array_equal(again[1], first[1])
+    np.testing.assert_array_equal(again[0].cameras.world_to_camera, first[0].cameras.world_to_camera)
+    assert again[2] == first[2] != other[2]
+    assert (again[0].frames != other[0].frames).mean() > 0.5
+
+
+def test_progress_counts_the_views():
+    calls = []
+    room = make_room(0, num_objects=4)
+    render_views(room, room_cameras(room, views=3, width=16, height=12), progress=lambda *row: calls.append(row))
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+# The capture.
+
+
+def test_cameras_are_rigid_and_look_at_the_table():
+    room = make_room(2)
+    cameras = room_cameras(room, views=12)
+    rotations = np.asarray(cameras.world_to_camera)[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (12, 3, 3)), atol=1e-6
+    )
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
+    assert (rotations[:, 1, 2] < 0).all()  # y goes down
+    assert (np.abs(cameras.centres) < [*room.half, room.ceiling]).all()
+    middle = np.asarray(cameras.world_to_camera)[:, :3, 3]
+    assert (np.abs(middle[:, :2]) < 0.25).all()
+    assert (middle[:, 2] > 1).all()
+
+
+def test_surfaces_reproject_to_the_pixels_that_see_them(small, depths):
+    """A pixel lifted by its depth falls on the same object at the same depth in each view, or is hidden there."""
+    capture, instances, _ = small
+    camera = capture.cameras
+    y, x = (a.ravel() for a in np.mgrid[:72, :96])
+    compared = 0
+    for a, b in [(1, 1), (1, 2), (4, 3), (6, 8)]:
+        z = depths[a].ravel()
+        local = np.stack([(x + 0.5 - camera.cx[a]) / camera.fx[a] * z, (y + 0.5 - camera.cy[a]) / camera.fy[a] * z, z])
+        pose_a, pose_b = (np.asarray(camera.world_to_camera[k], np.float64) for k in (a, b))
+        world = pose_a[:3, :3].T @ (local - pose_a[:3, 3:])
+        seen = pose_b[:3, :3] @ world + pose_b[:3, 3:]
+        u, v = seen[0] / seen[2] * camera.fx[b] + camera.cx[b], seen[1] / seen[2] * camera.fy[b] + camera.cy[b]
+        if a == b:
+            np.testing.assert_allclose(u, x + 0.5, atol=1e-3)
+            np.testing.assert_allclose(v, y + 0.5, atol=1e-3)
+        inside = (seen[2] > 0) & (u >= 0) & (u < 96) & (v >= 0) & (v < 72)
+        row, column = v[inside].astype(int), u[inside].astype(int)
+        same = np.abs(depths[b][row, column] - seen[2][inside]) < 0.004
+        agree = instances[b][row, column] == instances[a].ravel()[inside]
+        assert agree[same].mean() > 0.985  # all but pixels on an edge
+        # What is not at that depth is hidden by something nearer, there or in the next pixel: no surface lets through.
+        nearest = cv2.erode(depths[b], np.ones((3, 3), np.uint8))
+        assert (nearest[row, column] < seen[2][inside] + 0.05).all()
+        compared += same.sum()
+    assert compared > 5000
+
+
+def test_sparse_points_lie_on_surfaces_that_two_training_views_see(small, depths):
+    capture, _, _ = small
+    np.testing.assert_array_equal(np.flatnonzero(capture.held_out), [0, 5])
+    assert capture.points.shape == (400, 3)
+    assert capture.points.dtype == np.float32
+    seen, errors = np.zeros(400, int), np.full(400, np.inf)
+    for view in np.flatnonzero(~capture.held_out):
+        pose = capture.cameras.world_to_camera[view]
+        local = capture.points @ pose[:3, :3].T + pose[:3, 3]
+        u = local[:, 0] / local[:, 2] * capture.cameras.fx[view] + capture.cameras.cx[view]
+        v = local[:, 1] / local[:, 2] * capture.cameras.fy[view] + capture.cameras.cy[view]
+        inside = np.flatnonzero((local[:, 2] > 0) & (u >= 0) & (u < 96) & (v >= 0) & (v < 72))
+        off = np.abs(depths[view][v[inside].astype(int), u[inside].astype(int)] - local[inside, 2]) / local[inside, 2]
+        seen[inside] += off < 0.05
+        errors[inside] = np.minimum(errors[inside], off)
+    assert (seen >= 2).mean() > 0.97  # all but points that the noise moved over an edge
+    assert np.median(errors) < 0.01
+    assert errors.max() > 0  # noise there is
+
+
+def test_options_that_cannot_be():
+    with pytest.raises(ValueError, match="num_objects"):
+        make_room(0, num_objects=13)
+    with pytest.raises(ValueError, match="views"):
+        room_capture(0, views=2, holdout=2)
+    with pytest.raises(InputError, match="holdout"):
+        room_capture(0, holdout=1)
+
+
+def test_written_room_reads_back_as_an_ordinary_capture(tmp_path, small):
+    capture, instances, names = small
+    folder = tmp_path / "room"
+    write_room(folder, 9, views=12, width=16, height=12, points=20)  # an earlier room, of more frames
+    write_room(folder, 0, views=10, width=96, height=72, points=400)
+    read = load_capture(folder, holdout=5)
+    assert read.names == capture.names
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    np.testing.assert_array_equal(read.held_out, capture.held_out)
+    np.testing.assert_allclose(read.cameras.world_to_camera, capture.cameras.world_to_camera, atol=1e-6)
+    np.testing.assert_allclose(read.cameras.fx, capture.cameras.fx)
+    np.testing.assert_allclose(read.points, capture.points, atol=1e-6)
+    np.testing.assert_array_equal(read.point_colors, capture.point_colors)
+
+    labels = load_labels(folder / "masks", read.names, (72, 96)).labels
+    np.testing.assert_array_equal(labels, instances)
+
+    labelled = load_lerf_labels(folder / "label")
+    assert [frame.name for frame in labelled] == ["frame_00001", "frame_00006"]
+    for frame, view in zip(labelled, (0, 5)):
+        shown = {name for k, name in enumerate(names) if (instances[view] == k).sum() >= 40}
+        assert set(frame.objects) == shown
+        assert shown
+        for name, (mask, boxes) in frame.objects.items():
+            truth = instances[view] == names.index(name)
+            np.testing.assert_array_equal(mask, truth)
+            rows, columns = np.nonzero(truth)
+            np.testing.assert_array_equal(boxes, [[columns.min(), rows.min(), columns.max(), rows.max()]])
+
+    scene = json.loads((folder / "scene.json").read_text())
+    assert scene["seed"] == 0
+    assert list(scene["objects"].values()) == list(names)
+    assert len(list((folder / "images").iterdir())) == 10
