@@ -1,8 +1,9 @@
-"""OpenGaussian's protocol on LERF-style labels, "point level, rendered": select Gaussians by the text, render them alone.
+"""OpenGaussian's "point level, rendered" protocol on LERF-style labels: select by the text, render what was selected.
 
 For every labelled frame and every category labelled in it: the Gaussians selected for the category (once a scene, not a
-frame) are rendered without all others at the size of the labels, alpha > 0.7 is the mask, its IoU with the labelled mask
-is the pair's. mIoU and mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0 (REFERENCE C, D.5).
+frame) are rendered without all others at the size of the labels, alpha > 0.7 is the mask, its IoU with the labelled
+mask is the pair's. mIoU and mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0 (REFERENCE C,
+D.5).
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ VALA_THRESHOLD = 10 / 255
 LERF_PAIRS = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
 """(frame, query) pairs of each LERF-OVS scene (REFERENCE 0.2): a run with others does not measure the same thing"""
 LOCALISATION_WINDOW = 0.04
-"""side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px at about 730"""
+"""side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px of 730"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,32 +70,44 @@ def evaluate_point_level_rendered(
 
     Localisation, summary["loc_acc"]: the point of maximum of the selected Gaussians' similarity, composited by
     sum alpha T s over them alone and smoothed by a mean over a window of 4 % of the image's height, lies in a labelled
-    box of the category, edges included. Raises InputError for a labelled frame without a camera or of another aspect, for labels without pairs,
-    and where the number of pairs is not the expected one.
+    box of the category, edges included. Raises InputError for a labelled frame without a camera or of another aspect,
+    for labels without pairs, and where the number of pairs is not the expected one.
     """
     pairs = [(frame, category) for frame in labels for category in frame.objects]
     for frame in labels:
         _check(frame, cameras)
     if not pairs or (expected_pairs is not None and len(pairs) != expected_pairs):
-        raise InputError("labels", found=f"{len(pairs)} (frame, query) pairs", expected=f"{expected_pairs or 'at least one'}",
-                         remedy="Evaluate on the very label files of the protocol, all of them.")  # fmt: skip
+        raise InputError(
+            "labels",
+            found=f"{len(pairs)} (frame, query) pairs",
+            expected=f"{expected_pairs or 'at least one'}",
+            remedy="Evaluate on the very label files of the protocol, all of them.",
+        )
     answers: dict[str, Selection | None] = {}
     rows = []
     for done, (frame, category) in enumerate(pairs, start=1):
         if category not in answers:
             answers[category] = select(category)
-        rows.append(_row(gaussians, resized(cameras[frame.name], frame.width, frame.height), frame, category,
-                         answers[category], alpha_threshold))  # fmt: skip
+        rows.append(
+            _row(
+                gaussians,
+                resized(cameras[frame.name], frame.width, frame.height),
+                frame,
+                category,
+                answers[category],
+                alpha_threshold,
+            )
+        )
         if progress is not None:
             progress(done, len(pairs))
     return rows, summary(rows, alpha_threshold)
 
 
 def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> dict:
-    """{"protocol", "pairs", "frames", "queries", "missing", "miou", "macc", "acc_50", "loc_acc"} of rows of one scene."""
+    """{"protocol", "pairs", "frames", "queries", "missing", "miou", "macc", "acc_50", "loc_acc"} of one scene."""
     ious = [row.iou for row in rows]
     return {
-        "protocol": f"point level, rendered: selected Gaussians alone, alpha > {alpha_threshold:.3g}; mean over (frame, query) pairs",
+        "protocol": f"point level, rendered: selected Gaussians alone, alpha > {alpha_threshold:.3g}; mean over pairs",
         "pairs": len(rows),
         "frames": len({row.frame for row in rows}),
         "queries": len({row.query for row in rows}),
@@ -109,10 +122,19 @@ def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> di
 def resized(camera: Camera, width: int, height: int) -> Camera:
     """The same view at another size, px: focal lengths and principal point scaled."""
     x, y = width / camera.width, height / camera.height
-    return dataclasses.replace(camera, fx=camera.fx * x, cx=camera.cx * x, fy=camera.fy * y, cy=camera.cy * y, width=width, height=height)
+    return dataclasses.replace(
+        camera, fx=camera.fx * x, cx=camera.cx * x, fy=camera.fy * y, cy=camera.cy * y, width=width, height=height
+    )
 
 
-def _row(gaussians: Gaussians, camera: Camera, frame: LabelledFrame, category: str, selection: Selection | None, threshold: float) -> Row:
+def _row(
+    gaussians: Gaussians,
+    camera: Camera,
+    frame: LabelledFrame,
+    category: str,
+    selection: Selection | None,
+    threshold: float,
+) -> Row:
     true, boxes = frame.objects[category]
     if selection is None or not np.asarray(selection.mask).any():
         region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
@@ -120,8 +142,17 @@ def _row(gaussians: Gaussians, camera: Camera, frame: LabelledFrame, category: s
     rendering = render_selection(gaussians, jax.tree.map(jnp.asarray, camera), selection.mask, selection.similarity)
     mask = np.asarray(rendering.alpha) > threshold
     point = _maximum(np.asarray(rendering.features[..., 0]))
-    return Row(frame.name, category, float(iou(mask, true)) if true.any() else 0.0, point is not None and inside_any(point, boxes), point,
-               int(np.asarray(selection.mask).sum()), int(selection.region), float(selection.score), mask)  # fmt: skip
+    return Row(
+        frame.name,
+        category,
+        float(iou(mask, true)) if true.any() else 0.0,
+        point is not None and inside_any(point, boxes),
+        point,
+        int(np.asarray(selection.mask).sum()),
+        int(selection.region),
+        float(selection.score),
+        mask,
+    )
 
 
 def _maximum(similarity: np.ndarray) -> tuple[int, int] | None:
@@ -138,10 +169,17 @@ def _maximum(similarity: np.ndarray) -> tuple[int, int] | None:
 def _check(frame: LabelledFrame, cameras: Mapping[str, Camera]) -> None:
     if frame.name not in cameras:
         some = ", ".join(sorted(cameras)[:3])
-        raise InputError(f"labels of {frame.name}", found="no frame of that name in the capture", expected=f"one of {some}, ...",
-                         remedy="Evaluate with the capture that was labelled, and leave none of its labelled frames out.")  # fmt: skip
+        raise InputError(
+            f"labels of {frame.name}",
+            found="no frame of that name in the capture",
+            expected=f"one of {some}, ...",
+            remedy="Evaluate with the capture that was labelled, and leave none of its labelled frames out.",
+        )
     camera = cameras[frame.name]
     if abs(frame.width / camera.width - frame.height / camera.height) > 0.02 * frame.width / camera.width:
-        raise InputError(f"labels of {frame.name}", found=f"{frame.width}x{frame.height}",
-                         expected=f"the aspect of the frame, {camera.width}x{camera.height}",
-                         remedy="Label the undistorted frames, or scale the labels to them.")  # fmt: skip
+        raise InputError(
+            f"labels of {frame.name}",
+            found=f"{frame.width}x{frame.height}",
+            expected=f"the aspect of the frame, {camera.width}x{camera.height}",
+            remedy="Label the undistorted frames, or scale the labels to them.",
+        )

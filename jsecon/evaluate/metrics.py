@@ -9,11 +9,19 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require
 from jsecon.types import Array
 
+Point = tuple[float | int, float | int]
+"""x, y px"""
 
-def iou(predicted: Bool[Array, "*shape"], true: Bool[Array, "*shape"]) -> Float[Array, ""]:
+
+def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array, ""]:
     """Intersection over union of two masks of one shape (pixels or points); 1 where both are empty. Jit-safe."""
-    require(predicted.shape == true.shape, "iou", got=f"{predicted.shape} and {true.shape}", expected="one shape",
-            remedy="Render the prediction at the size of the truth.")
+    require(
+        predicted.shape == true.shape,
+        "iou",
+        got=f"{predicted.shape} and {true.shape}",
+        expected="one shape",
+        remedy="Render the prediction at the size of the truth.",
+    )
     both, either = jnp.sum(predicted & true), jnp.sum(predicted | true)
     return jnp.where(either > 0, both / jnp.maximum(either, 1), 1.0)
 
@@ -36,17 +44,17 @@ def accuracy_at(ious: Iterable[float | None], threshold: float = 0.25) -> float:
     return float((values > threshold).mean()) if values.size else float("nan")
 
 
-def localization_accuracy(points: Iterable[tuple[float, float] | None], boxes: Iterable[Float[Array, "b 4"]]) -> float:
-    """Share of (frame, query) pairs whose point (x, y) lies inside, edges included, any of the pair's boxes x1 y1 x2 y2.
+def localization_accuracy(points: Iterable[Point | None], boxes: Iterable[Float[Array, "b 4"]]) -> float:
+    """Share of (frame, query) pairs whose point (x, y) lies inside, edges included, any of the pair's boxes.
 
-    None, a missing prediction, counts as a failure. What the point is, is the caller's definition: say it beside the
-    number, as published ones mean different things (REFERENCE 0.3). NaN for no pairs at all.
+    Boxes are x1 y1 x2 y2. None, a missing prediction, counts as a failure. What the point is, is the caller's
+    definition: say it beside the number, as published ones mean different things (REFERENCE 0.3). NaN for no pairs.
     """
     hits = [point is not None and inside_any(point, box) for point, box in zip(points, boxes, strict=True)]
     return float(np.mean(hits)) if hits else float("nan")
 
 
-def inside_any(point: tuple[float, float], boxes: Float[Array, "b 4"]) -> bool:
+def inside_any(point: Point, boxes: Float[Array, "b 4"]) -> bool:
     """Whether (x, y) lies inside any of the boxes x1 y1 x2 y2, edges included."""
     x, y = point
     boxes = np.asarray(boxes)

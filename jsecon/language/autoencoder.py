@@ -1,7 +1,8 @@
-"""Region embeddings to small codes: LangSplat's autoencoder, and the rotation that takes its place where nothing is lost.
+"""Region embeddings to small codes: LangSplat's autoencoder, and a rotation where that loses nothing.
 
-`region_codes` chooses: the embeddings themselves where they are no longer than the code, a rotation into the regions' own
-span where that span fits, else the autoencoder. What it returns beside the codes has `.encode` and `.decode` for texts.
+`region_codes` chooses: the embeddings themselves where they are no longer than the code, a rotation into the regions'
+own span where that span fits, else the autoencoder. What it returns beside the codes has `.encode` and `.decode` for
+texts.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from jsecon.types import Array
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
-"""LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it, so that no layer is a bottleneck."""
+"""LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it."""
 MIN_STEPS = 1_000
 """LangSplat's 100 epochs run over tens of thousands of crops; a few masklets need more epochs to see as many steps."""
 MAX_COSINE_LOSS = 1e-4
@@ -36,7 +37,7 @@ Coder = Any
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Autoencoder:
-    """Parameters of one scene's autoencoder. The layers' sizes are read off the arrays, so the arrays are all there is."""
+    """Parameters of one scene's autoencoder. The layers' sizes are read off the arrays, so there is nothing else."""
 
     encoder: Any
     """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
@@ -53,8 +54,13 @@ class Autoencoder:
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
         """(..., E) embeddings of any length -> (..., d) unit codes; a zero embedding stays a zero (unknown) code."""
-        require(embeddings.shape[-1] == self.dim, "Autoencoder.encode", got=f"embeddings of size {embeddings.shape[-1]}",
-                expected=f"size {self.dim}", remedy="Encode embeddings of the embedder that the autoencoder was trained on.")
+        require(
+            embeddings.shape[-1] == self.dim,
+            "Autoencoder.encode",
+            got=f"embeddings of size {embeddings.shape[-1]}",
+            expected=f"size {self.dim}",
+            remedy="Encode embeddings of the embedder that the autoencoder was trained on.",
+        )
         units = normalize(jnp.asarray(embeddings))
         rows = units.reshape(-1, self.dim)
         codes = _Encoder(_widths(self.encoder["params"])).apply(self.encoder, rows, train=False)
@@ -63,8 +69,13 @@ class Autoencoder:
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
         """(..., d) codes -> (..., E) unit embeddings."""
-        require(codes.shape[-1] == self.latent, "Autoencoder.decode", got=f"codes of size {codes.shape[-1]}",
-                expected=f"size {self.latent}", remedy="Decode codes of this autoencoder.")
+        require(
+            codes.shape[-1] == self.latent,
+            "Autoencoder.decode",
+            got=f"codes of size {codes.shape[-1]}",
+            expected=f"size {self.latent}",
+            remedy="Decode codes of this autoencoder.",
+        )
         codes = jnp.asarray(codes)
         rows = _Decoder(_widths(self.decoder["params"])).apply(self.decoder, codes.reshape(-1, self.latent))
         return rows.reshape(*codes.shape[:-1], self.dim)
@@ -73,7 +84,7 @@ class Autoencoder:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Rotation:
-    """Codes as coordinates in an orthonormal basis: cosines between vectors of the basis's span are kept as they are."""
+    """Codes as coordinates in an orthonormal basis: cosines inside its span are kept as they are."""
 
     basis: Array
     """(E, d) orthonormal columns, or zero columns where the span has fewer than d dimensions."""
@@ -104,35 +115,62 @@ def train_autoencoder(
     cosine_over: str = "features",
     progress: Callable[[int, int], None] | None = None,
 ) -> Autoencoder:
-    """Trains LangSplat's autoencoder (REFERENCE B.5) on the regions' embeddings; the same key gives the same parameters.
+    """Trains LangSplat's autoencoder (REFERENCE B.5) on the regions' embeddings; the same key gives the same
+    parameters.
 
     embeddings: (R, E), R >= 1, brought to unit length first; zero rows (never embedded) are left out.
     epochs: passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
     batch: largest batch. The regions are dealt into batches of like size, so that no batch is a remnant of one or two,
         from which batch normalisation would learn nothing.
-    cosine_over: "features" for the cosine of each region with its reconstruction; "batch" for LangSplat's own form, which
-        takes it along the batch.
+    cosine_over: "features" for the cosine of each region with its reconstruction; "batch" for LangSplat's own form,
+        which takes it along the batch.
     The parameters returned are the best, by the loss in evaluation mode, of the last twentieth of the epochs.
     Raises ValueError for no usable row, numbers that are not finite, or options out of range.
     """
     require(latent >= 1, "train_autoencoder", got=f"latent={latent}", expected="at least 1", remedy="3 is LangSplat's.")
-    require(batch >= 1 and (epochs is None or epochs >= 1), "train_autoencoder", got=f"batch={batch}, epochs={epochs}",
-            expected="both at least 1", remedy="Leave epochs out to have it chosen.")
-    require(cosine_over in ("features", "batch"), "train_autoencoder", got=f"cosine_over={cosine_over!r}",
-            expected="'features' or 'batch'", remedy="'batch' reproduces LangSplat.")
+    require(
+        batch >= 1 and (epochs is None or epochs >= 1),
+        "train_autoencoder",
+        got=f"batch={batch}, epochs={epochs}",
+        expected="both at least 1",
+        remedy="Leave epochs out to have it chosen.",
+    )
+    require(
+        cosine_over in ("features", "batch"),
+        "train_autoencoder",
+        got=f"cosine_over={cosine_over!r}",
+        expected="'features' or 'batch'",
+        remedy="'batch' reproduces LangSplat.",
+    )
     rows = np.asarray(embeddings)
-    require(bool(np.isfinite(rows).all()), "train_autoencoder", got="embeddings that are not finite", expected="finite numbers",
-            remedy="Find the regions whose crops gave NaN and leave them out.")
+    require(
+        bool(np.isfinite(rows).all()),
+        "train_autoencoder",
+        got="embeddings that are not finite",
+        expected="finite numbers",
+        remedy="Find the regions whose crops gave NaN and leave them out.",
+    )
     rows = rows[np.any(rows != 0, axis=1)]
-    require(len(rows) >= 1, "train_autoencoder", got=f"{embeddings.shape[0]} rows, all zero or none",
-            expected="at least one embedding", remedy="Embed the regions first.")
+    require(
+        len(rows) >= 1,
+        "train_autoencoder",
+        got=f"{embeddings.shape[0]} rows, all zero or none",
+        expected="at least one embedding",
+        remedy="Embed the regions first.",
+    )
 
     units = normalize(jnp.asarray(rows))
     count, dim = units.shape
     batches = -(-count // batch)
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
-    plan = _Plan((*(max(w, latent) for w in ENCODER_WIDTHS), latent), (*(max(w, latent) for w in DECODER_WIDTHS), dim),
-                 batches, learning_rate, cosine_weight, cosine_over)
+    plan = _Plan(
+        (*(max(w, latent) for w in ENCODER_WIDTHS), latent),
+        (*(max(w, latent) for w in DECODER_WIDTHS), dim),
+        batches,
+        learning_rate,
+        cosine_weight,
+        cosine_over,
+    )
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
     stretch = total if progress is None else max(1, -(-total // 50))
@@ -184,8 +222,11 @@ def _start(units: Array, key: Key, plan: _Plan) -> Any:
     params = {}
     params["encoder"], used = layers(shapes["encoder"])
     params["decoder"], _ = layers(shapes["decoder"], used)
-    stats = {name: {"mean": jnp.zeros_like(norm["bias"]), "var": jnp.ones_like(norm["scale"])}
-             for name, norm in params["encoder"].items() if name.startswith("BatchNorm")}  # fmt: skip
+    stats = {
+        name: {"mean": jnp.zeros_like(norm["bias"]), "var": jnp.ones_like(norm["scale"])}
+        for name, norm in params["encoder"].items()
+        if name.startswith("BatchNorm")
+    }
     moments = _optimizer(plan).init(params)
     return (params, stats, moments), (jnp.asarray(jnp.inf, units.dtype), params, stats)
 
@@ -196,8 +237,9 @@ def _optimizer(plan: _Plan) -> optax.GradientTransformation:
 
 # The bounds are arguments: one compiled loop serves every stretch between two calls of `progress`.
 @functools.partial(jax.jit, static_argnames="plan")
-def _epochs(carry: Any, units: Array, key: Key, start: Array | int, stop: Array | int, judged_from: Array | int,
-            plan: _Plan) -> Any:
+def _epochs(
+    carry: Any, units: Array, key: Key, start: Array | int, stop: Array | int, judged_from: Array | int, plan: _Plan
+) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
     encoder, decoder = _Encoder(plan.encoder_widths), _Decoder(plan.decoder_widths)
@@ -249,8 +291,13 @@ def region_codes(
     Raises ValueError for numbers that are not finite.
     """
     require(latent >= 1, "region_codes", got=f"latent={latent}", expected="at least 1", remedy="3 is LangSplat's.")
-    require(bool(np.isfinite(np.asarray(embeddings)).all()), "region_codes", got="embeddings that are not finite",
-            expected="finite numbers", remedy="Find the regions whose crops gave NaN and leave them out.")
+    require(
+        bool(np.isfinite(np.asarray(embeddings)).all()),
+        "region_codes",
+        got="embeddings that are not finite",
+        expected="finite numbers",
+        remedy="Find the regions whose crops gave NaN and leave them out.",
+    )
     units = normalize(jnp.asarray(embeddings))
     count, dim = units.shape
     if dim <= latent:
@@ -259,7 +306,11 @@ def region_codes(
     if loss <= MAX_COSINE_LOSS:
         return rotation.encode(units), rotation, f"left out: {count} regions fit in {latent} dimensions without loss"
     coder = train_autoencoder(units, latent=latent, key=key, **training)
-    return coder.encode(units), coder, f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}"
+    return (
+        coder.encode(units),
+        coder,
+        f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}",
+    )
 
 
 def _rotation(units: Array, latent: int) -> tuple[Rotation, float]:
@@ -279,7 +330,9 @@ def _rotation(units: Array, latent: int) -> tuple[Rotation, float]:
 
 
 def _widths(params: Any) -> tuple[int, ...]:
-    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(sum(name.startswith("Dense_") for name in params)))
+    return tuple(
+        params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(sum(name.startswith("Dense_") for name in params))
+    )
 
 
 class _Encoder(nn.Module):

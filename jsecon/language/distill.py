@@ -1,8 +1,8 @@
 """Codes of the regions to codes of the Gaussians: closed forms on the votes, and the paper's path on the rendered L1.
 
-With the geometry frozen the rendered map is linear in the Gaussians' features, so the votes (weight that each region casts
-on each Gaussian) hold what a closed form needs. The paper instead descends on the rendered L1 with Adam; `distill_l1` is
-that path, kept to reproduce it and to measure against.
+With the geometry frozen the rendered map is linear in the Gaussians' features, so the votes (weight that each region
+casts on each Gaussian) hold what a closed form needs. The paper instead descends on the rendered L1 with Adam;
+`distill_l1` is that path, kept to reproduce it and to measure against.
 """
 
 import dataclasses
@@ -40,13 +40,23 @@ def distill_votes(votes: Votes, region_codes: Float[Array, "r d"], reduce: str =
     reduce: "mean", the weighted mean, which minimises the weighted squared (and, brought to unit length, the cosine)
     error; "median", the weighted median of each number of the code, which minimises the rendered L1 of a Gaussian taken
     alone, and where a whole interval does takes what is closest to the mode; "mode", the code of the strongest region.
-    Unknown, a zero code, are Gaussians without votes, with votes that are not finite, and those of which at least half of the weight
-    lies on regions that have no code themselves (zero rows). Raises ValueError on shapes that disagree.
+    Unknown, a zero code, are Gaussians without votes, with votes that are not finite, and those of which at least half
+    of the weight lies on regions that have no code themselves (zero rows). Raises ValueError on shapes that disagree.
     """
-    require(reduce in _REDUCTIONS, "distill_votes", got=f"reduce={reduce!r}", expected=f"one of {sorted(_REDUCTIONS)}",
-            remedy="'mode' is the default.")
-    require(region_codes.shape[0] == votes.num_regions, "distill_votes", got=f"{region_codes.shape[0]} region codes",
-            expected=f"{votes.num_regions}, the votes' regions", remedy="Pass one code a region, in the regions' order.")
+    require(
+        reduce in _REDUCTIONS,
+        "distill_votes",
+        got=f"reduce={reduce!r}",
+        expected=f"one of {sorted(_REDUCTIONS)}",
+        remedy="'mode' is the default.",
+    )
+    require(
+        region_codes.shape[0] == votes.num_regions,
+        "distill_votes",
+        got=f"{region_codes.shape[0]} region codes",
+        expected=f"{votes.num_regions}, the votes' regions",
+        remedy="Pass one code a region, in the regions' order.",
+    )
     if votes.num_regions == 0 or votes.regions.shape[1] == 0:
         return jnp.zeros((votes.regions.shape[0], region_codes.shape[1]), region_codes.dtype)
     return _distill_votes(votes.regions, votes.weights, jnp.asarray(region_codes), reduce)
@@ -126,70 +136,120 @@ def distill_l1(
 ) -> tuple[Float[Array, "n d"], Float[Array, " steps"]]:
     """The paper's distillation (as LangSplat's, REFERENCE B.6): Adam on the L1 between rendered and target codes.
 
-    One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d numbers of
-    |F m - G m|: F the rendering of f / (|f| + 1e-9) without background or renormalisation, G the code of the pixel's
-    region, m = 1 on labelled pixels, so that unlabelled ones count in the denominator alone. G is gathered from the
-    labels, (T, H, W) with -1 = none, and the (R, d) region codes when its view comes up. The geometry stays as it is.
+    One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
+    numbers of |F m - G m|: F the rendering of f / (|f| + 1e-9) without background or renormalisation, G the code of the
+    pixel's region, m = 1 on labelled pixels, so that unlabelled ones count in the denominator alone. G is gathered from
+    the labels, (T, H, W) with -1 = none, and the (R, d) region codes when its view comes up. The geometry stays as it
+    is.
 
-    init: "zero" is LangSplat's, and a trap: the gradient through f / (|f| + 1e-9) at zero is 1e9 times too large, Adam's
-    second moment remembers it for about 15,000 steps, and until then a Gaussian's code hardly moves from the corner of
-    the cube that its first step took it to (REFERENCE B.7). "random" (length 0.01) or codes to start from, (N, d) such as
-    those of `distill_votes`, escape it. Gaussians that no labelled pixel sees keep their initial code.
+    init: "zero" is LangSplat's, and a trap: the gradient through f / (|f| + 1e-9) at zero is 1e9 times too large,
+    Adam's second moment remembers it for about 15,000 steps, and until then a Gaussian's code hardly moves from the
+    corner of the cube that its first step took it to (REFERENCE B.7). "random" (length 0.01) or codes to start from,
+    (N, d) such as those of `distill_votes`, escape it. Gaussians that no labelled pixel sees get a zero code, or keep
+    the one given.
 
-    Returns the unit codes (N, d) (zero where still zero) and the loss before each step. capacity is planned from the data outside jit, and
-    needed inside it. Raises ValueError on shapes that disagree and, outside jit, where the capacity given is too small.
+    Returns the unit codes (N, d) (zero where still zero) and the loss before each step. capacity is planned from the
+    data outside jit, and needed inside it. Raises ValueError on shapes that disagree and, outside jit, where the
+    capacity given is too small.
     """
-    start = descent(gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init, learning_rate=learning_rate)
+    start = descent(
+        gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init, learning_rate=learning_rate
+    )
     if capacity is None:
-        capacity = plan_capacity(gaussians, cameras)
+        capacity = plan_capacity(gaussians, cameras, margin=1.0)
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state = start
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
-        state = descend(state, gaussians, cameras, labels, region_codes, until=stop, learning_rate=learning_rate, capacity=capacity)
+        state = descend(
+            state, gaussians, cameras, labels, region_codes, until=stop, learning_rate=learning_rate, capacity=capacity
+        )
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
     if not isinstance(state.history, jax.core.Tracer):
-        require(not bool(jnp.isnan(state.history).any()), "distill_l1", got=f"capacity={capacity}, too small for a view, or NaN",
-                expected="every view within the capacity, finite Gaussians and codes",
-                remedy="Leave capacity out to have it planned, and check the Gaussians with jsecon.numerics.finite.")
-    return normalize(state.features), state.history
+        require(
+            not bool(jnp.isnan(state.history).any()),
+            "distill_l1",
+            got=f"capacity={capacity}, too small for a view, or NaN",
+            expected="every view within the capacity, finite Gaussians and codes",
+            remedy="Leave capacity out to have it planned, and check the Gaussians with jsecon.numerics.finite.",
+        )
+    codes = normalize(state.features)
+    if isinstance(init, str) and init == "random":
+        # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
+        codes = jnp.where(jnp.any(state.features != start.features, axis=1, keepdims=True), codes, 0.0)
+    return codes, state.history
 
 
 def descent(
-    gaussians: Gaussians, cameras: Camera, labels: Int[Array, "t h w"], region_codes: Float[Array, "r d"], *,
-    steps: int, key: Key, init: str | Float[Array, "n d"] = "zero", learning_rate: float = 0.0025,
-) -> Descent:  # fmt: skip
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Int[Array, "t h w"],
+    region_codes: Float[Array, "r d"],
+    *,
+    steps: int,
+    key: Key,
+    init: str | Float[Array, "n d"] = "zero",
+    learning_rate: float = 0.0025,
+) -> Descent:
     """The state before the first step of `distill_l1`; see there for the arguments."""
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
-    require(labels.shape[1:] == (cameras.height, cameras.width) and cameras.world_to_camera.shape[:-2] == (views,),
-            "distill_l1", got=f"labels {labels.shape}", expected=f"one (H, W) = ({cameras.height}, {cameras.width}) image a camera",
-            remedy="Pass the labels and the cameras of the same views at the same size.")
-    require(views > 0 and steps > 0 and region_codes.shape[0] > 0, "distill_l1",
-            got=f"{views} views, {steps} steps, {region_codes.shape[0]} regions", expected="at least one of each", remedy="There is nothing to distil.")
+    require(
+        labels.shape[1:] == (cameras.height, cameras.width) and cameras.world_to_camera.shape[:-2] == (views,),
+        "distill_l1",
+        got=f"labels {labels.shape}",
+        expected=f"one (H, W) = ({cameras.height}, {cameras.width}) image a camera",
+        remedy="Pass the labels and the cameras of the same views at the same size.",
+    )
+    require(
+        views > 0 and steps > 0 and region_codes.shape[0] > 0,
+        "distill_l1",
+        got=f"{views} views, {steps} steps, {region_codes.shape[0]} regions",
+        expected="at least one of each",
+        remedy="There is nothing to distil.",
+    )
     order_key, init_key = jax.random.split(key)
     dtype = region_codes.dtype
     if isinstance(init, str):
-        require(init in ("zero", "random"), "distill_l1", got=f"init={init!r}", expected="'zero', 'random' or codes (N, d)",
-                remedy="Start from distill_votes(...) where you have votes.")
+        require(
+            init in ("zero", "random"),
+            "distill_l1",
+            got=f"init={init!r}",
+            expected="'zero', 'random' or codes (N, d)",
+            remedy="Start from distill_votes(...) where you have votes.",
+        )
         features = jnp.zeros((count, size), dtype)
         if init == "random":
             features = RANDOM_LENGTH * normalize(jax.random.normal(init_key, (count, size), dtype))
     else:
-        require(init.shape == (count, size), "distill_l1", got=f"init {init.shape}", expected=f"{(count, size)}",
-                remedy="Codes to start from have one row a Gaussian, of the regions' code size.")
+        require(
+            init.shape == (count, size),
+            "distill_l1",
+            got=f"init {init.shape}",
+            expected=f"{(count, size)}",
+            remedy="Codes to start from have one row a Gaussian, of the regions' code size.",
+        )
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    return Descent(features, _optimizer(learning_rate).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
+    return Descent(
+        features, _optimizer(learning_rate).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32)
+    )
 
 
 def descend(
-    state: Descent, gaussians: Gaussians, cameras: Camera, labels: Int[Array, "t h w"], region_codes: Float[Array, "r d"], *,
-    until: int, capacity: int, learning_rate: float = 0.0025,
-) -> Descent:  # fmt: skip
-    """Takes `state` on to `until` steps. In stretches or at once, the result is the same; one compilation serves all."""
+    state: Descent,
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Int[Array, "t h w"],
+    region_codes: Float[Array, "r d"],
+    *,
+    until: int,
+    capacity: int,
+    learning_rate: float = 0.0025,
+) -> Descent:
+    """Takes `state` on to `until` steps. In stretches or at once, with one compilation and one result."""
     return _descend(state, gaussians, cameras, labels, jnp.asarray(region_codes), until, learning_rate, capacity)
 
 
@@ -207,8 +267,8 @@ def _descend(state, gaussians, cameras, labels, region_codes, until, learning_ra
         camera = cameras[view]
         ids = jnp.clip(labels[view], 0, codes.shape[0] - 1)
         mask = ((labels[view] >= 0) & known[ids])[..., None]
-        # safe_norm has a zero gradient at zero, so that the gradient there is 1e9 times the rendering's, as in LangSplat.
-        units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
+        # safe_norm has a zero gradient at zero, so that the gradient there is 1e9 times the rendering's, as in
+        LangSplat.units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
         rendering = render(gaussians, camera, units, capacity=capacity)
         return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - codes[ids]), 0.0)), rendering.overflow
 
@@ -216,7 +276,12 @@ def _descend(state, gaussians, cameras, labels, region_codes, until, learning_ra
         (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])
         updates, moments = optimizer.update(gradient, state.moments)
         value = jnp.where(overflow > 0, jnp.nan, value)
-        return Descent(optax.apply_updates(state.features, updates), moments, state.order,
-                       state.history.at[index].set(value), jnp.asarray(index + 1, jnp.int32))
+        return Descent(
+            optax.apply_updates(state.features, updates),
+            moments,
+            state.order,
+            state.history.at[index].set(value),
+            jnp.asarray(index + 1, jnp.int32),
+        )
 
     return jax.lax.fori_loop(state.step, until, step, state)

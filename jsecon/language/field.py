@@ -1,7 +1,8 @@
 """The language field as one file: a zip of .npy arrays with a JSON header that says what they are. No pickle.
 
-The header, member `header.npy` (UTF-8 bytes), holds {"format", "version", "field"}; "field" is the field's tree, each node
-one of: {"record": name, "fields": {...}}, {"dict": {...}}, {"array": member, "shape", "dtype"}, or {"value": JSON value}.
+The header, member `header.npy` (UTF-8 bytes), holds {"format", "version", "field"}; "field" is the field's tree, each
+node one of: {"record": name, "fields": {...}}, {"dict": {...}}, {"array": member, "shape", "dtype"}, or {"value": JSON
+value}.
 """
 
 import dataclasses
@@ -28,10 +29,17 @@ _REMEDY = "Make the field again with `jsecon run`."
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     """Writes `field` to `path`, whole or not at all. Equal fields give equal bytes.
 
-    Raises ValueError for arrays whose shapes disagree or that are not plain numbers, InputError where the folder cannot be written.
+    Raises ValueError for arrays whose shapes disagree or that are not plain numbers, InputError where the folder cannot
+    be written.
     """
     problem = _disagreement(field)
-    require(problem is None, "save_field", got=problem, expected="arrays of one N, R, d, E and T", remedy="Build the field from one run.")
+    require(
+        problem is None,
+        "save_field",
+        got=problem,
+        expected="arrays of one N, R, d, E and T",
+        remedy="Build the field from one run.",
+    )
     arrays: dict[str, np.ndarray] = {}
     header = {"format": FORMAT, "version": VERSION, "field": _pack(field, "", arrays)}
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -46,26 +54,51 @@ def load_field(path: str | os.PathLike) -> LanguageField:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(path, found="a folder" if path.is_dir() else "no such file", expected="a field file", remedy=_REMEDY)
+        raise InputError(
+            path, found="a folder" if path.is_dir() else "no such file", expected="a field file", remedy=_REMEDY
+        )
     if not zipfile.is_zipfile(path):
-        raise InputError(path, found=f"{path.stat().st_size} bytes that are no complete zip archive",
-                         expected="a field file written by jsecon", remedy=f"It may have been cut short in copying. {_REMEDY}")  # fmt: skip
+        raise InputError(
+            path,
+            found=f"{path.stat().st_size} bytes that are no complete zip archive",
+            expected="a field file written by jsecon",
+            remedy=f"It may have been cut short in copying. {_REMEDY}",
+        )
     try:
         with np.load(path, allow_pickle=False) as members:
             if not isinstance(members, np.lib.npyio.NpzFile) or "header" not in members:
-                raise InputError(path, found="a zip archive without a jsecon header", expected="a field file", remedy=_REMEDY)
+                raise InputError(
+                    path, found="a zip archive without a jsecon header", expected="a field file", remedy=_REMEDY
+                )
             header = json.loads(members["header"].tobytes().decode())
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise InputError(path, found="another program's header", expected=f"format {FORMAT!r}", remedy=_REMEDY)
             if header.get("version") != VERSION:
-                raise InputError(path, found=f"version {header.get('version')}", expected=f"version {VERSION}",
-                                 remedy=f"Read it with the jsecon that wrote it. {_REMEDY}")  # fmt: skip
+                raise InputError(
+                    path,
+                    found=f"version {header.get('version')}",
+                    expected=f"version {VERSION}",
+                    remedy=f"Read it with the jsecon that wrote it. {_REMEDY}",
+                )
             field = _unpack(header["field"], members)
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise InputError(path, found=f"a damaged field file ({type(error).__name__}: {error})", expected="a whole one",
-                         remedy=f"It may have been changed or cut in copying. {_REMEDY}") from error  # fmt: skip
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OSError,
+        EOFError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise InputError(
+            path,
+            found=f"a damaged field file ({type(error).__name__}: {error})",
+            expected="a whole one",
+            remedy=f"It may have been changed or cut in copying. {_REMEDY}",
+        ) from error
     problem = "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field)
     if problem is not None:
         raise InputError(path, found=problem, expected="arrays of one N, R, d, E and T", remedy=_REMEDY)
@@ -81,8 +114,13 @@ def _pack(node: Any, name: str, arrays: dict[str, np.ndarray]) -> dict:
     if node is None or isinstance(node, str | int | tuple):
         return {"value": list(node) if isinstance(node, tuple) else node}
     array = np.asarray(node)
-    require(array.dtype.kind in "biuf", "save_field", got=f"{name[:-1]} of type {array.dtype}", expected="plain numbers",
-            remedy="Convert it to float32 or an integer type.")
+    require(
+        array.dtype.kind in "biuf",
+        "save_field",
+        got=f"{name[:-1]} of type {array.dtype}",
+        expected="plain numbers",
+        remedy="Convert it to float32 or an integer type.",
+    )
     arrays[name[:-1]] = array
     return {"array": name[:-1], "shape": list(array.shape), "dtype": array.dtype.name}
 
@@ -97,13 +135,15 @@ def _unpack(node: dict, members: Any) -> Any:
         return tuple(node["value"]) if isinstance(node["value"], list) else node["value"]
     array = members[node["array"]]
     if list(array.shape) != node["shape"] or array.dtype.name != node["dtype"]:
-        raise ValueError(f"{node['array']} is {array.dtype}{array.shape}, header says {node['dtype']}{tuple(node['shape'])}")
+        raise ValueError(
+            f"{node['array']} is {array.dtype}{array.shape}, header says {node['dtype']}{tuple(node['shape'])}"
+        )
     return jnp.asarray(array) if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype else array
 
 
 def _disagreement(field: LanguageField) -> str | None:
     """What is wrong with the shapes, in words, or None."""
-    n, (r, t) = field.gaussians.means.shape[0], field.regions.pixels.shape
+    n, r = field.gaussians.means.shape[0], field.regions.pixels.shape[0]
     d, e = field.region_codes.shape[-1], field.regions.embeddings.shape[-1]
     frames = field.cameras.world_to_camera.shape[0]
     k = field.votes.regions.shape[-1]

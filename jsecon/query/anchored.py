@@ -15,12 +15,21 @@ from jsecon.query.one_step import Number, similarities
 from jsecon.query.pixel import region_at, region_shares_at
 from jsecon.types import Array, LanguageField, Selection
 
-__all__ = ["CODE_THRESHOLD", "RETRIEVAL_THRESHOLD", "SHARE_THRESHOLD", "query_anchored", "query_region", "region_at", "region_shares_at"]
+__all__ = [
+    "CODE_THRESHOLD",
+    "RETRIEVAL_THRESHOLD",
+    "SHARE_THRESHOLD",
+    "query_anchored",
+    "query_region",
+    "region_at",
+    "region_shares_at",
+]
 
 RETRIEVAL_THRESHOLD = 0.2
-"""The paper's "low threshold to filter invalid prompts", which it does not state. In CLIP ViT-B/16 an image has a cosine of
-about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without CLIP's gap are far above for
-texts that fit. It only tells "nothing here" from "the best there is": which region is the best does not depend on it."""
+"""The paper's "low threshold to filter invalid prompts", which it does not state. In CLIP ViT-B/16 an image has a
+cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without CLIP's gap are
+far above for texts that fit. It only tells "nothing here" from "the best there is": which region is the best does not
+depend on it."""
 CODE_THRESHOLD = 0.9
 """on the cosine of codes: codes that were distilled from one region lie within a few degrees (0.9 is 26)"""
 SHARE_THRESHOLD = 0.5
@@ -55,23 +64,42 @@ def query_anchored(
     Retrieval: the region with the largest cosine; where that is below `retrieval_threshold` nothing is selected, and
     Selection.region is -1. Membership, `by`:
     "votes": the region's share of all the weight with which the Gaussian was seen, an estimate of the probability that
-        a pixel of it belongs to the region; default threshold 0.5. `unlabelled_weight` in [0, 1] says how much weight on
-        unlabelled pixels counts as evidence against (1 in full; less where masks are missing from many frames).
+        a pixel of it belongs to the region; default threshold 0.5. `unlabelled_weight` in [0, 1] says how much weight
+        on unlabelled pixels counts as evidence against (1 in full; less where masks are missing from many frames).
     "code": cosine of the Gaussian's code with the region's (the paper); default threshold 0.9.
     `alike_threshold`: where given, regions whose embedding has at least this cosine with the anchor's are taken as the
         same thing (a track that broke, a twin): their votes are added, or the best of their codes counts.
     Gaussians never seen, without a code, or with numbers that are not finite are never selected, nor regions without
-    an embedding. Pure: jit it or vmap it over texts, with the field closed over. Raises ValueError on a text of another size.
+    an embedding. Pure: jit it or vmap it over texts, with the field closed over. Raises ValueError on a text of
+    another size.
     """
     size = field.regions.embeddings.shape[1]
-    require(text_embedding.shape == (size,), "query_anchored", got=f"text {text_embedding.shape}", expected=f"({size},)",
-            remedy=f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}.")
-    require(by in _THRESHOLDS, "query_anchored", got=f"by={by!r}", expected="'code' or 'votes'", remedy="'votes' is the default.")
+    require(
+        text_embedding.shape == (size,),
+        "query_anchored",
+        got=f"text {text_embedding.shape}",
+        expected=f"({size},)",
+        remedy=f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}.",
+    )
+    require(
+        by in _THRESHOLDS,
+        "query_anchored",
+        got=f"by={by!r}",
+        expected="'code' or 'votes'",
+        remedy="'votes' is the default.",
+    )
     if field.regions.count == 0:
         return _nothing(field)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
-    return _query(_parts(field), jnp.asarray(text_embedding), retrieval_threshold, threshold, alike_threshold,
-                  unlabelled_weight, by)
+    return _query(
+        _parts(field),
+        jnp.asarray(text_embedding),
+        retrieval_threshold,
+        threshold,
+        alike_threshold,
+        unlabelled_weight,
+        by,
+    )
 
 
 def query_region(
@@ -87,13 +115,26 @@ def query_region(
 
     Nothing for region -1 (or any other id that the field does not have): Selection.region is then -1 and its score 0.
     """
-    require(by in _THRESHOLDS, "query_region", got=f"by={by!r}", expected="'code' or 'votes'", remedy="'votes' is the default.")
+    require(
+        by in _THRESHOLDS,
+        "query_region",
+        got=f"by={by!r}",
+        expected="'code' or 'votes'",
+        remedy="'votes' is the default.",
+    )
     if field.regions.count == 0:
         return _nothing(field)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
     valid = (region >= 0) & (jnp.asarray(region) < field.regions.count)
-    return _members(_parts(field), jnp.where(valid, region, -1), valid.astype(field.codes.dtype), threshold, alike_threshold,
-                    unlabelled_weight, by)
+    return _members(
+        _parts(field),
+        jnp.where(valid, region, -1),
+        valid.astype(field.codes.dtype),
+        threshold,
+        alike_threshold,
+        unlabelled_weight,
+        by,
+    )
 
 
 _THRESHOLDS = {"code": CODE_THRESHOLD, "votes": SHARE_THRESHOLD}
@@ -101,8 +142,21 @@ _THRESHOLDS = {"code": CODE_THRESHOLD, "votes": SHARE_THRESHOLD}
 
 def _parts(field: LanguageField) -> _Parts:
     votes = field.votes
-    return _Parts(*(jnp.asarray(a) for a in (field.regions.embeddings, field.region_codes, field.codes, votes.regions,
-                                             votes.weights, votes.labelled, votes.total, votes.views)))  # fmt: skip
+    return _Parts(
+        *(
+            jnp.asarray(a)
+            for a in (
+                field.regions.embeddings,
+                field.region_codes,
+                field.codes,
+                votes.regions,
+                votes.weights,
+                votes.labelled,
+                votes.total,
+                votes.views,
+            )
+        )
+    )
 
 
 def _nothing(field: LanguageField) -> Selection:

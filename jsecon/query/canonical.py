@@ -12,7 +12,12 @@ TEMPERATURE = 10.0
 """LERF's and LangSplat's factor on the cosines; not CLIP's own 100"""
 
 
-def query_canonical(features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"], threshold: Number) -> Selection:
+def query_canonical(
+    features: Float[Array, "n d"],
+    text: Float[Array, " d_text"],
+    canonical: Float[Array, "c d_canonical"],
+    threshold: Number,
+) -> Selection:
     """The Gaussians whose relevancy to the text is at least `threshold`.
 
     features (N, d), text (d,) and canonical phrases (C, d), C >= 1, in one space: embeddings, or codes of the same
@@ -22,9 +27,13 @@ def query_canonical(features: Float[Array, "n d"], text: Float[Array, " d"], can
     Raises ValueError on shapes that disagree.
     """
     size = features.shape[1]
-    require(text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1, "query_canonical",
-            got=f"text {text.shape}, canonical {canonical.shape}", expected=f"({size},) and (C >= 1, {size})",
-            remedy="Embed or encode text and canonical phrases as the features are.")
+    require(
+        text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1,
+        "query_canonical",
+        got=f"text {text.shape}, canonical {canonical.shape}",
+        expected=f"({size},) and (C >= 1, {size})",
+        remedy="Embed or encode text and canonical phrases as the features are.",
+    )
     return _canonical(jnp.asarray(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
 
 
@@ -34,7 +43,9 @@ def _canonical(features: Array, text: Array, canonical: Array, threshold: Number
     return Selection(known & (relevancy >= threshold), relevancy, jnp.asarray(-1, jnp.int32), best(relevancy, known))
 
 
-def relevancies(features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
+def relevancies(
+    features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]
+) -> tuple[Array, Array]:
     """LERF's relevancy (N,), and where it means something (N,); 0 elsewhere."""
     positive, known = similarities(features, text)
     # One phrase at a time: the sums stay multiply-and-sum, and no (N, C) array of products is made.

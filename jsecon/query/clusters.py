@@ -13,12 +13,13 @@ from scipy.spatial import cKDTree
 
 from jsecon.types import Array
 
+
 def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.ndarray, " m"]:
     """Cluster of each of the points (M, 3), counted from 0 in the order of their first core point; -1 = noise.
 
-    Equal to sklearn.cluster.DBSCAN(eps, min_samples).fit_predict up to rounding at distances of exactly eps: a core point
-    has min_samples points, itself included, within eps; a point that is not core joins the first cluster with a core
-    point within eps.
+    Equal to sklearn.cluster.DBSCAN(eps, min_samples).fit_predict up to rounding at distances of exactly eps: a core
+    point has min_samples points, itself included, within eps; a point that is not core joins the first cluster with a
+    core point within eps.
     """
     points = np.asarray(points, np.float64)
     labels = np.full(len(points), -1)

@@ -18,8 +18,14 @@ _HIDDEN_LOGIT = -30.0
 """an opacity of 1e-13, far below 1/255: culled in projection, with every number finite"""
 
 
-def selection_mask(gaussians: Gaussians, camera: Camera, mask: Bool[Array, " n"], *, threshold: float = ALPHA_THRESHOLD,
-                   capacity: int | None = None) -> Bool[Array, "h w"]:
+def selection_mask(
+    gaussians: Gaussians,
+    camera: Camera,
+    mask: Bool[Array, " n"],
+    *,
+    threshold: float = ALPHA_THRESHOLD,
+    capacity: int | None = None,
+) -> Bool[Array, "h w"]:
     """(H, W) bool: where the rendering of the selected Gaussians alone, all others deleted, has alpha > threshold.
 
     Occlusion by what is not selected is not taken into account: that is the protocol. capacity as for `render`.
@@ -27,14 +33,25 @@ def selection_mask(gaussians: Gaussians, camera: Camera, mask: Bool[Array, " n"]
     return render_selection(gaussians, camera, mask, capacity=capacity).alpha > threshold
 
 
-def render_selection(gaussians: Gaussians, camera: Camera, mask: Bool[Array, " n"],
-                     similarity: Float[Array, " n"] | None = None, *, capacity: int | None = None) -> Rendering:
+def render_selection(
+    gaussians: Gaussians,
+    camera: Camera,
+    mask: Bool[Array, " n"],
+    similarity: Float[Array, " n"] | None = None,
+    *,
+    capacity: int | None = None,
+) -> Rendering:
     """Renders the selected Gaussians alone: alpha, and features (H, W, 1) = sum alpha T similarity (ones by default).
 
     Those not selected become transparent instead of being cut out, so that every selection shares one compilation.
     """
-    require(mask.shape == (gaussians.count,), "mask", got=mask.shape, expected=f"({gaussians.count},)",
-            remedy="Pass one truth value a Gaussian.")
+    require(
+        mask.shape == (gaussians.count,),
+        "mask",
+        got=mask.shape,
+        expected=f"({gaussians.count},)",
+        remedy="Pass one truth value a Gaussian.",
+    )
     logits = jnp.where(mask, gaussians.opacity_logits, _HIDDEN_LOGIT)
     features = jnp.where(mask, jnp.ones_like(logits) if similarity is None else similarity, 0.0)
     hidden = jax.tree.map(jnp.asarray, dataclasses.replace(gaussians, opacity_logits=logits))
@@ -44,5 +61,7 @@ def render_selection(gaussians: Gaussians, camera: Camera, mask: Bool[Array, " n
     return _render(hidden, camera, features[:, None], capacity)
 
 
-_render = jax.jit(lambda gaussians, camera, features, capacity: render(gaussians, camera, features, capacity=capacity),
-                  static_argnums=3)  # fmt: skip
+_render = jax.jit(
+    lambda gaussians, camera, features, capacity: render(gaussians, camera, features, capacity=capacity),
+    static_argnums=3,
+)

@@ -12,15 +12,20 @@ Number = float | int | Array
 """a threshold: a Python number, or () under a trace"""
 
 
-def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d"], threshold: Number) -> Selection:
+def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
     """The Gaussians whose code has a cosine of at least `threshold` with the text's code.
 
     codes (N, d), text_code (d,), any length. A zero code (unknown) or one that is not finite has similarity 0 and is
     never selected; nothing is for a text code that is zero or not finite. Selection.score is the best similarity, 0
     where nothing is known. Raises ValueError on shapes that disagree.
     """
-    require(codes.shape[1] == text_code.shape[0], "query_one_step", got=f"text code of size {text_code.shape[0]}",
-            expected=f"{codes.shape[1]}, as the codes", remedy="Encode the text with the field's coder.")
+    require(
+        codes.shape[1] == text_code.shape[0],
+        "query_one_step",
+        got=f"text code of size {text_code.shape[0]}",
+        expected=f"{codes.shape[1]}, as the codes",
+        remedy="Encode the text with the field's coder.",
+    )
     return _one_step(jnp.asarray(codes), jnp.asarray(text_code), threshold)
 
 
@@ -36,9 +41,20 @@ def similarities(codes: Float[Array, "n d"], code: Float[Array, " d"]) -> tuple[
     unit = normalize(code)
     largest = jnp.max(jnp.abs(codes), axis=-1, initial=0.0)
     known = (largest > 0) & jnp.isfinite(largest) & jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
-    scaled = codes / jnp.where(known, largest, 1.0)[:, None]  # entries in [-1, 1]: squares neither overflow nor vanish
-    dots, squares = jnp.sum(scaled * unit, axis=-1), jnp.sum(scaled * scaled, axis=-1)
+    scaled = codes * jnp.where(known, _into_range(largest), 0.0)[:, None]
+    dots, squares = jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
     return jnp.where(known, dots / jnp.sqrt(jnp.where(known, squares, 1.0)), 0.0), known
+
+
+def _into_range(size: Array) -> Array:
+    """A power of two that brings numbers of this size to where squares neither overflow nor vanish.
+
+    Multiplied, not divided: XLA turns a division by a row's largest number into a product with its reciprocal, and
+    that of 1e38 is flushed to zero.
+    """
+    limit = jnp.finfo(size.dtype).maxexp
+    far, shift = limit * 5 // 16, limit * 21 // 32
+    return jnp.where(size > 2.0**far, 2.0**-shift, jnp.where(size < 2.0**-far, 2.0**shift, 1.0)).astype(size.dtype)
 
 
 def best(similarity: Float[Array, " n"], known: Bool[Array, " n"]) -> Float[Array, ""]:

@@ -9,24 +9,42 @@ from jsecon.query.clusters import dbscan
 from jsecon.types import Array
 
 EPS_SPACINGS = 6.0
-"""eps in units of the selection's own point spacing, the median distance to the third neighbour: wide enough to cross the
-gaps that weakly textured parts leave between splats, far below the distance between objects"""
+"""eps in units of the selection's own point spacing, the median distance to the third neighbour: wide enough to cross
+the gaps that weakly textured parts leave between splats, far below the distance between objects"""
 MIN_SAMPLES = 10
 """neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings"""
 
 
-def remove_outliers(means: Float[Array, "n 3"], mask: Bool[Array, " n"], *, eps: float | None = None,
-                    min_samples: int = MIN_SAMPLES, keep: str = "largest") -> Bool[np.ndarray, " n"]:
-    """The selection `mask` without what DBSCAN calls noise, and for keep="largest" without all clusters but the largest.
+def remove_outliers(
+    means: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    *,
+    eps: float | None = None,
+    min_samples: int = MIN_SAMPLES,
+    keep: str = "largest",
+) -> Bool[np.ndarray, " n"]:
+    """The selection `mask` without what DBSCAN calls noise, and for keep="largest" without all clusters but the
+    largest.
 
     means (N, 3), world units. eps: radius, world units; None takes `default_eps` of the selection. keep="all" keeps
     every cluster (several objects of one kind). Returned as it came, less centres that are not finite: a selection of
     fewer than `min_samples` points, or one in which DBSCAN finds no cluster at all, as there is nothing for outliers to
     lie outside of. Raises ValueError for options out of range.
     """
-    require(keep in ("largest", "all"), "remove_outliers", got=f"keep={keep!r}", expected="'largest' or 'all'", remedy="Use 'all' to keep several objects.")
-    require(min_samples >= 1 and (eps is None or eps > 0), "remove_outliers", got=f"eps={eps}, min_samples={min_samples}",
-            expected="eps > 0 and min_samples >= 1", remedy="Leave eps out to have it follow the selection's spacing.")
+    require(
+        keep in ("largest", "all"),
+        "remove_outliers",
+        got=f"keep={keep!r}",
+        expected="'largest' or 'all'",
+        remedy="Use 'all' to keep several objects.",
+    )
+    require(
+        min_samples >= 1 and (eps is None or eps > 0),
+        "remove_outliers",
+        got=f"eps={eps}, min_samples={min_samples}",
+        expected="eps > 0 and min_samples >= 1",
+        remedy="Leave eps out to have it follow the selection's spacing.",
+    )
     means = np.asarray(means)
     kept = np.asarray(mask) & np.isfinite(means).all(axis=1)
     chosen = np.flatnonzero(kept)

@@ -14,7 +14,9 @@ MIN_SHARE = 0.05
 """a region that makes up less of a pixel than this is no answer to what lies there: the pixel is background"""
 
 
-def pixel_weights(gaussians: Gaussians, camera: Camera, x: int, y: int) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def pixel_weights(
+    gaussians: Gaussians, camera: Camera, x: int, y: int
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Ids (M,) front to back and weights alpha T (M,) of the Gaussians that make up pixel (column x, row y) of a view.
 
     By the definition of the image (DESIGN section 5), without tiles: O(N) for one pixel, where a render is O(N) too
@@ -47,15 +49,27 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
     """
     frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
     if not 0 <= frame < frames:
-        raise InputError("frame", found=str(frame), expected=f"0 to {frames - 1}", remedy="Frames are numbered in the order of their names.")
+        raise InputError(
+            "frame",
+            found=str(frame),
+            expected=f"0 to {frames - 1}",
+            remedy="Frames are numbered in the order of their names.",
+        )
     if not (0 <= x < width and 0 <= y < height):
-        raise InputError("pixel", found=f"({x}, {y})", expected=f"column 0 to {width - 1}, row 0 to {height - 1}",
-                         remedy=f"Give x and y in the frames as the run used them, {width}x{height}.")
+        raise InputError(
+            "pixel",
+            found=f"({x}, {y})",
+            expected=f"column 0 to {width - 1}, row 0 to {height - 1}",
+            remedy=f"Give x and y in the frames as the run used them, {width}x{height}.",
+        )
     gaussians, camera = jax.tree.map(jnp.asarray, (field.gaussians, _view(field.cameras, frame)))
     ids, weights = pixel_weights(gaussians, camera, x, y)
     regions, votes = np.asarray(field.votes.regions)[ids], np.asarray(field.votes.weights)[ids].astype(np.float64)
     total = np.asarray(field.votes.total)[ids].astype(np.float64)
-    share = np.where(np.isfinite(votes) & (regions >= 0) & (total[:, None] > 0), votes, 0.0) / np.where(total > 0, total, 1.0)[:, None]
+    share = (
+        np.where(np.isfinite(votes) & (regions >= 0) & (total[:, None] > 0), votes, 0.0)
+        / np.where(total > 0, total, 1.0)[:, None]
+    )
     shares = np.zeros(field.regions.count)
     np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
     return shares

@@ -1,0 +1,54 @@
+"""A complete small field, made by the library itself: the 64 Gaussians of `scene` in five regions, votes from four views."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.language.autoencoder import region_codes
+from jsecon.language.distill import distill_votes
+from jsecon.language.votes import region_votes
+from jsecon.splat.render import render
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import LanguageField, Regions
+
+REGIONS = 5
+
+
+def unit_rows(rng, rows, size):
+    x = rng.normal(size=(rows, size)).astype(np.float32)
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+def true_regions(scene):
+    """(N,) region of each Gaussian: the nearest of five centres."""
+    centres = np.random.default_rng(3).uniform(-0.5, 0.5, (REGIONS, 3))
+    return np.argmin(((np.asarray(scene.means)[:, None] - centres) ** 2).sum(-1), axis=1)
+
+
+def labels_of(scene, cameras, members):
+    """(T, H, W) int16: the region that makes up most of each pixel, -1 where alpha is below 0.3."""
+    onehot = jnp.asarray(np.eye(REGIONS, dtype=np.float32)[members])
+    capacity = plan_capacity(scene, cameras)
+    draw = jax.jit(lambda camera: render(scene, camera, onehot, capacity=capacity))
+    labels = []
+    for view in range(cameras.world_to_camera.shape[0]):
+        shares = np.asarray(draw(cameras[view]).features)
+        labels.append(np.where(shares.sum(-1) > 0.3, shares.argmax(-1), -1))
+    return np.stack(labels).astype(np.int16)
+
+
+def make_field(scene, cameras, *, dim=12, latent=8):
+    rng = np.random.default_rng(5)
+    scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
+    labels = labels_of(scene, cameras, true_regions(scene))
+    votes = region_votes(scene, cameras, jnp.asarray(labels), REGIONS, top=3)
+    embeddings = unit_rows(rng, REGIONS, dim)
+    table, coder, _ = region_codes(jnp.asarray(embeddings), latent=latent, key=jax.random.key(0))
+    pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
+    field = LanguageField(
+        gaussians=scene, codes=distill_votes(votes, table), votes=votes, regions=Regions(embeddings, pixels),
+        region_codes=table, autoencoder=coder, cameras=cameras, canonical=unit_rows(rng, 4, dim),
+        to_source=np.eye(4), names=tuple(f"frame_{t}" for t in range(len(labels))), embedder="random",
+        provenance='{"made by": "a test"}',
+    )  # fmt: skip
+    return field, labels

@@ -1,0 +1,77 @@
+"""Metrics against counting by hand, and their manners at the edges: missing counts as 0, strict means strict."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from sklearn.metrics import jaccard_score, recall_score
+
+from jsecon.evaluate.metrics import (
+    accuracy_at,
+    iou,
+    localization_accuracy,
+    mean_iou,
+    point_accuracy,
+    point_class_means,
+)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1))
+def test_iou_equals_sets(seed, share_a, share_b):
+    rng = np.random.default_rng(seed)
+    a, b = rng.random((12, 9)) < share_a, rng.random((12, 9)) < share_b
+    set_a, set_b = set(map(tuple, np.argwhere(a))), set(map(tuple, np.argwhere(b)))
+    expected = len(set_a & set_b) / len(set_a | set_b) if set_a | set_b else 1.0
+    assert float(iou(a, b)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_iou_of_many_pixels_under_jit_and_vmap():
+    rng = np.random.default_rng(0)
+    a, b = rng.random((3, 200, 500)) < 0.4, rng.random((3, 200, 500)) < 0.6
+    expected = (a & b).sum((1, 2)) / (a | b).sum((1, 2))
+    np.testing.assert_allclose(jax.jit(jax.vmap(iou))(jnp.asarray(a), jnp.asarray(b)), expected, rtol=1e-6)
+
+
+def test_iou_of_other_sizes_is_told():
+    with pytest.raises(ValueError, match="one shape"):
+        iou(np.ones((2, 3), bool), np.ones((3, 2), bool))
+
+
+def test_a_missing_prediction_counts_as_nothing_found():
+    assert mean_iou([1.0, None, 0.5, float("nan")]) == pytest.approx(0.375)
+    assert accuracy_at([1.0, None, 0.5, float("nan")], 0.25) == 0.5
+    boxes = np.array([[0, 0, 10, 10.0]])
+    assert localization_accuracy([(5, 5), None], [boxes, boxes]) == 0.5
+
+
+def test_accuracy_is_strict():
+    assert accuracy_at([0.25, 0.2500001], 0.25) == 0.5
+    assert accuracy_at([0.0], 0.0) == 0
+
+
+def test_localisation_counts_edges_and_any_box():
+    boxes = np.array([[0, 0, 4, 4], [10, 10, 12, 14.0]])
+    points = [(4, 4), (4.5, 4), (12, 14), (11, 9.9), (0, 0)]
+    assert localization_accuracy(points, [boxes] * 5) == pytest.approx(3 / 5)
+    assert localization_accuracy([(0, 0)], [np.zeros((0, 4))]) == 0
+    with pytest.raises(ValueError, match="zip"):
+        localization_accuracy([(0, 0)], [])
+
+
+def test_no_pairs_is_no_number():
+    assert np.isnan(mean_iou([])) and np.isnan(accuracy_at([])) and np.isnan(localization_accuracy([], []))
+    assert np.isnan(point_accuracy(np.array([1]), np.array([-1])))
+    assert np.isnan(point_class_means(np.array([1]), np.array([-1]))).all()
+
+
+def test_point_means_equal_scikit_learn():
+    rng = np.random.default_rng(1)
+    true = rng.integers(-1, 5, 4_000)
+    predicted = np.where(rng.random(4_000) < 0.6, true, rng.integers(-1, 7, 4_000))
+    counted, classes = true >= 0, np.arange(5)
+    miou, macc = point_class_means(predicted, true)
+    assert miou == pytest.approx(jaccard_score(true[counted], predicted[counted], labels=classes, average="macro"))
+    assert macc == pytest.approx(recall_score(true[counted], predicted[counted], labels=classes, average="macro"))
+    assert point_accuracy(predicted, true) == pytest.approx((predicted == true)[counted].mean())
