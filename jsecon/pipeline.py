@@ -188,7 +188,7 @@ def _stages(
             lambda r, p: _fit(options, folder, keys["gaussians"], r["load"], p), rooms=("fit", "splat"), after=("load",),
             given=_of(options, "steps", "sh_degree", "seed"))
     if options.masks is not None:
-        add("masklets", f"read from {options.masks.name}", lambda r, p: stages.masklets_from_disk(options, r["load"]),
+        add("masklets", f"read from {options.masks.name}", lambda r, p: stages.masklets_from_disk(options, r["load"], p),
             rooms=("data",), after=("load",), files=options.masks)
     else:
         add("masklets", "proposals by colour and texture, followed through the Gaussians",

@@ -18,6 +18,7 @@ from jsecon.errors import InputError, require
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
 
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """All that the result of a run depends on, but for the files themselves."""
@@ -159,15 +160,16 @@ def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussian
     return Outcome(labels)
 
 
-def masklets_from_disk(options: Options, capture: Capture) -> Outcome:
+def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -> Outcome:
     """labels (T, H, W) int16 of the training frames, as the mask files have them."""
     from jsecon.data.labels import load_labels
 
-    train = training_frames(capture)
-    names = tuple(capture.names[t] for t in train)
-    masks = load_labels(options.masks, names, capture.frames.shape[1:3])
-    _require_regions(masks.labels, str(options.masks))
-    return Outcome(masks.labels, notes=masks.notes)
+    require(options.masks is not None, "masks", got=None, expected="a folder of masks", remedy="Give one.")
+    height, width = capture.frames.shape[1:3]
+    names = [capture.names[t] for t in training_frames(capture)]
+    found = load_labels(options.masks, names, (height, width), progress=progress)
+    _require_regions(found.labels, str(options.masks))
+    return Outcome(found.labels, notes=(f"{len(found.ids)} regions in the masks", *found.notes))
 
 
 def _require_regions(labels: np.ndarray, where: str) -> None:
@@ -216,12 +218,13 @@ def distil(options: Options, cast: Votes, table: np.ndarray) -> Outcome:
 
 def assemble(capture: Capture, gaussians: Gaussians, found: Regions, table: np.ndarray, coder: Any, cast: Votes,
              point_codes: np.ndarray, embedder: Any, provenance: str) -> LanguageField:
-    """The field: everything that a query needs."""
+    """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
+    pixels = np.zeros((found.count, len(capture.names)), np.int32)
+    pixels[:, training_frames(capture)] = found.pixels
     return LanguageField(
-        gaussians=gaussians, codes=point_codes, votes=cast, regions=found, region_codes=table, autoencoder=coder,
-        cameras=capture.cameras[training_frames(capture)], canonical=np.asarray(embedder.canonical, np.float32),
-        to_source=np.asarray(capture.to_source),
-        names=tuple(capture.names[t] for t in training_frames(capture)), embedder=embedder.name, provenance=provenance,
+        gaussians=gaussians, codes=point_codes, votes=cast, regions=Regions(found.embeddings, pixels), region_codes=table,
+        autoencoder=coder, cameras=capture.cameras, canonical=np.asarray(embedder.canonical, np.float32),
+        to_source=np.asarray(capture.to_source), names=capture.names, embedder=embedder.name, provenance=provenance,
     )
 
 

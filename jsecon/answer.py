@@ -1,0 +1,182 @@
+"""One question put to a field, and its answer as files: a .ply of the Gaussians, a JSON of figures, masks of a few frames."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.data.ply import save_ply
+from jsecon.errors import InputError, require
+from jsecon.files import write_text, written_whole
+from jsecon.language.autoencoder import encode
+from jsecon.query.anchored import query_anchored, query_region, region_at
+from jsecon.query.canonical import query_canonical
+from jsecon.query.masks import selection_mask
+from jsecon.query.one_step import query_one_step
+from jsecon.query.outliers import MIN_SAMPLES, remove_outliers
+from jsecon.splat.tiles import plan_capacity
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Gaussians, LanguageField, Selection
+
+METHODS = ("votes", "code", "one_step", "canonical")
+"""votes, code: GT-anchored, membership by a Gaussian's votes or by its code; one_step, canonical: codes against the text"""
+ONE_STEP_THRESHOLD = 0.8
+"""on the cosine of a Gaussian's code and the text's"""
+CANONICAL_THRESHOLD = 0.5
+"""on the relevancy: closer to the text than to every canonical phrase"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What a question selected."""
+
+    question: str
+    by: str
+    """one of METHODS."""
+    selection: Selection
+    """as the query gave it."""
+    mask: np.ndarray
+    """(N,) bool: the selection without outliers."""
+    left_out: dict[str, str]
+    """part -> why it was not needed."""
+
+    @property
+    def dropped(self) -> int:
+        """Gaussians dropped as outliers."""
+        return int(np.asarray(self.selection.mask).sum() - self.mask.sum())
+
+
+def ask_text(field: LanguageField, embedder: Any, text: str, *, by: str = "votes", threshold: float | None = None,
+             outliers: bool = True) -> Answer:
+    """The Gaussians that a text names. Raises InputError where the embedder has no words for it."""
+    require(by in METHODS, "by", got=by, expected=f"one of {METHODS}", remedy="votes is the default.")
+    embedding = jnp.asarray(embedder.embed_text([text])[0])
+    if by in ("votes", "code"):
+        selection = query_anchored(field, embedding, by=by, similarity_threshold=threshold)
+    else:
+        code = encode(field.autoencoder, embedding)
+        if by == "one_step":
+            selection = query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
+        else:
+            canonical = encode(field.autoencoder, field.canonical)
+            selection = query_canonical(field.codes, code, canonical,
+                                        CANONICAL_THRESHOLD if threshold is None else threshold)
+    return _answer(field, text, by, selection, outliers, {})
+
+
+def ask_pixel(field: LanguageField, frame: int | str, x: int, y: int, *, by: str = "votes",
+              threshold: float | None = None, outliers: bool = True) -> Answer:
+    """The Gaussians of what lies under pixel (column x, row y) of a frame (its index or name); no text is embedded.
+
+    Raises InputError for a frame or pixel that the field does not have, and where no region lies there.
+    """
+    index = frame_index(field, frame)
+    region = region_at(field, index, x, y)
+    name = field.names[index]
+    if region < 0:
+        raise InputError(f"--at {name} {x} {y}", found="no region under that pixel", expected="a pixel of an object",
+                         remedy="Choose another pixel or frame: report.html of the run shows the regions.")
+    membership = "code" if by == "code" else "votes"
+    selection = query_region(field, region, by=membership, similarity_threshold=threshold)
+    return _answer(field, f"at {name} {x} {y}", membership, selection, outliers,
+                   {"text encoder": "the region under the pixel is the anchor"})
+
+
+def frame_index(field: LanguageField, frame: int | str) -> int:
+    """A frame's index from its index or its name. Raises InputError for one that the field does not have."""
+    if str(frame) in field.names:
+        return field.names.index(str(frame))
+    stem = Path(str(frame)).stem
+    if stem in field.names:
+        return field.names.index(stem)
+    if str(frame).isdecimal() and int(frame) < len(field.names):
+        return int(frame)
+    raise InputError(f"frame {frame}", found="no such frame in the field",
+                     expected=f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})",
+                     remedy="Held-out frames are not in the field.")
+
+
+def _answer(field: LanguageField, question: str, by: str, selection: Selection, outliers: bool,
+            left: dict[str, str]) -> Answer:
+    mask = np.asarray(selection.mask)
+    if not outliers:
+        left = left | {"DBSCAN": "not asked for"}
+    elif mask.sum() < MIN_SAMPLES:
+        left = left | {"DBSCAN": f"fewer than {MIN_SAMPLES} Gaussians are selected"}
+    else:
+        mask = remove_outliers(np.asarray(field.gaussians.means), mask)
+    return Answer(question, by, selection, mask, left)
+
+
+def selected(gaussians: Gaussians, mask: np.ndarray) -> Gaussians:
+    """The selected Gaussians alone."""
+    return jax.tree.map(lambda a: np.asarray(a)[np.asarray(mask)], gaussians)
+
+
+def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
+    """The `count` frames that show the selection best: by the region's pixels, or by the Gaussians' centres in view."""
+    region = int(answer.selection.region)
+    if region >= 0:
+        seen = np.asarray(field.regions.pixels)[region]
+    else:
+        means = np.asarray(field.gaussians.means)[answer.mask]
+        pose = np.asarray(field.cameras.world_to_camera)
+        local = np.einsum("tij,nj->tni", pose[:, :3, :3], means) + pose[:, None, :3, 3]
+        z = np.where(local[..., 2] > 0, local[..., 2], np.nan)
+        u = np.asarray(field.cameras.fx)[:, None] * local[..., 0] / z + np.asarray(field.cameras.cx)[:, None]
+        v = np.asarray(field.cameras.fy)[:, None] * local[..., 1] / z + np.asarray(field.cameras.cy)[:, None]
+        seen = ((u >= 0) & (u < field.cameras.width) & (v >= 0) & (v < field.cameras.height)).sum(1)
+    order = np.argsort(-seen, kind="stable")[:count]
+    return [int(t) for t in order if seen[t] > 0]
+
+
+def figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
+    """What there is to say about an answer: count, score, region, and its place in the capture files' own world."""
+    chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
+    means = np.asarray(chosen.means, np.float64)
+    place = None
+    if len(means):
+        place = {"centroid": means.mean(0).round(6).tolist(),
+                 "bounding_box": {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()}}
+    region = int(answer.selection.region)
+    return {"query": answer.question, "by": answer.by, "count": len(means), "of": field.gaussians.count,
+            "score": round(float(answer.selection.score), 6), "region": region if region >= 0 else None,
+            "outliers_dropped": answer.dropped, "place": place, "left_out": answer.left_out}
+
+
+def write_answer(field: LanguageField, answer: Answer, out: Path, *, views: int = 3) -> dict[str, Any]:
+    """Writes OUT/<slug>.ply, .json and <slug>-<frame>.png for the `views` frames that show it best; returns the figures.
+
+    The .ply is in the capture files' own world, in INRIA's layout; a mask is 255 where the selected Gaussians alone have
+    an alpha above 0.7. An empty selection leaves out the .ply and the masks.
+    """
+    slug = slug_of(answer.question)
+    told = figures(field, answer) | {"ply": None, "masks": {}}
+    if answer.mask.any():
+        told["ply"] = f"{slug}.ply"
+        save_ply(out / told["ply"], transform_gaussians(selected(field.gaussians, answer.mask), field.to_source))
+        for t, mask in masks_of(field, answer.mask, best_frames(field, answer, views)).items():
+            told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
+            with written_whole(out / told["masks"][field.names[t]]) as temporary:
+                cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
+    write_text(out / f"{slug}.json", json.dumps(told, indent=2) + "\n")
+    return told
+
+
+def masks_of(field: LanguageField, mask: np.ndarray, frames: list[int]) -> dict[int, np.ndarray]:
+    """frame -> (H, W) bool: where the selected Gaussians alone cover it."""
+    gaussians = jax.tree.map(jnp.asarray, field.gaussians)
+    cameras = jax.tree.map(jnp.asarray, field.cameras)
+    capacity = plan_capacity(gaussians, cameras)
+    return {t: np.asarray(selection_mask(gaussians, cameras[t], jnp.asarray(mask), capacity=capacity)) for t in frames}
+
+
+def slug_of(question: str) -> str:
+    """A file name without spaces or signs."""
+    return re.sub(r"[^\w]+", "-", question.lower()).strip("-")[:80] or "query"
