@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+from jsecon.types import Array
+
 # Splatting semantics (Kerbl et al. 2023, diff-gaussian-rasterization; gsplat agrees). They define the image.
 BLUR_PX2 = 0.3
 """added to the 2D covariance's diagonal, px^2: a splat is never thinner than about a pixel"""
@@ -23,12 +25,13 @@ def tiny(dtype) -> float:
     return float(jnp.finfo(dtype).tiny) ** 0.5
 
 
-def safe_norm(x: jax.Array, axis: int = -1, keepdims: bool = False) -> jax.Array:
+def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
     """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at zero.
 
     The vector is scaled by its largest entry first, so that squares neither overflow nor vanish; the entry is treated
     as a constant, which leaves the gradient exact because the length is homogeneous.
     """
+    x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
     scale = jnp.where(usable, largest, 1.0)
@@ -39,8 +42,9 @@ def safe_norm(x: jax.Array, axis: int = -1, keepdims: bool = False) -> jax.Array
     return length if keepdims else jnp.squeeze(length, axis)
 
 
-def normalize(x: jax.Array, axis: int = -1) -> jax.Array:
+def normalize(x: Array, axis: int = -1) -> Array:
     """x / |x| over `axis`; zero (with zero gradient) where x is zero, NaN where x is not finite."""
+    x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
     scaled = jnp.where(usable, x / jnp.where(usable, largest, 1.0), 0.0)
@@ -50,17 +54,17 @@ def normalize(x: jax.Array, axis: int = -1) -> jax.Array:
     return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
 
 
-def cosine(x: jax.Array, y: jax.Array) -> jax.Array:
+def cosine(x: Array, y: Array) -> Array:
     """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see STYLE trap 1 (jax 39103)."""
     return jnp.sum(normalize(x) * normalize(y), axis=-1)
 
 
-def cosine_matrix(x: jax.Array, y: jax.Array) -> jax.Array:
+def cosine_matrix(x: Array, y: Array) -> Array:
     """(N, d), (M, d) -> (N, M) cosines as one matrix product, the form that jax issue 39103 leaves right."""
     return normalize(x) @ normalize(y).T
 
 
-def finite(*arrays: jax.Array) -> jax.Array:
+def finite(*arrays: Array) -> Array:
     """() bool: every number in every array is finite."""
     result = jnp.asarray(True)
     for array in arrays:

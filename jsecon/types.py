@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 Array: TypeAlias = jax.Array | np.ndarray
+Leaf: TypeAlias = Any
+"""an array field of a pytree defined elsewhere: while jax transforms it, it may hold a tracer, an axis or a sentinel"""
 
 
 def _static(**kwargs) -> Any:

@@ -125,7 +125,7 @@ def _add_view(state: dict[str, Array], gaussians: Gaussians, camera: Camera, lab
                     return transmittance, weight
 
                 transmittance, weights = lax.scan(step, transmittance, attributes, unroll=UNROLL)
-                weights = weights * covered
+                weights = weights * covered[None]
                 cast = jnp.einsum("cbp,bps->cbs", weights, is_slot)
                 target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped
                 votes = votes.at[ids[:, :, None], target[None]].add(cast, mode="drop")

@@ -19,23 +19,14 @@ from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.tiles import TileLists, grid
 from jsecon.types import Array
 
+# `splats` (N, 6) throughout: centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see splats.py.
+
 # Speed only; measured on the garden scene (benchmarks/).
 BATCH = 64
 CHUNK = 16
 UNROLL = 8
 WIDE = 8
 """from this many channels on, a chunk's weights are kept and multiplied with its features as one matrix product"""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Splats:
-    """What compositing needs of each Gaussian, one row each."""
-
-    attributes: Array
-    """(N, 6) centre x, y (px), l11, l21, l22 (1/px, scaled by sqrt(1/2)), opacity."""
-    features: Array
-    """(N, D)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +44,8 @@ class Batches:
     def pixels(self, tiles: Array, dtype) -> tuple[Array, Array]:
         """(BATCH, tile * tile) x and y of the pixel centres."""
         local = jnp.arange(self.tile) + 0.5
-        x = (tiles % self.across * self.tile)[:, None] + jnp.tile(local, self.tile)
-        y = (tiles // self.across * self.tile)[:, None] + jnp.repeat(local, self.tile)
+        x = (tiles % self.across * self.tile)[:, None] + jnp.tile(local, self.tile)[None]
+        y = (tiles // self.across * self.tile)[:, None] + jnp.repeat(local, self.tile)[None]
         return x.astype(dtype), y.astype(dtype)
 
 
@@ -134,10 +125,10 @@ def to_tiles(image: Array, tile: int) -> Array:
     return jnp.concatenate([tiles, jnp.zeros_like(tiles[:1])])
 
 
-def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
+def composite(splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists: TileLists, width: int, height: int) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
     """Features (H, W, D) = sum of alpha T f, and final transmittance (H, W)."""
     batches = make_batches(lists, width, height)
-    channels, dtype = splats.features.shape[1], splats.attributes.dtype
+    channels, dtype = features.shape[1], splats.dtype
     narrow = channels < WIDE
 
     def one_batch(tiles):
@@ -145,8 +136,8 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tupl
         x, y = batches.pixels(tiles, dtype)
 
         def body(first, state):
-            ids, attributes = chunk(splats.attributes, lists, start, length, first)
-            features = splats.features[ids]
+            ids, attributes = chunk(splats, lists, start, length, first)
+            rows = features[ids]
             if narrow:
 
                 def step(carry, item):
@@ -155,7 +146,7 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tupl
                     weight, transmittance = advance(transmittance, alpha)
                     return (transmittance, total + weight[None] * item[1].T[:, :, None]), None
 
-                return lax.scan(step, state, (attributes, features), unroll=UNROLL)[0]
+                return lax.scan(step, state, (attributes, rows), unroll=UNROLL)[0]
 
             def step(transmittance, item):
                 alpha, _ = alphas(item, x, y)
@@ -163,7 +154,7 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tupl
                 return transmittance, weight
 
             transmittance, weights = lax.scan(step, state[0], attributes, unroll=UNROLL)
-            return transmittance, state[1] + jnp.einsum("cbp,cbd->dbp", weights, features)
+            return transmittance, state[1] + jnp.einsum("cbp,cbd->dbp", weights, rows)
 
         initial = (jnp.ones_like(x), jnp.zeros((channels, *x.shape), dtype))
         transmittance, total = walk(body, initial, length, lambda state: state[0])
@@ -173,12 +164,12 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> tupl
     return image[..., :-1], image[..., -1]
 
 
-def composite_features_vjp(splats: Splats, lists: TileLists, cotangent: Float[Array, "h w d"]) -> Float[Array, "n d"]:
+def composite_features_vjp(splats: Float[Array, "n 6"], lists: TileLists, cotangent: Float[Array, "h w d"]) -> Float[Array, "n d"]:
     """Gradient with respect to the features alone: W^T cotangent. No gradient of the geometry is computed."""
     height, width, channels = cotangent.shape
     batches = make_batches(lists, width, height)
     cotangents = to_tiles(cotangent, lists.tile)
-    dtype = splats.attributes.dtype
+    dtype = splats.dtype
 
     def one_batch(gradient, tiles):
         start, length = batches.starts[tiles], batches.lengths[tiles]
@@ -187,7 +178,7 @@ def composite_features_vjp(splats: Splats, lists: TileLists, cotangent: Float[Ar
 
         def body(first, state):
             transmittance, gradient = state
-            ids, attributes = chunk(splats.attributes, lists, start, length, first)
+            ids, attributes = chunk(splats, lists, start, length, first)
 
             def step(transmittance, item):
                 alpha, _ = alphas(item, x, y)
@@ -200,12 +191,12 @@ def composite_features_vjp(splats: Splats, lists: TileLists, cotangent: Float[Ar
         state = walk(body, (jnp.ones_like(x), gradient), length, lambda state: state[0])
         return state[1], None
 
-    return lax.scan(one_batch, jnp.zeros((splats.features.shape[0], channels), dtype), batches.tiles)[0]
+    return lax.scan(one_batch, jnp.zeros((splats.shape[0], channels), dtype), batches.tiles)[0]
 
 
-def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"], transmittance: Float[Array, "h w"],
-                  cotangent: Float[Array, "h w d"], cotangent_transmittance: Float[Array, "h w"]) -> Splats:
-    """Gradient with respect to attributes and features. `image` and `transmittance` are what `composite` returned.
+def composite_vjp(splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists: TileLists, image: Float[Array, "h w d"], transmittance: Float[Array, "h w"],
+                  cotangent: Float[Array, "h w d"], cotangent_transmittance: Float[Array, "h w"]) -> tuple[Array, Array]:
+    """Gradients with respect to the splats (N, 6) and the features (N, D). `image` and `transmittance` are what `composite` returned.
 
     The transmittance is 1 - sum of w, so its cotangent joins the others as minus a channel of constant feature 1.
     """
@@ -213,7 +204,7 @@ def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"]
     batches = make_batches(lists, width, height)
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
     packed = to_tiles(jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1), lists.tile)
-    dtype = splats.attributes.dtype
+    dtype = splats.dtype
     half = lists.tile / 2
     local_x = (jnp.tile(jnp.arange(lists.tile) + 0.5, lists.tile) - half).astype(dtype)
     local_y = (jnp.repeat(jnp.arange(lists.tile) + 0.5, lists.tile) - half).astype(dtype)
@@ -228,9 +219,8 @@ def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"]
 
         def body(first, state):
             transmittance, before, gradient = state
-            ids, attributes = chunk(splats.attributes, lists, start, length, first)
-            features = splats.features[ids]
-            along = jnp.einsum("cbd,bpd->cbp", features, local) - along_transmittance
+            ids, attributes = chunk(splats, lists, start, length, first)
+            along = jnp.einsum("cbd,bpd->cbp", features[ids], local) - along_transmittance[None]
 
             def step(carry, item):
                 transmittance, before = carry
@@ -249,8 +239,8 @@ def composite_vjp(splats: Splats, lists: TileLists, image: Float[Array, "h w d"]
         state = walk(body, (jnp.ones_like(x), jnp.zeros_like(x), gradient), length, lambda state: state[0])
         return state[2], None
 
-    gradient = lax.scan(one_batch, jnp.zeros((splats.features.shape[0], 6 + channels), dtype), batches.tiles)[0]
-    return Splats(gradient[:, :6], gradient[:, 6:])
+    gradient = lax.scan(one_batch, jnp.zeros((splats.shape[0], 6 + channels), dtype), batches.tiles)[0]
+    return gradient[:, :6], gradient[:, 6:]
 
 
 def _attribute_gradient(moments: Array, attributes: Array, centre_x: Array, centre_y: Array) -> Array:
@@ -258,7 +248,7 @@ def _attribute_gradient(moments: Array, attributes: Array, centre_x: Array, cent
     m, mx, my, mxx, mxy, myy = (moments[..., k] for k in range(6))
     x, y, l11, l21, l22, opacity = (attributes[..., k] for k in range(6))
     # moments about the Gaussian's centre
-    sx, sy = centre_x - x, centre_y - y
+    sx, sy = centre_x[None] - x, centre_y[None] - y
     dx, dy = mx + sx * m, my + sy * m
     dxx, dxy, dyy = mxx + 2 * sx * mx + sx * sx * m, mxy + sx * my + sy * mx + sx * sy * m, myy + 2 * sy * my + sy * sy * m
     # h = alpha dL/dalpha; alpha = o exp(-(u^2 + v^2)), u = l11 dx + l21 dy, v = l22 dy

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import require
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, normalize
-from jsecon.types import Array, Camera, Gaussians
+from jsecon.types import Array, Camera, Gaussians, Leaf
 
 # A splat wider than this (px) is flat over any image; larger axes are shrunk to it, so that squares stay in float32.
 _WIDEST_PX = 1e15
@@ -21,19 +21,19 @@ _LARGEST_LOG_SCALE = 60.0
 class Projection:
     """N splats of one view."""
 
-    means_px: Array
+    means_px: Leaf
     """(N, 2) centres, px."""
-    whitening: Array
+    whitening: Leaf
     """(N, 3) l11, l21, l22 of the lower-triangular L with inverse covariance = L L^T, 1/px: with d = pixel - centre,
     the squared Mahalanobis distance is (l11 dx + l21 dy)^2 + (l22 dy)^2, never negative and without the cancellation
     that the expanded quadratic suffers far along a needle."""
-    opacities: Array
+    opacities: Leaf
     """(N,) in (0, 1)."""
-    depths: Array
+    depths: Leaf
     """(N,) z in the camera, world units."""
-    extents: Array
+    extents: Leaf
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
-    visible: Array
+    visible: Leaf
     """(N,) bool: in front of the near plane, able to reach alpha 1/255, box touching the image, all numbers finite."""
 
     @property
@@ -73,6 +73,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     invisible.
     """
     check_shapes(gaussians, camera)
+    gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
     w2c = camera.world_to_camera
     means, width, height = gaussians.means, camera.width, camera.height
 
@@ -90,7 +91,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     y_ratio = jnp.clip(y_ratio, -camera.cy / camera.fy - margin_y, (height - camera.cy) / camera.fy + margin_y)
 
     scales = jnp.exp(jnp.minimum(gaussians.log_scales, _LARGEST_LOG_SCALE))
-    axes = (w2c[:3, :3][None, :, :, None] * rotation_matrices(gaussians.quaternions)[:, None, :, :]).sum(2) * scales[:, None, :]
+    axes = (w2c[None, :3, :3, None] * rotation_matrices(gaussians.quaternions)[:, None, :, :]).sum(2) * scales[:, None, :]
     row_1 = (camera.fx / z_safe)[:, None] * (axes[:, 0] - x_ratio[:, None] * axes[:, 2])
     row_2 = (camera.fy / z_safe)[:, None] * (axes[:, 1] - y_ratio[:, None] * axes[:, 2])
     widest = jnp.maximum(jnp.max(jnp.abs(row_1), axis=1), jnp.max(jnp.abs(row_2), axis=1))
@@ -114,7 +115,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     extents = jax.lax.stop_gradient(reach * jnp.sqrt(jnp.stack([cov_xx, cov_yy], axis=-1)))
     extents = extents * (1 + 1e-5) + 1e-3  # covers the rounding of the box against that of the exponent
     centres = jax.lax.stop_gradient(means_px)
-    touching = ((centres + extents > 0) & (centres - extents < jnp.asarray([width, height], centres.dtype))).all(1)
+    touching = ((centres + extents > 0) & (centres - extents < jnp.asarray([[width, height]], centres.dtype))).all(1)
     numbers = jnp.concatenate([centres, extents, jax.lax.stop_gradient(whitening), z[:, None], opacities[:, None]], axis=1)
     visible = in_front & (opacities >= MIN_ALPHA) & touching & jnp.isfinite(numbers).all(1)
     return Projection(means_px, whitening, opacities, z, extents, visible)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR
-from jsecon.splat.composite import Splats, composite, composite_features_vjp, composite_vjp
+from jsecon.splat.composite import composite, composite_features_vjp, composite_vjp
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.splats import splats_of
@@ -16,35 +16,28 @@ from jsecon.splat.tiles import TileLists, plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
-def _splat(splats: Splats, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
-    return composite(splats, lists, width, height)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _splat(splats: Array, features: Array, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
+    return composite(splats, features, lists, width, height)
 
 
-def _splat_forward(splats, lists, width, height):
-    # symbolic_zeros: each leaf says whether anybody asked for its gradient, so that a field distilled into frozen
+def _splat_forward(splats, features, lists, width, height):
+    # symbolic_zeros: each argument says whether anybody asked for its gradient, so that a field distilled into frozen
     # Gaussians never pays for the gradient of their geometry.
-    wants_geometry = splats.attributes.perturbed
-    values = Splats(splats.attributes.value, splats.features.value)
+    wants_geometry = splats.perturbed
+    splats, features = splats.value, features.value
     lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
-    image, transmittance = composite(values, lists, width, height)
-    saved = (image, transmittance) if wants_geometry else None
-    return (image, transmittance), (values, lists, saved)
+    image, transmittance = composite(splats, features, lists, width, height)
+    saved = (features, image, transmittance) if wants_geometry else None
+    return (image, transmittance), (splats, lists, saved)
 
 
 def _splat_backward(width, height, residual, cotangents):
     splats, lists, saved = residual
-    like = ((height, width, splats.features.shape[1]), (height, width))
-    dtype = splats.attributes.dtype
-    image_bar, transmittance_bar = (
-        jnp.zeros(shape, dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar
-        for bar, shape in zip(cotangents, like, strict=True)
-    )
+    bars = [jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar for bar in cotangents]
     if saved is None:
-        gradient = Splats(jnp.zeros_like(splats.attributes), composite_features_vjp(splats, lists, image_bar))
-    else:
-        gradient = composite_vjp(splats, lists, *saved, image_bar, transmittance_bar)
-    return gradient, None
+        return jnp.zeros_like(splats), composite_features_vjp(splats, lists, bars[0]), None
+    return *composite_vjp(splats, saved[0], lists, saved[1], saved[2], *bars), None
 
 
 _splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
@@ -84,10 +77,15 @@ def render(gaussians: Gaussians, camera: Camera, features: Float[Array, "n d"], 
 
 
 def _render(gaussians, camera, features, background, capacity, near) -> Rendering:
-    attributes, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
-    image, transmittance = _splat(Splats(attributes, features.astype(attributes.dtype)), lists, camera.width, camera.height)
+    gaussians, camera, features = jax.tree.map(jnp.asarray, (gaussians, camera, features))
+    if gaussians.means.shape[0] == 0:
+        image, alpha = (jnp.zeros((camera.height, camera.width, *rest), gaussians.means.dtype) for rest in ((features.shape[1],), ()))
+        image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
+        return Rendering(image, alpha, jnp.int32(0))
+    splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
+    image, transmittance = _splat(splats, features.astype(splats.dtype), lists, camera.width, camera.height)
     if background is not None:
-        image = image + transmittance[..., None] * background
+        image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
     return Rendering(image, 1 - transmittance, lists.overflow)
 
 

@@ -37,7 +37,7 @@ def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]
     if bands == 1:
         rgb = C0 * gaussians.sh[:, 0]
     else:
-        basis = sh_basis(normalize(gaussians.means - camera.centres), bands)
+        basis = sh_basis(normalize(gaussians.means - camera.centres[None]), bands)
         rgb = (basis[:, :, None] * gaussians.sh).sum(1)
     return jnp.maximum(rgb + 0.5, 0.0)
 

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from jsecon.splat.project import Projection, project
-from jsecon.types import Array, Camera, Gaussians
+from jsecon.types import Array, Camera, Gaussians, Leaf
 
 TILE = 8
 """tile edge, px; speed only"""
@@ -21,11 +21,11 @@ TILE = 8
 class TileLists:
     """For each tile, row by row, the Gaussians whose box touches it, by depth (equal depths in index order)."""
 
-    gaussians: Array
+    gaussians: Leaf
     """(capacity,) int32 Gaussian ids, tile after tile; what lies past starts[-1] means nothing."""
-    starts: Array
+    starts: Leaf
     """(tiles + 1,) int32 where each tile's list begins."""
-    overflow: Array
+    overflow: Leaf
     """() int32 pairs that did not fit: the farthest Gaussians of the view."""
     tile: int = dataclasses.field(metadata={"static": True})
     """tile edge, px."""
@@ -86,8 +86,6 @@ def tile_lists(projection: Projection, width: int, height: int, *, capacity: int
     across, down = grid(width, height, tile)
     x0, x1, y0, y1 = _rectangles(projection, width, height, tile)
     count = projection.depths.shape[0]
-    if count == 0:
-        return TileLists(jnp.zeros(capacity, jnp.int32), jnp.zeros(across * down + 1, jnp.int32), jnp.int32(0), tile)
     nowhere = jnp.asarray(jnp.inf, projection.depths.dtype)
     order = depth_order(lax.stop_gradient(jnp.where(projection.visible, projection.depths, nowhere)))
     # Pairs are laid out Gaussian after Gaussian, nearest first; `owner` says whose pair the k-th is. int32 cumulative

@@ -1,0 +1,228 @@
+"""Rendering against the brute-force float64 twin, its gradients against central differences, and its manners."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import look_at
+
+from jsecon.splat.project import project
+from jsecon.splat.reference import project_reference, render_reference
+from jsecon.splat.render import render, render_depth, render_rgb
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Camera, Gaussians
+
+CAPACITY = 4096
+
+
+def to64(tree):
+    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float64) if jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else a, tree)
+
+
+def random_features(count, channels, seed=1):
+    return np.random.default_rng(seed).normal(size=(count, channels)).astype(np.float32)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 16])
+def test_equals_the_brute_force_sum(scene, cameras, channels):
+    features = random_features(scene.count, channels)
+    for t in range(4):
+        rendering = render(scene, cameras[t], features)
+        expected, alpha = render_reference(scene, cameras[t], features)
+        assert int(rendering.overflow) == 0
+        error = np.abs(np.asarray(rendering.features) - expected).max(-1)
+        # An alpha at the 1/255 cut may fall on the other side in float32: 1/255 of a feature, on few pixels.
+        assert np.median(error) < 1e-6
+        assert np.mean(error > 1e-5) < 0.01
+        assert error.max() < np.abs(features).max() * 2 / 255
+        assert np.abs(np.asarray(rendering.alpha) - alpha).max() < 1 / 255
+
+
+def test_float64_is_the_definition_to_rounding(x64, scene, cameras):
+    features = random_features(scene.count, 3).astype(np.float64)
+    rendering = render(to64(scene), to64(cameras[1]), features)
+    expected, alpha = render_reference(scene, cameras[1], features)
+    assert rendering.features.dtype == jnp.float64
+    np.testing.assert_allclose(rendering.features, expected, atol=1e-12)
+    np.testing.assert_allclose(rendering.alpha, alpha, atol=1e-12)
+
+
+def test_jit_is_eager_and_vmap_is_a_loop(scene, cameras):
+    features = random_features(scene.count, 3)
+    capacity = plan_capacity(scene, cameras)
+    one = lambda camera, features: render(scene, camera, features, capacity=capacity)
+    looped = [one(cameras[t], features) for t in range(4)]
+    jitted = jax.jit(one)(cameras[2], features)
+    np.testing.assert_allclose(jitted.features, looped[2].features, atol=5e-6)
+    over_cameras = jax.jit(jax.vmap(one, in_axes=(0, None)))(cameras, features)
+    np.testing.assert_allclose(over_cameras.features, np.stack([r.features for r in looped]), atol=5e-6)
+    sets = np.stack([features, 2 * features])
+    over_features = jax.jit(jax.vmap(one, in_axes=(None, 0)))(cameras[0], sets)
+    np.testing.assert_allclose(over_features.features[1], 2 * looped[0].features, atol=1e-5)
+
+
+def test_background_fills_what_is_left(scene, camera):
+    features = np.ones((scene.count, 2), np.float32)
+    rendering = render(scene, camera, features, background=jnp.ones(2))
+    np.testing.assert_allclose(rendering.features, 1.0, atol=1e-5)
+
+
+def test_overflow_is_reported_and_capacity_is_planned(scene, camera):
+    features = random_features(scene.count, 3)
+    small = render(scene, camera, features, capacity=64)
+    assert int(small.overflow) > 0
+    with pytest.raises(ValueError, match="plan_capacity"):
+        jax.jit(lambda g: render(g, camera, features).features)(scene)
+
+
+def test_shapes_that_disagree_raise(scene, camera, cameras):
+    with pytest.raises(ValueError, match="features"):
+        render(scene, camera, np.zeros((3, 2), np.float32))
+    with pytest.raises(ValueError, match="single camera"):
+        render(scene, cameras, random_features(scene.count, 2))
+
+
+def gradients(function, *arguments):
+    return jax.jit(jax.grad(function, argnums=tuple(range(len(arguments)))))(*arguments)
+
+
+def central_difference(function, argument, index, step):
+    high, low = (argument.at[index].add(s) for s in (step, -step))
+    return (function(high) - function(low)) / (2 * step)
+
+
+def test_every_gradient_equals_central_differences(x64, scene, camera):
+    scene64, camera64 = to64(jax.tree.map(lambda a: a[:24], scene)), to64(camera)
+    features = jnp.asarray(random_features(24, 3), jnp.float64)
+    cotangent = jnp.asarray(np.random.default_rng(2).normal(size=(40, 48, 4)))
+
+    def loss(parts, pose, features):
+        g = Gaussians(*parts, scene64.sh)
+        c = Camera(pose, camera64.fx, camera64.fy, camera64.cx, camera64.cy, 48, 40)
+        r = render(g, c, features, capacity=CAPACITY)
+        return (r.features * cotangent[..., :3]).sum() + (r.alpha * cotangent[..., 3]).sum()
+
+    parts = (scene64.means, scene64.log_scales, scene64.quaternions, scene64.opacity_logits)
+    analytic = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(parts, camera64.world_to_camera, features)
+    value = jax.jit(loss)
+    rng = np.random.default_rng(3)
+    checked = 0
+    for k, name in enumerate(("means", "log_scales", "quaternions", "opacity_logits")):
+        for _ in range(6):
+            index = tuple(rng.integers(0, s) for s in parts[k].shape)
+            estimates = [
+                central_difference(lambda a: value((*parts[:k], a, *parts[k + 1:]), camera64.world_to_camera, features), parts[k], index, h)
+                for h in (1e-6, 2e-6)
+            ]
+            if abs(estimates[0] - estimates[1]) > 1e-4 * (1 + abs(estimates[0])):
+                continue  # an alpha crosses a cut inside the step: no derivative there
+            checked += 1
+            assert abs(analytic[0][k][index] - estimates[0]) <= 1e-6 * max(1.0, abs(float(estimates[0]))) + 1e-6, (name, index)
+    for index in [(0, 1), (1, 3), (2, 2), (2, 3)]:
+        estimates = [central_difference(lambda a: value(parts, a, features), camera64.world_to_camera, index, h) for h in (1e-7, 2e-7)]
+        if abs(estimates[0] - estimates[1]) <= 1e-4 * (1 + abs(estimates[0])):
+            checked += 1
+            np.testing.assert_allclose(analytic[1][index], estimates[0], rtol=1e-5)
+    for index in [(0, 0), (5, 2), (23, 1)]:
+        np.testing.assert_allclose(analytic[2][index], central_difference(lambda a: value(parts, camera64.world_to_camera, a), features, index, 1e-4), rtol=1e-8, atol=1e-9)
+    assert checked >= 16
+
+
+def test_wide_features_have_the_same_gradient_as_narrow_ones(scene, camera):
+    wide = random_features(scene.count, 12)
+    loss = lambda f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()
+    gradient = jax.jit(jax.grad(loss))(wide)
+    for start in (0, 4, 8):
+        part = wide[:, start : start + 4]
+        np.testing.assert_allclose(gradient[:, start : start + 4], jax.jit(jax.grad(loss))(part), rtol=1e-4, atol=1e-4)
+
+
+def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
+    features = jnp.asarray(random_features(scene.count, 3))
+    loss = lambda g, f: (render(g, camera, f, capacity=CAPACITY).features ** 2).sum()
+    alone = jax.jit(jax.grad(loss, argnums=1))(scene, features)
+    together = jax.jit(jax.grad(loss, argnums=(0, 1)))(scene, features)[1]
+    np.testing.assert_allclose(alone, together, rtol=1e-4, atol=1e-5)
+    # and rendering is linear: <W f, W f> has gradient 2 W^T W f
+    other = jnp.asarray(random_features(scene.count, 3, seed=9))
+    slope = (alone * other).sum()
+    expected = 2 * (render(scene, camera, features).features * render(scene, camera, other).features).sum()
+    np.testing.assert_allclose(slope, expected, rtol=1e-4)
+
+
+def test_vmapped_gradients_equal_a_loop(scene, cameras):
+    features = jnp.asarray(random_features(scene.count, 3))
+    loss = lambda camera, f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()
+    batched = jax.jit(jax.vmap(jax.grad(loss, argnums=1), in_axes=(0, None)))(cameras, features)
+    for t in range(4):
+        np.testing.assert_allclose(batched[t], jax.jit(jax.grad(loss, argnums=1))(cameras[t], features), rtol=1e-4, atol=1e-5)
+
+
+def test_projection_equals_its_twin(scene, camera):
+    got, expected = project(scene, camera), project_reference(scene, camera)
+    np.testing.assert_allclose(got.means_px, expected["means_px"], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(got.depths, expected["depths"], rtol=1e-5)
+    inverse = np.linalg.inv(expected["covariances"])
+    np.testing.assert_allclose(got.conics, np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1), rtol=1e-3, atol=1e-5)
+    assert bool(got.visible.any())
+
+
+@pytest.mark.parametrize("count", [16385, 32769, 40000, 100000])
+def test_projection_at_the_sizes_where_jax_39103_strikes(count):
+    rng = np.random.default_rng(count)
+    gaussians = Gaussians(rng.uniform(-1, 1, (count, 3)).astype(np.float32), rng.uniform(-5, -2, (count, 3)).astype(np.float32),
+                          rng.normal(size=(count, 4)).astype(np.float32), rng.normal(size=count).astype(np.float32),
+                          np.zeros((count, 1, 3), np.float32))  # fmt: skip
+    pose = look_at((0.3, -0.5, -3.0))
+    camera = Camera(pose, np.float32(300), np.float32(310), np.float32(160), np.float32(120), 320, 240)
+    in_camera = gaussians.means.astype(np.float64) @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3]
+    expected = np.stack([300 * in_camera[:, 0] / in_camera[:, 2] + 160, 310 * in_camera[:, 1] / in_camera[:, 2] + 120], -1)
+    for got in (jax.jit(project)(gaussians, camera),
+                jax.tree.map(lambda a: a[0], jax.jit(jax.vmap(project, in_axes=(None, 0)))(gaussians, jax.tree.map(lambda a: np.asarray(a)[None], camera)))):
+        np.testing.assert_allclose(got.means_px, expected, rtol=1e-4, atol=2e-3)
+        np.testing.assert_allclose(got.depths, in_camera[:, 2], rtol=1e-5)
+
+
+def test_colour_follows_the_view_and_depth_is_that_of_the_surface(scene, cameras):
+    for t in (0, 2):
+        rendering = render_rgb(scene, cameras[t])
+        assert rendering.features.shape == (40, 48, 3)
+        assert float(rendering.features.min()) >= 0
+    wall = Gaussians(np.stack(np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30), [0.0]), -1).reshape(-1, 3).astype(np.float32),
+                     np.full((900, 3), np.log(0.08), np.float32), np.tile(np.float32([1, 0, 0, 0]), (900, 1)), np.full(900, 6, np.float32),
+                     np.zeros((900, 1, 3), np.float32))  # fmt: skip
+    camera = Camera(look_at((0, 0, -2.0), up=(0, -1, 0)), *(np.float32(v) for v in (45, 45, 24, 20)), 48, 40)
+    depth, alpha = render_depth(wall, camera)
+    assert float(alpha[10:30, 12:36].min()) > 0.95
+    np.testing.assert_allclose(depth[10:30, 12:36], 2.0, atol=0.02)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (9, 7), (64, 8)])
+def test_image_sizes_that_no_tile_divides(scene, width, height):
+    camera = Camera(look_at((0, 0, -2.5)), *(np.float32(v) for v in (40, 40, width / 2, height / 2)), width, height)
+    features = random_features(scene.count, 3)
+    expected, _ = render_reference(scene, camera, features)
+    np.testing.assert_allclose(render(scene, camera, features).features, expected, atol=np.abs(features).max() / 255)
+
+
+def test_nothing_to_see_and_nothing_at_all(scene, camera):
+    nobody = jax.tree.map(lambda a: a[:0], scene)
+    rendering = render(nobody, camera, np.zeros((0, 3), np.float32))
+    assert float(jnp.abs(rendering.features).max()) == 0
+    assert float(rendering.alpha.max()) == 0
+    behind = Gaussians(scene.means + np.float32([0, 0, -50]), *(getattr(scene, k) for k in ("log_scales", "quaternions", "opacity_logits", "sh")))
+    assert float(render(behind, camera, random_features(scene.count, 3)).alpha.max()) == 0
+
+
+def test_gaussians_that_are_not_finite_touch_nothing(scene, camera):
+    means = scene.means.copy()
+    means[3] = np.nan
+    scales = scene.log_scales.copy()
+    scales[5] = np.inf
+    broken = Gaussians(means, scales, scene.quaternions, scene.opacity_logits, scene.sh)
+    kept = np.setdiff1d(np.arange(scene.count), [3])
+    features = random_features(scene.count, 3)
+    rendering = render(broken, camera, features)
+    assert bool(jnp.isfinite(rendering.features).all())
+    wide = Gaussians(*(getattr(broken, k)[kept] for k in ("means", "log_scales", "quaternions", "opacity_logits", "sh")))
+    np.testing.assert_allclose(rendering.features, render(wide, camera, features[kept]).features, atol=1e-5)
