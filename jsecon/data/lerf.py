@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Real
 
 from jsecon.errors import InputError, require
 from jsecon.files import write_text
@@ -100,7 +100,7 @@ def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.
     return array
 
 
-def polygon_mask(corners: Float[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
+def polygon_mask(corners: Real[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
     """The pixels of a polygon, its edges included; corners are cut to integers (see the module's docstring)."""
     canvas = np.zeros((height, width), np.uint8)
     cv2.fillPoly(canvas, [np.asarray(corners).astype(np.int32)], 1)
