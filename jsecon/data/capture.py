@@ -17,7 +17,7 @@ POINTS_AT_ONCE = 65536
 def load_capture(
     path: str | Path,
     *,
-    downscale: float | None = None,
+    downscale: float | int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
     progress: Progress = None,

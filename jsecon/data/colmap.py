@@ -30,7 +30,7 @@ def find_model(path: str | Path) -> Path | None:
 def load_colmap(
     path: str | Path,
     *,
-    downscale: float | None = None,
+    downscale: float | int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
     progress: Progress = None,

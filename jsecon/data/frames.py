@@ -64,7 +64,7 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     return result
 
 
-def check_options(downscale: float | None, frames: int | None, holdout: int | None) -> None:
+def check_options(downscale: float | int | None, frames: int | None, holdout: int | None) -> None:
     """Raises InputError on options that no capture can be loaded with."""
     if downscale is not None and not (np.isfinite(downscale) and downscale >= 1):
         raise InputError(
@@ -137,7 +137,7 @@ def assemble(
     point_colors: UInt8[np.ndarray, "p 3"],
     *,
     where: object,
-    downscale: float | None = None,
+    downscale: float | int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
     to_source: Float[np.ndarray, "4 4"] | None = None,

@@ -30,7 +30,7 @@ _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 def load_nerfstudio(
     path: str | Path,
     *,
-    downscale: float | None = None,
+    downscale: float | int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
     progress: Progress = None,

@@ -1,0 +1,140 @@
+"""Small captures on disk, for the tests of the data room."""
+
+import json
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from jsecon.errors import InputError
+from jsecon.types import Camera, Capture
+
+
+def refused(*parts):
+    """A context in which an InputError is raised that names each of `parts` and ends in a remedy."""
+
+    class Refused:
+        def __enter__(self):
+            self.raises = pytest.raises(InputError)
+            self.info = self.raises.__enter__()
+            return self.info
+
+        def __exit__(self, *exception):
+            caught = self.raises.__exit__(*exception)
+            for part in parts:
+                assert str(part) in str(self.info.value)
+            assert self.info.value.remedy
+            assert self.info.value.expected
+            return caught
+
+    return Refused()
+
+
+def ring_poses(count: int, radius: float = 3.0) -> np.ndarray:
+    """(count, 4, 4) float64 world-to-camera around the origin, looking at it, each with a roll of its own."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for index, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        roll = np.array([[np.cos(0.3 * index), -np.sin(0.3 * index), 0], [np.sin(0.3 * index), np.cos(0.3 * index), 0], [0, 0, 1]])
+        poses[index, :3, :3] = roll @ turn
+        poses[index, :3, 3] = 0, 0, radius
+    return poses
+
+
+def small_capture(count: int = 5, width: int = 24, height: int = 16, points: int = 50) -> Capture:
+    """Random images of a ring of cameras, two intrinsics among them."""
+    rng = np.random.default_rng(7)
+    half = np.arange(count) % 2
+    cameras = Camera(
+        world_to_camera=ring_poses(count).astype(np.float32),
+        fx=(20.25 + half).astype(np.float32),
+        fy=(21.5 + half).astype(np.float32),
+        cx=np.full(count, 11.75, np.float32),
+        cy=np.full(count, 8.5, np.float32),
+        width=width,
+        height=height,
+    )
+    return Capture(
+        frames=rng.integers(0, 256, (count, height, width, 3), np.uint8),
+        cameras=cameras,
+        points=rng.normal(0, 0.3, (points, 3)).astype(np.float32),
+        point_colors=rng.integers(0, 256, (points, 3), np.uint8),
+        held_out=np.zeros(count, bool),
+        depths=None,
+        to_source=np.eye(4),
+        names=tuple(f"frame_{index:03d}" for index in range(count)),
+    )
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """wxyz by way of OpenCV's rotation vector."""
+    vector = cv2.Rodrigues(rotation)[0].ravel()
+    angle = np.linalg.norm(vector)
+    axis = vector / angle if angle > 0 else vector
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+
+
+def write_images(capture: Capture, folder, ending: str = ".png") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, frame in zip(capture.names, capture.frames):
+        assert cv2.imwrite(str(folder / (name + ending)), frame[..., ::-1])
+
+
+def write_text_model(capture: Capture, folder, cameras: list[str] | None = None) -> None:
+    """The capture as a COLMAP text model; `cameras` replaces the lines of cameras.txt (then camera 1 takes every image)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lenses = np.stack([capture.cameras.fx, capture.cameras.fy, capture.cameras.cx, capture.cameras.cy], -1)
+    size = f"{capture.cameras.width} {capture.cameras.height}"
+    lines = [f"{n} PINHOLE {size} " + " ".join(map(repr, map(float, lens))) for n, lens in enumerate(lenses, start=1)]
+    (folder / "cameras.txt").write_text("# CAMERA_ID, MODEL, ...\n" + "\n".join(cameras or lines) + "\n")
+    lines = ["# two lines an image"]
+    for n, (name, pose) in enumerate(zip(capture.names, capture.cameras.world_to_camera.astype(np.float64)), start=1):
+        numbers = " ".join(map(repr, map(float, (*quaternion(pose[:3, :3]), *pose[:3, 3]))))
+        # One image has observations, the next an empty line, as COLMAP writes them.
+        lines += [f"{n} {numbers} {1 if cameras else n} {name}.png", "1.5 2.5 -1 3 4 17" if n % 2 else ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = [
+        f"{n} {' '.join(map(repr, map(float, point)))} {' '.join(map(str, map(int, colour)))} 0.5 1 2 2 3"
+        for n, (point, colour) in enumerate(zip(capture.points, capture.point_colors), start=1)
+    ]
+    (folder / "points3D.txt").write_text("# POINT3D_ID ...\n" + "\n".join(rows) + "\n")
+
+
+def transforms(capture: Capture, ending: str = ".png", **more) -> dict:
+    """The capture as a transforms.json with intrinsics a frame."""
+    frames = []
+    cameras = capture.cameras
+    for index, name in enumerate(capture.names):
+        camera_to_world = np.linalg.inv(cameras.world_to_camera[index].astype(np.float64)) @ np.diag([1, -1, -1, 1])
+        frames.append(
+            {
+                "file_path": f"images/{name}{ending}",
+                "transform_matrix": camera_to_world.tolist(),
+                "fl_x": float(cameras.fx[index]),
+                "fl_y": float(cameras.fy[index]),
+            }
+        )
+    shared = {"w": cameras.width, "h": cameras.height, "cx": float(cameras.cx[0]), "cy": float(cameras.cy[0])}
+    return {**shared, "aabb_scale": 4, **more, "frames": frames}
+
+
+def write_transforms(capture: Capture, folder, content: dict | None = None) -> None:
+    write_images(capture, folder / "images")
+    (folder / "transforms.json").write_text(json.dumps(transforms(capture) if content is None else content))
+
+
+def png(rows: np.ndarray, *, bits: int, colour_type: int, palette: bytes = b"") -> bytes:
+    """A PNG of one channel, packed here by hand: OpenCV writes no palettes and no 2 or 4 bit files."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    height, width = rows.shape
+    binary = (rows[..., None] >> np.arange(bits)[::-1]) & 1
+    packed = np.packbits(binary.reshape(height, width * bits).astype(np.uint8), axis=1)
+    scanlines = b"".join(b"\0" + row.tobytes() for row in packed)
+    header = struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0)
+    chunks = [(b"IHDR", header), *([(b"PLTE", palette)] if palette else []), (b"IDAT", zlib.compress(scanlines)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*pair) for pair in chunks)

@@ -1,0 +1,315 @@
+"""COLMAP captures: binary and text say the same, distorted models are undone, damage is told."""
+
+import struct
+
+import numpy as np
+import pytest
+from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
+
+from jsecon.data.colmap import load_colmap, write_colmap
+from jsecon.data.colmap_model import MODELS, read_images
+from jsecon.data.images import write_image
+from jsecon.errors import InputError
+from jsecon.types import Camera
+
+CAPTURE = small_capture()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_colmap(CAPTURE, tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+def assert_same(loaded, expected, tolerance=1e-6):
+    np.testing.assert_array_equal(loaded.frames, expected.frames)
+    np.testing.assert_array_equal(loaded.points, expected.points)
+    np.testing.assert_array_equal(loaded.point_colors, expected.point_colors)
+    assert loaded.names == expected.names
+    assert (loaded.cameras.width, loaded.cameras.height) == (expected.cameras.width, expected.cameras.height)
+    for field in ("world_to_camera", "fx", "fy", "cx", "cy"):
+        np.testing.assert_allclose(getattr(loaded.cameras, field), getattr(expected.cameras, field), atol=tolerance)
+
+
+def test_binary_round_trip(folder):
+    loaded = load_colmap(folder, holdout=0)
+    assert_same(loaded, CAPTURE)
+    assert loaded.notes == ()
+    assert not loaded.held_out.any()
+    np.testing.assert_array_equal(loaded.to_source, np.eye(4))
+
+
+def test_text_model_in_sparse_without_a_number(tmp_path):
+    """Written by the test itself, with quaternions from OpenCV: an independent witness of both readers."""
+    write_text_model(CAPTURE, tmp_path / "sparse")
+    write_images(CAPTURE, tmp_path / "images")
+    assert_same(load_colmap(tmp_path, holdout=0), CAPTURE)
+
+
+def test_quaternions_in_every_quadrant(tmp_path):
+    """Half turns about each axis are where the common formulas divide by zero."""
+    poses = ring_poses(4)
+    for pose, signs in zip(poses, [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]):
+        pose[:3, :3] = np.diag(signs)
+    cameras = Camera(poses.astype(np.float32), *([np.full(4, 20.0, np.float32)] * 4), width=24, height=16)
+    capture = small_capture(4)
+    write_colmap(type(capture)(**{**vars(capture), "cameras": cameras}), tmp_path)
+    np.testing.assert_array_equal(load_colmap(tmp_path).cameras.world_to_camera, poses.astype(np.float32))
+
+
+def binary_with_tracks(path, points, colours, lengths):
+    records = [
+        struct.pack("<Q3d3BdQ", n, *point, *map(int, colour), 0.5, length) + bytes(8 * length)
+        for n, (point, colour, length) in enumerate(zip(points, colours, lengths), start=1)
+    ]
+    path.write_bytes(struct.pack("<Q", len(records)) + b"".join(records))
+
+
+def test_tracks_of_all_lengths_and_observations(folder):
+    lengths = np.random.default_rng(0).integers(0, 9, len(CAPTURE.points))
+    binary_with_tracks(folder / "sparse/0/points3D.bin", CAPTURE.points.astype(float), CAPTURE.point_colors, lengths)
+    images = (folder / "sparse/0/images.bin").read_bytes()
+    size = len(CAPTURE.names[0]) + 5 + 64
+    heads = [images[8 + n * (size + 8) : 8 + n * (size + 8) + size] for n in range(5)]
+    bodies = b"".join(head + struct.pack("<Q", n) + bytes(24 * n) for n, head in enumerate(heads))
+    (folder / "sparse/0/images.bin").write_bytes(images[:8] + bodies)
+    (folder / "sparse/0/rigs.bin").write_bytes(b"of a newer COLMAP")
+    assert_same(load_colmap(folder, holdout=0), CAPTURE)
+
+
+def test_name_order_holdout_and_subset(folder):
+    images = folder / "sparse/0/images.bin"
+    data = images.read_bytes()
+    size = (len(data) - 8) // 5
+    records = [data[8 + n * size : 8 + (n + 1) * size] for n in range(5)]
+    images.write_bytes(data[:8] + b"".join(records[n] for n in (3, 0, 4, 2, 1)))
+    loaded = load_colmap(folder, holdout=2)
+    assert_same(loaded, CAPTURE)
+    np.testing.assert_array_equal(loaded.held_out, [True, False, True, False, True])
+    some = load_colmap(folder, frames=3, holdout=3)
+    assert some.names == tuple(CAPTURE.names[n] for n in (0, 2, 4))
+    np.testing.assert_array_equal(some.held_out, [True, False, False])
+    assert "3 of 5 frames" in some.notes[0]
+
+
+def test_downscale_is_an_area_mean(folder):
+    loaded = load_colmap(folder, downscale=2)
+    means = CAPTURE.frames.reshape(5, 8, 2, 12, 2, 3).mean((2, 4))
+    assert np.abs(loaded.frames - means).max() <= 1
+    np.testing.assert_allclose(loaded.cameras.fx, CAPTURE.cameras.fx / 2)
+    np.testing.assert_allclose(loaded.cameras.cy, CAPTURE.cameras.cy / 2)
+    assert (loaded.cameras.width, loaded.cameras.height) == (12, 8)
+
+
+def test_smaller_images_than_the_model_says(tmp_path):
+    """As in a folder of images_2 renamed: intrinsics follow the files."""
+    write_text_model(CAPTURE, tmp_path / "sparse/0")
+    for name, frame in zip(CAPTURE.names, CAPTURE.frames):
+        write_image(tmp_path / "images" / f"{name}.png", frame[::2, ::2])
+    loaded = load_colmap(tmp_path)
+    np.testing.assert_allclose(loaded.cameras.fx, CAPTURE.cameras.fx / 2)
+    assert "5 images have another size" in loaded.notes[0]
+    write_image(tmp_path / "images" / f"{CAPTURE.names[3]}.png", np.zeros((24, 16, 3), np.uint8))
+    with refused("frame_003.png", "16x24", "24x16"):
+        load_colmap(tmp_path)
+
+
+def test_images_of_different_sizes(tmp_path):
+    """The commonest size wins; the odd one keeps its geometry through unequal focal lengths."""
+    lines = ["1 PINHOLE 24 16 20 20 12 8", "2 PINHOLE 16 24 20 20 8 12"]
+    write_text_model(CAPTURE, tmp_path / "sparse/0", lines)
+    images = (tmp_path / "sparse/0/images.txt").read_text().replace("1 frame_002.png", "2 frame_002.png")
+    (tmp_path / "sparse/0/images.txt").write_text(images)
+    write_images(CAPTURE, tmp_path / "images")
+    write_image(tmp_path / "images/frame_002.png", np.full((24, 16, 3), 99, np.uint8))
+    loaded = load_colmap(tmp_path)
+    assert loaded.frames.shape == (5, 16, 24, 3)
+    np.testing.assert_allclose([loaded.cameras.fx[2], loaded.cameras.fy[2]], [30, 20 * 16 / 24], rtol=1e-6)
+    np.testing.assert_allclose([loaded.cameras.cx[2], loaded.cameras.cy[2]], [12, 8])
+    assert any("1 images were resized to 24x16" in note for note in loaded.notes)
+
+
+def picture(x, y):
+    """A smooth picture painted on the plane z = 1."""
+    return 128 + 60 * np.sin(7 * x + 1) + 60 * np.cos(6 * y)
+
+
+def bent(model: str, parameters: tuple, width: int, height: int) -> np.ndarray:
+    """`picture` as a camera of this COLMAP model sees it; undistorted by fixed point iteration, apart from OpenCV."""
+    v, u = np.mgrid[:height, :width] + 0.5
+    focals = 1 if model in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE") else 2
+    fx, fy = parameters[0], parameters[focals - 1]
+    (cx, cy), k = parameters[focals : focals + 2], parameters[focals + 2 :]
+    x0, y0 = (u - cx) / fx, (v - cy) / fy
+    x, y = x0, y0
+    for _ in range(100):
+        if "FISHEYE" in model:
+            distorted, angle = np.hypot(x0, y0), np.arctan(np.hypot(x, y))
+            angle = distorted / (1 + sum(c * angle ** (2 * n + 2) for n, c in enumerate(k)))
+            x, y = (a * np.tan(angle) / np.maximum(distorted, 1e-12) for a in (x0, y0))
+            continue
+        r2 = x * x + y * y
+        if model in ("SIMPLE_RADIAL", "RADIAL"):
+            radial, dx, dy = 1 + sum(c * r2 ** (n + 1) for n, c in enumerate(k)), 0, 0
+        else:
+            k1, k2, p1, p2, k3, k4, k5, k6 = (*k, 0, 0, 0, 0)[:8]
+            radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+            dx, dy = 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        x, y = (x0 - dx) / radial, (y0 - dy) / radial
+    return np.repeat(picture(x, y).round().astype(np.uint8)[..., None], 3, -1)
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_RADIAL", (180.0, 99.0, 76.0, -0.12)),
+        ("RADIAL", (180.0, 99.0, 76.0, 0.1, 0.05)),
+        ("OPENCV", (180.0, 175.0, 99.0, 76.0, -0.1, 0.03, 0.004, -0.003)),
+        ("FULL_OPENCV", (180.0, 175.0, 99.0, 76.0, 0.2, 0.05, 0.001, 0.002, 0.01, 0.25, 0.02, 0.005)),
+        ("OPENCV_FISHEYE", (150.0, 148.0, 99.0, 76.0, 0.03, -0.01, 0.002, 0.001)),
+        ("SIMPLE_RADIAL_FISHEYE", (150.0, 99.0, 76.0, 0.05)),
+        ("RADIAL_FISHEYE", (150.0, 99.0, 76.0, 0.04, -0.02)),
+    ],
+)
+def test_distorted_models(tmp_path, model, parameters):
+    width, height = 200, 150
+    capture = small_capture(2, width, height)
+    write_text_model(capture, tmp_path / "sparse/0", [f"1 {model} {width} {height} {' '.join(map(str, parameters))}"])
+    for name in capture.names:
+        write_image(tmp_path / "images" / f"{name}.png", bent(model, parameters, width, height))
+    loaded = load_colmap(tmp_path)
+    v, u = np.mgrid[:height, :width] + 0.5
+    camera = loaded.cameras[0]
+    expected = picture((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    error = np.abs(loaded.frames[0, ..., 0] - expected)
+    # Bilinear sampling and two roundings of a picture whose second difference is below one level; half a pixel of
+    # misplacement would cost over 1 on average.
+    assert error.max() < 3
+    assert error.mean() < 0.5
+    assert "2 images were undistorted" in loaded.notes[0]
+
+
+@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
+def test_models_that_opencv_lacks(tmp_path, model):
+    parameters = ["100", "100", "12", "8", *["0.1"] * (MODELS[model][1] - 4)]
+    write_text_model(CAPTURE, tmp_path / "sparse", [f"1 {model} 24 16 {' '.join(parameters)}"])
+    write_images(CAPTURE, tmp_path / "images")
+    with refused("cameras.txt", model, "image_undistorter"):
+        load_colmap(tmp_path)
+
+
+def test_missing_images_are_counted(folder):
+    (folder / "images/frame_001.png").unlink()
+    (folder / "images/frame_004.png").unlink()
+    with refused("images", "2 of 5", "frame_001.png"):
+        load_colmap(folder)
+
+
+def test_empty_image(folder):
+    (folder / "images/frame_001.png").write_bytes(b"")
+    with refused("frame_001.png", "empty"):
+        load_colmap(folder)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_every_cut_of_a_model_file_is_told(folder, file):
+    path = folder / "sparse/0" / file
+    data = path.read_bytes()
+    for length in {*range(0, len(data), 53), len(data) - 1}:
+        path.write_bytes(data[:length])
+        with refused(file, f"after {length} bytes"):
+            load_colmap(folder)
+
+
+def test_absurd_counts_end_in_the_same_message(folder):
+    path = folder / "sparse/0/points3D.bin"
+    path.write_bytes(struct.pack("<Q", 2**60))
+    with refused("points3D.bin", "breaks off"):
+        load_colmap(folder)
+    data = struct.pack("<Q", 1) + struct.pack("<Q3d3BdQ", 1, 0, 0, 0, 0, 0, 0, 0, 2**63)
+    path.write_bytes(data)
+    with refused("points3D.bin", "breaks off"):
+        load_colmap(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "said"),
+    [
+        ("images.txt", "2 frame_001.png", "frame_001.png", "line"),
+        ("images.txt", "3 frame_002.png", "9 frame_002.png", "camera 9"),
+        ("cameras.txt", "PINHOLE 24", "PINHOLE wide", "line"),
+        ("cameras.txt", "PINHOLE 24 16 20.25", "PINHOLE 24 16", "3 parameters"),
+        ("cameras.txt", "PINHOLE 24 16 20.25", "PINHOLE 24 16 -20.25", "-20.25"),
+        ("points3D.txt", "\n2 ", "\n2 x", "line 3"),
+    ],
+)
+def test_damaged_text(tmp_path, file, old, new, said):
+    write_text_model(CAPTURE, tmp_path / "sparse")
+    write_images(CAPTURE, tmp_path / "images")
+    text = (tmp_path / "sparse" / file).read_text()
+    assert old in text
+    (tmp_path / "sparse" / file).write_text(text.replace(old, new, 1))
+    with refused(said):
+        load_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("numbers", [(np.nan, 0, 0, 0, 0, 0, 0), (1, 0, 0, 0, 0, np.inf, 0), (0, 0, 0, 0, 0, 0, 0)])
+def test_poses_that_are_none(folder, numbers):
+    path = folder / "sparse/0/images.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<7d", data, 12, *numbers)
+    path.write_bytes(data)
+    with refused("images.bin", "frame_000.png", "NaN"):
+        load_colmap(folder)
+
+
+def test_no_points_file_and_nan_points(folder):
+    (folder / "sparse/0/points3D.bin").unlink()
+    loaded = load_colmap(folder)
+    assert loaded.points.shape == (0, 3)
+    assert "no sparse points" in loaded.notes[0]
+    points = CAPTURE.points.astype(float)
+    points[3] = np.nan
+    binary_with_tracks(folder / "sparse/0/points3D.bin", points, CAPTURE.point_colors, [0] * len(points))
+    with refused("points3D.bin", "NaN"):
+        load_colmap(folder)
+    (folder / "sparse/0/images.bin").unlink()
+    with refused("no images.bin"):
+        load_colmap(folder)
+
+
+def test_names_that_clash(tmp_path):
+    """Folders tell them apart; endings alone do not."""
+    write_text_model(CAPTURE, tmp_path / "sparse")
+    path = tmp_path / "sparse/images.txt"
+    path.write_text(path.read_text().replace("frame_001.png", "left/a.png").replace("frame_003.png", "right/a.png"))
+    write_images(CAPTURE, tmp_path / "images")
+    for side, name in (("left", "frame_001"), ("right", "frame_003")):
+        (tmp_path / "images" / side).mkdir()
+        (tmp_path / f"images/{name}.png").rename(tmp_path / f"images/{side}/a.png")
+    assert load_colmap(tmp_path).names == ("frame_000", "frame_002", "frame_004", "left_a", "right_a")
+    path.write_text(path.read_text().replace("right/a.png", "left/a.jpg"))
+    (tmp_path / "images/right/a.png").rename(tmp_path / "images/left/a.jpg")
+    with refused("left_a"):
+        load_colmap(tmp_path)
+
+
+def test_jpeg_output_and_unwritable_folder(tmp_path):
+    write_colmap(CAPTURE, tmp_path / "a", image_format="jpg")
+    assert (tmp_path / "a/images/frame_000.jpg").is_file()
+    assert load_colmap(tmp_path / "a").names == CAPTURE.names
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError):
+        write_colmap(CAPTURE, tmp_path / "file" / "deeper")
+
+
+def test_bonsai(shared):
+    """The real model: what COLMAP's tracks say it saw is where the loaded cameras see it."""
+    loaded = load_colmap(shared / "captures/bonsai", frames=4, downscale=4)
+    assert loaded.frames.shape == (4, 131, 198, 3)
+    assert loaded.points.shape == (42338, 3)
+    assert len(read_images(shared / "captures/bonsai/sparse/0")) == 126
+    np.testing.assert_allclose(loaded.cameras.fx, 205.9757, atol=0.01)
+    pose = loaded.cameras.world_to_camera.astype(np.float64)
+    seen = np.einsum("tij,pj->tpi", pose[:, :3, :3], loaded.points) + pose[:, None, :3, 3]
+    assert ((seen[..., 2] > 0).mean(1) > 0.5).all()

@@ -1,0 +1,177 @@
+"""Image files and lenses: what is read is what was stored, and damage is told."""
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import png, refused
+
+from jsecon.data.images import image_size, read_depth, read_ids, read_image, write_image
+from jsecon.data.lens import Lens, distort, undistorted, undistortion_maps
+from jsecon.errors import InputError
+
+RNG = np.random.default_rng(3)
+FRAME = RNG.integers(0, 256, (13, 17, 3), np.uint8)
+
+
+def test_png_comes_back_exactly(tmp_path):
+    write_image(tmp_path / "a.png", FRAME)
+    image, transparent = read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(image, FRAME)
+    assert not transparent
+    assert image_size(tmp_path / "a.png") == (17, 13)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_jpeg_comes_back_nearly(tmp_path):
+    smooth = cv2.resize(FRAME, (170, 130), interpolation=cv2.INTER_CUBIC)
+    write_image(tmp_path / "a.jpg", smooth)
+    image, _ = read_image(tmp_path / "a.jpg")
+    assert np.abs(image.astype(int) - smooth).mean() < 4
+    assert image_size(tmp_path / "a.jpg") == (170, 130)
+
+
+def test_grey_16_bits_and_transparency(tmp_path):
+    cv2.imwrite(str(tmp_path / "grey.png"), FRAME[..., 0])
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png")[0], np.repeat(FRAME[..., :1], 3, -1))
+    cv2.imwrite(str(tmp_path / "deep.png"), FRAME[..., ::-1].astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png")[0], FRAME)
+    alpha = np.where(np.arange(17) < 5, 0, 255).astype(np.uint8) * np.ones((13, 1), np.uint8)
+    cv2.imwrite(str(tmp_path / "clear.png"), np.dstack([FRAME[..., ::-1], alpha]))
+    image, transparent = read_image(tmp_path / "clear.png")
+    assert transparent
+    np.testing.assert_array_equal(image, FRAME * (alpha > 0)[..., None])
+
+
+def test_exif_orientation_is_ignored(tmp_path):
+    """Poses are estimated on the stored pixels; OpenCV would turn them by this tag."""
+    stored = cv2.imencode(".jpg", FRAME)[1].tobytes()
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    turned = stored[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + stored[2:]
+    (tmp_path / "a.jpg").write_bytes(turned)
+    assert cv2.imread(str(tmp_path / "a.jpg")).shape == (17, 13, 3), "the tag must be one that OpenCV obeys"
+    assert read_image(tmp_path / "a.jpg")[0].shape == (13, 17, 3)
+    assert image_size(tmp_path / "a.jpg") == (17, 13)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_every_cut_is_told(tmp_path, ending):
+    file = tmp_path / ("cut" + ending)
+    write_image(file, FRAME)
+    whole = file.read_bytes()
+    for length in range(0, len(whole) - 1, 7):
+        file.write_bytes(whole[:length])
+        with refused(file, "empty" if length == 0 else "breaks off" if length > 8 else "bytes"):
+            read_image(file)
+
+
+def test_cut_jpeg_with_a_thumbnail(tmp_path):
+    """The thumbnail in the header ends like a whole JPEG does."""
+    stored = cv2.imencode(".jpg", FRAME)[1].tobytes()
+    header = b"\xff\xe1" + (len(stored) + 2).to_bytes(2, "big") + stored
+    (tmp_path / "a.jpg").write_bytes((stored[:2] + header + stored[2:])[:-40])
+    with refused("a.jpg", "breaks off"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_damaged_png_missing_file_and_no_image(tmp_path):
+    write_image(tmp_path / "a.png", FRAME)
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[len(data) // 2] ^= 0x10
+    (tmp_path / "a.png").write_bytes(data)
+    with refused("a.png", "checksum"):
+        read_image(tmp_path / "a.png")
+    with refused("none.png", "No such file"):
+        read_image(tmp_path / "none.png")
+    (tmp_path / "text.png").write_text("no image at all, but long enough to look at")
+    with refused("text.png", "no image"):
+        image_size(tmp_path / "text.png")
+    with refused("a.xyz", "'.xyz'"):
+        write_image(tmp_path / "a.xyz", FRAME)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
+def test_label_bits(tmp_path, bits):
+    ids = RNG.integers(0, 2**bits, (9, 11))
+    (tmp_path / "grey.png").write_bytes(png(ids, bits=bits, colour_type=0))
+    read, coloured = read_ids(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read, ids)
+    assert not coloured
+    if bits <= 8:
+        palette = RNG.integers(0, 256, 3 * 2**bits, np.uint8).tobytes()
+        (tmp_path / "palette.png").write_bytes(png(ids, bits=bits, colour_type=3, palette=palette))
+        np.testing.assert_array_equal(read_ids(tmp_path / "palette.png")[0], ids)
+
+
+def test_label_colours_and_refusals(tmp_path):
+    write_image(tmp_path / "a.png", FRAME)
+    ids, coloured = read_ids(tmp_path / "a.png")
+    assert coloured
+    np.testing.assert_array_equal(ids, FRAME.astype(int) @ [65536, 256, 1])
+    cv2.imwrite(str(tmp_path / "four.png"), np.dstack([FRAME, FRAME[..., 0]]))
+    with refused("four.png", "4 channels"):
+        read_ids(tmp_path / "four.png")
+    write_image(tmp_path / "a.jpg", FRAME)
+    with refused("a.jpg", "no PNG"):
+        read_ids(tmp_path / "a.jpg")
+
+
+def test_depth(tmp_path):
+    counts = RNG.integers(0, 65536, (6, 5)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "d.png"), counts)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.png", 0.001), counts / 1000, rtol=1e-6)
+    np.save(tmp_path / "d.npy", np.array([[1.0, np.nan, -2.0]]))
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.npy", 2.0), [[2, 0, 0]])
+    write_image(tmp_path / "rgb.png", FRAME)
+    with refused("rgb.png", "uint8"):
+        read_depth(tmp_path / "rgb.png", 0.001)
+
+
+BROWN = Lens(160, 120, 130.0, 128.0, 83.0, 58.0, (-0.21, 0.06, 0.002, -0.001))
+PINCUSHION = Lens(160, 120, 130.0, 128.0, 80.0, 60.0, (0.15, 0.02, 0.0, 0.0, 0.01))
+FISHEYE = Lens(160, 120, 70.0, 71.0, 79.0, 61.0, (0.02, -0.01, 0.003, 0.0), fisheye=True)
+
+
+def brown(lens, x, y):
+    """Brown's model, written out."""
+    k1, k2, p1, p2, k3 = (*lens.distortion, 0.0)[:5]
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return lens.fx * u + lens.cx, lens.fy * v + lens.cy
+
+
+def equidistant(lens, x, y):
+    """Kannala and Brandt's model, written out."""
+    r = np.hypot(x, y)
+    angle = np.arctan(r)
+    distorted = angle * (1 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(lens.distortion)))
+    factor = distorted / np.maximum(r, 1e-12)
+    return lens.fx * x * factor + lens.cx, lens.fy * y * factor + lens.cy
+
+
+@pytest.mark.parametrize(("lens", "model"), [(BROWN, brown), (PINCUSHION, brown), (FISHEYE, equidistant)])
+def test_undistortion(lens, model):
+    """Distorting is the model; the maps lead each pinhole pixel to where the model puts it; none lies outside."""
+    points = RNG.uniform(-0.5, 0.5, (200, 2))
+    np.testing.assert_allclose(distort(lens, points), np.stack(model(lens, *points.T), -1), atol=1e-6)
+    pinhole = undistorted(lens, "here")
+    assert not pinhole.distorted
+    map_x, map_y = undistortion_maps(lens, pinhole)
+    v, u = np.mgrid[: lens.height, : lens.width] + 0.5
+    x, y = model(lens, (u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy)
+    np.testing.assert_allclose(map_x + 0.5, x, atol=1e-3)
+    np.testing.assert_allclose(map_y + 0.5, y, atol=1e-3)
+    edges = np.stack([x, y])[:, [0, -1]].reshape(2, -1), np.stack([x, y])[:, :, [0, -1]].reshape(2, -1)
+    margins = [np.minimum(e, np.array([[lens.width], [lens.height]]) - e).min() for e in edges]
+    assert min(margins) > 0
+    assert min(margins) < 1.5, "a wider lens would still have been covered"
+
+
+def test_lenses_that_cannot_be_undone():
+    with refused("here", "no undistorted image"):
+        undistorted(Lens(160, 120, 130.0, 130.0, 300.0, 60.0, (0.1,)), "here")
+    with pytest.raises(InputError):
+        undistorted(Lens(160, 120, 1.0, 1.0, 80.0, 60.0, (-5000.0,)), "here")
+    plain = Lens(160, 120, 130.0, 130.0, 80.0, 60.0, (0.0, 0.0, 0.0, 0.0))
+    assert undistorted(plain, "here") == Lens(160, 120, 130.0, 130.0, 80.0, 60.0)

@@ -1,0 +1,253 @@
+"""transforms.json: axes, intrinsics in every spelling, missing images, depth, points; damage is told."""
+
+import copy
+import json
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import refused, small_capture, transforms, write_images, write_transforms
+
+from jsecon.data.nerfstudio import load_nerfstudio
+
+CAPTURE = small_capture()
+
+
+def load_changed(tmp_path, change, **options):
+    """Loads the capture after `change(content)` on its transforms.json."""
+    content = transforms(CAPTURE)
+    change(content)
+    write_transforms(CAPTURE, tmp_path, content)
+    return load_nerfstudio(tmp_path, **options)
+
+
+def test_round_trip(tmp_path):
+    loaded = load_changed(tmp_path, lambda content: None, holdout=0)
+    np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
+    for field in ("world_to_camera", "fx", "fy", "cx", "cy"):
+        np.testing.assert_allclose(getattr(loaded.cameras, field), getattr(CAPTURE.cameras, field), atol=1e-6)
+    assert (loaded.cameras.width, loaded.cameras.height) == (24, 16)
+    assert loaded.points.shape == (0, 3)
+    assert loaded.notes == ()
+    np.testing.assert_array_equal(loaded.to_source, np.eye(4))
+
+
+def test_opengl_axes(tmp_path):
+    """The identity looks along -z with y up: a point in front and above lies at z > 0, y < 0 of the OpenCV camera."""
+
+    def change(content):
+        content["frames"][0]["transform_matrix"] = np.eye(4).tolist()
+
+    pose = load_changed(tmp_path, change).cameras.world_to_camera[0]
+    np.testing.assert_allclose(pose @ [1.0, 2.0, -5.0, 1.0], [1.0, -2.0, 5.0, 1.0])
+
+
+@pytest.mark.parametrize("ending", ["", ".JPG"])
+def test_paths_without_ending_and_with_windows_separators(tmp_path, ending):
+    write_images(CAPTURE, tmp_path / "images", ".JPG")
+    content = transforms(CAPTURE, ending)
+    for entry in content["frames"]:
+        entry["file_path"] = ".\\" + entry["file_path"].replace("/", "\\")
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert load_nerfstudio(tmp_path).names == CAPTURE.names
+
+
+def test_camera_angle_and_sizes_from_the_images(tmp_path):
+    def change(content):
+        for record in (content, *content["frames"]):
+            for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+                record.pop(key, None)
+        content["camera_angle_x"] = 2 * np.arctan(0.5 * 24 / 30)
+
+    cameras = load_changed(tmp_path, change).cameras
+    np.testing.assert_allclose([cameras.fx, cameras.fy], 30, rtol=1e-6)
+    np.testing.assert_array_equal(cameras.cx, 12)
+    np.testing.assert_array_equal(cameras.cy, 8)
+
+
+def test_missing_images_are_said_and_left_out(tmp_path):
+    write_transforms(CAPTURE, tmp_path)
+    (tmp_path / "images/frame_001.png").unlink()
+    (tmp_path / "images/frame_002.png").unlink()
+    loaded = load_nerfstudio(tmp_path, holdout=2)
+    assert loaded.names == ("frame_000", "frame_003", "frame_004")
+    np.testing.assert_array_equal(loaded.frames, CAPTURE.frames[[0, 3, 4]])
+    np.testing.assert_array_equal(loaded.held_out, [True, False, True])
+    assert len(loaded.notes) == 1
+    assert "2 of 5" in loaded.notes[0]
+    assert "frame_001" in loaded.notes[0]
+    for name in loaded.names:
+        (tmp_path / f"images/{name}.png").unlink()
+    with refused("transforms.json", "none of which"):
+        load_nerfstudio(tmp_path)
+
+
+def test_applied_transform_and_scale_are_undone(tmp_path):
+    """nerfstudio: world = scale * (applied_transform source)."""
+    applied = [[1.0, 0, 0, 2.0], [0, 0, 1, 3.0], [0, -1, 0, 4.0]]
+    loaded = load_changed(tmp_path, lambda content: content.update(applied_transform=applied, applied_scale=2.0))
+    source = np.array([0.3, -0.4, 0.5, 1.0])
+    world = np.append(2.0 * (np.array(applied) @ source), 1.0)
+    np.testing.assert_allclose(loaded.to_source @ world, source, atol=1e-12)
+
+
+def test_depth_maps(tmp_path):
+    """Millimetres to metres to the scaled world; resized to the frames by nearest; 0 where a frame has none."""
+    counts = np.random.default_rng(0).integers(0, 5000, (16, 24)).astype(np.uint16)
+    assert cv2.imwrite(str(tmp_path / "d.png"), counts)
+
+    def change(content):
+        content["frames"][1]["depth_file_path"] = "d.png"
+        content["applied_scale"] = 2.0
+
+    loaded = load_changed(tmp_path, change)
+    np.testing.assert_allclose(loaded.depths[1], counts / 500, rtol=1e-6)
+    assert not loaded.depths[[0, 2, 3, 4]].any()
+    small = load_nerfstudio(tmp_path, downscale=2).depths[1]
+    assert np.isin(small, loaded.depths[1]).all()
+    assert cv2.imwrite(str(tmp_path / "d.png"), counts.T)
+    with refused("d.png", "16x24"):
+        load_nerfstudio(tmp_path)
+    (tmp_path / "d.png").unlink()
+    with refused("d.png", "no such depth map"):
+        load_nerfstudio(tmp_path)
+
+
+def test_points_from_a_ply(tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 2", "property float x", "property float y", "property float z",
+             "property uchar red", "property uchar green", "property uchar blue", "end_header", "1 2 3 4 5 6", "-1 0.5 0 7 8 9", ""]
+    (tmp_path / "sparse.ply").write_text("\n".join(lines))
+    loaded = load_changed(tmp_path, lambda content: content.update(ply_file_path="sparse.ply"))
+    np.testing.assert_array_equal(loaded.points, np.array([[1, 2, 3], [-1, 0.5, 0]], np.float32))
+    np.testing.assert_array_equal(loaded.point_colors, [[4, 5, 6], [7, 8, 9]])
+
+
+def test_distortion_keys(tmp_path):
+    loaded = load_changed(tmp_path, lambda content: content.update(k1=0.1, k2=-0.02, p1=0.001, p2=0.0, k3=0.0, k4=0.0))
+    assert "5 images were undistorted" in loaded.notes[0]
+    fisheye = load_changed(tmp_path, lambda content: content.update(camera_model="OPENCV_FISHEYE", k1=0.1))
+    assert not np.allclose(fisheye.cameras.fx, loaded.cameras.fx)
+    with refused("transforms.json", "k4"):
+        load_changed(tmp_path, lambda content: content.update(camera_model="OPENCV", k4=0.1))
+    with refused("transforms.json", "EQUIRECTANGULAR"):
+        load_changed(tmp_path, lambda content: content.update(camera_model="EQUIRECTANGULAR"))
+
+
+def test_masks_are_said_to_be_unused(tmp_path):
+    loaded = load_changed(tmp_path, lambda content: content["frames"][0].update(mask_path="m.png"))
+    assert "mask_path" in loaded.notes[0]
+
+
+def _drop(*path):
+    def change(content):
+        for key in path[:-1]:
+            content = content[key]
+        del content[path[-1]]
+
+    return change
+
+
+def _put(value, *path):
+    def change(content):
+        for key in path[:-1]:
+            content = content[key]
+        content[path[-1]] = value
+
+    return change
+
+
+NAN_POSE = [[1.0, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_drop("frames"), "no key 'frames'"),
+        (_drop("frames", 2, "transform_matrix"), "no key 'transform_matrix' in frame 2 (images/frame_002.png)"),
+        (_drop("frames", 1, "file_path"), "no key 'file_path' in frame 1"),
+        (_put("x", "frames"), "type str"),
+        (_put([], "frames"), "0 frames"),
+        (_put(7, "frames", 0), "no object"),
+        (_put("wide", "w"), "w = 'wide'"),
+        (_put(None, "cx"), "cx = None"),
+        (_put(0, "w"), "0x16"),
+        (_put([[1, 2], [3, 4]], "frames", 0, "transform_matrix"), "shape (2, 2)"),
+        (_put([["a"] * 4] * 4, "frames", 0, "transform_matrix"), "more than numbers"),
+        (_put(NAN_POSE, "frames", 3, "transform_matrix"), "pose of images/frame_003.png with NaN"),
+        (_put(MIRROR, "frames", 3, "transform_matrix"), "not rigid"),
+        (_put(SCALED, "frames", 3, "transform_matrix"), "not rigid"),
+        (_put(0.0, "applied_scale"), "cannot be inverted"),
+        (_put("gone.ply", "ply_file_path"), "gone.ply"),
+    ],
+)
+def test_damage_is_told(tmp_path, change, said):
+    with refused(said):
+        load_changed(tmp_path, change)
+
+
+def test_no_focal_length(tmp_path):
+    def change(content):
+        for entry in content["frames"]:
+            del entry["fl_x"], entry["fl_y"]
+
+    with refused("no focal length", "camera_angle_x"):
+        load_changed(tmp_path, change)
+    with refused("camera_angle_x = 4.0"):
+        load_changed(tmp_path, lambda content: (change(content), content.update(camera_angle_x=4.0)))
+
+
+def test_not_json(tmp_path):
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms(CAPTURE))[:-9])
+    with refused("transforms.json", "no JSON"):
+        load_nerfstudio(tmp_path)
+    (tmp_path / "transforms.json").write_text("[1]")
+    with refused("transforms.json", "JSON without keys"):
+        load_nerfstudio(tmp_path)
+
+
+def test_rounded_rotations_are_made_exact(tmp_path):
+    def change(content):
+        for entry in content["frames"]:
+            entry["transform_matrix"] = np.round(entry["transform_matrix"], 4).tolist()
+
+    rotation = load_changed(tmp_path, change).cameras.world_to_camera[:, :3, :3].astype(np.float64)
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-6)
+
+
+def test_content_is_only_read(tmp_path):
+    content = transforms(CAPTURE)
+    before = copy.deepcopy(content)
+    write_transforms(CAPTURE, tmp_path, content)
+    load_nerfstudio(tmp_path / "transforms.json")
+    assert json.loads((tmp_path / "transforms.json").read_text()) == before
+
+
+def test_fox(shared):
+    """67 entries, 17 of which have no image; matches between two views meet in front of both, within a pixel."""
+    loaded = load_nerfstudio(shared / "captures/fox", downscale=2)
+    assert loaded.frames.shape == (50, 960, 540, 3)
+    assert "17 of 67" in loaded.notes[0]
+    assert loaded.held_out.sum() == 7
+    sift = cv2.SIFT_create(2000)
+    (points_a, found_a), (points_b, found_b) = (
+        sift.detectAndCompute(cv2.cvtColor(loaded.frames[t], cv2.COLOR_RGB2GRAY), None) for t in (0, 2)
+    )
+    pairs = cv2.BFMatcher().knnMatch(found_a, found_b, k=2)
+    kept = [first for first, second in pairs if first.distance < 0.7 * second.distance]
+    pixels = [
+        np.array([points_a[match.queryIdx].pt for match in kept]) + 0.5,
+        np.array([points_b[match.trainIdx].pt for match in kept]) + 0.5,
+    ]
+    projections = []
+    for t in (0, 2):
+        camera = loaded.cameras[t]
+        matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64)
+        projections.append(matrix @ camera.world_to_camera[:3].astype(np.float64))
+    lifted = cv2.triangulatePoints(*projections, *(p.T for p in pixels))
+    for projection, seen in zip(projections, pixels):
+        x, y, z = projection @ (lifted / lifted[3])
+        assert (z > 0).mean() > 0.95
+        assert np.median(np.hypot(x / z - seen[:, 0], y / z - seen[:, 1])) < 0.5
+    assert len(kept) > 100
