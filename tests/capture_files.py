@@ -1,5 +1,6 @@
 """Small captures on disk, for the tests of the data room."""
 
+import contextlib
 import json
 import struct
 import zlib
@@ -12,24 +13,16 @@ from jsecon.errors import InputError
 from jsecon.types import Camera, Capture
 
 
+@contextlib.contextmanager
 def refused(*parts):
-    """A context in which an InputError is raised that names each of `parts` and ends in a remedy."""
-
-    class Refused:
-        def __enter__(self):
-            self.raises = pytest.raises(InputError)
-            self.info = self.raises.__enter__()
-            return self.info
-
-        def __exit__(self, *exception):
-            caught = self.raises.__exit__(*exception)
-            for part in parts:
-                assert str(part) in str(self.info.value)
-            assert self.info.value.remedy
-            assert self.info.value.expected
-            return caught
-
-    return Refused()
+    """A context in which an InputError must be raised that names each of `parts`, says what it expected, and a remedy."""
+    with pytest.raises(InputError) as info:
+        yield
+    for part in parts:
+        assert str(part) in str(info.value)
+    assert info.value.found
+    assert info.value.expected
+    assert info.value.remedy
 
 
 def ring_poses(count: int, radius: float = 3.0) -> np.ndarray:

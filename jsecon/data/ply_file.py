@@ -73,6 +73,8 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
                 form = words[1]
             elif words[0] == "element":
                 elements.append(_Element(words[1], int(words[2]), []))
+                if elements[-1].count < 0:
+                    raise ValueError(words[2])
             elif words[0] == "property":
                 kind = "list" if words[1] == "list" else _TYPES[words[1]]
                 elements[-1].fields.append((words[-1], kind))
@@ -108,6 +110,8 @@ def read_vertices(path: Path) -> np.ndarray:
         raise bad_ply(
             path, "list properties before or in the element vertex", "numbers only", "Export the points alone."
         )
+    if not vertex.fields:
+        raise bad_ply(path, "an element vertex without properties", "x y z and more")
     if len({name for name, _ in vertex.fields}) < len(vertex.fields):
         raise bad_ply(path, "a vertex property that is there twice", "distinct names")
     if form == "ascii":
@@ -124,7 +128,6 @@ def read_vertices(path: Path) -> np.ndarray:
 
 def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndarray:
     lines = body.split(b"\n")[skip : skip + vertex.count]
-    result = np.empty(vertex.count, vertex.dtype("="))
     try:
         numbers = np.array([line.split() for line in lines], np.float64).reshape(len(lines), len(vertex.fields))
     except ValueError as error:
@@ -133,6 +136,7 @@ def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: _Element) -> np.
         ) from error
     if len(lines) < vertex.count:
         raise bad_ply(path, f"{len(lines)} of {vertex.count} vertices: the file is cut short")
+    result = np.empty(vertex.count, vertex.dtype("="))
     for column, (name, _) in enumerate(vertex.fields):
         result[name] = numbers[:, column]
     return result

@@ -1,0 +1,218 @@
+"""INRIA .ply files come back bit by bit; every variant in the wild is read or refused with a reason."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from capture_files import refused
+
+from jsecon.data.ply import SH_DC, load_ply, load_points_ply, save_ply
+from jsecon.errors import InputError
+from jsecon.types import Gaussians
+
+FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
+NAMES = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+
+
+def random_gaussians(count: int, basis: int = 4) -> Gaussians:
+    rng = np.random.default_rng(count + basis)
+    shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, basis, 3)]
+    return Gaussians(*(jnp.asarray(rng.normal(size=shape) * 10, jnp.float32) for shape in shapes))
+
+
+def write(path, columns: dict, form: str = "binary_little_endian", types: dict | None = None, extra: str = "", cut: int = 0) -> None:
+    """A .ply of these columns, header and all, apart from the writer under test."""
+    order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}[form]
+    types = types or {}
+    numpy = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2"}
+    count = len(next(iter(columns.values())))
+    table = np.empty(count, [(name, order + numpy[types.get(name, "float")]) for name in columns])
+    for name, values in columns.items():
+        table[name] = values
+    properties = [f"property {types.get(name, 'float')} {name}" for name in columns]
+    header = "\n".join(["ply", f"format {form} 1.0", "comment of mine", f"element vertex {count}", *properties]) + f"\n{extra}end_header\n"
+    text = "\n".join(" ".join(repr(value.item()) for value in row) for row in table) + "\n"
+    body = text.encode() if form == "ascii" else table.tobytes()
+    path.write_bytes(header.encode() + body[: len(body) - cut])
+
+
+def columns(count: int = 6, rest: int = 0) -> dict:
+    rng = np.random.default_rng(count)
+    return {name: rng.normal(size=count).astype(np.float32) for name in [*NAMES, *(f"f_rest_{n}" for n in range(rest))]}
+
+
+@pytest.mark.parametrize("basis", [1, 4, 9, 16])
+@pytest.mark.parametrize("count", [0, 1, 100])
+def test_round_trip_is_exact(tmp_path, basis, count):
+    gaussians = random_gaussians(count, basis)
+    save_ply(tmp_path / "a.ply", gaussians)
+    loaded = load_ply(tmp_path / "a.ply")
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(loaded, field), getattr(gaussians, field))
+        assert getattr(loaded, field).dtype == jnp.float32
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_round_trip_of_many(tmp_path):
+    gaussians = random_gaussians(40000, 1)
+    save_ply(tmp_path / "a.ply", gaussians)
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(load_ply(tmp_path / "a.ply"), field), getattr(gaussians, field))
+
+
+def test_layout_is_inrias(tmp_path):
+    """The order of the properties, zero normals and the channel-major rest, by raw bytes."""
+    gaussians = random_gaussians(3, 4)
+    save_ply(tmp_path / "a.ply", gaussians)
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float")]
+    assert names == NAMES[:9] + [f"f_rest_{n}" for n in range(9)] + NAMES[9:]
+    assert header.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n")
+    rows = np.frombuffer(body, "<f4").reshape(3, len(names))
+    np.testing.assert_array_equal(rows[:, 3:6], 0)
+    for gaussian, row in enumerate(rows):
+        for channel in range(3):
+            for term in range(3):
+                assert row[9 + channel * 3 + term] == gaussians.sh[gaussian, 1 + term, channel]
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_variants(tmp_path, form):
+    """Any order of properties, extra ones of OpenGaussian and Gaussian Grouping, doubles, further elements behind."""
+    given = columns(rest=24)
+    mixed = {"ins_feat_r": given["x"], **dict(reversed(given.items())), "obj_dc_0": given["y"], "red": np.full(6, 128)}
+    types = {"red": "uchar", "opacity": "double"}
+    write(tmp_path / "a.ply", mixed, form, types, extra="element face 0\nproperty list uchar int vertex_indices\n")
+    loaded = load_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(loaded.means, np.stack([given[axis] for axis in "xyz"], -1))
+    np.testing.assert_array_equal(loaded.quaternions, np.stack([given[f"rot_{n}"] for n in range(4)], -1))
+    np.testing.assert_array_equal(loaded.opacity_logits, given["opacity"])
+    assert loaded.sh.shape == (6, 9, 3)
+    np.testing.assert_array_equal(loaded.sh[:, 5, 2], given["f_rest_20"])
+
+
+def test_colours_instead_of_harmonics(tmp_path):
+    gaussians, rgb = random_gaussians(50, 16), np.random.default_rng(0).uniform(size=(50, 3)).astype(np.float32)
+    save_ply(tmp_path / "a.ply", gaussians, rgb=rgb)
+    loaded = load_ply(tmp_path / "a.ply")
+    assert loaded.sh.shape == (50, 1, 3)
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * loaded.sh[:, 0], rgb, atol=1e-6)
+    np.testing.assert_allclose(SH_DC, 0.28209479177387814)
+    np.testing.assert_array_equal(loaded.means, gaussians.means)
+    with pytest.raises(ValueError, match="Give one colour a Gaussian"):
+        save_ply(tmp_path / "a.ply", gaussians, rgb=rgb[:49])
+
+
+def test_compressed(tmp_path):
+    """The header that SuperSplat writes."""
+    chunk = "\n".join(f"property float {name}_{axis}" for name in ("min", "max") for axis in "xyz")
+    packed = "\n".join(f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement chunk 1\n{chunk}\nelement vertex 2\n{packed}\nend_header\n"
+    (tmp_path / "a.compressed.ply").write_bytes(header.encode() + bytes(24 + 32))
+    with refused("a.compressed.ply", "compressed", "uncompressed PLY"):
+        load_ply(tmp_path / "a.compressed.ply")
+
+
+@pytest.mark.parametrize("missing", ["opacity", "scale_2", "rot_3", "f_dc_0", "x"])
+def test_missing_properties(tmp_path, missing):
+    given = columns()
+    del given[missing]
+    write(tmp_path / "a.ply", given)
+    with refused("a.ply", f"no properties {missing};"):
+        load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("rest", [3, 10, 72])
+def test_odd_harmonics(tmp_path, rest):
+    write(tmp_path / "a.ply", columns(rest=rest))
+    with refused(f"{rest} properties f_rest"):
+        load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_cut_short(tmp_path, form):
+    write(tmp_path / "a.ply", columns(), form, cut=90)
+    with refused("a.ply", "cut short"):
+        load_ply(tmp_path / "a.ply")
+    whole = (tmp_path / "a.ply").read_bytes()
+    for length in range(0, len(whole), 31):
+        (tmp_path / "a.ply").write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "field"),
+    [("y", np.nan, "means"), ("scale_1", np.inf, "log_scales"), ("rot_0", np.nan, "quaternions"), ("opacity", np.nan, "opacity_logits"), ("f_dc_2", -np.inf, "sh")],
+)
+def test_numbers_that_are_none(tmp_path, name, value, field):
+    given = columns()
+    given[name][4] = value
+    write(tmp_path / "a.ply", given)
+    with refused(f"1 Gaussians of 6 whose {field}", "the first: 4"):
+        load_ply(tmp_path / "a.ply")
+
+
+def test_opacity_of_one_and_no_rotation(tmp_path):
+    given = columns()
+    given["opacity"][:2] = np.inf, -np.inf
+    write(tmp_path / "a.ply", given)
+    np.testing.assert_array_equal(load_ply(tmp_path / "a.ply").opacity_logits[:2], [np.inf, -np.inf])
+    for axis in range(4):
+        given[f"rot_{axis}"][3] = 0
+    write(tmp_path / "a.ply", given)
+    with refused("without rotation", "the first: 3"):
+        load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (b"", "empty"),
+        (b"no ply", "no .ply header"),
+        (b"ply\nformat binary_middle_endian 1.0\nelement vertex 0\nend_header\n", "binary_middle_endian"),
+        (b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "elements face"),
+        (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "element vertex many"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty quad x\nend_header\n", "property quad x"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty list uchar int x\nend_header\n", "list properties"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float x\nend_header\n", "twice"),
+        (b"ply\nformat ascii 1.0\nelement vertex 2\nend_header\n\n\n", "without properties"),
+        (b"ply\nformat ascii 1.0\nelement vertex 999999999999999\nproperty float x\nend_header\n1\n", "cut short"),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
+    ],
+)
+def test_headers_that_are_none(tmp_path, text, said):
+    (tmp_path / "a.ply").write_bytes(text)
+    with refused("a.ply", said):
+        load_ply(tmp_path / "a.ply")
+
+
+def test_missing_file_and_unwritable_folder(tmp_path):
+    with refused("none.ply", "No such file"):
+        load_ply(tmp_path / "none.ply")
+    (tmp_path / "file").write_text("in the way")
+    with refused("a.ply", "expected a folder"):
+        save_ply(tmp_path / "file" / "a.ply", random_gaussians(2))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"), [("uchar", [0, 51, 255]), ("ushort", [0, 51 * 257, 65535]), ("float", [0.0, 0.2, 1.0]), ("double", [0, 51, 255])]
+)
+def test_plain_points(tmp_path, kind, values):
+    given = {"x": np.arange(3.0), "y": np.ones(3), "z": -np.arange(3.0), **dict.fromkeys(("red", "green", "blue"), np.array(values))}
+    write(tmp_path / "p.ply", given, types={**dict.fromkeys(("red", "green", "blue"), kind), "x": "double"})
+    points, colours = load_points_ply(tmp_path / "p.ply")
+    np.testing.assert_array_equal(points, np.stack([given[axis] for axis in "xyz"], -1).astype(np.float32))
+    np.testing.assert_array_equal(colours, np.repeat([[0], [51], [255]], 3, 1))
+
+
+def test_points_without_colour_or_place(tmp_path):
+    write(tmp_path / "p.ply", {axis: np.zeros(2) for axis in "xyz"})
+    np.testing.assert_array_equal(load_points_ply(tmp_path / "p.ply")[1], 128)
+    write(tmp_path / "p.ply", {axis: np.zeros(2) for axis in "xy"})
+    with refused("p.ply", "no properties z"):
+        load_points_ply(tmp_path / "p.ply")
+    write(tmp_path / "p.ply", {axis: np.full(2, np.nan) for axis in "xyz"})
+    with refused("p.ply", "NaN"):
+        load_points_ply(tmp_path / "p.ply")
