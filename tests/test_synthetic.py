@@ -252,7 +252,7 @@ def test_every_object_is_seen_often(seed):
 def test_colours_are_true_to_their_names(seed):
     """The mean colour of an object's pixels is nearest, in CIELAB, to the palette's colour of its own name."""
     room = make_room(seed)
-    frames, instances, _ = render_views(room, room_cameras(room, views=4, width=160, height=120))
+    frames, instances, _ = render_views(room, room_cameras(room, views=3, width=128, height=96))
     lab = cv2.cvtColor(frames.astype(np.float32).reshape(-1, 1, 3) / 255, cv2.COLOR_RGB2LAB).reshape(*frames.shape)
     names = list(PALETTE)
     palette = cv2.cvtColor(np.float32(list(PALETTE.values()))[:, None] / 255, cv2.COLOR_RGB2LAB)[:, 0]
@@ -267,9 +267,9 @@ def test_colours_are_true_to_their_names(seed):
 
 
 def test_seed_decides_everything():
-    again = room_capture(3, views=3, width=32, height=24, points=50)
-    first = room_capture(3, views=3, width=32, height=24, points=50)
-    other = room_capture(4, views=3, width=32, height=24, points=50)
+    again = room_capture(3, views=2, width=32, height=24, holdout=0, points=50, num_objects=6)
+    first = room_capture(3, views=2, width=32, height=24, holdout=0, points=50, num_objects=6)
+    other = room_capture(4, views=2, width=32, height=24, holdout=0, points=50, num_objects=6)
     for name in ("frames", "points", "point_colors"):
         np.testing.assert_array_equal(getattr(again[0], name), getattr(first[0], name))
     np.testing.assert_array_equal(again[1], first[1])
@@ -363,7 +363,7 @@ def test_options_that_cannot_be():
 def test_written_room_reads_back_as_an_ordinary_capture(tmp_path, small):
     capture, instances, names = small
     folder = tmp_path / "room"
-    write_room(folder, 9, views=12, width=16, height=12, points=20)  # an earlier room, of more frames
+    write_room(folder, 9, views=12, width=16, height=12, points=20, num_objects=2)  # an earlier room, of more frames
     write_room(folder, 0, views=10, width=96, height=72, points=400)
     read = load_capture(folder, holdout=5)
     assert read.names == capture.names

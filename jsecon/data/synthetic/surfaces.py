@@ -73,7 +73,7 @@ def bake(room: Room) -> BakedRoom:
         _wall(room, draw, np.array(corner, np.float32), first, span, tall, normal)
         for corner, first, span, normal in sides
     ]
-    ground = _flat(room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006, 0.03, _tiles)
+    ground = _flat(room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006, 0.05, _tiles)
     above = _flat(room, draw, np.array([-x, -y, ceiling], np.float32), 2 * x, 2 * y, -up, 0.02, None, _plaster)
     tx, ty = TABLE_HALF
     table = _flat(room, draw, np.array([-tx, -ty, 0], np.float32), 2 * tx, 2 * ty, up, 0.0025, 0.005, _planks)
@@ -161,17 +161,17 @@ def _wall(room, draw, origin, first, span, tall, normal):
     tone -= 0.28 * low + 0.15 * ((v > 0.95) & (v < 0.99)) + 0.2 * (v < 0.1)
     tone = np.where(low & (u % 0.5 < 0.012), tone - 0.12, tone)
     paint = linear((178, 169, 153)) * (1 + tone)[..., None]
+    blot = np.sign(_noise(draw, u.shape, 20))[..., None]
     for k in range(3):
-        _hang_picture(draw, paint, u, v, span * (k + 0.5) / 3 + draw.uniform(-0.15, 0.15))
+        _hang_picture(draw, paint, blot, u, v, span * (k + 0.5) / 3 + draw.uniform(-0.15, 0.15))
     turn = np.broadcast_to(normal[:, None], points.shape)
     light = SKY * (0.82 + 0.18 * np.clip(v / 0.5, 0, 1)) + 0.6 * LAMP * direct(room, points, turn).reshape(u.shape)
     return _Plane(origin, first, up, 0.008, (paint * light[..., None]).astype(np.float32))
 
 
-def _hang_picture(draw, paint, u, v, middle):
+def _hang_picture(draw, paint, blot, u, v, middle):
     """A framed picture in greys, for walls that a camera can be located by."""
     half_w, half_h, height = draw.uniform(0.2, 0.3), draw.uniform(0.18, 0.26), draw.uniform(1.42, 1.55)
     inside = np.maximum(np.abs(u - middle) - half_w, np.abs(v - height) - half_h)
-    blot = np.sign(_noise(draw, u.shape, 20))[..., None]
     paint[inside < 0.03] = linear((98, 94, 90))
     paint[inside < 0] = (linear((150, 150, 152)) * (1 + 0.25 * blot))[inside < 0]
