@@ -11,7 +11,8 @@ Progress = Callable[[int, int], None]
 
 
 def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_threshold: float = 0.5, min_area: float = 0.001,
-             max_masklets: int = 1000, min_views: int = 2, progress: Progress | None = None) -> np.ndarray:
+             max_masklets: int = 1000, min_views: int = 2, min_support: float = 0.5,
+              progress: Progress | None = None) -> np.ndarray:
     """Labels (T, H, W) int16 of the masklets of a sequence, -1 = none.
 
     frames (T, H, W, 3) uint8. For each frame t in order, each proposal that fills at least `min_area` (share of the
@@ -19,9 +20,10 @@ def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_thre
     t itself, REFERENCE 0.1) becomes a prompt, and the frame's prompts are tracked through the whole sequence. Proposals
     of one frame that repeat each other (IoU above kappa) count once, the better first.
 
-    Overlaps: a pixel belongs to the masklet with the best support, ties to the earlier. A masklet's support is the mean,
-    over the frames in which it is seen, of its best IoU with that frame's proposals: an object that the segmenter finds
-    again and again wins over a fragment or a merger that it found once.
+    Overlaps: a masklet's support is the mean, over the frames in which it is seen, of its best IoU with that frame's
+    proposals. A pixel belongs to the smallest masklet there (in mean area) whose support is at least `min_support`,
+    else to the best supported one. So what the segmenter finds again and again is cut out of what surrounds it, and a
+    fragment or a merger that it found once gives way.
 
     Then masklets seen in fewer than `min_views` frames (with `min_area` in each) are dropped and the rest renumbered in
     order of appearance; at most `max_masklets` are kept, the first found. `progress(done, total)` counts frames.
@@ -48,11 +50,13 @@ def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_thre
             progress(t + 1, count)
     for t in range(count):
         masks = np.unpackbits(proposals[t], axis=1, count=height * width).astype(bool)
-        support.append(iou_matrix(layers.at(t).reshape(layers.count, -1), masks).max(1, initial=0.0))
-    seen = np.stack([layers.area(t) for t in range(count)]) > 0
-    scores = np.stack(support) if layers.count else np.zeros((count, 0))
-    mean = (scores * seen).sum(0) / np.maximum(seen.sum(0), 1)
-    return clean_masklets(layers.flatten(np.argsort(-mean, kind="stable")), min_area=min_area, min_views=min_views)
+        support.append(iou_matrix(layers.at(t).reshape(-1, height * width), masks).max(1, initial=0.0))
+    area = np.stack([layers.area(t) for t in range(count)]) if layers.count else np.zeros((count, 0))
+    views = np.maximum((area > 0).sum(0), 1)
+    mean_support = (np.stack(support) * (area > 0)).sum(0) / views
+    trusted = mean_support >= min_support
+    order = np.lexsort((np.where(trusted, area.sum(0) / views, -mean_support), ~trusted))
+    return clean_masklets(layers.flatten(order), min_area=min_area, min_views=min_views)
 
 
 def iou_matrix(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -84,8 +88,9 @@ def clean_masklets(labels: np.ndarray, *, min_area: float = 0.001, min_views: in
 
 def _new(masks: np.ndarray, known: np.ndarray, threshold: float) -> np.ndarray:
     """The masks (M, H, W) whose IoU with all `known` (R, H, W), and with the better masks taken, is at most `threshold`."""
-    flat = masks.reshape(len(masks), -1)
-    free = iou_matrix(flat, known.reshape(len(known), -1)).max(1, initial=0.0) <= threshold
+    pixels = masks.shape[1] * masks.shape[2]
+    flat = masks.reshape(-1, pixels)
+    free = iou_matrix(flat, known.reshape(-1, pixels)).max(1, initial=0.0) <= threshold
     among = iou_matrix(flat, flat)
     taken: list[int] = []
     for m in np.flatnonzero(free):

@@ -35,17 +35,22 @@ PALETTE: dict[str, tuple[int, int, int]] = {
     "magenta": (216, 36, 168), "burgundy": (112, 18, 46), "rose": (236, 96, 136), "bronze": (150, 106, 46),
     "copper": (184, 106, 62), "silver": (192, 194, 198), "ivory": (246, 240, 222), "charcoal": (52, 54, 58),
 }
+BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
+"""the eleven basic colour terms"""
 _SYNONYMS = {"gray": "grey", "azure": "sky", "scarlet": "red", "aqua": "cyan", "fuchsia": "magenta", "golden": "gold",
              "silvery": "silver", "aquamarine": "turquoise", "amber": "gold", "chocolate": "dark brown", "mauve": "lilac",
              "plum": "dark purple", "ochre": "mustard", "rust": "dark orange", "emerald": "green", "ruby": "dark red",
-             "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy"}
+             "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy",
+             "rosy": "rose", "creamy": "cream", "rusty": "dark orange", "peachy": "peach"}
 _DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
 _PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
 _NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
 # Words of what surrounds the things in a room; they turn the extent's coordinate towards large regions.
-_SURROUNDINGS = {"wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "sky", "table",
+_SURROUNDINGS = {"wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "table",
                  "tabletop", "tablecloth", "curtain", "curtains", "desk", "counter", "countertop", "lawn"}
-_NOUN_SKY = "sky"
+# A colour word names a range: its point, and a darker and a lighter neighbour.
+_SPREAD = np.float32([[0, 0, 0], [-10, 0, 0], [10, 0, 0]])
+_SPREAD_WEIGHTS = np.float32([0.7, 0.15, 0.15])
 
 KERNEL_WIDTH = 22.0
 """CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or light"""
@@ -112,10 +117,10 @@ class ColourEmbedder:
         """Q texts -> (Q, E) float32 unit. Raises InputError for a text without a colour word, or with a negation."""
         out = np.zeros((len(texts), self.dim), np.float32)
         for row, text in zip(out, texts):
-            points = np.concatenate([self._colour(phrase) for phrase in self._phrases(text)])
-            weights = np.concatenate([np.full(3, 1.0) * (0.7, 0.15, 0.15)] * (len(points) // 3))
-            surroundings = bool(_SURROUNDINGS & set(_words(text)) - ({_NOUN_SKY} if _NOUN_SKY in text else set()))
-            row[:] = _joined(self._mean(points, weights), float(surroundings))
+            points = np.stack([self._colour(phrase) for phrase in self._phrases(text)])  # (colours, 3)
+            spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
+            weights = np.tile(_SPREAD_WEIGHTS, len(points))
+            row[:] = _joined(self._mean(spread.astype(np.float32), weights), float(bool(_SURROUNDINGS & set(_words(text)))))
         return out
 
     def _mean(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -126,25 +131,22 @@ class ColourEmbedder:
 
     def _phrases(self, text: str) -> list[list[str]]:
         """Splits a text into runs of modifiers and colour words, one run a colour."""
-        words = _words(text)
+        words = _words(text, separators=True)
         if _NEGATION & set(words):
             raise InputError(f"query {text!r}", found="a negation", expected="the colours that the thing has",
                              remedy="Say what colour it is, instead of what it is not.")
         phrases: list[list[str]] = []
         modifiers: list[str] = []
-        run_open = False
+        run_open = False  # the last word was a colour
         for word in words:
-            base, _ = self._base(word)
-            if base is not None:
-                if run_open:
-                    phrases[-1] += [*modifiers, word]
+            if self._base(word)[0] is not None:
+                if run_open:  # 'blue green', 'orange-red': one colour between the two
+                    phrases[-1].append(word)
                 else:
                     phrases.append([*modifiers, word])
                 modifiers, run_open = [], True
             elif word in _DARK | _LIGHT | _PLAIN:
-                if run_open:
-                    run_open = False
-                modifiers.append(word)
+                modifiers, run_open = [*modifiers, word], False
             else:
                 modifiers, run_open = [], False
         if not phrases:
@@ -161,16 +163,17 @@ class ColourEmbedder:
         word = _SYNONYMS.get(word, word)
         if word in self._by_name:
             return word, False
-        if word.endswith(("ish", "y")):
-            stem = word[:-3] if word.endswith("ish") else word[:-1]
-            for candidate in (stem, stem + "e", stem[:-1], stem[:-1] + "e"):  # reddish, bluish, ...
+        if word.endswith("ish"):
+            stem = word[:-3]
+            doubled = [stem[:-1]] if len(stem) > 3 and stem[-1] == stem[-2] else []  # reddish
+            for candidate in (stem, stem + "e", *doubled):
                 candidate = _SYNONYMS.get(candidate, candidate)
-                if candidate in self._by_name and len(stem) >= 3:
+                if candidate in self._by_name:
                     return candidate, True
         return None, False
 
     def _colour(self, phrase: list[str]) -> np.ndarray:
-        """A run like [dark, bluish, green] -> (3, 3) CIELAB: the colour and a darker and a lighter neighbour."""
+        """A run like [dark, bluish, green] -> (3,) CIELAB."""
         found = [self._base(word) for word in phrase]
         names = [(base, ish) for base, ish in found if base is not None]
         dark, light = bool(_DARK & set(phrase)), bool(_LIGHT & set(phrase))
@@ -181,13 +184,13 @@ class ColourEmbedder:
             if shaded is None:
                 shaded = self._by_name[base] + np.float32([-22.0 if dark else 22.0 if light else 0.0, 0.0, 0.0])
             points.append(shaded)
-            weights.append(0.5 if ish else 1.0)
+            # 'bluish green' is more green than blue; 'navy blue' is navy, its basic term only says what kind navy is.
+            weights.append(0.25 if base in BASIC and weights and names[0][0] not in BASIC else 0.5 if ish else 1.0)
         weight = np.asarray(weights, np.float32)[:, None]
         mixed = (np.stack(points) * weight).sum(0) / weight.sum()
         if all(ish for _, ish in names):
             mixed = mixed * np.float32([1.0, 0.7, 0.7])  # 'greenish' is greener than grey, not green
-        spread = np.float32([[0, 0, 0], [-10, 0, 0], [10, 0, 0]])
-        return np.clip(mixed + spread, [0, -128, -128], [100, 128, 128]).astype(np.float32)
+        return mixed.astype(np.float32)
 
 
 def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -221,5 +224,6 @@ def _without_shadow_and_shine(lab: np.ndarray) -> np.ndarray:
     return lab[(lab[:, 0] >= low) & (lab[:, 0] <= high)]
 
 
-def _words(text: str) -> list[str]:
-    return [w for w in re.split(r"[^a-z]+", text.lower().replace("'", "")) if w]
+def _words(text: str, *, separators: bool = False) -> list[str]:
+    """Lower-case words; with `separators`, also commas, semicolons, slashes and ampersands, which end a colour."""
+    return re.findall(r"[a-z]+|[,;/&+]" if separators else r"[a-z]+", text.lower().replace("'", ""))

@@ -51,13 +51,13 @@ class GeometricTracker:
     """
 
     def __init__(self, gaussians: Gaussians, cameras: Camera, proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
-                 *, atoms_per_frame: int = 256, proposal_share: float = 0.5, atom_share: float = 0.6,
+                 *, atoms_per_frame: int = 256, proposal_share: float = 0.4, atom_share: float = 0.6,
                  contradiction: float = 0.2, known_share: float = 0.3, capacity: int | None = None):
         require(0 < atoms_per_frame, "atoms_per_frame", got=atoms_per_frame, expected="at least 1",
                 remedy="Use about 200 for small frames.")
         self.gaussians, self.cameras, self.capacity = gaussians, cameras, capacity
         self.proposal_share, self.atom_share = proposal_share, atom_share
-        self.contradiction, self.known_share = contradiction, known_share
+        self.contradiction, self.known_share, self.glimpse = contradiction, known_share, 0.5
         self.atoms_per_frame = atoms_per_frame
         self._propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: dict[int, _View] = {}
@@ -76,17 +76,25 @@ class GeometricTracker:
         if not len(prompts):
             return labels
         start = self.view(frames, index)
-        mine = labels[index][None] == np.arange(len(prompts), dtype=np.int16)[:, None, None]
-        evidence = start.votes @ _coverage(start.atoms, mine, start.votes.shape[1]).T
-        seen = np.repeat(np.asarray(start.votes.sum(1), np.float32), len(prompts), axis=1)
+        classes = self._with_rivals(labels[index], index, len(prompts))
+        evidence = start.votes @ _coverage(start.atoms, classes, start.votes.shape[1]).T
         for t in sorted((t for t in range(count) if t != index), key=lambda t: (abs(t - index), t < index)):
             view = self.view(frames, t)
-            owner = self._match(view, evidence, seen)
-            labels[t] = owner[view.atoms]
-            onehot = (owner[:, None] == np.arange(len(prompts))).astype(np.float32)
-            evidence += view.votes @ onehot
-            seen += np.asarray(view.votes.sum(1), np.float32) * (onehot.sum(0) > 0)
+            owner = self._match(view, evidence)
+            labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[view.atoms]
+            evidence += view.votes @ (owner[:, None] == np.arange(len(classes))).astype(np.float32)
         return labels
+
+    def _with_rivals(self, labels: np.ndarray, index: int, count: int) -> np.ndarray:
+        """(B + C, H, W) bool: the prompts, and what they share the frame with: its other proposals, and the rest."""
+        classes = [labels == b for b in range(count)]
+        free = labels < 0
+        for mask in np.asarray(self._propose(index), bool):
+            rival = mask & free
+            if rival.any():
+                classes.append(rival)
+                free &= ~rival
+        return np.stack([*classes, free])
 
     def view(self, frames: np.ndarray, t: int) -> _View:
         """The frame's atoms and votes; computed once."""
@@ -101,28 +109,30 @@ class GeometricTracker:
             self._views[t] = _View(atoms, matrix, matrix.T.tocsr(), _coverage(atoms, masks, number))
         return self._views[t]
 
-    def _match(self, view: _View, evidence: np.ndarray, seen: np.ndarray) -> np.ndarray:
-        """The prompt (A,) int16 that owns each atom of a view, -1 = none."""
-        known = seen > 1e-3
-        owned = np.where(known, evidence / np.where(known, seen, 1.0), 0.0)
-        mass, known_mass = view.to_atoms @ owned, view.to_atoms @ known.astype(np.float32)  # (A, B)
+    def _match(self, view: _View, evidence: np.ndarray) -> np.ndarray:
+        """The class (A,) that owns each atom of a view, -1 = none; evidence (N, B + C)."""
+        seen = evidence.sum(1, keepdims=True)
+        here = np.asarray(view.votes.sum(1), np.float32)
+        # What a Gaussian has cast so far against what it casts here: one that was only glimpsed tells nothing yet.
+        known = np.minimum(seen / np.maximum(self.glimpse * here, 1e-3), 1.0)
+        # Gaussians on an outline lean into the neighbours: squares side with the majority.
+        owned = np.square(evidence)
+        owned *= known / np.maximum(owned.sum(1, keepdims=True), 1e-12)
+        mass, known_mass = view.to_atoms @ owned, view.to_atoms @ known  # (A, B + C), (A, 1)
         total = np.asarray(view.to_atoms.sum(1), np.float32)  # (A, 1)
         atom_share = mass / np.maximum(known_mass, 1e-6)
-        atom_known = known_mass / np.maximum(total, 1e-6)
+        atom_sure = (known_mass >= self.known_share * total)[:, 0]
+        share = (view.proposals @ mass) / np.maximum(view.proposals @ known_mass, 1e-6)  # (M, B + C)
+        sure = (view.proposals @ known_mass >= self.known_share * (view.proposals @ total))[:, 0]
 
-        share = (view.proposals @ mass) / np.maximum(view.proposals @ known_mass, 1e-6)
-        certain = (view.proposals @ known_mass) / np.maximum(view.proposals @ total, 1e-6)
-        share = np.where(certain >= self.known_share, share, 0.0)  # (M, B)
-        winner = share.argmax(1) if len(share) else np.zeros(0, np.int64)
-        score = np.where((atom_share >= self.atom_share) & (atom_known >= self.known_share), atom_share, 0.0)
-        for m, b in enumerate(winner):
-            if share[m, b] < self.proposal_share:
-                continue
-            against = (atom_share[:, b] < self.contradiction) & (atom_known[:, b] >= self.known_share)
-            inside = (view.proposals[m] > 0.5) & ~against
-            score[inside, b] = np.maximum(score[inside, b], share[m, b])
-        best = score.argmax(1)
-        return np.where(score[np.arange(len(best)), best] > 0, best, -1).astype(np.int16)
+        owner = np.where(atom_sure & (atom_share.max(1) >= self.atom_share), atom_share.argmax(1), -1)
+        strongest = np.where(sure, share.max(1), 0.0) if len(share) else np.zeros(0)
+        for m in np.argsort(strongest, kind="stable"):
+            b = share[m].argmax()
+            if strongest[m] >= self.proposal_share:
+                against = atom_sure & (atom_share[:, b] < self.contradiction) & (atom_share.max(1) >= self.atom_share)
+                owner[(view.proposals[m] > 0.5) & ~against] = b
+        return owner
 
 
 def image_atoms(frame: np.ndarray, masks: np.ndarray, *, count: int, smallest: int = 12) -> np.ndarray:
