@@ -13,7 +13,6 @@ import numpy as np
 from jsecon.data.synthetic.shapes import SHAPES, reach
 from jsecon.data.synthetic.solids import Solid, box, place, rotation
 from jsecon.errors import require
-from jsecon.types import Array
 
 PALETTE = {
     "dark green": (18, 92, 42),
@@ -64,7 +63,7 @@ class Texture:
     """period, m."""
     depth: float
     """amplitude, 0 to 1."""
-    phase: Array
+    phase: np.ndarray
     """(3,) shift, m."""
 
 
@@ -76,7 +75,7 @@ class Part:
     hollow: Solid | None
     owner: int
     """index of its object; -1 = furniture."""
-    albedo: Array
+    albedo: np.ndarray
     """(3,) linear RGB."""
 
 
@@ -88,9 +87,9 @@ class RoomObject:
     """colour + shape: "dark green bottle"; unique in its room."""
     colour: str
     shape: str
-    centre: Array
+    centre: np.ndarray
     """(3,) where it touches the table, world."""
-    axes: Array
+    axes: np.ndarray
     """(3, 3) columns are its axes in the world."""
     radius: float
     """of a circle around its footprint, m."""
@@ -105,11 +104,11 @@ class Room:
     objects: tuple[RoomObject, ...]
     furniture: tuple[Part, ...]
     """the table's top first, then its legs."""
-    half: Array
+    half: np.ndarray
     """(2,) half the room's width and depth, m; walls at +-half."""
     ceiling: float
     """z of the ceiling; the floor is at -TABLE_HEIGHT."""
-    light: Array
+    light: np.ndarray
     """(3,) centre of the square lamp under the ceiling."""
     light_half: float
     """half the lamp's side, m."""

@@ -12,8 +12,6 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.types import Array
-
 _NEVER = np.float32(1e30)
 _TINY = np.float32(1e-20)
 
@@ -22,15 +20,15 @@ _TINY = np.float32(1e-20)
 class Solid:
     """One convex solid with its pose."""
 
-    quadric: Array
+    quadric: np.ndarray
     """(5,) q, l, g of q0 x^2 + q1 y^2 + q2 z^2 + 2 l z + g <= 0 in the solid's own frame; q = 0, g < 0 for none."""
-    planes: Array
+    planes: np.ndarray
     """(k, 4) outward unit normals and offsets in the solid's own frame: inside where n . p <= offset."""
-    axes: Array
+    axes: np.ndarray
     """(3, 3) columns are the solid's axes in the parent frame: a rotation."""
-    centre: Array
+    centre: np.ndarray
     """(3,) origin of the solid's frame in the parent frame."""
-    bound: Array
+    bound: np.ndarray
     """(4,) centre (parent frame) and radius of a sphere around the solid."""
     nappe: float = 0.0
     """dr/dz of a cone, whose mirror image beyond the apex is not part of the solid; 0 for anything else."""

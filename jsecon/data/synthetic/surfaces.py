@@ -9,18 +9,17 @@ from jaxtyping import Float
 
 from jsecon.data.synthetic.light import LAMP, LIFT, SKY, contact, direct, lamp_points, lamp_visibility
 from jsecon.data.synthetic.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Room, Texture, linear
-from jsecon.types import Array
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plane:
     """A flat surface baked into a picture: radiance[v, u] at origin + u texel first + v texel second."""
 
-    origin: Array
-    first: Array
-    second: Array
+    origin: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
     texel: float
-    radiance: Array
+    radiance: np.ndarray
 
     def look_up(self, points):
         height, width = self.radiance.shape[:2]
