@@ -30,7 +30,9 @@ def ring_poses(count: int, radius: float = 3.0) -> np.ndarray:
     poses = np.tile(np.eye(4), (count, 1, 1))
     for index, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        roll = np.array([[np.cos(0.3 * index), -np.sin(0.3 * index), 0], [np.sin(0.3 * index), np.cos(0.3 * index), 0], [0, 0, 1]])
+        roll = np.array(
+            [[np.cos(0.3 * index), -np.sin(0.3 * index), 0], [np.sin(0.3 * index), np.cos(0.3 * index), 0], [0, 0, 1]]
+        )
         poses[index, :3, :3] = roll @ turn
         poses[index, :3, 3] = 0, 0, radius
     return poses
@@ -129,5 +131,10 @@ def png(rows: np.ndarray, *, bits: int, colour_type: int, palette: bytes = b"") 
     packed = np.packbits(binary.reshape(height, width * bits).astype(np.uint8), axis=1)
     scanlines = b"".join(b"\0" + row.tobytes() for row in packed)
     header = struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0)
-    chunks = [(b"IHDR", header), *([(b"PLTE", palette)] if palette else []), (b"IDAT", zlib.compress(scanlines)), (b"IEND", b"")]
+    chunks = [
+        (b"IHDR", header),
+        *([(b"PLTE", palette)] if palette else []),
+        (b"IDAT", zlib.compress(scanlines)),
+        (b"IEND", b""),
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*pair) for pair in chunks)

@@ -114,8 +114,21 @@ def test_depth_maps(tmp_path):
 
 
 def test_points_from_a_ply(tmp_path):
-    lines = ["ply", "format ascii 1.0", "element vertex 2", "property float x", "property float y", "property float z",
-             "property uchar red", "property uchar green", "property uchar blue", "end_header", "1 2 3 4 5 6", "-1 0.5 0 7 8 9", ""]
+    lines = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 2",
+        "property float x",
+        "property float y",
+        "property float z",
+        "property uchar red",
+        "property uchar green",
+        "property uchar blue",
+        "end_header",
+        "1 2 3 4 5 6",
+        "-1 0.5 0 7 8 9",
+        "",
+    ]
     (tmp_path / "sparse.ply").write_text("\n".join(lines))
     loaded = load_changed(tmp_path, lambda content: content.update(ply_file_path="sparse.ply"))
     np.testing.assert_array_equal(loaded.points, np.array([[1, 2, 3], [-1, 0.5, 0]], np.float32))

@@ -12,7 +12,25 @@ from jsecon.errors import InputError
 from jsecon.types import Gaussians
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-NAMES = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+NAMES = [
+    "x",
+    "y",
+    "z",
+    "nx",
+    "ny",
+    "nz",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+]
 
 
 def random_gaussians(count: int, basis: int = 4) -> Gaussians:
@@ -21,7 +39,9 @@ def random_gaussians(count: int, basis: int = 4) -> Gaussians:
     return Gaussians(*(jnp.asarray(rng.normal(size=shape) * 10, jnp.float32) for shape in shapes))
 
 
-def write(path, columns: dict, form: str = "binary_little_endian", types: dict | None = None, extra: str = "", cut: int = 0) -> None:
+def write(
+    path, columns: dict, form: str = "binary_little_endian", types: dict | None = None, extra: str = "", cut: int = 0
+) -> None:
     """A .ply of these columns, header and all, apart from the writer under test."""
     order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}[form]
     types = types or {}
@@ -31,7 +51,10 @@ def write(path, columns: dict, form: str = "binary_little_endian", types: dict |
     for name, values in columns.items():
         table[name] = values
     properties = [f"property {types.get(name, 'float')} {name}" for name in columns]
-    header = "\n".join(["ply", f"format {form} 1.0", "comment of mine", f"element vertex {count}", *properties]) + f"\n{extra}end_header\n"
+    header = (
+        "\n".join(["ply", f"format {form} 1.0", "comment of mine", f"element vertex {count}", *properties])
+        + f"\n{extra}end_header\n"
+    )
     text = "\n".join(" ".join(repr(value.item()) for value in row) for row in table) + "\n"
     body = text.encode() if form == "ascii" else table.tobytes()
     path.write_bytes(header.encode() + body[: len(body) - cut])
@@ -144,7 +167,13 @@ def test_cut_short(tmp_path, form):
 
 @pytest.mark.parametrize(
     ("name", "value", "field"),
-    [("y", np.nan, "means"), ("scale_1", np.inf, "log_scales"), ("rot_0", np.nan, "quaternions"), ("opacity", np.nan, "opacity_logits"), ("f_dc_2", -np.inf, "sh")],
+    [
+        ("y", np.nan, "means"),
+        ("scale_1", np.inf, "log_scales"),
+        ("rot_0", np.nan, "quaternions"),
+        ("opacity", np.nan, "opacity_logits"),
+        ("f_dc_2", -np.inf, "sh"),
+    ],
 )
 def test_numbers_that_are_none(tmp_path, name, value, field):
     given = columns()
@@ -197,10 +226,16 @@ def test_missing_file_and_unwritable_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "values"), [("uchar", [0, 51, 255]), ("ushort", [0, 51 * 257, 65535]), ("float", [0.0, 0.2, 1.0]), ("double", [0, 51, 255])]
+    ("kind", "values"),
+    [("uchar", [0, 51, 255]), ("ushort", [0, 51 * 257, 65535]), ("float", [0.0, 0.2, 1.0]), ("double", [0, 51, 255])],
 )
 def test_plain_points(tmp_path, kind, values):
-    given = {"x": np.arange(3.0), "y": np.ones(3), "z": -np.arange(3.0), **dict.fromkeys(("red", "green", "blue"), np.array(values))}
+    given = {
+        "x": np.arange(3.0),
+        "y": np.ones(3),
+        "z": -np.arange(3.0),
+        **dict.fromkeys(("red", "green", "blue"), np.array(values)),
+    }
     write(tmp_path / "p.ply", given, types={**dict.fromkeys(("red", "green", "blue"), kind), "x": "double"})
     points, colours = load_points_ply(tmp_path / "p.ply")
     np.testing.assert_array_equal(points, np.stack([given[axis] for axis in "xyz"], -1).astype(np.float32))

@@ -145,7 +145,9 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
 def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
     """Polygons (K, 2), integer x y, without holes, whose `polygon_mask`s OR-ed are the mask exactly."""
     polygons = []
-    contours, tree = cv2.findContours(np.asarray(mask, np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    image = np.ascontiguousarray(mask, np.uint8)
+    _, labels = cv2.connectedComponents(image, connectivity=8)
+    contours, tree = cv2.findContours(image, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     for contour, (_, _, hole, parent) in zip(contours, tree[0] if tree is not None else ()):
         if parent >= 0:
             continue
@@ -153,11 +155,18 @@ def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
         if hole < 0:
             polygons.append(outline)
             continue
-        # Cut through the first hole, above and below its middle row: it opens into a notch of either part.
-        piece = polygon_mask(outline, mask.shape[1], mask.shape[0]) & mask
-        cut = int(contours[hole][:, 0, 1].min() + contours[hole][:, 0, 1].max() + 1) // 2
-        for part in (np.arange(len(mask)) < cut, np.arange(len(mask)) >= cut):
-            polygons += mask_polygons(piece & part[:, None])
+        # Cut along the middle row of a hole: it opens into a notch of either part. The hole nearest to the piece's own
+        # middle, so that many holes are halved at each cut.
+        cuts = []
+        while hole >= 0:
+            rows = contours[hole][:, 0, 1]
+            cuts.append(int(rows.min() + rows.max() + 1) // 2)
+            hole = tree[0][hole][0]
+        cut = min(cuts, key=lambda row: abs(2 * row - outline[:, 1].min() - outline[:, 1].max()))
+        x, y, width, height = cv2.boundingRect(outline)
+        piece = labels[y : y + height, x : x + width] == labels[outline[0, 1], outline[0, 0]]
+        polygons += [polygon + [x, y] for polygon in mask_polygons(piece[: cut - y])]
+        polygons += [polygon + [x, cut] for polygon in mask_polygons(piece[cut - y :])]
     return polygons
 
 
