@@ -165,8 +165,9 @@ def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
         cut = min(cuts, key=lambda row: abs(2 * row - outline[:, 1].min() - outline[:, 1].max()))
         x, y, width, height = cv2.boundingRect(outline)
         piece = labels[y : y + height, x : x + width] == labels[outline[0, 1], outline[0, 0]]
-        polygons += [polygon + [x, y] for polygon in mask_polygons(piece[: cut - y])]
-        polygons += [polygon + [x, cut] for polygon in mask_polygons(piece[cut - y :])]
+        upper, lower = piece[: cut - y], piece[cut - y :]
+        polygons += [polygon + np.array([x, y]) for polygon in mask_polygons(upper)]
+        polygons += [polygon + np.array([x, cut]) for polygon in mask_polygons(lower)]
     return polygons
 
 
