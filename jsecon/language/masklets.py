@@ -11,52 +11,89 @@ Progress = Callable[[int, int], None]
 
 
 def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_threshold: float = 0.5, min_area: float = 0.001,
-             max_masklets: int = 1000, min_views: int = 2, min_support: float = 0.5,
-              progress: Progress | None = None) -> np.ndarray:
+             max_masklets: int = 1000, min_views: int = 2, min_support: float = 0.5, join_rate: float = 0.5,
+             progress: Progress | None = None) -> np.ndarray:
     """Labels (T, H, W) int16 of the masklets of a sequence, -1 = none.
 
     frames (T, H, W, 3) uint8. For each frame t in order, each proposal that fills at least `min_area` (share of the
     frame) and whose IoU with every masklet's mask at t is at most `iou_threshold` (the paper's kappa; IoU taken at frame
     t itself, REFERENCE 0.1) becomes a prompt, and the frame's prompts are tracked through the whole sequence. Proposals
-    of one frame that repeat each other (IoU above kappa) count once, the better first.
+    of one frame that repeat each other (IoU above kappa) count once, the better first. At most `max_masklets`, the first
+    found, are tracked. `progress(done, total)` counts frames.
 
-    Overlaps: a masklet's support is the mean, over the frames in which it is seen, of its best IoU with that frame's
-    proposals. A pixel belongs to the smallest masklet there (in mean area) whose support is at least `min_support`,
-    else to the best supported one. So what the segmenter finds again and again is cut out of what surrounds it, and a
-    fragment or a merger that it found once gives way.
-
-    Then masklets seen in fewer than `min_views` frames (with `min_area` in each) are dropped and the rest renumbered in
-    order of appearance; at most `max_masklets` are kept, the first found. `progress(done, total)` counts frames.
+    Parts: of the frames that show two masklets, if more than `join_rate` hold both in one proposal, they are joined
+    (`joined`; 1 leaves that out). Overlaps: a masklet's support is the mean, over the frames that show it, of its best
+    IoU with that frame's proposals. A pixel belongs to the smallest masklet there (in mean area) whose support is at
+    least `min_support`, else to the best supported one. So what the segmenter finds again and again is cut out of what
+    surrounds it, and a fragment or a merger that it found once gives way. Last, `clean_masklets`.
     """
     require(frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8, "frames",
             got=(frames.shape, frames.dtype), expected="(T, H, W, 3) uint8", remedy="Stack RGB frames of one size.")
     count, height, width = frames.shape[:3]
-    proposals = []
+    proposals = _Layers(count, height, width)
     layers = _Layers(count, height, width)
-    support: list[np.ndarray] = []
     for t in range(count):
         masks = np.asarray(segment(frames[t], t), bool)
         require(masks.ndim == 3 and masks.shape[1:] == (height, width), "segment", got=masks.shape,
                 expected=f"(M, {height}, {width})", remedy="A segmenter returns masks of the frame's own size.")
         masks = masks[masks.sum((1, 2)) >= max(min_area * height * width, 1)]
-        proposals.append(np.packbits(masks.reshape(len(masks), -1), axis=1))
-        prompts = _new(masks, layers.at(t), iou_threshold)[:max(max_masklets - layers.count, 0)]
+        proposals.add_at(t, masks)
+        prompts = _new(masks, layers.at(t), iou_threshold)[:max(max_masklets - layers.size(t), 0)]
         if len(prompts):
             labels = np.asarray(track(frames, t, prompts))
             require(labels.shape == (count, height, width), "track", got=labels.shape,
                     expected=str((count, height, width)), remedy="A tracker returns one label image a frame.")
-            layers.add(labels, len(prompts))
+            for other, image in enumerate(labels):
+                layers.add_at(other, image[None] == np.arange(len(prompts))[:, None, None])
         if progress is not None:
             progress(t + 1, count)
-    for t in range(count):
-        masks = np.unpackbits(proposals[t], axis=1, count=height * width).astype(bool)
-        support.append(iou_matrix(layers.at(t).reshape(-1, height * width), masks).max(1, initial=0.0))
-    area = np.stack([layers.area(t) for t in range(count)]) if layers.count else np.zeros((count, 0))
-    views = np.maximum((area > 0).sum(0), 1)
-    mean_support = (np.stack(support) * (area > 0)).sum(0) / views
-    trusted = mean_support >= min_support
-    order = np.lexsort((np.where(trusted, area.sum(0) / views, -mean_support), ~trusted))
+    if not layers.size(0):
+        return np.full((count, height, width), -1, np.int16)
+    layers, area, support = joined(layers, proposals, join_rate=join_rate)
+    order = np.lexsort((np.where(support >= min_support, area, -support), support < min_support))
     return clean_masklets(layers.flatten(order), min_area=min_area, min_views=min_views)
+
+
+def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
+    """The masklets with the parts of one object joined, their mean area (R,) px and their support (R,).
+
+    Two masklets count as one object in a frame if some proposal there covers more than half of each; they are joined,
+    the most agreed pairs first, where that holds in more than `join_rate` of the frames (two at least) that show both:
+    the view consensus of mask clustering (Yan et al., CVPR 2024), between tracks instead of single masks.
+    """
+    while True:
+        together, both, area, support = _agreement(layers, proposals)
+        rate = np.where(both >= 2, together / np.maximum(both, 1), 0.0)
+        np.fill_diagonal(rate, 0.0)
+        groups = np.arange(len(rate))
+        free = np.ones(len(rate), bool)
+        rows, columns = np.nonzero(np.triu(rate > join_rate))
+        for k in np.lexsort((-both[rows, columns], -rate[rows, columns])):
+            a, b = rows[k], columns[k]
+            if free[a] and free[b]:  # one join a round: the next round counts anew with the union
+                groups[b] = a
+                free[a] = free[b] = False
+        if np.array_equal(groups, np.arange(len(rate))):
+            return layers, area, support
+        layers = layers.grouped(groups)
+
+
+def _agreement(layers: "_Layers", proposals: "_Layers"
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support."""
+    together, both, area, support, views = 0.0, 0.0, 0.0, 0.0, 0.0
+    for t in range(layers.count):
+        masks, proposed = layers.flat(t), proposals.flat(t)
+        size = masks.sum(1)
+        shared = masks @ proposed.T  # (R, M)
+        shown = (size > 0).astype(np.float32)
+        covered = (shared > 0.5 * size[:, None]).astype(np.float32)
+        union = size[:, None] + proposed.sum(1) - shared
+        together = together + (covered @ covered.T > 0)
+        both = both + shown[:, None] * shown
+        area, views = area + size, views + shown
+        support = support + (shared / np.maximum(union, 1.0)).max(1, initial=0.0)
+    return together, both, area / np.maximum(views, 1.0), support / np.maximum(views, 1.0)
 
 
 def iou_matrix(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -100,33 +137,39 @@ def _new(masks: np.ndarray, known: np.ndarray, threshold: float) -> np.ndarray:
 
 
 class _Layers:
-    """Masklets before their overlaps are resolved: one bit a pixel, since hundreds of them overlap."""
+    """Masks of many things in every frame, free to overlap: one bit a pixel, since there are hundreds."""
 
     def __init__(self, count: int, height: int, width: int):
-        self.shape = (height, width)
-        self.count = 0
-        self._bits: list[list[np.ndarray]] = [[] for _ in range(count)]
+        self.count, self.shape = count, (height, width)
+        self._bits = [np.zeros((0, -(-height * width // 8)), np.uint8) for _ in range(count)]
 
-    def add(self, labels: np.ndarray, number: int) -> None:
-        for t, image in enumerate(labels):
-            masks = image.reshape(-1)[None] == np.arange(number)[:, None]
-            self._bits[t].append(np.packbits(masks, axis=1))
-        self.count += number
+    def size(self, t: int) -> int:
+        return len(self._bits[t])
+
+    def add_at(self, t: int, masks: np.ndarray) -> None:
+        """Appends masks (M, H, W) bool to frame t."""
+        packed = np.packbits(masks.reshape(len(masks), self.shape[0] * self.shape[1]), axis=1)
+        self._bits[t] = np.concatenate([self._bits[t], packed])
 
     def at(self, t: int) -> np.ndarray:
-        """(R, H, W) bool masks of all masklets at frame t."""
-        if not self._bits[t]:
-            return np.zeros((0, *self.shape), bool)
-        bits = np.concatenate(self._bits[t])
-        return np.unpackbits(bits, axis=1, count=self.shape[0] * self.shape[1]).astype(bool).reshape(-1, *self.shape)
+        """(R, H, W) bool masks at frame t."""
+        bits = np.unpackbits(self._bits[t], axis=1, count=self.shape[0] * self.shape[1])
+        return bits.view(bool).reshape(-1, *self.shape)
 
-    def area(self, t: int) -> np.ndarray:
-        """(R,) pixels of all masklets at frame t."""
-        return self.at(t).sum((1, 2))
+    def flat(self, t: int) -> np.ndarray:
+        """(R, H W) float32 masks at frame t, for matrix products."""
+        return self.at(t).reshape(self.size(t), -1).astype(np.float32)
+
+    def grouped(self, groups: np.ndarray) -> "_Layers":
+        """The layers with those of one group (R,) united, in the order of the groups."""
+        result = _Layers(self.count, *self.shape)
+        kept = np.unique(groups)
+        result._bits = [np.stack([np.bitwise_or.reduce(bits[groups == g], axis=0) for g in kept]) for bits in self._bits]
+        return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:
         """(T, H, W) int16 labels: the first in `best_first` that covers a pixel owns it."""
-        labels = np.full((len(self._bits), *self.shape), -1, np.int16)
+        labels = np.full((self.count, *self.shape), -1, np.int16)
         for t, image in enumerate(labels):
             masks = self.at(t)
             for masklet in best_first[::-1]:

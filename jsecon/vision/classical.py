@@ -23,11 +23,11 @@ Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | 
 class ClassicalSegmenter:
     """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units (a just noticeable step is ~2)."""
 
-    merge_distance: float = 11.0
+    merge_distance: float = 13.0
     """neighbours less dissimilar than this are one region, CIELAB units"""
     lightness_weight: float = 0.5
     """weight of L beside a and b: shading and soft shadows change L"""
-    smoothing: float = 12.0
+    smoothing: float = 20.0
     """colour radius of the mean-shift filter, 8-bit units; 0 leaves it out"""
     min_area: float = 0.0012
     """smaller regions are given to their most alike neighbour or dropped; share of the frame"""
