@@ -1,4 +1,4 @@
-"""A complete small field, made by the library itself: the 64 Gaussians of `scene` in five regions, votes from four views."""
+"""A complete small field made by the library itself: the 64 Gaussians of `scene`, five regions, votes of four views."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""query_one_step against NumPy float64, where jax has been silently wrong (STYLE trap 1), and at the ends of the floats."""
+"""query_one_step against NumPy float64, where jax was silently wrong (STYLE trap 1), and at the ends of the floats."""
 
 import jax
 import jax.numpy as jnp

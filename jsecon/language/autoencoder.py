@@ -63,8 +63,7 @@ class Autoencoder:
         )
         units = normalize(jnp.asarray(embeddings))
         rows = units.reshape(-1, self.dim)
-        codes = _Encoder(_widths(self.encoder["params"])).apply(self.encoder, rows, train=False)
-        codes = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
+        codes = _encode(self.encoder, rows)
         return codes.reshape(*units.shape[:-1], self.latent)
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
@@ -77,7 +76,7 @@ class Autoencoder:
             remedy="Decode codes of this autoencoder.",
         )
         codes = jnp.asarray(codes)
-        rows = _Decoder(_widths(self.decoder["params"])).apply(self.decoder, codes.reshape(-1, self.latent))
+        rows = _decode(self.decoder, codes.reshape(-1, self.latent))
         return rows.reshape(*codes.shape[:-1], self.dim)
 
 
@@ -180,7 +179,8 @@ def train_autoencoder(
         if progress is not None:
             jax.block_until_ready(carry)
             progress(stop, total)
-    _, params, stats = carry[1]
+    _, vector, stats = carry[1]
+    params = _unflatten(vector, _shapes(units, plan)[0])
     return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
 
 
@@ -197,42 +197,38 @@ class _Plan(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _start(units: Array, key: Key, plan: _Plan) -> Any:
-    """((params, batch statistics, Adam's moments), best so far: (loss, params, batch statistics))."""
-    codes = jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
-    # eval_shape: the modules' own initialisers never run, as one draw for all layers compiles several times faster.
+    """((parameters as one vector, batch statistics, Adam's moments), best so far: (loss, vector, batch statistics))."""
+    shapes, stats = _shapes(units, plan)
+    middle, spread = [], []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
+        part, name, kind = (step.key for step in path)
+        norm = name.startswith("BatchNorm")
+        middle.append(np.full(leaf.size, float(norm and kind == "scale")))
+        # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
+        spread.append(np.full(leaf.size, 0.0 if norm else shapes[part][name]["kernel"].shape[0] ** -0.5))
+    middle, spread = (jnp.asarray(np.concatenate(values), units.dtype) for values in (middle, spread))
+    # One draw for all layers compiles several times faster than flax's initialisers, a draw a layer.
+    vector = middle + spread * jax.random.uniform(key, middle.shape, units.dtype, -1.0, 1.0)
+    stats = {
+        name: {"mean": jnp.zeros_like(norm["mean"]), "var": jnp.ones_like(norm["var"])} for name, norm in stats.items()
+    }
+    moments = optax.adam(plan.learning_rate).init(vector)
+    return (vector, stats, moments), (jnp.asarray(jnp.inf, units.dtype), vector, stats)
+
+
+def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
+    """Shapes of the parameters {"encoder", "decoder"} and of the batch statistics."""
+    key, codes = jax.random.key(0), jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
     first = jax.eval_shape(lambda: _Encoder(plan.encoder_widths).init(key, units[:1], train=False))
     second = jax.eval_shape(lambda: _Decoder(plan.decoder_widths).init(key, codes))
-    shapes = {"encoder": first["params"], "decoder": second["params"]}
-    draws = jax.random.uniform(key, (sum(leaf.size for leaf in jax.tree.leaves(shapes)),), units.dtype, -1.0, 1.0)
-
-    def layers(shapes, used=0):
-        params = {}
-        for name, layer in shapes.items():
-            params[name] = {}
-            for part, leaf in layer.items():
-                if name.startswith("BatchNorm"):
-                    params[name][part] = jnp.full(leaf.shape, part == "scale", leaf.dtype)
-                    continue
-                # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
-                inputs = layer["kernel"].shape[0]
-                params[name][part] = draws[used : used + leaf.size].reshape(leaf.shape) * inputs**-0.5
-                used += leaf.size
-        return params, used
-
-    params = {}
-    params["encoder"], used = layers(shapes["encoder"])
-    params["decoder"], _ = layers(shapes["decoder"], used)
-    stats = {
-        name: {"mean": jnp.zeros_like(norm["bias"]), "var": jnp.ones_like(norm["scale"])}
-        for name, norm in params["encoder"].items()
-        if name.startswith("BatchNorm")
-    }
-    moments = _optimizer(plan).init(params)
-    return (params, stats, moments), (jnp.asarray(jnp.inf, units.dtype), params, stats)
+    return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
 
 
-def _optimizer(plan: _Plan) -> optax.GradientTransformation:
-    return optax.flatten(optax.adam(plan.learning_rate))  # one long vector: compiles faster than Adam layer by layer
+def _unflatten(vector: Array, shapes: Any) -> Any:
+    """The tree of parameters that `vector` holds end to end."""
+    leaves, tree = jax.tree.flatten(shapes)
+    parts = jnp.split(vector, np.cumsum([leaf.size for leaf in leaves])[:-1])
+    return jax.tree.unflatten(tree, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
 
 
 # The bounds are arguments: one compiled loop serves every stretch between two calls of `progress`.
@@ -243,23 +239,25 @@ def _epochs(
     count = units.shape[0]
     size = -(-count // plan.batches)
     encoder, decoder = _Encoder(plan.encoder_widths), _Decoder(plan.decoder_widths)
-    optimizer = _optimizer(plan)
+    optimizer = optax.adam(plan.learning_rate)
+    shapes, _ = _shapes(units, plan)
 
     def difference(params, codes, x, weight):
         out = decoder.apply({"params": params["decoder"]}, codes)
         alike = cosine(out, x) if plan.cosine_over == "features" else cosine(out.T, x.T)
         return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(alike))
 
-    def loss(params, stats, x):
+    def loss(vector, stats, x):
+        params = _unflatten(vector, shapes)
         variables = {"params": params["encoder"], "batch_stats": stats}
         codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
         return difference(params, codes, x, plan.cosine_weight), changed["batch_stats"]
 
     def step(state, x):
-        params, stats, moments = state
-        gradient, stats = jax.grad(loss, has_aux=True)(params, stats, x)
+        vector, stats, moments = state
+        gradient, stats = jax.grad(loss, has_aux=True)(vector, stats, x)
         updates, moments = optimizer.update(gradient, moments)
-        return (optax.apply_updates(params, updates), stats, moments), None
+        return (optax.apply_updates(vector, updates), stats, moments), None
 
     def epoch(index, carry):
         state, best = carry
@@ -268,11 +266,12 @@ def _epochs(
         state, _ = jax.lax.scan(lambda s, rows: step(s, units[rows]), state, order)
 
         def judge(best):
-            params, stats, _ = state
+            vector, stats, _ = state
+            params = _unflatten(vector, shapes)
             codes = encoder.apply({"params": params["encoder"], "batch_stats": stats}, units, train=False)
             # LangSplat trains with the cosine term at 0.001 and chooses its checkpoint with it at full weight.
             value = difference(params, codes, units, 1.0)
-            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, params, stats), best)
+            return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, stats), best)
 
         return state, jax.lax.cond(index >= judged_from, judge, lambda best: best, best)
 
@@ -333,6 +332,17 @@ def _widths(params: Any) -> tuple[int, ...]:
     return tuple(
         params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(sum(name.startswith("Dense_") for name in params))
     )
+
+
+@jax.jit
+def _encode(variables: Any, rows: Array) -> Array:
+    codes = _Encoder(_widths(variables["params"])).apply(variables, rows, train=False)
+    return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
+
+
+@jax.jit
+def _decode(variables: Any, rows: Array) -> Array:
+    return _Decoder(_widths(variables["params"])).apply(variables, rows)
 
 
 class _Encoder(nn.Module):

@@ -25,9 +25,9 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     labels = np.full(len(points), -1)
     if not len(points):
         return labels
-    corner = points.min(axis=0)
     side = eps / np.sqrt(3) * (1 - 1e-9)
-    cells, cell_of = _distinct(np.floor((points - corner) / side))
+    # Counted from the median, so that a stray at the end of the world costs the others no digits.
+    cells, cell_of = _distinct(np.floor((points - np.median(points, axis=0)) / side))
     core = np.bincount(cell_of)[cell_of] >= min_samples
     rest = np.flatnonzero(~core)
     if len(rest):
@@ -47,11 +47,14 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
 
 
 def _distinct(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows of whole numbers (M, 3) >= 0, and which of them each row is."""
-    sizes = places.max(axis=0) + 1
+    """The distinct rows of whole numbers (M, 3), and which of them each row is."""
+    first_place = places.min(axis=0)
+    sizes = places.max(axis=0) - first_place + 1
     if np.prod(sizes) < 2.0**62:
         # One integer a row sorts some ten times faster than rows do.
-        keys = (places.astype(np.int64) * np.array([sizes[1] * sizes[2], sizes[2], 1], np.int64)).sum(axis=1)
+        keys = ((places - first_place).astype(np.int64) * np.array([sizes[1] * sizes[2], sizes[2], 1], np.int64)).sum(
+            axis=1
+        )
         _, first, which = np.unique(keys, return_index=True, return_inverse=True)
         return places[first], which
     distinct, which = np.unique(places, axis=0, return_inverse=True)

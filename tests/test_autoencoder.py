@@ -1,0 +1,211 @@
+"""The autoencoder: LangSplat's layers, sound on few and on equal regions; the rotation where nothing is lost."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import unit_rows
+
+from jsecon.language.autoencoder import Autoencoder, Rotation, encode, region_codes, train_autoencoder
+from jsecon.numerics import cosine
+
+KEY = jax.random.key(0)
+
+
+def clustered(rng, regions, size, spread=0.8):
+    """Embeddings about a common direction, as CLIP's are."""
+    x = rng.normal(size=size) + spread * rng.normal(size=(regions, size))
+    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    embeddings = clustered(np.random.default_rng(0), 65, 48)
+    calls = []
+    coder = train_autoencoder(embeddings, latent=3, key=KEY, epochs=600, progress=lambda *done: calls.append(done))
+    return embeddings, coder, calls
+
+
+def layers(coder, part):
+    params = getattr(coder, part)["params"]
+    return [params[f"Dense_{i}"]["kernel"].shape for i in range(sum(name.startswith("Dense") for name in params))]
+
+
+def shapes_of(size, latent):
+    """Shapes only: tracing is enough, so nothing is compiled."""
+    embeddings = unit_rows(np.random.default_rng(0), 3, size)
+
+    def train(key):
+        return train_autoencoder(embeddings, latent=latent, key=key, epochs=1)
+
+    return jax.eval_shape(train, KEY)
+
+
+def test_layers_are_langsplats():
+    coder = shapes_of(512, 3)
+    assert layers(coder, "encoder") == [(512, 256), (256, 128), (128, 64), (64, 32), (32, 3)]
+    decoder = [(3, 16), (16, 32), (32, 64), (64, 128), (128, 256), (256, 256), (256, 512)]
+    assert layers(coder, "decoder") == decoder
+    assert sorted(coder.encoder["batch_stats"]) == [f"BatchNorm_{i}" for i in range(4)]
+    assert "batch_stats" not in coder.decoder
+    assert coder.latent == 3
+    assert coder.dim == 512
+
+
+def test_latents_wider_than_langsplats_layers_are_no_bottleneck():
+    coder = shapes_of(50, 40)
+    assert min(width for part in ("encoder", "decoder") for _, width in layers(coder, part)) >= 40
+    assert coder.latent == 40
+
+
+def test_regions_come_back_from_three_numbers(trained):
+    embeddings, coder, calls = trained
+    codes = coder.encode(embeddings)
+    back = coder.decode(codes)
+    assert codes.shape == (65, 3)
+    np.testing.assert_allclose(np.linalg.norm(codes, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(back, axis=1), 1, atol=1e-5)
+    nearest = np.argmax(np.asarray(back) @ embeddings.T, axis=1)
+    assert (nearest == np.arange(65)).mean() >= 0.95
+    common = float(cosine(jnp.asarray(embeddings), jnp.mean(embeddings, axis=0, keepdims=True)).mean())
+    assert float(cosine(back, jnp.asarray(embeddings)).mean()) > common + 0.5 * (1 - common)
+    assert calls[-1] == (600, 600)
+    assert [done for done, _ in calls] == sorted({done for done, _ in calls})
+
+
+def test_forward_pass_equals_numpy_float64(trained):
+    embeddings, coder, _ = trained
+    params, stats = jax.tree.map(
+        lambda a: np.asarray(a, np.float64), (coder.encoder["params"], coder.encoder["batch_stats"])
+    )
+    x = embeddings.astype(np.float64)
+    for layer in range(5):
+        if layer:
+            norm, running = params[f"BatchNorm_{layer - 1}"], stats[f"BatchNorm_{layer - 1}"]
+            x = (x - running["mean"]) / np.sqrt(running["var"] + 1e-5) * norm["scale"] + norm["bias"]
+            x = np.maximum(x, 0)
+        x = x @ params[f"Dense_{layer}"]["kernel"] + params[f"Dense_{layer}"]["bias"]
+    codes = x / np.linalg.norm(x, axis=1, keepdims=True)
+    np.testing.assert_allclose(coder.encode(embeddings), codes, atol=2e-4)
+    params, x = jax.tree.map(lambda a: np.asarray(a, np.float64), coder.decoder["params"]), codes
+    for layer in range(7):
+        x = (np.maximum(x, 0) if layer else x) @ params[f"Dense_{layer}"]["kernel"] + params[f"Dense_{layer}"]["bias"]
+    np.testing.assert_allclose(
+        coder.decode(codes.astype(np.float32)), x / np.linalg.norm(x, axis=1, keepdims=True), atol=1e-5
+    )
+
+
+def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained):
+    embeddings, coder, _ = trained
+    many = np.resize(embeddings[:40], (40_000, 48))
+    codes = coder.encode(many)
+    np.testing.assert_allclose(codes[:40], codes[39_960:], atol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.vmap(coder.encode))(many), codes, atol=1e-5)
+    np.testing.assert_allclose(coder.encode(embeddings[7]), codes[7], atol=1e-5)
+    np.testing.assert_allclose(coder.decode(codes[7]), coder.decode(codes)[7], atol=1e-5)
+    np.testing.assert_allclose(coder.encode(many.reshape(40, 1000, 48)).reshape(-1, 3), codes, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(lambda c, x: c.encode(x))(coder, 1e30 * embeddings[:40]), codes[:40], atol=1e-5)
+
+
+def test_zero_is_unknown_and_nan_stays_nan(trained):
+    embeddings, coder, _ = trained
+    rows = np.stack([np.zeros(48), np.full(48, np.nan)]).astype(np.float32)
+    codes = np.asarray(coder.encode(rows))
+    assert (codes[0] == 0).all()
+    assert np.isnan(codes[1]).all()
+
+
+def test_the_key_decides_everything(trained):
+    embeddings, coder, _ = trained
+    again = train_autoencoder(embeddings, latent=3, key=KEY, epochs=600)
+    assert all((a == b).all() for a, b in zip(jax.tree.leaves(coder), jax.tree.leaves(again), strict=True))
+    other = train_autoencoder(embeddings, latent=3, key=jax.random.key(1), epochs=600)
+    assert not np.allclose(other.encode(embeddings), coder.encode(embeddings), atol=1e-2)
+
+
+@pytest.mark.parametrize("regions", [1, 2])
+def test_sound_for_few_regions(regions):
+    embeddings = clustered(np.random.default_rng(regions), regions, 20)
+    coder = train_autoencoder(embeddings, latent=2, key=KEY, epochs=400)
+    codes = np.asarray(coder.encode(embeddings))
+    assert np.isfinite(codes).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(coder))
+    back = cosine(coder.decode(codes), jnp.asarray(embeddings))
+    assert float(back.mean()) > 0.99
+
+
+def test_sound_for_equal_embeddings_beside_an_unknown_one():
+    embeddings = np.repeat(unit_rows(np.random.default_rng(0), 1, 20), 3, axis=0)
+    embeddings[1] = 0
+    coder = train_autoencoder(embeddings, latent=2, key=KEY, epochs=400)
+    codes = np.asarray(coder.encode(embeddings))
+    assert (codes[1] == 0).all()
+    np.testing.assert_allclose(codes[0], codes[2], atol=1e-6)
+    assert float(cosine(coder.decode(codes[0]), jnp.asarray(embeddings[0]))) > 0.99
+
+
+def test_what_cannot_be_trained_on_is_told():
+    for rows, match in (
+        (np.zeros((4, 8)), "all zero"),
+        (np.zeros((0, 8)), "0 rows"),
+        (np.full((2, 8), np.nan), "not finite"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            train_autoencoder(rows.astype(np.float32), latent=3, key=KEY)
+    good = unit_rows(np.random.default_rng(0), 4, 8)
+    for options in (
+        {"latent": 0},
+        {"latent": 3, "batch": 0},
+        {"latent": 3, "epochs": 0},
+        {"latent": 3, "cosine_over": "x"},
+    ):
+        with pytest.raises(ValueError, match="train_autoencoder"):
+            train_autoencoder(good, key=KEY, **options)
+
+
+def test_codes_of_other_sizes_are_told(trained):
+    _, coder, _ = trained
+    with pytest.raises(ValueError, match="size 48"):
+        coder.encode(np.ones((2, 47), np.float32))
+    with pytest.raises(ValueError, match="size 3"):
+        coder.decode(np.ones((2, 4), np.float32))
+
+
+def test_no_coder_where_embeddings_are_short():
+    embeddings = 2 * unit_rows(np.random.default_rng(0), 9, 6)
+    codes, coder, reason = region_codes(embeddings, latent=6, key=KEY)
+    assert coder is None
+    np.testing.assert_allclose(codes, embeddings / 2, atol=1e-6)
+    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
+    assert "left out" in reason
+
+
+@pytest.mark.parametrize(("regions", "latent"), [(0, 3), (1, 3), (2, 3), (5, 5), (5, 16)])
+def test_a_rotation_keeps_every_cosine(regions, latent):
+    embeddings = unit_rows(np.random.default_rng(regions), regions, 512)
+    codes, coder, reason = region_codes(embeddings, latent=latent, key=KEY)
+    assert isinstance(coder, Rotation)
+    assert "without loss" in reason
+    assert codes.shape == (regions, latent)
+    np.testing.assert_allclose(np.asarray(codes) @ np.asarray(codes).T, embeddings @ embeddings.T, atol=2e-6)
+    np.testing.assert_allclose(coder.decode(codes), embeddings, atol=2e-6)
+    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
+
+
+def test_equal_and_unknown_embeddings_fit_in_one_number():
+    embeddings = np.repeat(unit_rows(np.random.default_rng(0), 1, 32), 70, axis=0)
+    embeddings[5] = 0
+    codes, coder, _ = region_codes(embeddings, latent=1, key=KEY)
+    assert isinstance(coder, Rotation)
+    assert (np.asarray(codes[5]) == 0).all()
+    np.testing.assert_allclose(np.abs(np.delete(np.asarray(codes), 5, axis=0)), 1, atol=1e-6)
+
+
+def test_an_autoencoder_where_regions_do_not_fit():
+    embeddings = unit_rows(np.random.default_rng(0), 12, 40)
+    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50, cosine_over="batch")
+    assert isinstance(coder, Autoencoder)
+    assert reason.startswith("run")
+    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
+    with pytest.raises(ValueError, match="not finite"):
+        region_codes(np.full((3, 40), np.inf, np.float32), latent=3, key=KEY)

@@ -1,0 +1,135 @@
+"""DBSCAN with scikit-learn's labels, and the outliers it removes from a selection."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from sklearn.cluster import DBSCAN
+
+from jsecon.query.clusters import dbscan
+from jsecon.query.outliers import default_eps, remove_outliers
+
+
+def crowd(rng, count, blobs):
+    """Blobs of very different density, strays, and exact duplicates, shuffled."""
+    parts = [
+        rng.normal(size=(count // blobs + 1, 3)) * rng.uniform(0.02, 1) + rng.uniform(-3, 3, 3) for _ in range(blobs)
+    ]
+    points = np.concatenate([*parts, rng.uniform(-4, 4, (count // 5, 3)), parts[0][: count // 10]])
+    return rng.permutation(points)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 1_500),
+    st.integers(1, 7),
+    st.sampled_from([0.03, 0.1, 0.3, 0.6, 5.0]),
+    st.integers(1, 15),
+)
+def test_labels_are_scikit_learns(seed, count, blobs, eps, min_samples):
+    points = crowd(np.random.default_rng(seed), count, blobs)
+    expected = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(points)
+    np.testing.assert_array_equal(dbscan(points, eps, min_samples), expected)
+
+
+def test_labels_are_scikit_learns_on_a_grid_of_ties():
+    # every distance is a multiple of the spacing; eps between them, so that rounding at exactly eps plays no part
+    points = np.stack(np.meshgrid(*[np.arange(9.0)] * 3), axis=-1).reshape(-1, 3)[::2]
+    for eps, min_samples in ((1.2, 3), (1.5, 7), (1.5, 13), (1.8, 13)):
+        np.testing.assert_array_equal(
+            dbscan(points, eps, min_samples), DBSCAN(eps=eps, min_samples=min_samples).fit_predict(points)
+        )
+
+
+def test_strays_at_the_end_of_the_world_cost_nothing():
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    far = np.concatenate([points, [[1e12, -1e12, 1e12]], [[-1e25, 0, 0]]])
+    near = dbscan(points, 0.5, 4)
+    assert near.max() >= 0
+    np.testing.assert_array_equal(dbscan(far, 0.5, 4), [*near, -1, -1])
+
+
+def two_blobs_and_strays(scale=1.0):
+    rng = np.random.default_rng(0)
+    blob = rng.normal(size=(300, 3)) * 0.1
+    small = rng.normal(size=(100, 3)) * 0.1 + 4
+    strays = rng.uniform(8, 30, (6, 3))
+    return (scale * np.concatenate([blob, small, strays])).astype(np.float32)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_strays_go_and_eps_follows_the_scale(scale):
+    points = two_blobs_and_strays(scale)
+    everything = np.ones(len(points), bool)
+    every = remove_outliers(points, everything, keep="all")
+    assert every[:400].mean() > 0.97
+    assert not every[400:].any()
+    largest = remove_outliers(points, everything, keep="largest")
+    np.testing.assert_array_equal(largest, every & (np.arange(len(points)) < 300))
+
+
+def test_only_what_was_selected_is_looked_at():
+    points = two_blobs_and_strays()
+    mask = np.arange(len(points)) >= 300
+    mask[:150] = False
+    kept = remove_outliers(points, mask)
+    assert not kept[~mask].any()
+    assert kept[300:400].mean() > 0.95
+
+
+def test_centres_that_are_not_finite_are_never_kept():
+    points = two_blobs_and_strays()
+    points[3] = np.nan
+    points[4, 1] = np.inf
+    kept = remove_outliers(points, np.ones(len(points), bool))
+    assert not kept[[3, 4]].any()
+    assert kept[:300].sum() > 280
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 9])
+def test_too_few_to_tell_come_back_as_they_are(count):
+    points = np.random.default_rng(0).normal(size=(20, 3)) * 100
+    mask = np.arange(20) < count
+    np.testing.assert_array_equal(remove_outliers(points, mask), mask)
+
+
+def test_a_selection_without_any_cluster_comes_back_as_it_is():
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    np.testing.assert_array_equal(remove_outliers(points, np.ones(40, bool), eps=1e-3), np.ones(40, bool))
+
+
+def test_one_component_is_kept_whole():
+    turn = np.linspace(0, 6, 2_000)
+    ring = np.stack([np.cos(turn), np.sin(turn), 0.1 * turn], axis=1)
+    assert remove_outliers(ring, np.ones(2_000, bool)).all()
+
+
+def test_points_on_top_of_each_other():
+    same = np.zeros((50, 3))
+    assert remove_outliers(same, np.ones(50, bool)).all()
+    mostly = np.concatenate([same, np.random.default_rng(0).normal(size=(20, 3))])
+    assert default_eps(mostly) > 0
+    assert remove_outliers(mostly, np.ones(70, bool))[:50].all()
+
+
+def test_half_a_million_points_in_seconds():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points[:200_000] = 0.3 * points[:200_000] + [3, 0, 0]
+    points[200_000:250_000] = 0.02 * points[200_000:250_000] - [3, 0, 0]  # thousands of neighbours each
+    points[:2_000] = rng.uniform(-30, 30, (2_000, 3))
+    start = time.perf_counter()
+    kept = remove_outliers(points, np.ones(500_000, bool))
+    assert time.perf_counter() - start < 30  # about 4 s; scikit-learn runs out of memory on the dense ball's lists
+    assert kept[250_000:].all()
+    assert not kept[:250_000].any()
+
+
+def test_options_out_of_range_are_told():
+    points, mask = np.zeros((20, 3)), np.ones(20, bool)
+    for options in ({"keep": "some"}, {"eps": 0.0}, {"eps": -1.0}, {"min_samples": 0}, {"eps": float("nan")}):
+        with pytest.raises(ValueError, match="remove_outliers"):
+            remove_outliers(points, mask, **options)
