@@ -78,7 +78,7 @@ def write_images(capture: Capture, folder, ending: str = ".png") -> None:
 
 
 def write_text_model(capture: Capture, folder, cameras: list[str] | None = None) -> None:
-    """The capture as a COLMAP text model; `cameras` replaces the lines of cameras.txt (camera 1 then takes them all)."""
+    """The capture as a COLMAP text model; `cameras` replaces the lines of cameras.txt (camera 1 takes them all)."""
     folder.mkdir(parents=True, exist_ok=True)
     lenses = np.stack([capture.cameras.fx, capture.cameras.fy, capture.cameras.cx, capture.cameras.cy], -1)
     size = f"{capture.cameras.width} {capture.cameras.height}"
