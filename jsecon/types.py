@@ -8,7 +8,7 @@ where the data has them. Letters: N Gaussians, T frames, H x W pixels, R regions
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ def _static(**kwargs) -> Any:
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
+@dataclass_transform(frozen_default=True)
 def _record(cls):
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
 

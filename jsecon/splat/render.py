@@ -1,46 +1,17 @@
 """Rendering: D-channel features, colour, depth, of one view; differentiable in every array."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR
-from jsecon.splat.composite import composite, composite_features_vjp, composite_vjp
+from jsecon.splat.differentiate import splat
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.splats import splats_of
-from jsecon.splat.tiles import TileLists, plan_capacity
+from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Rendering
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def _splat(splats: Array, features: Array, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
-    return composite(splats, features, lists, width, height)
-
-
-def _splat_forward(splats, features, lists, width, height):
-    # symbolic_zeros: each argument says whether anybody asked for its gradient, so that a field distilled into frozen
-    # Gaussians never pays for the gradient of their geometry.
-    wants_geometry = splats.perturbed
-    splats, features = splats.value, features.value
-    lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
-    image, transmittance = composite(splats, features, lists, width, height)
-    saved = (features, image, transmittance) if wants_geometry else None
-    return (image, transmittance), (splats, lists, saved)
-
-
-def _splat_backward(width, height, residual, cotangents):
-    splats, lists, saved = residual
-    bars = [jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar for bar in cotangents]
-    if saved is None:
-        return jnp.zeros_like(splats), composite_features_vjp(splats, lists, bars[0]), None
-    return *composite_vjp(splats, saved[0], lists, saved[1], saved[2], *bars), None
-
-
-_splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
 
 
 def is_traced(tree) -> bool:
@@ -83,7 +54,7 @@ def _render(gaussians, camera, features, background, capacity, near) -> Renderin
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0))
     splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
-    image, transmittance = _splat(splats, features.astype(splats.dtype), lists, camera.width, camera.height)
+    image, transmittance = splat(splats, features.astype(splats.dtype), lists, camera.width, camera.height)
     if background is not None:
         image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
     return Rendering(image, 1 - transmittance, lists.overflow)

@@ -1,0 +1,98 @@
+"""Compositing as jax sees it: its own gradient rule, and its own way under vmap.
+
+Gradient: symbolic zeros tell whether anybody asked for the geometry's, so that a field distilled into frozen Gaussians
+never pays for it.
+
+vmap: a loop with an early exit runs in lockstep when it is batched, as long as its slowest member. So several feature
+sets of one view become more channels of one walk over its tiles, and several views are walked one after another.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap, sequential_vmap
+
+from jsecon.splat.composite import composite, composite_features_vjp, composite_vjp
+from jsecon.splat.project import Projection
+from jsecon.splat.tiles import TILE, TileLists, tile_lists
+from jsecon.types import Array
+
+
+def view_lists(projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE) -> TileLists:
+    """`tile_lists`, one view after another under vmap; no gradient passes."""
+    lists = sequential_vmap(lambda p: tile_lists(p, width, height, capacity=capacity, tile=tile))
+    return lists(jax.tree.map(lax.stop_gradient, projection))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def splat(splats: Array, features: Array, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
+    """Image (H, W, D) and final transmittance (H, W) of `splats` (N, 6) with `features` (N, D); see composite.py."""
+    return _forward(splats, features, lists, width, height)
+
+
+def _splat_forward(splats, features, lists, width, height):
+    wants_geometry = splats.perturbed
+    splats, features = splats.value, features.value
+    lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
+    image, transmittance = _forward(splats, features, lists, width, height)
+    saved = (features, image, transmittance) if wants_geometry else None
+    return (image, transmittance), (splats, lists, saved)
+
+
+def _splat_backward(width, height, residual, cotangents):
+    splats, lists, saved = residual
+    bars = [jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar for bar in cotangents]
+    if saved is None:
+        return jnp.zeros_like(splats), _features_backward(splats, bars[0], lists), None
+    return *sequential_vmap(composite_vjp)(splats, saved[0], lists, saved[1], saved[2], *bars), None
+
+
+splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
+
+
+def _forward(splats: Array, features: Array, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
+    def one(splats, features, lists):
+        return composite(splats, features, lists, width, height)
+
+    return _merging_channels(one, lambda out, sets: (_unmerge(out[0], sets), jnp.broadcast_to(out[1], (sets, *out[1].shape))))(
+        splats, features, lists)
+
+
+def _features_backward(splats: Array, cotangent: Array, lists: TileLists) -> Array:
+    def one(splats, cotangent, lists):
+        return composite_features_vjp(splats, lists, cotangent)
+
+    return _merging_channels(one, _unmerge)(splats, cotangent, lists)
+
+
+def _merging_channels(one: Callable, split: Callable) -> Callable:
+    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call, which
+    `split(result, S)` takes apart; anything else runs one after another."""
+    function = custom_vmap(one)
+
+    @function.def_vmap
+    def rule(size, batched, splats, channels, lists):
+        if any(jax.tree.leaves((batched[0], batched[2]))):
+            out = _in_sequence(function, size, tuple(batched), splats, channels, lists)
+        else:
+            merged = jnp.moveaxis(channels, 0, -2)
+            out = split(function(splats, merged.reshape(*merged.shape[:-2], -1), lists), size)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return function
+
+
+def _in_sequence(function: Callable, size: int, batched: tuple, *arguments):
+    def pick(index):
+        take = lambda argument, is_batched: lax.dynamic_index_in_dim(argument, index, 0, keepdims=False) if is_batched else argument
+        return jax.tree.map(take, arguments, batched)
+
+    return lax.map(lambda index: function(*pick(index)), jnp.arange(size))
+
+
+def _unmerge(array: Array, sets: int) -> Array:
+    """(..., S D) -> (S, ..., D)."""
+    return jnp.moveaxis(array.reshape(*array.shape[:-1], sets, -1), -2, 0)
