@@ -26,6 +26,11 @@ _WANTED = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2
 
 
 def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:
+    fields = vertices.dtype.names or ()
+    if len({vertices.dtype[name] for name in fields}) == 1:
+        # One type throughout, as in nearly every file: a plain table, read along its rows (twice as fast).
+        table = vertices.view(vertices.dtype[0]).reshape(len(vertices), len(fields))
+        return table[:, [fields.index(name) for name in names]].astype(np.float32)
     result = np.empty((len(vertices), len(names)), np.float32)
     for column, name in enumerate(names):
         result[:, column] = vertices[name]
