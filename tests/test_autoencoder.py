@@ -108,7 +108,7 @@ def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained):
 
 
 def test_zero_is_unknown_and_nan_stays_nan(trained):
-    embeddings, coder, _ = trained
+    _embeddings, coder, _ = trained
     rows = np.stack([np.zeros(48), np.full(48, np.nan)]).astype(np.float32)
     codes = np.asarray(coder.encode(rows))
     assert (codes[0] == 0).all()

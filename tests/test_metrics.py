@@ -61,7 +61,9 @@ def test_localisation_counts_edges_and_any_box():
 
 
 def test_no_pairs_is_no_number():
-    assert np.isnan(mean_iou([])) and np.isnan(accuracy_at([])) and np.isnan(localization_accuracy([], []))
+    assert np.isnan(mean_iou([]))
+    assert np.isnan(accuracy_at([]))
+    assert np.isnan(localization_accuracy([], []))
     assert np.isnan(point_accuracy(np.array([1]), np.array([-1])))
     assert np.isnan(point_class_means(np.array([1]), np.array([-1]))).all()
 

@@ -57,16 +57,19 @@ def test_what_is_unknown_is_never_selected(threshold):
     got = query_one_step(codes, jnp.asarray([1.0, 0, 0]), threshold)
     assert got.mask.tolist() == [False, False, False, True]
     np.testing.assert_array_equal(got.similarity[:3], 0)
-    assert float(got.score) == 1 and int(got.region) == -1
+    assert float(got.score) == 1
+    assert int(got.region) == -1
     for text in ([0, 0, 0], [nan, 0, 0], [inf, 0, 0]):
         nothing = query_one_step(codes, jnp.asarray(text, jnp.float32), threshold)
-        assert not nothing.mask.any() and float(nothing.score) == 0
+        assert not nothing.mask.any()
+        assert float(nothing.score) == 0
 
 
 def test_nan_threshold_and_no_gaussians_select_nothing():
     assert not query_one_step(jnp.eye(3), jnp.ones(3), np.nan).mask.any()
     empty = query_one_step(jnp.zeros((0, 3)), jnp.ones(3), 0.5)
-    assert empty.mask.shape == (0,) and float(empty.score) == 0
+    assert empty.mask.shape == (0,)
+    assert float(empty.score) == 0
 
 
 def test_sizes_that_disagree_are_told():

@@ -267,8 +267,8 @@ def _descend(state, gaussians, cameras, labels, region_codes, until, learning_ra
         camera = cameras[view]
         ids = jnp.clip(labels[view], 0, codes.shape[0] - 1)
         mask = ((labels[view] >= 0) & known[ids])[..., None]
-        # safe_norm has a zero gradient at zero, so that the gradient there is 1e9 times the rendering's, as in
-        LangSplat.units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
+        # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
+        units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
         rendering = render(gaussians, camera, units, capacity=capacity)
         return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - codes[ids]), 0.0)), rendering.overflow
 

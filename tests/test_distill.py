@@ -1,0 +1,274 @@
+"""Reductions of votes against NumPy float64, and the paper's L1 path against its definition written densely."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given, settings, strategies as st
+from small_field import REGIONS, labels_of, true_regions, unit_rows
+
+from jsecon.language.distill import descend, descent, distill_l1, distill_votes
+from jsecon.splat.render import render
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Votes
+
+KEY = jax.random.key(0)
+
+
+def make_votes(regions, weights, num_regions):
+    regions, weights = np.asarray(regions, np.int32), np.asarray(weights, np.float32)
+    total = weights.sum(-1)
+    return Votes(
+        regions, weights, total, total, np.zeros_like(total), (total > 0).astype(np.int32), np.int32(0), num_regions
+    )
+
+
+def random_votes(rng, count, top, num_regions):
+    regions = np.stack([rng.permutation(num_regions)[:top] for _ in range(count)])
+    weights = -np.sort(-rng.exponential(size=(count, top)) * 10.0 ** rng.uniform(-4, 4, (count, 1)), axis=1)
+    gone = rng.random((count, 1)) < 0.1
+    empty = gone | (np.arange(top) >= rng.integers(1, top + 1, (count, 1)))
+    return make_votes(np.where(empty, -1, regions), np.where(empty, 0, weights), num_regions)
+
+
+def exact(votes, codes, reduce):
+    """The reductions as one would write them for one Gaussian, float64."""
+    codes, result = np.asarray(codes, np.float64), []
+    for ids, weights in zip(votes.regions, np.asarray(votes.weights, np.float64)):
+        ids, weights = ids[ids >= 0], weights[ids >= 0]
+        if not len(ids):
+            result.append(np.zeros(codes.shape[1]))
+            continue
+        values, strongest = codes[ids], codes[ids[np.argmax(weights)]]
+        if reduce == "mean":
+            code = (weights[:, None] * values).sum(0) / weights.sum()
+        elif reduce == "mode":
+            code = strongest
+        else:
+            code = np.empty(codes.shape[1])
+            for axis in range(codes.shape[1]):
+                order = np.argsort(values[:, axis], kind="stable")
+                summed = np.cumsum(weights[order])
+                low = values[order, axis][np.searchsorted(summed, summed[-1] / 2 * (1 - 1e-9))]
+                high = values[order, axis][np.searchsorted(summed, summed[-1] / 2 * (1 + 1e-9))]
+                code[axis] = np.clip(strongest[axis], low, high)
+        result.append(code / np.linalg.norm(code))
+    return np.array(result)
+
+
+@pytest.mark.parametrize("reduce", ["mean", "median", "mode"])
+def test_reductions_equal_float64(reduce):
+    rng = np.random.default_rng(0)
+    votes, codes = random_votes(rng, 9_000, 6, 20), unit_rows(rng, 20, 4)
+    got = distill_votes(votes, codes, reduce)
+    np.testing.assert_allclose(got, exact(votes, codes, reduce), atol=3e-5)
+    jitted = jax.jit(lambda v, c: distill_votes(v, c, reduce))(votes, codes)
+    np.testing.assert_allclose(jitted, got, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [16_385, 32_769, 40_000, 100_000])
+def test_reductions_of_many_gaussians_under_jit_and_vmap(count):
+    rng = np.random.default_rng(0)
+    small, tables = random_votes(rng, 100, 4, 8), np.stack([unit_rows(rng, 8, 3) for _ in range(2)])
+    rows = np.arange(count) % 100
+    votes = dataclasses.replace(jax.tree.map(lambda a: a[rows] if np.ndim(a) else a, small))
+    for reduce in ("mean", "median", "mode"):
+        got = jax.jit(jax.vmap(lambda table, reduce=reduce: distill_votes(votes, table, reduce)))(tables)
+        for index, table in enumerate(tables):
+            np.testing.assert_allclose(got[index], exact(small, table, reduce)[rows], atol=3e-5)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_the_median_is_l1_optimal(seed):
+    rng = np.random.default_rng(seed)
+    votes, codes = random_votes(rng, 50, 6, 20), unit_rows(rng, 20, 4)
+    # before it is brought to unit length, so compare through the exact one, whose direction the first test ties to ours
+    for ids, weights in zip(votes.regions, votes.weights):
+        ids, weights = ids[ids >= 0], weights[ids >= 0].astype(np.float64)
+        if not len(ids):
+            continue
+        one = make_votes([np.pad(ids, (0, 6 - len(ids)), constant_values=-1)], [np.pad(weights, (0, 6 - len(ids)))], 20)
+        from jsecon.language.distill import _median
+
+        code = np.asarray(_median(jnp.asarray(codes)[np.maximum(one.regions[0], 0)], jnp.asarray(one.weights[0])))
+        cost = (weights[:, None] * np.abs(codes[ids] - code)).sum(0)
+        best = np.min([(weights[:, None] * np.abs(codes[ids] - value)).sum(0) for value in codes[ids]], axis=0)
+        np.testing.assert_array_less(cost, best * (1 + 1e-4) + 1e-4 * weights.sum())
+
+
+def test_a_tie_of_two_regions_gives_the_first_of_them_whole():
+    codes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    votes = make_votes([[2, 0, -1]], [[3.0, 3.0, 0]], 3)
+    np.testing.assert_allclose(distill_votes(votes, codes, "median"), [[0, 0, 1]], atol=1e-6)
+
+
+@pytest.mark.parametrize("reduce", ["mean", "median", "mode"])
+def test_extremes(reduce):
+    codes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0], [np.nan, 0, 0]], np.float32)
+    regions = [[0, 1], [0, 1], [-1, -1], [2, 0], [0, 2], [0, 1], [3, 0], [0, 1]]
+    weights = [[3e30, 1e30], [3e-30, 1e-30], [0, 0], [3, 1], [3, 1], [np.nan, 1], [3, 1], [np.inf, 1]]
+    got = np.asarray(distill_votes(make_votes(regions, weights, 4), codes, reduce))
+    first = exact(make_votes([[0, 1]], [[3, 1]], 4), np.nan_to_num(codes), reduce)[0]
+    np.testing.assert_allclose(got[[0, 1]], [first, first], atol=1e-6)
+    assert (got[[2, 3, 5, 7]] == 0).all()  # no votes, a region without a code, votes that are not finite
+    np.testing.assert_allclose(got[4], [1, 0, 0], atol=1e-6)
+    assert not np.isfinite(got[6]).all() or (got[6] == 0).all()  # a NaN code never passes for a code
+
+
+def test_no_regions_at_all():
+    votes = make_votes(np.zeros((7, 0)), np.zeros((7, 0)), 0)
+    assert (np.asarray(distill_votes(votes, np.zeros((0, 3), np.float32))) == np.zeros((7, 3))).all()
+
+
+def test_wrong_options_and_tables_are_told():
+    votes = make_votes([[0, 1]], [[1, 1]], 2)
+    with pytest.raises(ValueError, match="expected one of"):
+        distill_votes(votes, np.eye(2, dtype=np.float32), "sum")
+    with pytest.raises(ValueError, match="3 region codes"):
+        distill_votes(votes, np.eye(3, dtype=np.float32))
+
+
+@pytest.fixture(scope="module")
+def task(scene, cameras):
+    """Gaussians, cameras, labels of five regions, their codes, members, capacity."""
+    scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
+    members = true_regions(scene)
+    labels = jnp.asarray(labels_of(scene, cameras, members))
+    return (
+        scene,
+        cameras,
+        labels,
+        jnp.asarray(unit_rows(np.random.default_rng(1), REGIONS, 3)),
+        members,
+        plan_capacity(scene, cameras),
+    )
+
+
+def dense_weights(scene, cameras):
+    """(T, H W, N) alpha T of every Gaussian at every pixel, by rendering one-hot features."""
+    onehot = jnp.eye(scene.count)
+    draw = jax.jit(lambda camera: render(scene, camera, onehot, capacity=plan).features.reshape(-1, scene.count))
+    plan = plan_capacity(scene, cameras)
+    return np.stack([np.asarray(draw(cameras[t]), np.float64) for t in range(cameras.world_to_camera.shape[0])])
+
+
+def test_steps_equal_the_definition_in_float64(task):
+    """Loss and three Adam steps, PyTorch's formula, from a dense matrix of weights."""
+    scene, cameras, labels, codes, _, capacity = task
+    weights, flat = dense_weights(scene, cameras), np.asarray(labels).reshape(4, -1)
+    start = 0.1 * unit_rows(np.random.default_rng(2), scene.count, 3)
+    got, history = distill_l1(scene, cameras, labels, codes, steps=3, key=KEY, init=start, capacity=capacity)
+    order = descent(scene, cameras, labels, codes, steps=3, key=KEY).order
+    features, first, second = start.astype(np.float64), 0.0, 0.0
+    for step, view in enumerate(np.asarray(order), start=1):
+        length = np.linalg.norm(features, axis=1, keepdims=True)
+        error = weights[view] @ (features / (length + 1e-9)) - np.asarray(codes, np.float64)[np.maximum(flat[view], 0)]
+        mask = (flat[view] >= 0)[:, None]
+        assert history[step - 1] == pytest.approx(np.abs(error * mask).mean(), rel=1e-5)
+        on_units = weights[view].T @ (np.sign(error) * mask) / error.size
+        unit = features / length
+        gradient = (on_units - unit * (unit * on_units).sum(1, keepdims=True)) / length
+        first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+        features = features - 0.0025 * (first / (1 - 0.9**step)) / (np.sqrt(second / (1 - 0.999**step)) + 1e-15)
+    expected = features / np.linalg.norm(features, axis=1, keepdims=True)
+    # a Gaussian with a gradient near zero may take its +-0.0025 step either way
+    assert np.quantile(np.abs(np.asarray(got) - expected).max(axis=1), 0.95) < 1e-4
+
+
+def test_every_view_comes_before_any_repeats(task):
+    scene, cameras, labels, codes, _, _ = task
+    order = np.asarray(descent(scene, cameras, labels, codes, steps=10, key=KEY).order)
+    assert sorted(order[:4]) == sorted(order[4:8]) == [0, 1, 2, 3]
+    assert len(order) == 10
+    other = np.asarray(descent(scene, cameras, labels, codes, steps=10, key=jax.random.key(5)).order)
+    assert (order != other).any()
+
+
+def test_random_and_given_starts_learn_and_zero_is_the_trap(task):
+    scene, cameras, labels, codes, members, capacity = task
+    options = {"steps": 240, "key": KEY, "capacity": capacity}
+    calls = []
+    at_random, history = distill_l1(
+        scene, cameras, labels, codes, init="random", progress=lambda *c: calls.append(c), **options
+    )
+    assert calls[-1] == (240, 240)
+    assert float(history[-20:].mean()) < 0.6 * float(history[:4].mean())
+    right = np.argmax(np.asarray(at_random) @ np.asarray(codes).T, axis=1) == members
+    from_zero, zero_history = distill_l1(scene, cameras, labels, codes, init="zero", **options)
+    seen = np.asarray(from_zero).any(axis=1)
+    # The trap: the codes stay at the corners of the cube, (+-1, +-1, +-1) / sqrt 3, whatever the target.
+    corner = np.abs(np.asarray(from_zero)[seen]) * np.sqrt(3)
+    assert np.quantile(np.abs(corner - 1), 0.9) < 0.05
+    assert right.mean() > 0.6
+    assert float(zero_history[-20:].mean()) > float(history[-20:].mean())
+    again, _ = distill_l1(scene, cameras, labels, codes, init="random", **options)
+    np.testing.assert_array_equal(again, at_random)  # in one stretch or in a hundred
+
+
+def test_a_stopped_run_goes_on_where_it_was(task):
+    scene, cameras, labels, codes, _, capacity = task
+    given = (scene, cameras, labels, codes)
+    start = descent(*given, steps=240, key=KEY, init="random")
+    whole = descend(start, *given, until=240, capacity=capacity)
+    half = descend(start, *given, until=77, capacity=capacity)
+    assert int(half.step) == 77
+    kept = jax.tree.map(np.asarray, half)
+    resumed = descend(kept, *given, until=240, capacity=capacity)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(resumed), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denominator_alone(task):
+    scene, cameras, labels, codes, _, capacity = task
+    behind = dataclasses.replace(scene, means=scene.means.at[0].set(jnp.asarray([0.0, 50.0, 0.0])))
+    got, _ = distill_l1(behind, cameras, labels, codes, steps=12, key=KEY, init="random", capacity=capacity)
+    assert (np.asarray(got[0]) == 0).all()
+    kept, _ = distill_l1(behind, cameras, labels, codes, steps=12, key=KEY, init=jnp.asarray(unit_rows(np.random.default_rng(0), 64, 3)),
+                         capacity=capacity)  # fmt: skip
+    assert np.linalg.norm(kept[0]) == pytest.approx(1, abs=1e-5)
+    _, history = distill_l1(
+        scene, cameras, jnp.full_like(labels, -1), codes, steps=3, key=KEY, init="random", capacity=capacity
+    )
+    assert (np.asarray(history) == 0).all()
+
+
+def test_under_jit_too_small_a_capacity_is_data_and_outside_an_error(task):
+    scene, cameras, labels, codes, _, _capacity = task
+    crowd = jax.tree.map(lambda a: jnp.concatenate([a] * 40), scene)
+    needed = plan_capacity(crowd, cameras)
+    assert needed > 1024
+    with pytest.raises(ValueError, match="capacity=1024"):
+        distill_l1(crowd, cameras, labels, codes, steps=2, key=KEY, init="random", capacity=1024)
+    run = jax.jit(
+        lambda key: distill_l1(crowd, cameras, labels, codes, steps=2, key=key, init="random", capacity=1024)[1]
+    )
+    assert np.isnan(run(KEY)).all()
+
+
+def test_shapes_that_disagree_are_told(task):
+    scene, cameras, labels, codes, _, _ = task
+    for wrong, match in (
+        ({"labels": labels[:2]}, "labels"), ({"labels": labels[:, :3]}, "labels"), ({"region_codes": codes[:0]}, "0 regions"),
+        ({"init": "mean"}, "init='mean'"), ({"init": jnp.zeros((3, 3))}, "init"), ({"steps": 0}, "0 steps"),
+    ):  # fmt: skip
+        given = {"labels": labels, "region_codes": codes, "steps": 1, "init": "zero"} | wrong
+        with pytest.raises(ValueError, match=match):
+            distill_l1(scene, cameras, key=KEY, **given)
+
+
+def test_adam_is_pytorchs():
+    """optax.adam with eps outside the square root and bias-corrected moments, as PyTorch's: checked on one number."""
+    adam = optax.adam(0.1, eps=1e-3)
+    x = jnp.asarray(2.0)
+    state, first, second, expected = adam.init(x), 0.0, 0.0, 2.0
+    for step in range(1, 6):
+        gradient = 2 * expected
+        first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+        update, state = adam.update(2 * x, state)
+        x = optax.apply_updates(x, update)
+        expected -= 0.1 * (first / (1 - 0.9**step)) / (np.sqrt(second / (1 - 0.999**step)) + 1e-3)
+        assert float(x) == pytest.approx(expected, rel=1e-5)
