@@ -145,7 +145,7 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 
 def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
     """labels (T, H, W) int16 of the training frames: proposals of each, followed through the scene's own Gaussians."""
-    from jsecon.language.masklets import masklets
+    from jsecon.language.masklets import clean_masklets, masklets
     from jsecon.vision.classical import ClassicalSegmenter
     from jsecon.vision.geometric import GeometricTracker
 
@@ -156,6 +156,7 @@ def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussian
     tracker = GeometricTracker(gaussians, jax.tree.map(jnp.asarray, cameras), proposals)
     labels = masklets(frames, lambda frame, t: proposals(t), tracker, iou_threshold=options.iou_threshold,
                       progress=progress)
+    labels = clean_masklets(tracker.consistent(frames, labels))
     _require_regions(labels, str(options.capture))
     return Outcome(labels)
 

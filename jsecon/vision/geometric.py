@@ -16,6 +16,7 @@ import scipy.sparse as sparse
 
 from jsecon.errors import require
 from jsecon.language.votes import region_votes
+from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians
 
 _CHUNK = 64
@@ -55,7 +56,9 @@ class GeometricTracker:
                  contradiction: float = 0.2, known_share: float = 0.3, capacity: int | None = None):
         require(0 < atoms_per_frame, "atoms_per_frame", got=atoms_per_frame, expected="at least 1",
                 remedy="Use about 200 for small frames.")
-        self.gaussians, self.cameras, self.capacity = gaussians, cameras, capacity
+        self.gaussians, self.cameras = gaussians, cameras
+        # Planned once for all views: one compiled shape.
+        self.capacity = plan_capacity(gaussians, cameras) if capacity is None else capacity
         self.proposal_share, self.atom_share = proposal_share, atom_share
         self.contradiction, self.known_share, self.glimpse = contradiction, known_share, 0.5
         self.atoms_per_frame = atoms_per_frame
@@ -95,6 +98,32 @@ class GeometricTracker:
                 classes.append(rival)
                 free &= ~rival
         return np.stack([*classes, free])
+
+    def consistent(self, frames: np.ndarray, labels: np.ndarray, *, least_own: float = 0.5) -> np.ndarray:
+        """labels (T, H, W) with every region given away whose Gaussians belong to another one in the sum of all views.
+
+        A region is kept if at least `least_own` of the weight that it casts falls on Gaussians on which no other region
+        casts more; otherwise (a part that few frames tell from the rest, a shadow) its pixels become the region's that
+        owns most of it. Numbers of regions are kept, so some may end without a pixel.
+        """
+        labels = np.array(labels)
+        for _ in range(4):  # what is given away may tip another region; seldom more than two rounds
+            count = int(labels.max(initial=-1)) + 1
+            votes = np.zeros((self.gaussians.means.shape[0], count), np.float32)
+            for t in range(len(frames)):
+                view = self.view(frames, t)
+                votes += (view.votes @ _label_shares(view.atoms, labels[t], view.votes.shape[1], count)).toarray()
+            owner = sparse.csr_matrix((np.ones(len(votes), np.float32), (np.arange(len(votes)), votes.argmax(1))),
+                                      shape=votes.shape)
+            cast = votes.T @ owner  # (R, R): row r's weight by the region that owns the Gaussian
+            heir = cast.argmax(1)
+            total = np.maximum(cast.sum(1), 1e-12)
+            lost = (heir != np.arange(count)) & (np.diagonal(cast) < least_own * total)
+            if not lost.any():
+                break
+            table = np.append(np.where(lost, heir, np.arange(count)), -1).astype(labels.dtype)
+            labels = table[labels]
+        return labels
 
     def view(self, frames: np.ndarray, t: int) -> _View:
         """The frame's atoms and votes; computed once."""
@@ -163,6 +192,13 @@ def _coverage(atoms: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:
     area = np.bincount(atoms.reshape(-1), minlength=count)
     inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
+
+
+def _label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> sparse.csr_matrix:
+    """(A, R) float32 share of each atom's pixels that carry each label."""
+    inside = labels >= 0
+    weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
+    return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
 
 
 def _sparse(regions: np.ndarray, weights: np.ndarray, columns: int, *, negligible: float = 0.005) -> sparse.csr_matrix:
