@@ -84,7 +84,7 @@ def _merge(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
 
 
 @functools.partial(jax.jit, static_argnums=(3,))
-def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int, top: int) -> tuple[Array, Array]:
+def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int | Array, top: int) -> tuple[Array, Array]:
     """Merges a dense block of votes into the strongest ones kept so far."""
     ids = jnp.broadcast_to(first + jnp.arange(votes.shape[1], dtype=jnp.int32), votes.shape)
     ids, weights = jnp.concatenate([kept[0], ids], 1), jnp.concatenate([kept[1], votes], 1)

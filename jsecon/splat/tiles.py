@@ -1,7 +1,6 @@
 """Which Gaussians touch which tile of the image, front to back: one packed single-key sort of (tile, depth rank)."""
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
@@ -135,5 +134,5 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
 def round_capacity(pairs: int) -> int:
     """`pairs` rounded up to an eighth of a power of two, at least 1024."""
     pairs = max(pairs, 1024)
-    step = 2 ** max(math.ceil(math.log2(pairs)) - 3, 0)
+    step = 2 ** max(pairs.bit_length() - 4, 0)
     return -(-pairs // step) * step

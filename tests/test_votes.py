@@ -1,0 +1,115 @@
+"""Votes against the float64 twin's weights."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.language.votes import region_votes
+from jsecon.splat.reference import weights_reference
+from jsecon.splat.tiles import plan_capacity
+
+REGIONS = 11
+
+
+@pytest.fixture(scope="module")
+def labels(cameras):
+    """Four label images: blocks, one of them noise (many regions in a tile), one with nothing labelled."""
+    rng = np.random.default_rng(5)
+    blocks = rng.integers(-1, REGIONS, (4, 5, 6)).repeat(8, 1).repeat(8, 2).astype(np.int32)
+    blocks[1] = rng.integers(-1, REGIONS, (40, 48))
+    blocks[3] = -1
+    return blocks
+
+
+@pytest.fixture(scope="module")
+def expected(scene, cameras, labels):
+    """(N, R) votes, (N,) total, (N,) peak, (N,) views by brute force in float64."""
+    votes, total = np.zeros((scene.count, REGIONS)), np.zeros(scene.count)
+    peak, views = np.zeros(scene.count), np.zeros(scene.count, int)
+    for t in range(4):
+        weights = weights_reference(scene, cameras[t]).reshape(-1, scene.count)
+        for r in range(REGIONS):
+            votes[:, r] += weights[labels[t].reshape(-1) == r].sum(0)
+        total += weights.sum(0)
+        peak = np.maximum(peak, weights.max(0))
+        views += weights.sum(0) > 0
+    return votes, total, peak, views
+
+
+@pytest.fixture(scope="module")
+def cast(scene, cameras, labels):
+    return region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
+
+
+def test_equals_the_oracles_weights(cast, expected):
+    votes, total, peak, views = expected
+    assert int(cast.overflow) == 0
+    # float32, and alphas that fall on the other side of the 1/255 cut on single pixels
+    np.testing.assert_allclose(cast.dense(), votes, rtol=2e-4, atol=0.02)
+    assert np.linalg.norm(cast.dense() - votes) <= 1e-4 * np.linalg.norm(votes)
+    np.testing.assert_allclose(cast.total, total, rtol=2e-4, atol=0.02)
+    np.testing.assert_allclose(cast.peak, peak, atol=1e-4)
+    np.testing.assert_array_equal(cast.views, views)
+
+
+def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels):
+    few = region_votes(scene, cameras, labels, REGIONS, top=2)
+    assert few.regions.shape == (scene.count, 2)
+    np.testing.assert_allclose(few.weights, cast.weights[:, :2], rtol=1e-6)
+    np.testing.assert_allclose(few.cut, cast.weights[:, 2:].sum(-1), rtol=1e-4, atol=1e-4)
+    assert bool((cast.weights[:, :-1] >= cast.weights[:, 1:]).all())
+    np.testing.assert_array_equal(cast.regions >= 0, cast.weights > 0)
+
+
+def test_traced_is_eager(cast, scene, cameras, labels):
+    capacity = plan_capacity(scene, cameras)
+    traced = jax.jit(lambda g, l: region_votes(g, cameras, l, REGIONS, top=REGIONS, capacity=capacity))(scene, labels)
+    np.testing.assert_allclose(traced.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
+
+
+def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):
+    from jsecon.language import votes as module
+
+    monkeypatch.setattr(module, "_DENSE_BYTES", 4 * 4 * scene.count)  # four regions a pass
+    blocks = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
+    np.testing.assert_allclose(blocks.dense(), cast.dense(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(blocks.labelled, cast.labelled, rtol=1e-5)
+    np.testing.assert_allclose(blocks.total, cast.total, rtol=1e-6)
+
+
+def test_progress_counts_the_views(scene, cameras, labels):
+    seen = []
+    region_votes(scene, cameras, labels, REGIONS, progress=lambda done, total: seen.append((done, total)))
+    assert seen[-1] == (4, 4)
+    assert [d for d, _ in seen] == sorted(d for d, _ in seen)
+
+
+def test_what_nobody_sees_has_no_votes(scene, cameras, labels):
+    hidden = jax.tree.map(np.copy, scene)
+    hidden.means[0] = [0, -1e4, 0]  # far above every view
+    cast = region_votes(hidden, cameras, labels, REGIONS)
+    assert int(cast.views[0]) == 0
+    assert float(cast.total[0]) == 0
+    assert bool((cast.regions[0] == -1).all())
+
+
+def test_no_regions_at_all(scene, cameras):
+    cast = region_votes(scene, cameras, np.full((4, 40, 48), -1, np.int32), 0)
+    assert cast.dense().shape == (scene.count, 0)
+    assert bool((cast.regions == -1).all())
+    assert float(cast.total.sum()) > 0
+
+
+def test_shapes_that_disagree_raise(scene, cameras, camera, labels):
+    with pytest.raises(ValueError, match="batch"):
+        region_votes(scene, camera, labels, REGIONS)
+    with pytest.raises(ValueError, match="labels"):
+        region_votes(scene, cameras, labels[:2], REGIONS)
+    with pytest.raises(ValueError, match="plan_capacity"):
+        jax.jit(lambda l: region_votes(scene, cameras, l, REGIONS))(labels)
+
+
+def test_votes_are_the_transpose_of_rendering(cast, scene, cameras, labels):
+    """<W f, onehot> = <f, W^T onehot> for any f: here with f = 1 a region's votes are its rendered weight."""
+    assert abs(float(cast.labelled.sum()) - float(jnp.sum(cast.dense()))) < 1e-2
