@@ -85,6 +85,12 @@ def gaussians_from_points(
     )
 
 
+def _require_depths(capture: Capture) -> None:
+    if capture.depths is None:
+        raise InputError("capture", found="no depth frames", expected="RGB-D frames",
+                         remedy="Start from sparse points (gaussians_from_points) or triangulate them.")
+
+
 def _back_projected(capture: Capture, frame: int, stride: int):
     """World points (S, 3), colours (S, 3) and pixels (S, 2) of the frame's known depths, every `stride` pixels."""
     camera = capture.cameras[frame]
@@ -141,9 +147,7 @@ def points_from_depth(
     """
     require((voxel is None) != (max_points is None), "voxel, max_points", got=(voxel, max_points),
             expected="exactly one of the two", remedy="Give voxel in world units, or max_points.")
-    if capture.depths is None:
-        raise InputError("capture", found="no depth frames", expected="RGB-D frames",
-                         remedy="Start from sparse points (gaussians_from_points) or triangulate them.")
+    _require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
     parts = [_back_projected(capture, int(t), stride) for t in chosen]
     points = np.concatenate([p for p, _, _ in parts]) if parts else np.zeros((0, 3))
@@ -162,6 +166,45 @@ def points_from_depth(
     color = np.stack([np.bincount(ids, colors[:, a], minlength=count) for a in range(3)], axis=1) / counts[:, None]
     return DepthPoints(mean.astype(np.float32), np.rint(color).astype(np.uint8), counts.astype(np.int32), float(voxel),
                        pixels.astype(np.int32), ids.astype(np.int32))
+
+
+def confirmed_depths(
+    capture: Capture,
+    *,
+    tolerance: float,
+    min_views: int = 2,
+    frames: Int[np.ndarray, " f"] | None = None,
+) -> Float[np.ndarray, "t h w"]:
+    """The depths without those that the other views do not bear out: sensor noise, and pixels that mix two surfaces.
+
+    A depth stays where at least `min_views` other views measure the same point, to within `tolerance` (relative to their
+    depth), and no more views look past it than do; everything else becomes 0, unknown. Only `frames` are filtered and asked
+    (by default those that are not held out); the depths of the others are returned as they are. Raises InputError where the
+    capture has no depth.
+    """
+    _require_depths(capture)
+    depths = np.array(capture.depths, np.float32)
+    chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
+    height, width = depths.shape[1:]
+    filtered = depths.copy()
+    for t in chosen:
+        world, _, pixels = _back_projected(capture, int(t), 1)
+        same, past = np.zeros(len(world), np.int32), np.zeros(len(world), np.int32)
+        for other in chosen[chosen != t]:
+            camera = capture.cameras[int(other)]
+            pose = np.asarray(camera.world_to_camera, np.float64)
+            seen = world @ pose[:3, :3].T + pose[:3, 3]
+            z = np.where(seen[:, 2] > 0, seen[:, 2], 1.0)
+            x = float(camera.fx) * seen[:, 0] / z + float(camera.cx)
+            y = float(camera.fy) * seen[:, 1] / z + float(camera.cy)
+            inside = np.flatnonzero((seen[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+            measured = depths[other, y[inside].astype(int), x[inside].astype(int)]
+            off = np.where(measured > 0, (measured - z[inside]) / np.maximum(measured, 1e-9), np.nan)
+            same[inside] += np.abs(off) <= tolerance
+            past[inside] += off > tolerance
+        bad = pixels[(same < min_views) | (past > same)]
+        filtered[t, bad[:, 0], bad[:, 1]] = 0
+    return filtered
 
 
 def labels_of_points(points: DepthPoints, labels: Int[Array, "t h w"], num_labels: int) -> Int[np.ndarray, " p"]:

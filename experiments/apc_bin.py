@@ -1,0 +1,226 @@
+"""Four objects in a shelf bin, RGB-D: masks of some views -> votes -> each object's Gaussians -> IoU in the other views.
+
+    python -m experiments.apc_bin [FOLDER]
+
+The capture is a scene of the MIT-Princeton APC 2016 data (15 views, 640x480). The Gaussians are the back-projected depths of
+the views that are not held out; their masks vote; a selection is rendered alone in the held-out views (alpha > 0.7) and
+compared with their masks there. The masks are the objects' models projected, so they also cover what the gripper hides.
+"""
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import results
+from jsecon.errors import InputError
+from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
+from jsecon.fit.initialise import confirmed_depths, gaussians_from_points, points_from_depth
+from jsecon.fit.optimise import LearningRates, evaluate_psnr, fit_gaussians
+from jsecon.language.distill import distill_votes
+from jsecon.language.votes import region_votes
+from jsecon.query.anchored import query_region
+from jsecon.query.masks import selection_mask
+from jsecon.query.outliers import remove_outliers
+from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
+
+OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}
+"""the numbers that segm/ uses, 0 being none of them"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the experiment can vary."""
+
+    capture: str = str(results.CAPTURES / "apc_bin" / "scene-0000")
+    held_out_every: int = 3
+    """every so many-th frame is held out, starting with the second"""
+    nearest_m: float = 0.2
+    """depths below are the gripper in front of the camera: the sensor's range begins here"""
+    depth_tolerance: float = 0.015
+    """relative difference up to which two views' depths confirm each other; 0 takes every depth"""
+    confirming_views: int = 1
+    """other views that have to confirm a depth"""
+    voxel_m: float = 0.003
+    scale: float = 0.6
+    """standard deviation of a Gaussian in units of its distance to its neighbours"""
+    opacity: float = 0.9
+    fit_steps: int = 0
+    """steps of a photometric fit of colours, opacities and scales; 0 leaves the points as they are"""
+    threshold: float = 0.5
+    """share of votes from which a Gaussian belongs to an object"""
+    seed: int = 0
+    out: str = str(results.HOME / "results" / "apc_bin")
+
+
+def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
+    """(3, 3) colour intrinsics and (T, 4, 4) camera-to-world poses (OpenCV axes) of a cam.info.txt."""
+    blocks: dict[str, list[list[float]]] = {}
+    title = ""
+    for line in text.splitlines():
+        if line.startswith("#"):
+            title = line[1:].strip()
+        elif line.strip():
+            blocks.setdefault(title, []).append([float(v) for v in line.split()])
+    intrinsics = next((m for t, m in blocks.items() if t.startswith("Color camera intrinsic")), None)
+    poses = {t.rsplit("-", 1)[1]: m for t, m in blocks.items() if t.startswith("Camera-to-world")}
+    if intrinsics is None or np.shape(intrinsics) != (3, 3) or not poses or any(np.shape(m) != (4, 4) for m in poses.values()):
+        raise InputError("cam.info.txt", found=f"the matrices {sorted(blocks)}",
+                         expected="a 3x3 colour intrinsic matrix and a 4x4 camera-to-world matrix a frame",
+                         remedy="Give the file as the APC toolbox writes it.")
+    return np.array(intrinsics), np.array([poses[k] for k in sorted(poses)])
+
+
+def decode_depth(raw: np.ndarray) -> np.ndarray:
+    """Metres of a depth PNG (uint16): the bits are rotated by three, the unit is 0.1 mm."""
+    return (((raw >> 3) | (raw << 13)) & 0xFFFF).astype(np.float32) / 10_000
+
+
+def _image(path: Path, flags: int) -> np.ndarray:
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise InputError(path, found="no readable image", expected="a PNG", remedy="Fetch the capture again.")
+    return image
+
+
+def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tuple[Capture, np.ndarray]:
+    """The capture, and labels (T, H, W) int16: 0..3 the objects in the order of OBJECTS, 4 the rest."""
+    folder = Path(folder)
+    try:
+        intrinsics, poses = parse_cameras((folder / "cam.info.txt").read_text())
+    except OSError as error:
+        raise InputError(folder / "cam.info.txt", found=str(error.strerror), expected="the cameras",
+                         remedy="Give the folder scene-0000 of apc_bin.") from error
+    names = tuple(f"frame-{t:06d}" for t in range(len(poses)))
+    frames = np.stack([_image(folder / f"{n}.color.png", cv2.IMREAD_COLOR)[..., ::-1] for n in names])
+    depths = np.stack([decode_depth(_image(folder / f"{n}.depth.png", cv2.IMREAD_UNCHANGED)) for n in names])
+    depths[depths < nearest_m] = 0
+    segments = np.stack([_image(folder / "segm" / f"{n}.segm.png", cv2.IMREAD_UNCHANGED) for n in names])
+    labels = np.full(segments.shape, len(OBJECTS), np.int16)
+    for index, number in enumerate(OBJECTS):
+        labels[segments == number] = index
+    # The matrix counts pixel centres as integers (OpenCV), jsecon from the upper left corner: half a pixel more.
+    count = len(names)
+    fx, fy, cx, cy = (np.full(count, v, np.float32) for v in
+                      (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2] + 0.5, intrinsics[1, 2] + 0.5))
+    cameras = Camera(np.linalg.inv(poses).astype(np.float32), fx, fy, cx, cy, width=frames.shape[2], height=frames.shape[1])
+    held_out = np.arange(count) % held_out_every == 1
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return Capture(frames, cameras, *nothing, held_out, depths, np.eye(4), names), labels
+
+
+def build_gaussians(capture: Capture, options: Options) -> Gaussians:
+    """The back-projected depths of the views that are not held out, fitted where the options ask for it."""
+    if options.depth_tolerance:
+        depths = confirmed_depths(capture, tolerance=options.depth_tolerance, min_views=options.confirming_views)
+        capture = dataclasses.replace(capture, depths=depths)
+    points = points_from_depth(capture, voxel=options.voxel_m)
+    gaussians = gaussians_from_points(points.points, points.colors, opacity=options.opacity, scale=options.scale,
+                                      max_scale=3 * options.voxel_m)
+    if options.fit_steps:
+        rates = LearningRates(means=0.0, quaternions=0.0)
+        gaussians, _ = fit_gaussians(capture, steps=options.fit_steps, key=jax.random.key(options.seed), start=gaussians,
+                                     rates=rates)
+    return jax.tree.map(jnp.asarray, gaussians)
+
+
+def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> LanguageField:
+    """Votes of the masks that are not held out. The regions are told apart by unit codes of their own: one-hot."""
+    used = np.flatnonzero(~capture.held_out)
+    cameras = jax.tree.map(jnp.asarray, capture.cameras[used])
+    count = len(OBJECTS) + 1
+    votes = region_votes(gaussians, cameras, jnp.asarray(labels[used]), count)
+    codes = jnp.eye(count)
+    pixels = np.stack([(labels[used] == r).sum((1, 2)) for r in range(count)]).astype(np.int32)
+    return LanguageField(gaussians=gaussians, codes=distill_votes(votes, codes, "mode"), votes=votes,
+                         regions=Regions(codes, jnp.asarray(pixels)), region_codes=codes, autoencoder=None, cameras=cameras,
+                         canonical=jnp.zeros((1, count)), to_source=jnp.eye(4),
+                         names=tuple(capture.names[t] for t in used), embedder="labels")
+
+
+def evaluate(field: LanguageField, capture: Capture, labels: np.ndarray, options: Options) -> tuple[list[dict], dict]:
+    """A row for each way to select, object and held-out view; and the predicted masks by (way, object, frame)."""
+    rows, masks = [], {}
+    for way in ("votes", "code", "votes + DBSCAN"):
+        by = way.split()[0]
+        for index, name in enumerate(OBJECTS.values()):
+            chosen = query_region(field, index, by=by, similarity_threshold=options.threshold if by == "votes" else None).mask
+            if way.endswith("DBSCAN"):
+                chosen = jnp.asarray(remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all"))
+            for t in np.flatnonzero(capture.held_out):
+                camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
+                masks[way, index, int(t)] = np.asarray(selection_mask(field.gaussians, camera, chosen))
+                true = labels[t] == index
+                rows.append({"by": way, "object": name, "frame": capture.names[t], "selected": int(chosen.sum()),
+                             "iou": float(iou(masks[way, index, int(t)], true))})
+    return rows, masks
+
+
+def draw(capture: Capture, labels: np.ndarray, masks: dict, way: str):
+    """Held-out views: true outlines in white, selected pixels in the object's colour."""
+    from matplotlib.figure import Figure
+
+    held = np.flatnonzero(capture.held_out)
+    colors = np.array([[230, 80, 230], [60, 200, 60], [60, 120, 240], [240, 200, 40]])
+    figure = Figure(figsize=(6 * len(held), 4.6))
+    for column, t in enumerate(held):
+        picture = capture.frames[t].astype(np.float32)
+        for index in range(len(OBJECTS)):
+            mask = masks[way, index, int(t)]
+            picture[mask] = 0.4 * picture[mask] + 0.6 * colors[index]
+        picture = np.ascontiguousarray(picture.astype(np.uint8))
+        for index in range(len(OBJECTS)):
+            outline, _ = cv2.findContours((labels[t] == index).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(picture, outline, -1, (255, 255, 255), 2)
+        axes = figure.add_subplot(1, len(held), column + 1)
+        axes.imshow(picture)
+        axes.set_title(capture.names[t], fontsize=8)
+        axes.axis("off")
+    return figure
+
+
+def main(options: Options = Options()) -> dict:  # noqa: B008 - frozen
+    """Runs the experiment, writes its results and returns the metrics."""
+    seconds, began = {}, time.perf_counter()
+
+    def lap(stage: str) -> None:
+        nonlocal began
+        seconds[stage], began = round(time.perf_counter() - began, 2), time.perf_counter()
+
+    capture, labels = load_apc(options.capture, held_out_every=options.held_out_every, nearest_m=options.nearest_m)
+    lap("load")
+    gaussians = build_gaussians(capture, options)
+    lap("gaussians")
+    field = jax.block_until_ready(build_field(gaussians, capture, labels))
+    lap("votes")
+    rows, masks = evaluate(field, capture, labels, options)
+    lap("select and render")
+    ways = list(dict.fromkeys(r["by"] for r in rows))
+    metrics = {
+        "gaussians": gaussians.count, "held_out": [capture.names[t] for t in np.flatnonzero(capture.held_out)],
+        "psnr_held_out_db": float(evaluate_psnr(gaussians, capture).mean()),
+        "miou": {way: mean_iou(r["iou"] for r in rows if r["by"] == way) for way in ways},
+        "macc_025": {way: accuracy_at([r["iou"] for r in rows if r["by"] == way]) for way in ways},
+        "objects": {way: {name: mean_iou(r["iou"] for r in rows if (r["by"], r["object"]) == (way, name))
+                          for name in OBJECTS.values()} for way in ways},
+        "seconds": seconds, "rows": rows,
+    }
+    lines = [(way, *(metrics["objects"][way][n] for n in OBJECTS.values()), metrics["miou"][way]) for way in ways]
+    table = results.table(("selected by", *OBJECTS.values(), "mean IoU"), lines)
+    out = Path(options.out)
+    results.save(out, options, metrics, table)
+    # The picture shows photographs of the capture, which stay out of the project: it lies beside the committed results.
+    with_pictures = out / "pictures"
+    with_pictures.mkdir(parents=True, exist_ok=True)
+    draw(capture, labels, masks, "votes").savefig(with_pictures / "held_out.png", dpi=110, bbox_inches="tight")
+    print(table)
+    return metrics
+
+
+if __name__ == "__main__":
+    main(dataclasses.replace(Options(), **({"capture": sys.argv[1]} if len(sys.argv) > 1 else {})))
