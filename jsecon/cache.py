@@ -52,15 +52,20 @@ def key_of(stage: str, parts: Mapping[str, Any]) -> str:
 
 
 def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
-    """Digest of files, and of all files beneath folders, by name, size and time of change. Hidden files and anything
-    beneath `leave_out` (the run's own output, where it lies inside the capture) don't count."""
+    """Digest of files, and of all files beneath folders, by name, size and time of change.
+
+    Hidden files don't count, nor does `leave_out`, the run's own output, where it lies inside of such a folder.
+    """
     entries = []
     for root in paths:
+        own = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out.resolve()
+        if own is not None and not own.is_relative_to(root.resolve()):
+            own = None
         for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
             inside = path.relative_to(root) if path != root else Path(path.name)
             if any(part.startswith(".") for part in inside.parts) or not path.is_file():
                 continue
-            if leave_out is not None and path.resolve().is_relative_to(leave_out.resolve()):
+            if own is not None and path.resolve().is_relative_to(own):
                 continue
             stat = path.stat()
             entries.append(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}")

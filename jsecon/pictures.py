@@ -59,7 +59,7 @@ def selection_overlay(
 def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int], thickness: int) -> np.ndarray:
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     image = np.ascontiguousarray(image)
-    cv2.drawContours(image, contours, -1, colour, thickness, cv2.LINE_AA)
+    cv2.drawContours(image, contours, -1, colour, thickness)
     return image
 
 

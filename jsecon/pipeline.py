@@ -98,6 +98,9 @@ def run(
     """
     reporter = reporter or Silent()
     folder = cache_folder or out / "cache"
+    if out.resolve() == options.capture.resolve():
+        raise InputError(out, found="the capture's own folder as the output folder", expected="a folder of its own",
+                         remedy=f"For example {out / 'field'}, or one elsewhere.")
     embedder = embedder_named()
     require_writable(out)
     cache.prepare(folder)

@@ -2,16 +2,12 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
-from typing import Literal, Protocol, TypeAlias
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 
-class Progress(Protocol):
-    """Told how far a step has come."""
-
-    def __call__(self, done: int, total: int) -> None: ...
-
-
+Progress: TypeAlias = Callable[[int, int], None]
+"""told how far a step has come: (done, total)"""
 Status: TypeAlias = Literal["run", "cached", "left out"]
 
 
@@ -26,6 +22,7 @@ class Step:
     """how it will be done, or why not."""
 
 
+@runtime_checkable
 class Reporter(Protocol):
     """Whoever is told of a run: the command line, a notebook, nobody."""
 

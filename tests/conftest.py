@@ -82,3 +82,21 @@ def shared() -> Path:
     if not (folder / "captures").is_dir():
         pytest.skip("no real captures beside the checkout")
     return folder
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory) -> Path:
+    """The demo room on disk, as small as it can be and still have objects to find: 8 views of 80x60, 2 held out."""
+    from jsecon.data.synthetic import write_room
+
+    return write_room(tmp_path_factory.mktemp("room") / "capture", 0, views=8, width=80, height=60, holdout=4, points=600)
+
+
+@pytest.fixture(scope="session")
+def room_run(room, tmp_path_factory):
+    """A finished run on that room with its true masks given, and the folder that it was written to."""
+    from jsecon import pipeline
+
+    out = tmp_path_factory.mktemp("run")
+    options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=60, sh_degree=0)
+    return pipeline.run(options, out), out

@@ -1,0 +1,160 @@
+"""The stage cache: what is kept comes back as it was, keys follow what matters, damage costs time and nothing else."""
+
+import dataclasses
+import os
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jsecon import cache
+from jsecon.errors import InputError
+from jsecon.language.autoencoder import Autoencoder, Rotation
+from jsecon.stages import Outcome
+
+
+def _tree(scene, cameras):
+    return {"scene": scene, "cameras": cameras, "pair": (np.arange(3, dtype=np.int16), None), "list": [1, 2.5, "x", True],
+            "coder": Autoencoder({"params": {"Dense_0": {"kernel": np.ones((4, 2), np.float32)}}}, {"params": {}}),
+            "rotation": Rotation(np.eye(3, 2, dtype=np.float32)), "nan": float("nan"), "empty": np.zeros((0, 3)),
+            "outcome": Outcome(np.ones(2, bool), {"part": "why"}, ("a note",))}
+
+
+def _same(a, b):
+    assert type(a) is type(b)
+    if dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            _same(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for name in a:
+            _same(a[name], b[name])
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b)
+        for x, y in zip(a, b):
+            _same(x, y)
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    else:
+        assert a == b or (a != a and b != b)
+
+
+def test_what_is_kept_comes_back(scene, cameras, tmp_path):
+    tree = _tree(scene, cameras)
+    cache.save(tmp_path / "x.npz", tree)
+    _same(cache.load(tmp_path / "x.npz"), tree)
+
+
+def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
+    compute = lambda: {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")}
+    fresh = cache.fetch(tmp_path, "stage", "0" * 16, compute)
+    again = cache.fetch(tmp_path, "stage", "0" * 16, lambda: pytest.fail("computed twice"))
+    assert fresh.fresh
+    assert not again.fresh
+    assert isinstance(fresh.value["a"], np.ndarray)
+    _same(fresh.value, again.value)
+    assert again.seconds == fresh.seconds
+
+
+def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
+    for name in ("a.npz", "b.npz"):
+        cache.save(tmp_path / name, _tree(scene, cameras))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+@pytest.mark.parametrize("damage", [
+    lambda data: data[: len(data) // 2],
+    lambda data: b"",
+    lambda data: data[:200] + bytes(64) + data[264:],
+    lambda data: b"no archive at all",
+], ids=["cut", "empty", "overwritten", "other"])
+def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
+    value = np.random.default_rng(0).normal(size=500)
+    cache.fetch(tmp_path, "stage", "k", lambda: value)
+    path = cache.path_of(tmp_path, "stage", "k")
+    path.write_bytes(damage(path.read_bytes()))
+    said = []
+    kept = cache.fetch(tmp_path, "stage", "k", lambda: value, note=said.append)
+    assert kept.fresh
+    np.testing.assert_array_equal(kept.value, value)
+    assert len(said) == 1
+    assert "stage is computed again" in said[0]
+    assert not cache.fetch(tmp_path, "stage", "k", lambda: value).fresh
+
+
+def test_a_failed_computation_leaves_nothing_behind(tmp_path):
+    def fail():
+        raise InputError("x", found="a", expected="b", remedy="c")
+
+    with pytest.raises(InputError):
+        cache.fetch(tmp_path, "stage", "k", fail)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pickles_are_neither_written_nor_read(tmp_path):
+    with pytest.raises(TypeError, match="cannot be kept"):
+        cache.save(tmp_path / "x.npz", {"a": object()})
+    np.savez(tmp_path / "y.npz", a=np.array([object()], object), allow_pickle=True)
+    with pytest.raises(cache.CorruptCacheError):
+        cache.load(tmp_path / "y.npz")
+
+
+def test_only_records_of_jsecon_are_made():
+    for record in ("os:system", "jsecon.cache:fetch", "jsecon.files:Path"):
+        with pytest.raises((ValueError, AttributeError)):
+            cache.unpack({"record": record, "fields": {}}, {})
+
+
+def test_keys_follow_stage_and_parts():
+    key = cache.key_of("votes", {"a": 1, "b": [2, None]})
+    assert key == cache.key_of("votes", {"b": [2, None], "a": 1})
+    assert len({key, cache.key_of("codes", {"a": 1, "b": [2, None]}), cache.key_of("votes", {"a": 1, "b": [3, None]})}) == 3
+
+
+def test_files_digest_follows_names_sizes_and_times(tmp_path):
+    folder = tmp_path / "capture"
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "a.png").write_bytes(b"one")
+    first = cache.files_digest([folder])
+    assert first == cache.files_digest([folder])
+    os.utime(folder / "images" / "a.png", ns=(0, 1))
+    second = cache.files_digest([folder])
+    (folder / "images" / "a.png").write_bytes(b"four")
+    third = cache.files_digest([folder])
+    (folder / "images" / "b.png").write_bytes(b"one")
+    assert len({first, second, third, cache.files_digest([folder])}) == 4
+
+
+def test_files_digest_leaves_out_the_output_and_hidden_files(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"one")
+    before = cache.files_digest([tmp_path], leave_out=tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "field.npz").write_bytes(b"result")
+    (tmp_path / ".DS_Store").write_bytes(b"x")
+    assert cache.files_digest([tmp_path], leave_out=tmp_path / "out") == before
+
+
+def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
+    capture = tmp_path / "out" / "capture"
+    capture.mkdir(parents=True)
+    (capture / "a.png").write_bytes(b"one")
+    before = cache.files_digest([capture], leave_out=tmp_path / "out")
+    assert before == cache.files_digest([capture], leave_out=tmp_path / "elsewhere")
+    (capture / "a.png").write_bytes(b"other")
+    assert cache.files_digest([capture], leave_out=tmp_path / "out") != before
+
+
+def test_source_digest_follows_the_rooms_named():
+    assert cache.source_digest(["splat"]) != cache.source_digest(["splat", "language.votes"])
+    assert cache.source_digest(["splat", "fit"]) == cache.source_digest(["fit", "splat"])
+
+
+def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):
+    old, young = tmp_path / ".a.0.partial.npz", tmp_path / ".b.0.partial.npz"
+    for path in (old, young):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    cache.prepare(tmp_path)
+    assert not old.exists()
+    assert young.exists()
+    assert (tmp_path / "CACHEDIR.TAG").read_text().startswith("Signature: 8a477f597d28d172789f06886806bc55")

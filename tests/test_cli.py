@@ -1,0 +1,329 @@
+"""The command line: what each verb leaves behind, and one clear message and exit code 2 for each kind of bad input."""
+
+import json
+import os
+import shutil
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from jsecon import cli, pipeline
+from jsecon.console import Console
+from jsecon.data.ply import load_ply, save_ply
+from jsecon.plan import Reporter, Silent
+
+
+def _run(*arguments):
+    return cli.main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def capture(room, tmp_path):
+    """A copy of the tiny room, to be damaged."""
+    return shutil.copytree(room, tmp_path / "capture")
+
+
+# What the verbs do
+
+
+def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
+    _, out = room_run
+    shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
+    code = _run("run", room, "--out", tmp_path / "out", "--masks", room / "masks", "--holdout", 4, "--steps", 60, "--sh-degree", 0)
+    told = capsys.readouterr().out
+    assert code == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["regions"] >= 10
+    assert metrics["held_out_psnr"] > 10
+    assert set(metrics["seconds"]) >= {"load", "gaussians", "votes"}
+    assert "segmenter" in metrics["left_out"]
+    assert metrics["peak_memory_mib"] > 0
+    for words in ("gaussians        cached", "segmenter        left out", "held-out PSNR", "report.html"):
+        assert words in told
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/") >= 24
+    assert "Held-out frames" in page
+    assert (tmp_path / "out" / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
+
+
+@pytest.mark.parametrize("by", ["votes", "code", "one_step", "canonical"])
+def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, capsys, by):
+    run, out = room_run
+    names = list(json.loads((run.options.capture / "scene.json").read_text())["objects"].values())[:2]
+    assert _run("query", out / "field.npz", *names, "--out", tmp_path, "--by", by, "--views", 2) == 0
+    told = capsys.readouterr().out
+    for name in names:
+        slug = name.replace(" ", "-")
+        answer = json.loads((tmp_path / f"{slug}.json").read_text())
+        assert answer["query"] == name
+        assert answer["by"] == by
+        assert repr(name) in told
+        if by == "votes":
+            assert 0 < answer["count"] < answer["of"]
+        if answer["count"]:
+            chosen = load_ply(tmp_path / answer["ply"])
+            assert chosen.count == answer["count"]
+            box, means = answer["place"]["bounding_box"], np.asarray(chosen.means)
+            np.testing.assert_allclose(means.min(0), box["min"], atol=1e-5)
+            np.testing.assert_allclose(means.mean(0), answer["place"]["centroid"], atol=1e-5)
+            for file in answer["masks"].values():
+                mask = cv2.imread(str(tmp_path / file), cv2.IMREAD_UNCHANGED)
+                assert mask.shape == (60, 80)
+                assert set(np.unique(mask)) <= {0, 255}
+    assert "data:image/" in (tmp_path / "answers.html").read_text()
+
+
+def test_query_at_a_pixel_selects_the_object_under_it(room_run, room, tmp_path):
+    run, out = room_run
+    name = run.capture.names[1]
+    masks = cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+    largest = np.bincount(masks[masks > 0]).argmax()
+    inside = cv2.distanceTransform((masks == largest).astype(np.uint8), cv2.DIST_L2, 5)
+    y, x = np.unravel_index(inside.argmax(), inside.shape)
+    assert _run("query", out / "field.npz", "--at", name, x, y, "--out", tmp_path) == 0
+    answer = json.loads(next(tmp_path.glob("*.json")).read_text())
+    assert answer["count"] > 0
+    assert "text encoder" in answer["left_out"]
+    assert answer["region"] == np.flatnonzero(np.unique(masks_of_all(room)) == largest)[0] - 1
+
+
+def masks_of_all(room):
+    return np.concatenate([cv2.imread(str(p), cv2.IMREAD_UNCHANGED).ravel() for p in sorted((room / "masks").glob("*.png"))])
+
+
+def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, capsys):
+    _, out = room_run
+    assert _run("eval", out / "field.npz", "--labels", room / "label", "--out", tmp_path) == 0
+    told = capsys.readouterr().out
+    found = json.loads((tmp_path / "evaluation.json").read_text())
+    assert set(found) == {"anchored", "anchored_code", "one_step", "canonical"}
+    for kind, summary in found.items():
+        assert kind in told
+        assert len(summary["rows"]) == summary["pairs"] > 0
+        assert summary["miou"] == pytest.approx(np.mean([row["iou"] for row in summary["rows"]]), abs=1e-3)
+    assert "mAcc@0.25" in told
+    assert "alpha > 0.7" in told
+
+
+def test_help_of_every_verb_has_words_for_every_option(capsys):
+    for verb in ("demo", "run", "query", "eval"):
+        assert _run(verb, "--help") == 0
+        assert len(capsys.readouterr().out) > 300
+    for action in cli.parser()._subparsers._group_actions[0].choices.values():
+        assert all(option.help for option in action._actions), action.prog
+
+
+def test_wrong_usage_is_exit_code_2(capsys):
+    assert _run("run") == 2
+    assert _run("fly") == 2
+    assert "usage" in capsys.readouterr().err
+
+
+def test_a_stop_by_the_user_is_exit_code_130_and_says_that_it_can_go_on(room, tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "run", stop)
+    assert _run("run", room, "--out", tmp_path) == 130
+    assert "goes on where it stopped" in capsys.readouterr().err
+
+
+def test_an_unexpected_error_keeps_its_traceback(room, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(pipeline, "run", fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        _run("run", room, "--out", tmp_path)
+
+
+# Bad input: one message each, with file, found, expected, remedy
+
+
+def _refused(capsys, *arguments, says=()):
+    """Exit code 2, one message on standard error, no traceback, every one of `says` in it."""
+    assert _run(*arguments) == 2
+    told = capsys.readouterr().err
+    message = [line for line in told.splitlines() if line.startswith("jsecon: ")]
+    assert len(message) == 1
+    assert "Traceback" not in told
+    for word in ("found", "expected", *says):
+        assert word in message[0]
+
+
+def _refused_run(capsys, capture, tmp_path, *options, says=()):
+    _refused(capsys, "run", capture, "--out", tmp_path / "out", "--holdout", 4, "--steps", 5, *options, says=says)
+    left = {path.name for path in (tmp_path / "out").rglob("*.npz")} if (tmp_path / "out").exists() else set()
+    assert not any("partial" in name or name == "field.npz" for name in left)
+
+
+def _image(capture):
+    return sorted((capture / "images").iterdir())[2]
+
+
+def test_a_missing_image(capture, tmp_path, capsys):
+    name = _image(capture).name
+    _image(capture).unlink()
+    _refused_run(capsys, capture, tmp_path, says=[name])
+
+
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"x" * 200],
+                         ids=["empty", "cut", "other"])
+def test_a_damaged_png(capture, tmp_path, capsys, damage):
+    path = _image(capture)
+    path.write_bytes(damage(path.read_bytes()))
+    _refused_run(capsys, capture, tmp_path, says=[path.name])
+
+
+def _transforms(room, tmp_path, change):
+    """The tiny room as a nerfstudio capture, changed."""
+    folder = tmp_path / "nerfstudio"
+    shutil.copytree(room / "images", folder / "images")
+    frames = [{"file_path": f"images/{path.name}", "transform_matrix": np.eye(4).tolist()}
+              for path in sorted((folder / "images").iterdir())]
+    scene = {"w": 80, "h": 60, "fl_x": 70.0, "fl_y": 70.0, "cx": 40.0, "cy": 30.0, "frames": frames}
+    change(scene)
+    (folder / "transforms.json").write_text(json.dumps(scene))
+    return folder
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda scene: scene.pop("frames"), "frames"),
+    (lambda scene: scene["frames"][1].pop("transform_matrix"), "transform_matrix"),
+    (lambda scene: scene["frames"][1].pop("file_path"), "file_path"),
+    (lambda scene: [scene.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
+])
+def test_transforms_json_with_a_missing_key(room, tmp_path, capsys, change, says):
+    _refused_run(capsys, _transforms(room, tmp_path, change), tmp_path, says=["transforms.json", says])
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_colmap_file_cut_short(capture, tmp_path, capsys, name):
+    path = next((capture / "sparse" / "0").glob(f"{name}.*"))
+    path.write_bytes(path.read_bytes()[:-7])
+    _refused_run(capsys, capture, tmp_path, says=[path.name])
+
+
+def test_a_pose_that_is_not_a_number(room, tmp_path, capsys):
+    def change(scene):
+        scene["frames"][3]["transform_matrix"][0][3] = float("nan")
+
+    _refused_run(capsys, _transforms(room, tmp_path, change), tmp_path, says=["NaN"])
+
+
+def test_views_that_do_not_overlap(room, tmp_path, capsys):
+    def change(scene):
+        for n, frame in enumerate(scene["frames"]):  # all look along -z from places far apart in depth of field of view
+            matrix = np.eye(4)
+            matrix[:3, :3] = np.diag([1.0, 1.0, 1.0]) if n % 2 else np.diag([-1.0, 1.0, -1.0])
+            matrix[:3, 3] = (1000.0 * n, 0.0, -10.0 if n % 2 else 10.0)
+            frame["transform_matrix"] = matrix.tolist()
+
+    _refused_run(capsys, _transforms(room, tmp_path, change), tmp_path, says=["overlap"])
+
+
+def test_a_compressed_ply(capture, tmp_path, capsys):
+    header = ("ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+              "property uint packed_position\nproperty uint packed_rotation\nproperty uint packed_scale\n"
+              "property uint packed_color\nend_header\n")
+    (tmp_path / "packed.ply").write_bytes(header.encode() + struct.pack("<f4I", 0, 0, 0, 0, 0))
+    _refused_run(capsys, capture, tmp_path, "--gaussians", tmp_path / "packed.ply", says=["packed.ply", "compressed"])
+
+
+def test_a_ply_with_missing_properties(capture, room_run, tmp_path, capsys):
+    save_ply(tmp_path / "scene.ply", room_run[0].field.gaussians)
+    data = (tmp_path / "scene.ply").read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n")
+    (tmp_path / "scene.ply").write_bytes(data)
+    _refused_run(capsys, capture, tmp_path, "--gaussians", tmp_path / "scene.ply", says=["scene.ply", "opacity"])
+
+
+def test_a_mask_of_the_wrong_size(capture, tmp_path, capsys):
+    for path in (capture / "masks").iterdir():
+        cv2.imwrite(str(path), np.ones((60, 60), np.uint8))
+    _refused_run(capsys, capture, tmp_path, "--masks", capture / "masks", says=["60x60", "80x60"])
+
+
+def test_an_output_folder_that_cannot_be_written(capture, room_run, tmp_path, capsys):
+    (tmp_path / "file").write_text("not a folder")
+    _refused(capsys, "run", capture, "--out", tmp_path / "file" / "out", says=["out"])
+    _refused(capsys, "demo", "--out", tmp_path / "file" / "out", says=["out"])
+    _refused(capsys, "query", room_run[1] / "field.npz", "red", "--out", tmp_path / "file" / "out", says=["out"])
+    _refused(capsys, "eval", room_run[1] / "field.npz", "--labels", capture, "--out", tmp_path / "file", says=["file"])
+
+
+def test_the_capture_itself_as_the_output_folder(capture, capsys):
+    _refused(capsys, "run", capture, "--out", capture, says=["own folder"])
+
+
+def test_a_text_that_is_not_understood_leaves_nothing_half_done(room_run, tmp_path, capsys):
+    _refused(capsys, "query", room_run[1] / "field.npz", "red ball", "the meaning of life", "--out", tmp_path / "answers",
+             says=["meaning of life"])
+    assert list((tmp_path / "answers").iterdir()) == []
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    (["--at", "nowhere", 3, 3], "nowhere"),
+    (["--at", 0, 80, 3], "79"),
+    (["--at", 0, "left", 3], "left"),
+    ([], "nothing to find"),
+])
+def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
+    _refused(capsys, "query", room_run[1] / "field.npz", *options, "--out", tmp_path, says=[says])
+
+
+def test_a_field_that_is_damaged_or_not_there(room_run, tmp_path, capsys):
+    data = (room_run[1] / "field.npz").read_bytes()
+    (tmp_path / "field.npz").write_bytes(data[: len(data) // 2])
+    _refused(capsys, "query", tmp_path / "field.npz", "red", "--out", tmp_path / "o", says=["field.npz"])
+    _refused(capsys, "query", tmp_path / "none.npz", "red", "--out", tmp_path / "o", says=["none.npz"])
+
+
+def test_labels_that_are_not_there(room_run, tmp_path, capsys):
+    _refused(capsys, "eval", room_run[1] / "field.npz", "--labels", tmp_path, "--out", tmp_path / "o", says=["json"])
+
+
+# What is said while it works
+
+
+def test_both_reporters_keep_the_protocol():
+    assert isinstance(Console(), Reporter)
+    assert isinstance(Silent(), Reporter)
+
+
+class _Terminal:
+    def __init__(self, tty):
+        self.text, self._tty = "", tty
+
+    def isatty(self):
+        return self._tty
+
+    def write(self, text):
+        self.text += text
+
+    def flush(self):
+        pass
+
+
+def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
+    from jsecon import console
+
+    monkeypatch.setattr(console, "QUIET_SECONDS", 0.0)
+    monkeypatch.setattr(console, "LINE_SECONDS", 0.0)
+    for tty, sign in ((True, "%|"), (False, "s left\n")):
+        err = _Terminal(tty)
+        with Console(err=err).progress("votes") as progress:
+            for total in (4, 2):  # a second round with another total starts afresh
+                for done in range(1, total + 1):
+                    progress(done, total)
+        assert "votes" in err.text
+        assert sign in err.text
+
+
+def test_short_steps_stay_silent_in_logs():
+    err = _Terminal(False)
+    with Console(err=err).progress("votes") as progress:
+        for done in range(100):
+            progress(done + 1, 100)
+    assert err.text == ""
+    assert os.sep
