@@ -95,7 +95,7 @@ class ColourEmbedder:
         kept = values > 1e-3 * values[-1]
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
         self.dim = int(kept.sum()) + 2
-        neutral = lab_of(np.asarray([(128, 128, 128), (214, 206, 194), (58, 56, 54)]))
+        neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points, np.ones(len(self._points)))]
         colours += [self._mean(point[None], np.ones(1)) for point in neutral]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])

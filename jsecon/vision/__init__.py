@@ -1,0 +1,1 @@
+"""What looks at pixels, behind three small protocols: segmenters, trackers, embedders."""

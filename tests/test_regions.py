@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from jsecon.language.regions import region_embeddings
+
+
+def embed(frame, masks):
+    """Mean colour and a constant, as unit vectors: an embedder simple enough to check by hand."""
+    rows = [np.append(frame[m].mean(0), 50.0) if m.any() else np.zeros(4) for m in masks]
+    rows = np.asarray(rows, np.float64).reshape(-1, 4)
+    return (rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+
+
+def slow(frames, labels, count, weighting):
+    """The definition, in float64 loops."""
+    result = np.zeros((count, 4))
+    for r in range(count):
+        sizes = [(image == r).sum() for image in labels]
+        for t, size in enumerate(sizes):
+            if size:
+                omega = size / sum(sizes) if weighting == "pixels" else 1 / np.count_nonzero(sizes)
+                result[r] += omega * embed(frames[t], (labels[t] == r)[None])[0].astype(np.float64)
+        if any(sizes):
+            result[r] /= np.linalg.norm(result[r])
+    return result
+
+
+def sequence(seed, count=5, frames=4):
+    rng = np.random.default_rng(seed)
+    return (rng.integers(0, 256, (frames, 6, 7, 3)).astype(np.uint8),
+            rng.integers(-1, count, (frames, 6, 7)).astype(np.int16))
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["pixels", "uniform"]))
+def test_equals_the_definition(seed, weighting):
+    frames, labels = sequence(seed)
+    regions = region_embeddings(frames, labels, embed, weighting=weighting, num_regions=7)
+    assert regions.embeddings.shape == (7, 4)
+    assert regions.embeddings.dtype == np.float32
+    np.testing.assert_allclose(regions.embeddings, slow(frames, labels, 7, weighting), atol=1e-6)
+    np.testing.assert_array_equal(regions.pixels, [[(image == r).sum() for image in labels] for r in range(7)])
+
+
+def test_a_large_view_outweighs_a_small_one_only_with_pixels():
+    frames = np.zeros((2, 8, 8, 3), np.uint8)
+    frames[0, ..., 0] = 200
+    frames[1, ..., 2] = 200
+    labels = np.full((2, 8, 8), -1, np.int16)
+    labels[0] = 0
+    labels[1, 0, :2] = 0
+    by_pixels = region_embeddings(frames, labels, embed).embeddings[0]
+    by_view = region_embeddings(frames, labels, embed, weighting="uniform").embeddings[0]
+    assert by_pixels[0] > 10 * by_pixels[2]
+    np.testing.assert_allclose(by_view[0], by_view[2], atol=1e-6)
+
+
+def test_invariant_to_the_order_of_frames_and_equivariant_to_renaming():
+    frames, labels = sequence(3)
+    plain = region_embeddings(frames, labels, embed)
+    turned = region_embeddings(frames[::-1], labels[::-1], embed)
+    np.testing.assert_allclose(turned.embeddings, plain.embeddings, atol=1e-6)
+    name = np.append(np.random.default_rng(0).permutation(5), -1).astype(np.int16)
+    renamed = region_embeddings(frames, name[labels], embed)
+    np.testing.assert_allclose(renamed.embeddings[name[:5]], plain.embeddings, atol=1e-6)
+
+
+def test_what_is_never_seen_is_zero_and_counts_nowhere():
+    frames, labels = sequence(1)
+    labels[labels == 2] = -1
+    regions = region_embeddings(frames, labels, embed)
+    assert not regions.embeddings[2].any()
+    assert not regions.pixels[2].any()
+    nothing = region_embeddings(frames, np.full_like(labels, -1), embed, num_regions=3)
+    assert nothing.embeddings.shape == (3, 4)
+    assert not nothing.embeddings.any()
+    assert region_embeddings(frames, np.full_like(labels, -1), embed).embeddings.shape == (0, 4)
+
+
+def test_progress_counts_frames():
+    frames, labels = sequence(0)
+    told = []
+    region_embeddings(frames, labels, embed, progress=lambda done, total: told.append((done, total)))
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+@pytest.mark.parametrize(("options", "word"), [({"weighting": "area"}, "weighting"), ({"num_regions": 2}, "num_regions")])
+def test_bad_options_are_refused(options, word):
+    frames, labels = sequence(0)
+    with pytest.raises(Exception, match=word):
+        region_embeddings(frames, labels, embed, **options)
+    with pytest.raises(ValueError, match="labels"):
+        region_embeddings(frames, labels[:, 1:], embed)
