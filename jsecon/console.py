@@ -4,7 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TextIO
+from typing import Protocol, runtime_checkable
 
 from tqdm import tqdm
 
@@ -16,10 +16,21 @@ LINE_SECONDS = 15.0
 """between two lines of progress where standard error is no terminal"""
 
 
+@runtime_checkable
+class Stream(Protocol):
+    """Where lines go: sys.stdout, sys.stderr, or what stands in for them."""
+
+    def write(self, text: str, /) -> object: ...
+
+    def flush(self) -> None: ...
+
+    def isatty(self) -> bool: ...
+
+
 class Console:
     """The reporter of the command line (see jsecon.plan.Reporter)."""
 
-    def __init__(self, out: TextIO | None = None, err: TextIO | None = None):
+    def __init__(self, out: Stream | None = None, err: Stream | None = None):
         self._out, self._err = out or sys.stdout, err or sys.stderr
 
     def plan(self, title: str, steps: Sequence[Step]) -> None:
@@ -56,7 +67,7 @@ class Console:
 class _Bar:
     """A tqdm bar that appears after two seconds and starts afresh when the total changes or the count falls back."""
 
-    def __init__(self, name: str, err: TextIO):
+    def __init__(self, name: str, err: Stream):
         self._name, self._err, self._bar = name, err, None
         self._started = time.monotonic()
 
@@ -80,7 +91,7 @@ class _Bar:
 class _Lines:
     """A line every so many seconds, for logs."""
 
-    def __init__(self, name: str, err: TextIO):
+    def __init__(self, name: str, err: Stream):
         self._name, self._err = name, err
         self._begin(0, None)
         self._last = self._started

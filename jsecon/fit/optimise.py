@@ -85,7 +85,7 @@ def start_state(gaussians: Gaussians, steps: int) -> FitState:
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
-def _rates(gaussians: Gaussians, rates: LearningRates, extent: float, progress, step, band_every: int) -> Gaussians:
+def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, step, band_every: Array) -> Gaussians:
     """One rate an array (one a band for sh), in the shape of Gaussians."""
     bands = gaussians.sh.shape[1]
     degree = np.floor(np.sqrt(np.arange(bands))).astype(np.int32)
