@@ -227,8 +227,16 @@ def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denomin
     behind = dataclasses.replace(scene, means=scene.means.at[0].set(jnp.asarray([0.0, 50.0, 0.0])))
     got, _ = distill_l1(behind, cameras, labels, codes, steps=12, key=KEY, init="random", capacity=capacity)
     assert (np.asarray(got[0]) == 0).all()
-    kept, _ = distill_l1(behind, cameras, labels, codes, steps=12, key=KEY, init=jnp.asarray(unit_rows(np.random.default_rng(0), 64, 3)),
-                         capacity=capacity)  # fmt: skip
+    kept, _ = distill_l1(
+        behind,
+        cameras,
+        labels,
+        codes,
+        steps=12,
+        key=KEY,
+        init=jnp.asarray(unit_rows(np.random.default_rng(0), 64, 3)),
+        capacity=capacity,
+    )
     assert np.linalg.norm(kept[0]) == pytest.approx(1, abs=1e-5)
     _, history = distill_l1(
         scene, cameras, jnp.full_like(labels, -1), codes, steps=3, key=KEY, init="random", capacity=capacity
@@ -252,9 +260,13 @@ def test_under_jit_too_small_a_capacity_is_data_and_outside_an_error(task):
 def test_shapes_that_disagree_are_told(task):
     scene, cameras, labels, codes, _, _ = task
     for wrong, match in (
-        ({"labels": labels[:2]}, "labels"), ({"labels": labels[:, :3]}, "labels"), ({"region_codes": codes[:0]}, "0 regions"),
-        ({"init": "mean"}, "init='mean'"), ({"init": jnp.zeros((3, 3))}, "init"), ({"steps": 0}, "0 steps"),
-    ):  # fmt: skip
+        ({"labels": labels[:2]}, "labels"),
+        ({"labels": labels[:, :3]}, "labels"),
+        ({"region_codes": codes[:0]}, "0 regions"),
+        ({"init": "mean"}, "init='mean'"),
+        ({"init": jnp.zeros((3, 3))}, "init"),
+        ({"steps": 0}, "0 steps"),
+    ):
         given = {"labels": labels, "region_codes": codes, "steps": 1, "init": "zero"} | wrong
         with pytest.raises(ValueError, match=match):
             distill_l1(scene, cameras, key=KEY, **given)

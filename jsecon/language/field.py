@@ -81,11 +81,13 @@ def load_field(path: str | os.PathLike) -> LanguageField:
                     remedy=f"Read it with the jsecon that wrote it. {_REMEDY}",
                 )
             field = _unpack(header["field"], members)
+        problem = "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field)
     except InputError:
         raise
     except (
         ValueError,
         KeyError,
+        IndexError,
         TypeError,
         AttributeError,
         OSError,
@@ -99,7 +101,6 @@ def load_field(path: str | os.PathLike) -> LanguageField:
             expected="a whole one",
             remedy=f"It may have been changed or cut in copying. {_REMEDY}",
         ) from error
-    problem = "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field)
     if problem is not None:
         raise InputError(path, found=problem, expected="arrays of one N, R, d, E and T", remedy=_REMEDY)
     return field

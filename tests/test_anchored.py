@@ -1,0 +1,318 @@
+"""The anchored query, by votes and by codes, against the definition in NumPy; the region under a pixel against a rendering."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import REGIONS, make_field, true_regions, unit_rows
+
+from jsecon.errors import InputError
+from jsecon.query.anchored import query_anchored, query_region, region_at, region_shares_at
+from jsecon.query.pixel import pixel_weights
+from jsecon.splat.render import render
+from jsecon.types import Regions, Votes
+
+
+@pytest.fixture(scope="module")
+def made(scene, cameras):
+    return make_field(scene, cameras)
+
+
+@pytest.fixture(scope="module")
+def field(made):
+    return made[0]
+
+
+def exact_share(votes, regions, unlabelled_weight=1.0):
+    inside = np.isin(np.asarray(votes.regions), regions)
+    weight = np.where(inside, np.asarray(votes.weights, np.float64), 0).sum(1)
+    labelled, total = np.asarray(votes.labelled, np.float64), np.asarray(votes.total, np.float64)
+    seen = labelled + unlabelled_weight * (total - labelled)
+    return np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0)
+
+
+def exact_cosine(a, b):
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    length = np.linalg.norm(a, axis=1) * np.linalg.norm(b)
+    return np.divide(a @ b, length, out=np.zeros(len(a)), where=length > 0)
+
+
+@pytest.mark.parametrize("region", range(REGIONS))
+def test_a_text_like_a_region_finds_it_and_its_gaussians(field, region):
+    text = field.regions.embeddings[region] + 0.1 * unit_rows(np.random.default_rng(region), 1, 12)[0]
+    got = query_anchored(field, text)
+    assert int(got.region) == region
+    assert float(got.score) == pytest.approx(exact_cosine(field.regions.embeddings[[region]], text)[0], abs=1e-6)
+    share = exact_share(field.votes, [region])
+    np.testing.assert_allclose(got.similarity, share, atol=1e-6)
+    np.testing.assert_array_equal(got.mask, share >= 0.5)
+    by_code = query_anchored(field, text, by="code")
+    cosine = exact_cosine(field.codes, field.region_codes[region])
+    np.testing.assert_allclose(by_code.similarity, cosine, atol=1e-6)
+    np.testing.assert_array_equal(by_code.mask, cosine >= 0.9)
+
+
+def test_what_is_selected_is_mostly_right(field, scene):
+    """The labels were rendered from these regions, in a scene whose 64 translucent Gaussians hide one another."""
+    true = true_regions(scene)
+    for by in ("votes", "code"):
+        masks = np.stack([query_region(field, region, by=by).mask for region in range(REGIONS)])
+        right = sum((masks[region] & (true == region)).sum() for region in range(REGIONS))
+        assert right / masks.sum() > 0.75
+        assert right / 64 > 0.4
+
+
+def test_a_region_asked_for_by_its_number_is_the_same(field):
+    for by in ("votes", "code"):
+        asked = query_region(field, 2, by=by)
+        found = query_anchored(field, field.regions.embeddings[2], by=by)
+        np.testing.assert_array_equal(asked.mask, found.mask)
+        np.testing.assert_array_equal(asked.similarity, found.similarity)
+        assert int(asked.region) == 2
+        assert float(asked.score) == 1
+        for absent in (-1, REGIONS, 10_000, jnp.asarray(-1)):
+            nothing = query_region(field, absent, by=by)
+            assert not nothing.mask.any()
+            assert int(nothing.region) == -1
+            assert float(nothing.score) == 0
+
+
+def test_nothing_passes_a_retrieval_threshold_that_no_region_reaches(field):
+    text = unit_rows(np.random.default_rng(9), 1, 12)[0]
+    best = exact_cosine(field.regions.embeddings, text).max()
+    for by in ("votes", "code"):
+        assert int(query_anchored(field, text, retrieval_threshold=best - 1e-4, by=by).region) >= 0
+        nothing = query_anchored(field, text, retrieval_threshold=best + 1e-4, similarity_threshold=-1.0, by=by)
+        assert int(nothing.region) == -1
+        assert not nothing.mask.any()
+        assert float(nothing.score) == pytest.approx(best, abs=1e-6)  # how close it was is still told
+
+
+def test_jit_and_vmap_over_texts_equal_the_loop(field):
+    texts = unit_rows(np.random.default_rng(4), 7, 12)
+    for by in ("votes", "code"):
+        together = jax.jit(jax.vmap(lambda text, by=by: query_anchored(field, text, by=by)))(texts)
+        for index, text in enumerate(texts):
+            alone = query_anchored(field, text, by=by)
+            np.testing.assert_array_equal(together.mask[index], alone.mask)
+            np.testing.assert_allclose(together.similarity[index], alone.similarity, atol=1e-7)
+            assert int(together.region[index]) == int(alone.region)
+
+
+@pytest.mark.parametrize("count", [16_385, 32_769, 40_000, 100_000])
+def test_many_gaussians_equal_float64_under_jit_and_vmap(field, count):
+    rows = np.arange(count) % 64
+    wide = jax.tree.map(
+        lambda a: np.asarray(a)[rows],
+        (field.gaussians, field.codes, dataclasses.replace(field.votes, overflow=np.zeros(64))),
+    )
+    many = dataclasses.replace(
+        field, gaussians=wide[0], codes=wide[1], votes=dataclasses.replace(wide[2], overflow=np.int32(0))
+    )
+    texts = np.stack([field.regions.embeddings[0], field.regions.embeddings[3]])
+    got = jax.jit(jax.vmap(lambda text: query_anchored(many, text, by="code")))(texts)
+    voted = jax.jit(jax.vmap(lambda text: query_anchored(many, text)))(texts)
+    for index, region in enumerate((0, 3)):
+        np.testing.assert_allclose(
+            got.similarity[index], exact_cosine(field.codes, field.region_codes[region])[rows], atol=1e-6
+        )
+        np.testing.assert_allclose(voted.similarity[index], exact_share(field.votes, [region])[rows], atol=1e-6)
+
+
+def test_regions_that_are_alike_count_as_one(field):
+    embeddings = np.array(field.regions.embeddings)
+    embeddings[4] = embeddings[1]
+    twin = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels))
+    alone, both = query_anchored(twin, embeddings[1]), query_anchored(twin, embeddings[1], alike_threshold=0.99)
+    np.testing.assert_allclose(alone.similarity, exact_share(field.votes, [1]), atol=1e-6)
+    np.testing.assert_allclose(both.similarity, exact_share(field.votes, [1, 4]), atol=1e-6)
+    by_code = query_anchored(twin, embeddings[1], alike_threshold=0.99, by="code")
+    expected = np.maximum(*(exact_cosine(field.codes, field.region_codes[r]) for r in (1, 4)))
+    np.testing.assert_allclose(by_code.similarity, expected, atol=1e-6)
+
+
+def test_unlabelled_weight_says_how_much_unlabelled_pixels_count(field):
+    text = field.regions.embeddings[2]
+    for weight in (0.0, 0.3):
+        got = query_anchored(field, text, unlabelled_weight=weight)
+        np.testing.assert_allclose(got.similarity, exact_share(field.votes, [2], weight), atol=1e-6)
+
+
+def with_votes(field, **changes):
+    return dataclasses.replace(field, votes=dataclasses.replace(field.votes, **changes))
+
+
+@pytest.mark.parametrize("by", ["votes", "code"])
+@pytest.mark.parametrize("threshold", [-2.0, 0.0, 0.5])
+def test_what_was_never_seen_is_never_selected(field, by, threshold):
+    unseen = np.arange(64) % 2 == 0
+    gone = {
+        name: np.where(unseen, 0, np.asarray(getattr(field.votes, name)))
+        for name in ("labelled", "total", "views", "peak")
+    }
+    votes = Votes(
+        np.where(unseen[:, None], -1, field.votes.regions),
+        np.where(unseen[:, None], 0, field.votes.weights),
+        overflow=np.int32(0),
+        num_regions=REGIONS,
+        **gone,
+    )
+    got = query_region(dataclasses.replace(field, votes=votes), 1, by=by, similarity_threshold=threshold)
+    assert not np.asarray(got.mask)[unseen].any()
+    codes = np.where(unseen[:, None], 0, field.codes)
+    if by == "code":
+        assert not np.asarray(
+            query_region(dataclasses.replace(field, codes=codes), 1, by=by, similarity_threshold=threshold).mask
+        )[unseen].any()
+
+
+def test_numbers_that_are_not_finite_never_select(field):
+    nan, inf = np.nan, np.inf
+    codes = np.array(field.codes)
+    codes[0], codes[1], codes[2], codes[3] = nan, inf, 1e30 * codes[2], 1e-30 * codes[3]
+    broken = dataclasses.replace(field, codes=codes)
+    for region in range(REGIONS):
+        got, sound = query_region(broken, region, by="code"), query_region(field, region, by="code")
+        assert not got.mask[:2].any()
+        np.testing.assert_array_equal(got.mask[2:], sound.mask[2:])
+    weights, total = np.array(field.votes.weights), np.array(field.votes.total)
+    weights[0], total[1], weights[2], weights[3] = nan, nan, inf, weights[3] * 1e30
+    total[3] *= 1e30
+    labelled = np.array(field.votes.labelled)
+    labelled[3] *= 1e30
+    broken = with_votes(field, weights=weights, total=total, labelled=labelled)
+    for region in range(REGIONS):
+        got, sound = query_region(broken, region), query_region(field, region)
+        assert not got.mask[:3].any()
+        np.testing.assert_array_equal(got.mask[3:], sound.mask[3:])
+        np.testing.assert_allclose(got.similarity[3:], sound.similarity[3:], rtol=1e-5)
+
+
+@pytest.mark.parametrize("by", ["votes", "code"])
+def test_broken_texts_and_regions_select_nothing(field, by):
+    for text in (np.zeros(12), np.full(12, np.nan), np.r_[np.inf, np.zeros(11)]):
+        got = query_anchored(field, text.astype(np.float32), retrieval_threshold=-1.0, by=by)
+        assert int(got.region) == -1
+        assert not got.mask.any()
+        assert float(got.score) == 0
+    embeddings = np.array(field.regions.embeddings)
+    text = embeddings[1].copy()
+    embeddings[0], embeddings[1] = np.nan, 0  # neither can be retrieved
+    got = query_anchored(
+        dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels)),
+        text,
+        retrieval_threshold=-1.0,
+        by=by,
+    )
+    assert int(got.region) in (2, 3, 4)
+    for value in (0.0, np.nan):
+        table = np.array(field.region_codes)
+        table[1] = value
+        assert not query_region(
+            dataclasses.replace(field, region_codes=table), 1, by="code", similarity_threshold=-1.0
+        ).mask.any()
+    assert not query_region(field, 1, by=by, similarity_threshold=np.nan).mask.any()
+
+
+def test_a_field_without_regions_answers_nothing(field):
+    votes = Votes(
+        np.full((64, 0), -1, np.int32),
+        np.zeros((64, 0), np.float32),
+        *np.zeros((3, 64), np.float32),
+        np.ones(64, np.int32),
+        np.int32(0),
+        0,
+    )
+    empty = dataclasses.replace(
+        field,
+        votes=votes,
+        regions=Regions(np.zeros((0, 12), np.float32), np.zeros((0, 4), np.int32)),
+        region_codes=np.zeros((0, 8), np.float32),
+    )
+    for got in (query_anchored(empty, np.ones(12, np.float32)), query_region(empty, 0)):
+        assert got.mask.shape == (64,)
+        assert not got.mask.any()
+        assert int(got.region) == -1
+    assert region_at(empty, 0, 20, 20) == -1
+
+
+def test_wrong_arguments_are_told(field):
+    with pytest.raises(ValueError, match=r"expected \(12,\).*random"):
+        query_anchored(field, np.ones(11, np.float32))
+    for call in (
+        lambda: query_anchored(field, np.ones(12, np.float32), by="x"),
+        lambda: query_region(field, 1, by="x"),
+    ):
+        with pytest.raises(ValueError, match="'code' or 'votes'"):
+            call()
+
+
+def test_weights_of_a_pixel_equal_the_renderers(field, cameras):
+    onehot = jnp.eye(64)
+    for view, x, y in ((0, 25, 20), (1, 18, 25), (2, 30, 15), (3, 0, 0)):
+        camera = field.cameras[view]
+        expected = np.asarray(render(field.gaussians, camera, onehot).features[y, x])
+        ids, weights = pixel_weights(field.gaussians, camera, x, y)
+        got = np.zeros(64)
+        got[ids] = weights
+        np.testing.assert_allclose(got, expected, atol=2e-6)
+
+
+def test_an_opaque_stack_stops_where_the_renderer_stops(field):
+    """Eight opaque Gaussians behind one another, two at one depth: order, ties and the stop at T = 1e-4."""
+    depths = np.array([0.3, 0.1, 0.1, 0.4, 0.2, 0.6, 0.5, 0.7], np.float32)
+    towards = np.asarray(field.cameras.world_to_camera[0])[2, :3]
+    chosen = jax.tree.map(lambda a: np.array(a)[:8], field.gaussians)
+    chosen = dataclasses.replace(
+        chosen,
+        means=depths[:, None] * towards,
+        log_scales=np.full((8, 3), -2.0, np.float32),
+        opacity_logits=np.array([2, 3, 4, 5, 4, 6, 6, 5], np.float32),
+    )
+    expected = np.asarray(render(jax.tree.map(jnp.asarray, chosen), field.cameras[0], jnp.eye(8)).features)
+    y, x = np.unravel_index(expected.sum(-1).argmax(), expected.shape[:2])
+    ids, weights = pixel_weights(chosen, field.cameras[0], int(x), int(y))
+    got = np.zeros(8)
+    got[ids] = weights
+    np.testing.assert_allclose(got, expected[y, x], atol=2e-6)
+    assert len(ids) < 8
+
+
+def test_the_region_under_a_pixel_is_the_labelled_one(field, made):
+    labels = made[1]
+    agree, clear = 0, 0
+    for view, y, x in np.random.default_rng(0).permutation(np.argwhere(labels >= 0))[:40]:
+        shares = region_shares_at(field, int(view), int(x), int(y))
+        rendered = _rendered_shares(field, int(view))[y, x]
+        np.testing.assert_allclose(shares, rendered, atol=1e-5)
+        found = region_at(field, int(view), int(x), int(y))
+        assert found == (shares.argmax() if shares.max() >= 0.05 else -1)
+        agree, clear = agree + (found == labels[view, y, x]), clear + 1
+    assert agree / clear > 0.8
+    assert (labels[0, 0, 0] == -1) == (region_at(field, 0, 0, 0) == -1)
+    assert region_at(field, 0, 0, 0, min_share=1.1) == -1
+
+
+_CACHE = {}
+
+
+def _rendered_shares(field, view):
+    """(H, W, R): the shares of votes rendered as features, the definition."""
+    if view not in _CACHE:
+        total = np.asarray(field.votes.total)[:, None]
+        shares = np.divide(
+            np.asarray(field.votes.dense()), total, out=np.zeros((64, REGIONS), np.float32), where=total > 0
+        )
+        _CACHE[view] = np.asarray(render(field.gaussians, field.cameras[view], jnp.asarray(shares)).features)
+    return _CACHE[view]
+
+
+@pytest.mark.parametrize(
+    ("frame", "x", "y", "match"),
+    [(4, 0, 0, "0 to 3"), (-1, 0, 0, "0 to 3"), (0, 48, 0, "0 to 47"), (0, 0, 40, "0 to 39"), (0, -1, 0, "0 to 47")],
+)
+def test_pixels_that_are_not_there_are_told(field, frame, x, y, match):
+    with pytest.raises(InputError, match=match):
+        region_at(field, frame, x, y)

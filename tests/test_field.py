@@ -1,0 +1,177 @@
+"""The field's file: what goes in comes out, and every broken file is told apart with one clear message."""
+
+import dataclasses
+import json
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import make_field, unit_rows
+
+from jsecon.errors import InputError
+from jsecon.language.autoencoder import train_autoencoder
+from jsecon.language.field import load_field, save_field
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    return make_field(scene, cameras)[0]
+
+
+@pytest.fixture
+def path(field, tmp_path):
+    save_field(tmp_path / "scene.field", field)
+    return tmp_path / "scene.field"
+
+
+def assert_same(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)  # static fields included
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.asarray(x).dtype == np.asarray(y).dtype
+        np.testing.assert_array_equal(x, y)
+
+
+def test_what_goes_in_comes_out(field, path):
+    assert_same(load_field(path), field)
+
+
+def test_with_an_autoencoder_and_without_any_coder(field, tmp_path):
+    coder = train_autoencoder(unit_rows(np.random.default_rng(0), 1, 12), latent=8, key=jax.random.key(0), epochs=1)
+    for changed in (dataclasses.replace(field, autoencoder=coder), dataclasses.replace(field, autoencoder=None)):
+        save_field(tmp_path / "a.field", changed)
+        back = load_field(tmp_path / "a.field")
+        assert_same(back, changed)
+    texts = unit_rows(np.random.default_rng(1), 3, 12)
+    save_field(tmp_path / "a.field", dataclasses.replace(field, autoencoder=coder))
+    np.testing.assert_array_equal(load_field(tmp_path / "a.field").autoencoder.encode(texts), coder.encode(texts))
+
+
+def test_wide_numbers_keep_their_width(field, path):
+    assert field.to_source.dtype == np.float64
+    assert load_field(path).to_source.dtype == np.float64
+
+
+def test_equal_fields_give_equal_bytes_and_no_pickle(field, path, tmp_path):
+    save_field(tmp_path / "again.field", field)
+    assert (tmp_path / "again.field").read_bytes() == path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        assert all(name.endswith(".npy") for name in archive.namelist())
+    with np.load(path, allow_pickle=False) as members:
+        assert all(members[name].dtype.kind in "biuf" for name in members.files)
+
+
+def test_empty_scene_and_no_regions(field, tmp_path):
+    def none(a):
+        return np.asarray(a)[:0] if np.ndim(a) else np.asarray(a)
+
+    gaussians, votes, codes = jax.tree.map(none, (field.gaussians, field.votes, field.codes))
+    regions = jax.tree.map(none, field.regions)
+    votes = dataclasses.replace(votes, num_regions=0)
+    changed = dataclasses.replace(
+        field, gaussians=gaussians, votes=votes, codes=codes, regions=regions, region_codes=none(field.region_codes)
+    )
+    save_field(tmp_path / "a.field", changed)
+    assert_same(load_field(tmp_path / "a.field"), changed)
+
+
+def fails(path, match):
+    with pytest.raises(InputError, match=match) as caught:
+        load_field(path)
+    assert caught.value.remedy
+    assert str(path) in str(caught.value)
+
+
+def test_no_file_a_folder_an_empty_file_and_another_kind(tmp_path):
+    fails(tmp_path / "none.field", "no such file")
+    fails(tmp_path, "a folder")
+    for name, content in (
+        ("empty", b""),
+        ("ply", b"ply\nformat binary_little_endian 1.0\n"),
+        ("text", b"hello" * 1000),
+    ):
+        (tmp_path / name).write_bytes(content)
+        fails(tmp_path / name, "no complete zip")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.99, 0.9999])
+def test_a_file_cut_short(path, share):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    fails(path, "zip|damaged")
+
+
+def test_a_file_with_bytes_changed(path):
+    content = bytearray(path.read_bytes())
+    rng = np.random.default_rng(0)
+    told = 0
+    for place in rng.integers(0, len(content), 40):
+        changed = bytearray(content)
+        changed[place] ^= 0xFF
+        path.write_bytes(changed)
+        try:
+            load_field(path)  # a byte that does not matter (a date, padding) may pass; nothing else may escape
+        except InputError:
+            told += 1
+    assert told >= 20
+
+
+def test_another_programs_zip(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.ones(3))
+    fails(tmp_path / "other.npz", "without a jsecon header")
+    header = np.frombuffer(json.dumps({"format": "something"}).encode(), np.uint8)
+    np.savez(tmp_path / "foreign.npz", header=header)
+    fails(tmp_path / "foreign.npz", "another program")
+    np.savez(tmp_path / "pickled.npz", header=np.array([{"a": 1}], dtype=object))
+    fails(tmp_path / "pickled.npz", "damaged")
+    np.savez(tmp_path / "list.npz", header=np.frombuffer(b"[1, 2]", np.uint8))
+    fails(tmp_path / "list.npz", "another program")
+
+
+def rewritten(path, change):
+    """The file with its header and arrays changed by `change(header, arrays)`."""
+    with np.load(path) as members:
+        arrays = {name: members[name] for name in members.files}
+    header = json.loads(arrays.pop("header").tobytes())
+    change(header, arrays)
+    with open(path, "wb") as file:
+        np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda h, a: h.update(version=99), "version 99"),
+        (lambda h, a: h.pop("field"), "damaged"),
+        (lambda h, a: a.pop("codes"), "damaged"),
+        (lambda h, a: a.update(codes=a["codes"][:-1]), "damaged"),
+        (lambda h, a: h["field"]["fields"].pop("codes"), "damaged"),
+        (lambda h, a: h["field"].update(record="Popen"), "damaged"),
+        (lambda h, a: h.update(field={"value": 3}), "no field at its root"),
+        (lambda h, a: h["field"]["fields"].update(gaussians={"value": None}), "damaged"),
+        (lambda h, a: h["field"]["fields"]["names"].update(value=["one"]), "1 frame names"),
+        (lambda h, a: h["field"]["fields"]["votes"]["fields"]["num_regions"].update(value=4), "votes over 4 regions"),
+    ],
+)
+def test_a_header_that_does_not_fit(path, change, match):
+    rewritten(path, change)
+    fails(path, match)
+
+
+def test_fields_that_do_not_fit_together_are_not_written(field, tmp_path):
+    for changed in (
+        dataclasses.replace(field, codes=field.codes[:-1]),
+        dataclasses.replace(field, region_codes=field.region_codes[:, :2]),
+        dataclasses.replace(field, names=("one",)),
+        dataclasses.replace(field, autoencoder={"w": jnp.ones(3, jnp.bfloat16)}),
+    ):
+        with pytest.raises(ValueError, match="save_field"):
+            save_field(tmp_path / "a.field", changed)
+    assert not list(tmp_path.iterdir())  # neither the file nor a temporary one
+
+
+def test_a_folder_that_cannot_be_written(field, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match="folder that can be written"):
+        save_field(tmp_path / "file" / "a.field", field)

@@ -1,0 +1,147 @@
+"""The point-level rendered protocol: pairs, denominators, missing answers, sizes; on truths rendered from the scene itself."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.data.lerf import LabelledFrame
+from jsecon.errors import InputError
+from jsecon.evaluate.lerf import LERF_PAIRS, VALA_THRESHOLD, evaluate_point_level_rendered, resized
+from jsecon.query.masks import selection_mask
+from jsecon.types import Selection
+
+
+def members(scene):
+    means = np.asarray(scene.means)
+    return {"left": means[:, 0] < -0.2, "right": means[:, 0] > 0.2, "top": means[:, 1] < -0.35}
+
+
+def selection(mask, similarity=None):
+    mask = jnp.asarray(mask)
+    similarity = jnp.where(mask, 1.0, 0.0) if similarity is None else jnp.asarray(similarity)
+    return Selection(mask, similarity, jnp.asarray(3, jnp.int32), jnp.asarray(0.8))
+
+
+def box_of(mask):
+    y, x = np.nonzero(mask)
+    return np.array([[x.min(), y.min(), x.max(), y.max()]], np.float32)
+
+
+@pytest.fixture(scope="module")
+def labelled(scene, cameras):
+    frames = []
+    for view, queries in ((0, ("left", "right", "top")), (2, ("left", "top"))):
+        objects = {}
+        for query in queries:
+            mask = np.asarray(selection_mask(scene, cameras[view], members(scene)[query]))
+            objects[query] = mask, box_of(mask)
+        frames.append(LabelledFrame(f"view_{view}", 48, 40, objects))
+    return frames
+
+
+@pytest.fixture(scope="module")
+def views(cameras):
+    return {f"view_{t}": cameras[t] for t in range(4)}
+
+
+def test_a_perfect_selection_scores_one(scene, views, labelled):
+    asked, calls = [], []
+
+    def select(query):
+        asked.append(query)
+        return selection(members(scene)[query])
+
+    rows, summary = evaluate_point_level_rendered(
+        scene, views, labelled, select, expected_pairs=5, progress=lambda *c: calls.append(c)
+    )
+    assert [(row.frame, row.query) for row in rows] == [
+        ("view_0", "left"),
+        ("view_0", "right"),
+        ("view_0", "top"),
+        ("view_2", "left"),
+        ("view_2", "top"),
+    ]
+    assert sorted(asked) == ["left", "right", "top"]  # a query is asked once a scene
+    assert all(row.iou == 1 and row.located and row.region == 3 for row in rows)
+    assert rows[0].selected == members(scene)["left"].sum()
+    assert {
+        key: summary[key] for key in ("pairs", "frames", "queries", "missing", "miou", "macc", "acc_50", "loc_acc")
+    } == {"pairs": 5, "frames": 2, "queries": 3, "missing": 0, "miou": 1.0, "macc": 1.0, "acc_50": 1.0, "loc_acc": 1.0}
+    assert "alpha > 0.7" in summary["protocol"]
+    assert calls[-1] == (5, 5)
+
+
+def test_missing_answers_count_as_nothing_found(scene, views, labelled):
+    answers = {"left": selection(members(scene)["left"]), "right": None, "top": selection(np.zeros(64, bool))}
+    rows, summary = evaluate_point_level_rendered(scene, views, labelled, answers.get)
+    assert [row.iou for row in rows] == [1, 0, 0, 1, 0]
+    assert summary["missing"] == 3
+    assert summary["pairs"] == 5
+    assert summary["miou"] == summary["macc"] == summary["loc_acc"] == pytest.approx(0.4)
+    assert all(not row.mask.any() and row.point is None for row in rows if row.iou == 0)
+
+
+def test_iou_is_of_the_selected_alone(scene, views, labelled):
+    wrong = members(scene)["right"]
+    rows, _ = evaluate_point_level_rendered(scene, views, labelled[:1], lambda query: selection(wrong))
+    for row in rows:
+        predicted = np.asarray(selection_mask(scene, views["view_0"], wrong))
+        true = labelled[0].objects[row.query][0]
+        assert row.iou == pytest.approx((predicted & true).sum() / (predicted | true).sum(), abs=1e-6)
+        np.testing.assert_array_equal(row.mask, predicted)
+
+
+def test_the_threshold_of_the_silhouette_is_an_option(scene, views, labelled):
+    strict, _ = evaluate_point_level_rendered(
+        scene, views, labelled[:1], lambda query: selection(members(scene)[query])
+    )
+    lenient, summary = evaluate_point_level_rendered(
+        scene, views, labelled[:1], lambda query: selection(members(scene)[query]), alpha_threshold=VALA_THRESHOLD
+    )
+    assert all(a.mask.sum() < b.mask.sum() for a, b in zip(strict, lenient, strict=True))
+    assert "alpha > 0.0392" in summary["protocol"]
+
+
+def test_the_point_is_the_maximum_of_the_similarity(scene, views, labelled):
+    """Two groups selected, one ten times as similar: the point lies on that one."""
+    left, right = members(scene)["left"], members(scene)["right"]
+    for strong, other, query in ((left, right, "left"), (right, left, "right")):
+        answer = selection(strong | other, np.where(strong, 1.0, np.where(other, 0.1, 0.0)).astype(np.float32))
+        rows, _ = evaluate_point_level_rendered(scene, views, labelled[:1], lambda _, answer=answer: answer)
+        row = next(row for row in rows if row.query == query)
+        x, y = row.point
+        assert labelled[0].objects[query][0][y, x]
+        assert row.located
+
+
+def test_labels_of_another_size_are_evaluated_at_their_own(scene, views, labelled):
+    camera = resized(views["view_0"], 96, 80)
+    mask = np.asarray(selection_mask(scene, jax.tree.map(jnp.asarray, camera), members(scene)["left"]))
+    frame = LabelledFrame("view_0", 96, 80, {"left": (mask, box_of(mask))})
+    rows, _ = evaluate_point_level_rendered(scene, views, [frame], lambda query: selection(members(scene)[query]))
+    assert rows[0].iou == 1
+    assert rows[0].mask.shape == (80, 96)
+    small = np.asarray(selection_mask(scene, views["view_0"], members(scene)["left"]))
+    halved = mask.reshape(40, 2, 48, 2).mean((1, 3)) > 0.5
+    assert (halved == small).mean() > 0.97  # the same view, only finer
+
+
+def test_wrong_denominators_names_and_sizes_are_told(scene, views, labelled):
+    def run(frames, **options):
+        return evaluate_point_level_rendered(scene, views, frames, lambda query: None, **options)
+
+    with pytest.raises(InputError, match=r"5 \(frame, query\) pairs; expected 56"):
+        run(labelled, expected_pairs=LERF_PAIRS["figurines"])
+    with pytest.raises(InputError, match="at least one"):
+        run([])
+    with pytest.raises(InputError, match="no frame of that name"):
+        run([dataclasses.replace(labelled[0], name="view_9")])
+    with pytest.raises(InputError, match="aspect"):
+        run([dataclasses.replace(labelled[0], width=60)])
+
+
+def test_the_published_denominators():
+    assert sum(LERF_PAIRS.values()) == 208
