@@ -1,4 +1,4 @@
-"""One question put to a field, and its answer as files: a .ply of the Gaussians, a JSON of figures, masks of a few frames."""
+"""One question put to a field, and its answer as files: a .ply of the Gaussians, a JSON of figures, a few masks."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField, Selection
 
 METHODS = ("votes", "code", "one_step", "canonical")
-"""votes, code: GT-anchored, membership by a Gaussian's votes or by its code; one_step, canonical: codes against the text"""
+"""votes, code: anchored, membership by a Gaussian's votes or its code; one_step, canonical: codes against the text"""
 ONE_STEP_THRESHOLD = 0.8
 """on the cosine of a Gaussian's code and the text's"""
 CANONICAL_THRESHOLD = 0.5
@@ -52,8 +52,15 @@ class Answer:
         return int(np.asarray(self.selection.mask).sum() - self.mask.sum())
 
 
-def ask_text(field: LanguageField, embedder: Any, text: str, *, by: str = "votes", threshold: float | None = None,
-             outliers: bool = True) -> Answer:
+def ask_text(
+    field: LanguageField,
+    embedder: Any,
+    text: str,
+    *,
+    by: str = "votes",
+    threshold: float | None = None,
+    outliers: bool = True,
+) -> Answer:
     """The Gaussians that a text names. Raises InputError where the embedder has no words for it."""
     require(by in METHODS, "by", got=by, expected=f"one of {METHODS}", remedy="votes is the default.")
     embedding = jnp.asarray(embedder.embed_text([text])[0])
@@ -65,13 +72,22 @@ def ask_text(field: LanguageField, embedder: Any, text: str, *, by: str = "votes
             selection = query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
         else:
             canonical = encode(field.autoencoder, field.canonical)
-            selection = query_canonical(field.codes, code, canonical,
-                                        CANONICAL_THRESHOLD if threshold is None else threshold)
+            selection = query_canonical(
+                field.codes, code, canonical, CANONICAL_THRESHOLD if threshold is None else threshold
+            )
     return _answer(field, text, by, selection, outliers, {})
 
 
-def ask_pixel(field: LanguageField, frame: int | str, x: int, y: int, *, by: str = "votes",
-              threshold: float | None = None, outliers: bool = True) -> Answer:
+def ask_pixel(
+    field: LanguageField,
+    frame: int | str,
+    x: int,
+    y: int,
+    *,
+    by: str = "votes",
+    threshold: float | None = None,
+    outliers: bool = True,
+) -> Answer:
     """The Gaussians of what lies under pixel (column x, row y) of a frame (its index or name); no text is embedded.
 
     Raises InputError for a frame or pixel that the field does not have, and where no region lies there.
@@ -80,12 +96,22 @@ def ask_pixel(field: LanguageField, frame: int | str, x: int, y: int, *, by: str
     region = region_at(field, index, x, y)
     name = field.names[index]
     if region < 0:
-        raise InputError(f"--at {name} {x} {y}", found="no region under that pixel", expected="a pixel of an object",
-                         remedy="Choose another pixel or frame: report.html of the run shows the regions.")
+        raise InputError(
+            f"--at {name} {x} {y}",
+            found="no region under that pixel",
+            expected="a pixel of an object",
+            remedy="Choose another pixel or frame: report.html of the run shows the regions.",
+        )
     membership = "code" if by == "code" else "votes"
     selection = query_region(field, region, by=membership, similarity_threshold=threshold)
-    return _answer(field, f"at {name} {x} {y}", membership, selection, outliers,
-                   {"text encoder": "the region under the pixel is the anchor"})
+    return _answer(
+        field,
+        f"at {name} {x} {y}",
+        membership,
+        selection,
+        outliers,
+        {"text encoder": "the region under the pixel is the anchor"},
+    )
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:
@@ -97,13 +123,17 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
         return field.names.index(stem)
     if str(frame).isdecimal() and int(frame) < len(field.names):
         return int(frame)
-    raise InputError(f"frame {frame}", found="no such frame in the field",
-                     expected=f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})",
-                     remedy="Held-out frames are not in the field.")
+    raise InputError(
+        f"frame {frame}",
+        found="no such frame in the field",
+        expected=f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})",
+        remedy="Held-out frames are not in the field.",
+    )
 
 
-def _answer(field: LanguageField, question: str, by: str, selection: Selection, outliers: bool,
-            left: dict[str, str]) -> Answer:
+def _answer(
+    field: LanguageField, question: str, by: str, selection: Selection, outliers: bool, left: dict[str, str]
+) -> Answer:
     mask = np.asarray(selection.mask)
     if not outliers:
         left = left | {"DBSCAN": "not asked for"}
@@ -142,19 +172,29 @@ def figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
     means = np.asarray(chosen.means, np.float64)
     place = None
     if len(means):
-        place = {"centroid": means.mean(0).round(6).tolist(),
-                 "bounding_box": {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()}}
+        place = {
+            "centroid": means.mean(0).round(6).tolist(),
+            "bounding_box": {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()},
+        }
     region = int(answer.selection.region)
-    return {"query": answer.question, "by": answer.by, "count": len(means), "of": field.gaussians.count,
-            "score": round(float(answer.selection.score), 6), "region": region if region >= 0 else None,
-            "outliers_dropped": answer.dropped, "place": place, "left_out": answer.left_out}
+    return {
+        "query": answer.question,
+        "by": answer.by,
+        "count": len(means),
+        "of": field.gaussians.count,
+        "score": round(float(answer.selection.score), 6),
+        "region": region if region >= 0 else None,
+        "outliers_dropped": answer.dropped,
+        "place": place,
+        "left_out": answer.left_out,
+    }
 
 
 def write_answer(field: LanguageField, answer: Answer, out: Path, *, views: int = 3) -> dict[str, Any]:
-    """Writes OUT/<slug>.ply, .json and <slug>-<frame>.png for the `views` frames that show it best; returns the figures.
+    """Writes OUT/<slug>.ply, .json, and <slug>-<frame>.png for the `views` best frames; returns the figures.
 
-    The .ply is in the capture files' own world, in INRIA's layout; a mask is 255 where the selected Gaussians alone have
-    an alpha above 0.7. An empty selection leaves out the .ply and the masks.
+    The .ply is in the capture files' own world, in INRIA's layout; a mask is 255 where the selected Gaussians alone
+    have an alpha above 0.7. An empty selection leaves out the .ply and the masks.
     """
     slug = slug_of(answer.question)
     told = figures(field, answer) | {"ply": None, "masks": {}}

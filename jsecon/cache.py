@@ -90,7 +90,7 @@ def path_of(folder: Path, stage: str, key: str) -> Path:
 
 
 def prepare(folder: Path) -> None:
-    """Makes the folder, marks it as a cache for backup programs, and removes what writers that were killed left behind."""
+    """Makes the folder, marks it as a cache for backup programs, and removes what killed writers left behind."""
     tag = folder / "CACHEDIR.TAG"
     if not tag.exists():
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")

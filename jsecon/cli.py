@@ -1,6 +1,7 @@
-"""The command line: demo, run, query, eval. It alone prints; a message and exit code 2 for bad input, 130 for Ctrl-C."""
+"""The command line: demo, run, query, eval. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
 
 import argparse
+import dataclasses
 import sys
 import textwrap
 from collections.abc import Sequence
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import jsecon
 from jsecon.errors import InputError
+from jsecon.options import Options, require_writable
 
 _EPILOG = """
 examples
@@ -26,8 +28,11 @@ A run that is stopped goes on where it stopped when the same command is given ag
 def parser() -> argparse.ArgumentParser:
     """The whole grammar of the command line."""
     top = argparse.ArgumentParser(
-        prog="jsecon", formatter_class=argparse.RawDescriptionHelpFormatter, epilog=_EPILOG,
-        description="Find things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.")
+        prog="jsecon",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_EPILOG,
+        description="Find things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.",
+    )
     top.add_argument("--version", action="version", version=f"jsecon {jsecon.__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     for add in (_demo, _run, _query, _eval):
@@ -36,82 +41,168 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _verb(verbs, name: str, short: str, long: str) -> argparse.ArgumentParser:
-    return verbs.add_parser(name, help=short, description=textwrap.dedent(long).strip(),
-                            formatter_class=argparse.RawDescriptionHelpFormatter)
+    return verbs.add_parser(
+        name,
+        help=short,
+        description=textwrap.dedent(long).strip(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def _demo(verbs) -> None:
-    verb = _verb(verbs, "demo", "make a room, build its field, query it and write a report", """
+    verb = _verb(
+        verbs,
+        "demo",
+        "make a room, build its field, query it and write a report",
+        """
         Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on
         it what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is
         used. Ends with report.html, metrics.json, field.npz and a .ply for each query. About five minutes on two cores.
-        """)
+        """,
+    )
     verb.add_argument("--seed", type=int, default=0, help="which room (default 0)")
-    verb.add_argument("--out", type=Path, default=Path("jsecon-demo"), help="folder for all of it (default ./jsecon-demo)")
+    verb.add_argument(
+        "--out", type=Path, default=Path("jsecon-demo"), help="folder for all of it (default ./jsecon-demo)"
+    )
     verb.add_argument("--steps", type=int, default=None, help="of the photometric fit (default 2000)")
     verb.set_defaults(act=_act_demo)
 
 
 def _run(verbs) -> None:
-    verb = _verb(verbs, "run", "build the language field of a capture", """
+    verb = _verb(
+        verbs,
+        "run",
+        "build the language field of a capture",
+        """
         From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found and followed
         through the frames, or given as masks), one embedding a region, codes distilled into the Gaussians. Prints its
         plan first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
-        """)
-    verb.add_argument("capture", type=Path, metavar="CAPTURE",
-                      help="folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)")
+        """,
+    )
+    verb.add_argument(
+        "capture",
+        type=Path,
+        metavar="CAPTURE",
+        help="folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)",
+    )
     verb.add_argument("--out", type=Path, required=True, help="folder for the field, the report and the cache")
-    verb.add_argument("--gaussians", type=Path, metavar="PLY", help="a scene of 3D Gaussians in the capture's world; "
-                      "without it, Gaussians are fitted to the frames")
-    verb.add_argument("--masks", type=Path, metavar="DIR", help="instance masks, one integer PNG a frame under the frame's "
-                      "name (0 = none), or LangSplat's _s.npy; without it, they are found and followed")
-    verb.add_argument("--downscale", type=float, metavar="K", help="make frames K times smaller "
-                      "(default: so that the longer side is at most 480 px)")
+    verb.add_argument(
+        "--gaussians",
+        type=Path,
+        metavar="PLY",
+        help="a scene of 3D Gaussians in the capture's world; without it, Gaussians are fitted to the frames",
+    )
+    verb.add_argument(
+        "--masks",
+        type=Path,
+        metavar="DIR",
+        help="instance masks, one integer PNG a frame under the frame's "
+        "name (0 = none), or LangSplat's _s.npy; without it, they are found and followed",
+    )
+    verb.add_argument(
+        "--downscale",
+        type=float,
+        metavar="K",
+        help="make frames K times smaller (default: so that the longer side is at most 480 px)",
+    )
     verb.add_argument("--frames", type=int, metavar="N", help="use at most N frames, evenly spaced (default: all)")
-    verb.add_argument("--holdout", type=int, default=8, metavar="K", help="keep every K-th frame for measuring only; "
-                      "0 = none (default 8)")
-    verb.add_argument("--steps", type=int, default=3000, help="of the photometric fit (default 3000)")
-    verb.add_argument("--sh-degree", type=int, default=1, choices=range(4), help="of the fitted colours (default 1)")
-    verb.add_argument("--latent", type=int, default=16, metavar="D", help="most numbers a code may have; 3 as in the paper "
-                      "(default 16)")
-    verb.add_argument("--reduce", choices=("mode", "median", "mean"), default="mode",
-                      help="from a Gaussian's votes to its code (default mode)")
-    verb.add_argument("--iou-threshold", type=float, default=0.5, metavar="KAPPA", help="a proposal that overlaps a masklet "
-                      "by more is not new (default 0.5)")
-    verb.add_argument("--seed", type=int, default=0, help="of whatever is drawn at random (default 0)")
+    verb.add_argument(
+        "--holdout",
+        type=int,
+        default=Options.holdout,
+        metavar="K",
+        help="keep every K-th frame for measuring only; 0 = none (default %(default)s)",
+    )
+    verb.add_argument("--steps", type=int, default=Options.steps, help="of the photometric fit (default %(default)s)")
+    verb.add_argument(
+        "--sh-degree",
+        type=int,
+        default=Options.sh_degree,
+        choices=range(4),
+        help="of the fitted colours (default %(default)s)",
+    )
+    verb.add_argument(
+        "--latent",
+        type=int,
+        default=Options.latent,
+        metavar="D",
+        help="most numbers a code may have; 3 as in the paper (default %(default)s)",
+    )
+    verb.add_argument(
+        "--reduce",
+        choices=("mode", "median", "mean"),
+        default=Options.reduce,
+        help="from a Gaussian's votes to its code (default %(default)s)",
+    )
+    verb.add_argument(
+        "--iou-threshold",
+        type=float,
+        default=Options.iou_threshold,
+        metavar="KAPPA",
+        help="a proposal that overlaps a masklet by more is not new (default %(default)s)",
+    )
+    verb.add_argument(
+        "--seed", type=int, default=Options.seed, help="of whatever is drawn at random (default %(default)s)"
+    )
     verb.set_defaults(act=_act_run)
 
 
 def _query(verbs) -> None:
-    verb = _verb(verbs, "query", "the Gaussians that a text names, or that lie under a pixel", """
-        For each text, or for a pixel, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's own
-        world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames
-        that show it best, and answers.html with the pictures.
-        """)
+    verb = _verb(
+        verbs,
+        "query",
+        "the Gaussians that a text names, or that lie under a pixel",
+        """
+        For each text, or for a pixel, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's
+        own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the
+        frames that show it best, and answers.html with the pictures.
+        """,
+    )
     verb.add_argument("field", type=Path, metavar="FIELD", help="field.npz of a run")
     verb.add_argument("texts", nargs="*", metavar="TEXT", help='what to find: "red mug" "dark green bottle" ...')
-    verb.add_argument("--at", nargs=3, action="append", default=[], metavar=("FRAME", "X", "Y"), help="what lies under pixel "
-                      "(column X, row Y) of a frame, by its name or number, in the frames as the run used them; needs no text")
+    verb.add_argument(
+        "--at",
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("FRAME", "X", "Y"),
+        help="what lies under pixel "
+        "(column X, row Y) of a frame, by its name or number, in the frames as the run used them; needs no text",
+    )
     verb.add_argument("--out", type=Path, required=True, help="folder for the answers")
-    verb.add_argument("--by", choices=("votes", "code", "one_step", "canonical"), default="votes",
-                      help="votes, code: text -> most similar region -> the Gaussians whose votes, or whose code, are its own; "
-                      "one_step, canonical: each Gaussian's code against the text (default votes)")
-    verb.add_argument("--threshold", type=float, help="on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, "
-                      "0.5 canonical)")
+    verb.add_argument(
+        "--by",
+        choices=("votes", "code", "one_step", "canonical"),
+        default="votes",
+        help="votes, code: text -> most similar region -> the Gaussians whose votes, or whose code, are its own; "
+        "one_step, canonical: each Gaussian's code against the text (default votes)",
+    )
+    verb.add_argument(
+        "--threshold",
+        type=float,
+        help="on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, 0.5 canonical)",
+    )
     verb.add_argument("--keep-outliers", action="store_true", help="leave out the last step, DBSCAN")
     verb.add_argument("--views", type=int, default=3, metavar="N", help="masks to write a query (default 3)")
     verb.set_defaults(act=_act_query)
 
 
 def _eval(verbs) -> None:
-    verb = _verb(verbs, "eval", "measure a field against labels", """
-        Point-level rendered protocol on LERF-style labels (one .json a frame): the selected Gaussians alone are rendered,
-        alpha > 0.7, against each labelled mask; a missing prediction counts as 0. Prints mIoU, mAcc@0.25 and localisation
-        accuracy of each kind of query, and writes OUT/metrics.json with every pair.
-        """)
+    verb = _verb(
+        verbs,
+        "eval",
+        "measure a field against labels",
+        """
+        Point-level rendered protocol on LERF-style labels (one .json a frame): the selected Gaussians alone are
+        rendered, alpha > 0.7, against each labelled mask; a missing prediction counts as 0. Prints mIoU, mAcc@0.25
+        and localisation accuracy of each kind of query, and writes OUT/evaluation.json with every pair.
+        """,
+    )
     verb.add_argument("field", type=Path, metavar="FIELD", help="field.npz of a run")
-    verb.add_argument("--labels", type=Path, required=True, metavar="DIR", help="folder of LERF label files (frame.json)")
-    verb.add_argument("--out", type=Path, help="folder for metrics.json (default: the field's)")
+    verb.add_argument(
+        "--labels", type=Path, required=True, metavar="DIR", help="folder of LERF label files (frame.json)"
+    )
+    verb.add_argument("--out", type=Path, help="folder for evaluation.json (default: the field's)")
     verb.set_defaults(act=_act_eval)
 
 
@@ -136,7 +227,12 @@ def _act_demo(arguments: argparse.Namespace) -> None:
     from jsecon.console import Console
     from jsecon.demo import demo
 
-    demo(arguments.out, seed=arguments.seed, reporter=Console(), **({} if arguments.steps is None else {"steps": arguments.steps}))
+    demo(
+        arguments.out,
+        seed=arguments.seed,
+        reporter=Console(),
+        **({} if arguments.steps is None else {"steps": arguments.steps}),
+    )
 
 
 def _act_run(arguments: argparse.Namespace) -> None:
@@ -145,10 +241,8 @@ def _act_run(arguments: argparse.Namespace) -> None:
     from jsecon.summary import write_run
 
     console = Console()
-    options = pipeline.Options(
-        capture=arguments.capture, gaussians=arguments.gaussians, masks=arguments.masks, downscale=arguments.downscale,
-        frames=arguments.frames, holdout=arguments.holdout, steps=arguments.steps, sh_degree=arguments.sh_degree,
-        latent=arguments.latent, reduce=arguments.reduce, iou_threshold=arguments.iou_threshold, seed=arguments.seed)
+    given = vars(arguments)
+    options = Options(**{f.name: given[f.name] for f in dataclasses.fields(Options) if f.name in given})
     finished = pipeline.run(options, arguments.out, reporter=console)
     write_run(finished, arguments.out, console)
 
@@ -160,13 +254,18 @@ def _act_query(arguments: argparse.Namespace) -> None:
     from jsecon.summary import write_answers
 
     if not arguments.texts and not arguments.at:
-        raise InputError("query", found="nothing to find", expected="a TEXT, or --at FRAME X Y",
-                         remedy='For example: jsecon query field.npz "red mug" --out answers')
+        raise InputError(
+            "query",
+            found="nothing to find",
+            expected="a TEXT, or --at FRAME X Y",
+            remedy='For example: jsecon query field.npz "red mug" --out answers',
+        )
     pixels = [(frame, _whole("X", x), _whole("Y", y)) for frame, x, y in arguments.at]
-    pipeline.require_writable(arguments.out)
+    require_writable(arguments.out)
     field = load_field(arguments.field)
     embedder = pipeline.embedder_named(field.embedder)
-    embedder.embed_text(arguments.texts)  # a text that cannot be understood: say so before any work
+    if arguments.texts:
+        embedder.embed_text(arguments.texts)  # a text that cannot be understood: say so before any work
     how = {"by": arguments.by, "threshold": arguments.threshold, "outliers": not arguments.keep_outliers}
     answers = [answer.ask_text(field, embedder, text, **how) for text in arguments.texts]
     answers += [answer.ask_pixel(field, frame, x, y, **how) for frame, x, y in pixels]
@@ -180,12 +279,17 @@ def _act_eval(arguments: argparse.Namespace) -> None:
     from jsecon.summary import write_evaluation
 
     out = arguments.out or arguments.field.parent
-    pipeline.require_writable(out)
+    require_writable(out)
     field = load_field(arguments.field)
     write_evaluation(field, pipeline.embedder_named(field.embedder), arguments.labels, out, Console())
 
 
 def _whole(name: str, text: str) -> int:
     if not text.isdecimal():
-        raise InputError(f"--at {name}", found=text, expected="a whole number of pixels", remedy="For example: --at frame_00012 310 145")
+        raise InputError(
+            f"--at {name}",
+            found=text,
+            expected="a whole number of pixels",
+            remedy="For example: --at frame_00012 310 145",
+        )
     return int(text)

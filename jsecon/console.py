@@ -79,8 +79,15 @@ class _Bar:
             self._bar.close()
             self._bar = None
         if self._bar is None:
-            self._bar = tqdm(total=total, desc=f"  {self._name}", file=self._err, leave=False, delay=QUIET_SECONDS,
-                             initial=done, dynamic_ncols=True)
+            self._bar = tqdm(
+                total=total,
+                desc=f"  {self._name}",
+                file=self._err,
+                leave=False,
+                delay=QUIET_SECONDS,
+                initial=done,
+                dynamic_ncols=True,
+            )
         self._bar.update(done - self._bar.n)
 
     def __exit__(self, *_) -> None:

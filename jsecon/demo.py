@@ -16,7 +16,8 @@ from jsecon.data.synthetic import write_room
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row
 from jsecon.files import write_text
-from jsecon.pipeline import Options, Run
+from jsecon.options import Options, require_writable
+from jsecon.pipeline import Run
 from jsecon.plan import Reporter
 from jsecon.types import LanguageField
 
@@ -24,12 +25,14 @@ HOLDOUT = 5
 STEPS = 2000
 
 
-def demo(out: Path, *, seed: int = 0, steps: int = STEPS, reporter: Reporter, room: dict[str, int] | None = None) -> dict[str, Any]:
+def demo(
+    out: Path, *, seed: int = 0, steps: int = STEPS, reporter: Reporter, room: dict[str, int] | None = None
+) -> dict[str, Any]:
     """Writes OUT/{capture, field.npz, true_masks/field.npz, queries, metrics.json, report.html}; returns the metrics.
 
     `room` holds options of `write_room` (views, width, height, ...), for rooms smaller than the default.
     """
-    pipeline.require_writable(out)
+    require_writable(out)
     capture = _capture(out / "capture", seed, {"holdout": HOLDOUT} | (room or {}), reporter)
     options = Options(capture, holdout=HOLDOUT, steps=steps, long_side=10**6, seed=seed)
     found = pipeline.run(options, out, reporter=reporter)
@@ -49,8 +52,10 @@ def demo(out: Path, *, seed: int = 0, steps: int = STEPS, reporter: Reporter, ro
     metrics["peak_memory_mib"] = round(pipeline.peak_memory_mib(), 1)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     summary.say_table(results, reporter)
-    reporter.say(f"held-out PSNR {metrics['held_out_psnr']:.2f} dB, {metrics['seconds_in_all']:.0f} s of work, "
-                 f"peak memory {metrics['peak_memory_mib']:.0f} MiB")
+    reporter.say(
+        f"held-out PSNR {metrics['held_out_psnr']:.2f} dB, {metrics['seconds_in_all']:.0f} s of work, "
+        f"peak memory {metrics['peak_memory_mib']:.0f} MiB"
+    )
     reporter.say(f"field   {out / 'field.npz'}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
     return metrics
 
@@ -75,9 +80,11 @@ def _metrics(results: dict[str, tuple[list[Row], dict[str, Any]]], found: Run, g
     return metrics | {
         "protocol": results["anchored"][1]["protocol"],
         "held_out_psnr": round(float(np.mean(found.psnr)), 3),
-        "regions": found.field.regions.count, "gaussians": found.field.gaussians.count,
+        "regions": found.field.regions.count,
+        "gaussians": found.field.gaussians.count,
         "seconds": {name: round(value, 2) for name, value in seconds.items()},
-        "seconds_in_all": round(sum(seconds.values()), 1), "left_out": given.left_out | found.left_out,
+        "seconds_in_all": round(sum(seconds.values()), 1),
+        "left_out": given.left_out | found.left_out,
         "peak_memory_mib": 0.0,
     }
 
@@ -93,31 +100,70 @@ def _queries(field: LanguageField, embedder: Any, labels: list[LabelledFrame], o
     return told
 
 
-def _page(found: Run, given: Run, results: dict[str, tuple[list[Row], dict[str, Any]]], queries: dict[str, dict[str, Any]],
-          labels: list[LabelledFrame], metrics: dict[str, Any], seed: int) -> str:
+def _page(
+    found: Run,
+    given: Run,
+    results: dict[str, tuple[list[Row], dict[str, Any]]],
+    queries: dict[str, dict[str, Any]],
+    labels: list[LabelledFrame],
+    metrics: dict[str, Any],
+    seed: int,
+) -> str:
     anchored = results["anchored"][1]
-    head = report.tiles({
-        "mIoU, text to Gaussians": f"{anchored['miou']:.3f}", "mAcc@0.25": f"{anchored['macc']:.3f}",
-        "localisation accuracy": f"{anchored['loc_acc']:.3f}", "mIoU, true masks given": f"{metrics['true_masks']['miou']:.3f}",
-        "mIoU, one-step query": f"{metrics['one_step']['miou']:.3f}", "held-out PSNR": f"{metrics['held_out_psnr']:.2f} dB",
-        "of work": f"{metrics['seconds_in_all']:.0f} s"})
-    names = {"anchored": "text -> region -> its votes", "anchored_code": "text -> region -> its code",
-             "one_step": "text -> codes, directly", "true_masks": "text -> region -> its votes, true masks given",
-             "true_masks_one_step": "text -> codes, directly, true masks given"}
-    rows = [(names[kind], *(f"{told[n]:.3f}" for n in ("miou", "macc", "acc_50", "loc_acc")), told["pairs"], told["missing"])
-            for kind, (_, told) in results.items()]
+    head = report.tiles(
+        {
+            "mIoU, text to Gaussians": f"{anchored['miou']:.3f}",
+            "mAcc@0.25": f"{anchored['macc']:.3f}",
+            "localisation accuracy": f"{anchored['loc_acc']:.3f}",
+            "mIoU, true masks given": f"{metrics['true_masks']['miou']:.3f}",
+            "mIoU, one-step query": f"{metrics['one_step']['miou']:.3f}",
+            "held-out PSNR": f"{metrics['held_out_psnr']:.2f} dB",
+            "of work": f"{metrics['seconds_in_all']:.0f} s",
+        }
+    )
+    names = {
+        "anchored": "text -> region -> its votes",
+        "anchored_code": "text -> region -> its code",
+        "one_step": "text -> codes, directly",
+        "true_masks": "text -> region -> its votes, true masks given",
+        "true_masks_one_step": "text -> codes, directly, true masks given",
+    }
+    rows = [
+        (
+            names[kind],
+            *(f"{told[n]:.3f}" for n in ("miou", "macc", "acc_50", "loc_acc")),
+            told["pairs"],
+            told["missing"],
+        )
+        for kind, (_, told) in results.items()
+    ]
     measured = report.section(
-        "How well", f"{metrics['protocol']}. Held-out views only; a missing prediction counts as 0.",
-        report.table(["query", "mIoU", "mAcc@0.25", "Acc@0.5", "Loc. acc.", "pairs", "missing"], rows))
+        "How well",
+        f"{metrics['protocol']}. Held-out views only; a missing prediction counts as 0.",
+        report.table(["query", "mIoU", "mAcc@0.25", "Acc@0.5", "Loc. acc.", "pairs", "missing"], rows),
+    )
     return report.page(
-        f"jsecon demo, room {seed}", "A made-up room as an ordinary capture: frames, poses and sparse points in, "
+        f"jsecon demo, room {seed}",
+        "A made-up room as an ordinary capture: frames, poses and sparse points in, "
         "answers to texts out, on a plain CPU and without any learned weights.",
-        [head, measured, _query_part(found, results["anchored"][0], given, results["true_masks"][0], queries, labels),
-         *summary.scene_parts(found), *summary.work_parts(found)])
+        [
+            head,
+            measured,
+            _query_part(found, results["anchored"][0], given, results["true_masks"][0], queries, labels),
+            *summary.scene_parts(found),
+            *summary.work_parts(found),
+        ],
+    )
 
 
-def _query_part(found: Run, rows: list[Row], given: Run, true_rows: list[Row], queries: dict[str, dict[str, Any]],
-                labels: list[LabelledFrame]) -> str:
+def _query_part(
+    found: Run,
+    rows: list[Row],
+    given: Run,
+    true_rows: list[Row],
+    queries: dict[str, dict[str, Any]],
+    labels: list[LabelledFrame],
+) -> str:
     """For each query, the held-out view that shows it largest: the frame, the selection, the same with true masks."""
     frames = dict(zip(found.capture.names, np.asarray(found.capture.frames)))
     truth = {(frame.name, name): mask for frame in labels for name, (mask, _) in frame.objects.items()}
@@ -129,9 +175,19 @@ def _query_part(found: Run, rows: list[Row], given: Run, true_rows: list[Row], q
         other = given_rows[row.frame, text]
         cells += [
             report.figure(frame, row.frame, strong=text),
-            report.figure(pictures.selection_overlay(frame, row.mask, true),
-                          f"{row.selected} Gaussians, region {row.region}, score {row.score:.2f}", strong=f"IoU {row.iou:.2f}"),
-            report.figure(pictures.selection_overlay(frame, other.mask, true),
-                          f"true masks given: {other.selected} Gaussians", strong=f"IoU {other.iou:.2f}")]
-    return report.section("Queries", "Pink: the selected Gaussians, rendered alone, over a held-out view. White line: the "
-                          "ground truth.", report.grid(cells, 3))
+            report.figure(
+                pictures.selection_overlay(frame, row.mask, true),
+                f"{row.selected} Gaussians, region {row.region}, score {row.score:.2f}",
+                strong=f"IoU {row.iou:.2f}",
+            ),
+            report.figure(
+                pictures.selection_overlay(frame, other.mask, true),
+                f"true masks given: {other.selected} Gaussians",
+                strong=f"IoU {other.iou:.2f}",
+            ),
+        ]
+    return report.section(
+        "Queries",
+        "Pink: the selected Gaussians, rendered alone, over a held-out view. White line: the ground truth.",
+        report.grid(cells, 3),
+    )

@@ -1,4 +1,4 @@
-"""Pictures of what a run found: regions in colours that stay the same from view to view, codes as colours, selections."""
+"""Pictures of what a run found: regions in colours that stay the same in every view, codes as colours, selections."""
 
 import colorsys
 
@@ -21,13 +21,15 @@ UNKNOWN = 0.25
 
 
 def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
-    """RGB of regions 0 .. count-1: hues a golden angle apart, two lightnesses in turn; a region's never depends on count."""
+    """RGB of regions 0 .. count-1: hues a golden angle apart, three lightnesses in turn; kept as count grows."""
     hues = (0.11 + 0.61803398875 * np.arange(count)) % 1.0
     colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
 
-def label_overlay(frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"], *, opacity: float = 0.72) -> UInt8[np.ndarray, "h w 3"]:
+def label_overlay(
+    frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"], *, opacity: float = 0.72
+) -> UInt8[np.ndarray, "h w 3"]:
     """The frame in grey with each region in its colour and a dark line between regions; unlabelled pixels stay grey."""
     grey = np.repeat(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2).astype(np.float32)
     known = labels >= 0
@@ -64,7 +66,7 @@ def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int],
 
 
 def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
-    """(N, 3) RGB in [0, 1]: the codes' first three principal components, each stretched over the regions; grey = unknown."""
+    """(N, 3) RGB in [0, 1]: the codes' first three principal components, stretched over the regions; grey = unknown."""
     table = np.asarray(field.region_codes, np.float64)
     codes = np.asarray(field.codes, np.float64)
     known = np.abs(codes).max(axis=1, initial=0.0) > 0

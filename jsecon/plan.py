@@ -5,7 +5,6 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
-
 Progress: TypeAlias = Callable[[int, int], None]
 """told how far a step has come: (done, total)"""
 Status: TypeAlias = Literal["run", "cached", "left out"]

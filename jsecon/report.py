@@ -10,7 +10,8 @@ import numpy as np
 from jsecon.plan import Step
 
 _STYLE = """
-:root { color-scheme: light dark; --ink: #1c2024; --soft: #60656c; --line: #e0e2e6; --paper: #fcfcfd; --card: #f3f4f6; --mark: #c2185b; }
+:root { color-scheme: light dark; --ink: #1c2024; --soft: #60656c; --line: #e0e2e6; --paper: #fcfcfd; --card: #f3f4f6;
+  --mark: #c2185b; }
 @media (prefers-color-scheme: dark) {
   :root { --ink: #eceef0; --soft: #9ba1a8; --line: #33373c; --paper: #121416; --card: #1c1f23; --mark: #ff5fa2; } }
 * { box-sizing: border-box; }
@@ -30,16 +31,19 @@ th { font-weight: 600; color: var(--soft); font-size: .85rem; } td.n, th.n { tex
 figure { margin: 0; } figure img { width: 100%; display: block; border-radius: 6px; background: #000; }
 figcaption { font-size: .85rem; color: var(--soft); padding-top: .25rem; } figcaption b { color: var(--ink); }
 .bar { background: var(--mark); height: .75rem; border-radius: 3px; min-width: 2px; }
-pre { background: var(--card); border-radius: 8px; padding: .8rem 1rem; overflow-x: auto; font-size: .8rem; white-space: pre-wrap; }
+pre { background: var(--card); border-radius: 8px; padding: .8rem 1rem; overflow-x: auto; font-size: .8rem;
+  white-space: pre-wrap; }
 .scroll { overflow-x: auto; }
 """
 
 
 def page(title: str, lead: str, parts: Iterable[str]) -> str:
     """The whole document; `parts` are what the functions below return."""
-    return (f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
-            f'content="width=device-width, initial-scale=1"><title>{_text(title)}</title><style>{_STYLE}</style></head>\n'
-            f'<body><h1>{_text(title)}</h1><p class="soft">{_text(lead)}</p>\n' + "\n".join(parts) + "\n</body></html>\n")
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+        f'content="width=device-width, initial-scale=1"><title>{_text(title)}</title><style>{_STYLE}</style></head>\n'
+        f'<body><h1>{_text(title)}</h1><p class="soft">{_text(lead)}</p>\n' + "\n".join(parts) + "\n</body></html>\n"
+    )
 
 
 def section(title: str, words: str, *parts: str) -> str:
@@ -50,24 +54,38 @@ def section(title: str, words: str, *parts: str) -> str:
 
 def tiles(figures: Mapping[str, str]) -> str:
     """Headline figures: what -> value."""
-    return '<div class="tiles">' + "".join(f'<div class="tile"><b>{_text(value)}</b><span>{_text(what)}</span></div>'
-                                           for what, value in figures.items()) + "</div>"
+    return (
+        '<div class="tiles">'
+        + "".join(
+            f'<div class="tile"><b>{_text(value)}</b><span>{_text(what)}</span></div>'
+            for what, value in figures.items()
+        )
+        + "</div>"
+    )
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_from: int = 1) -> str:
     """A table; columns from `numbers_from` on are set to the right."""
+
     def cells(tag: str, row: Sequence[object]) -> str:
-        return "".join(f'<{tag}{" class=n" if i >= numbers_from else ""}>{_text(cell)}</{tag}>' for i, cell in enumerate(row))
+        return "".join(
+            f"<{tag}{' class=n' if i >= numbers_from else ''}>{_text(cell)}</{tag}>" for i, cell in enumerate(row)
+        )
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{cells("th", header)}</tr></thead><tbody>{body}</tbody></table></div>'
+    return (
+        f'<div class="scroll"><table><thead><tr>{cells("th", header)}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
 
 
 def bars(seconds: Mapping[str, float]) -> str:
     """A bar for each stage's seconds."""
     longest = max(seconds.values(), default=0.0) or 1.0
-    rows = "".join(f'<tr><td>{_text(name)}</td><td class="n">{value:.1f} s</td><td style="width:24rem"><div class="bar" '
-                   f'style="width:{100 * value / longest:.1f}%"></div></td></tr>' for name, value in seconds.items())
+    rows = "".join(
+        f'<tr><td>{_text(name)}</td><td class="n">{value:.1f} s</td><td style="width:24rem"><div class="bar" '
+        f'style="width:{100 * value / longest:.1f}%"></div></td></tr>'
+        for name, value in seconds.items()
+    )
     total = f'<tr><td><b>all</b></td><td class="n"><b>{sum(seconds.values()):.1f} s</b></td><td></td></tr>'
     return f'<div class="scroll"><table><tbody>{rows}{total}</tbody></table></div>'
 
@@ -80,7 +98,8 @@ def plan(steps: Iterable[Step]) -> str:
 def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = False) -> str:
     """(H, W, 3) uint8 RGB with its caption; `sharp` keeps it without loss (masks, flat colours)."""
     told = (f"<b>{_text(strong)}</b> " if strong else "") + _text(caption)
-    return f'<figure><img alt="{_text((strong + " " + caption).strip())}" src="{data_uri(image, sharp=sharp)}"><figcaption>{told}</figcaption></figure>'
+    words = _text(f"{strong} {caption}".strip())
+    return f'<figure><img alt="{words}" src="{data_uri(image, sharp=sharp)}"><figcaption>{told}</figcaption></figure>'
 
 
 def grid(figures: Iterable[str], columns: int) -> str:

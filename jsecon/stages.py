@@ -7,7 +7,6 @@ by any step after the loading, the final measurement apart.
 import dataclasses
 import functools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,44 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.errors import InputError, require
+from jsecon.options import Options
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """All that the result of a run depends on, but for the files themselves."""
-
-    capture: Path
-    """folder: COLMAP (images/, sparse/0) or nerfstudio / instant-ngp (transforms.json)."""
-    gaussians: Path | None = None
-    """.ply (INRIA layout) of the scene; None: Gaussians are fitted to the frames."""
-    masks: Path | None = None
-    """folder of instance masks, one integer PNG a frame or LangSplat's `_s.npy`; None: found in the frames."""
-    downscale: float | None = None
-    """frames are made this many times smaller; None: so that the longer side is at most `long_side`."""
-    long_side: int = 480
-    """px."""
-    frames: int | None = None
-    """at most this many frames, evenly spaced; None: all."""
-    holdout: int = 8
-    """every so manieth frame is kept for measuring only; 0 = none."""
-    steps: int = 3000
-    """of the photometric fit."""
-    sh_degree: int = 1
-    """of the fitted colours, 0 to 3."""
-    iou_threshold: float = 0.5
-    """a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
-    weighting: str = "pixels"
-    """of the views in a region's embedding: pixels or uniform."""
-    latent: int = 16
-    """most numbers a code may have; 3 reproduces the paper."""
-    reduce: str = "mode"
-    """of a Gaussian's votes to its code: mode, median or mean."""
-    top: int = 8
-    """regions whose votes a Gaussian keeps."""
-    seed: int = 0
-    """of whatever is drawn at random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +35,12 @@ def training_frames(capture: Capture) -> np.ndarray:
     """Indices of the frames that may be fitted to. Raises InputError where there are fewer than two."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     if len(train) < 2:
-        raise InputError("frames", found=f"{len(train)} of {len(capture.names)} frames to work with",
-                         expected="at least 2", remedy="Hold out fewer frames (--holdout), or use more (--frames).")
+        raise InputError(
+            "frames",
+            found=f"{len(train)} of {len(capture.names)} frames to work with",
+            expected="at least 2",
+            remedy="Hold out fewer frames (--holdout), or use more (--frames).",
+        )
     return train
 
 
@@ -84,8 +52,9 @@ def load_frames(options: Options, progress: Progress) -> Outcome:
     if downscale is None:
         size = load_capture(options.capture, frames=1, holdout=0).cameras
         downscale = max(max(size.width, size.height) / options.long_side, 1.0)
-    capture = load_capture(options.capture, downscale=downscale, frames=options.frames, holdout=options.holdout,
-                           progress=progress)
+    capture = load_capture(
+        options.capture, downscale=downscale, frames=options.frames, holdout=options.holdout, progress=progress
+    )
     return checked(capture, f"{downscale:.3g} times smaller" if downscale > 1 else "at full size")
 
 
@@ -96,8 +65,10 @@ def checked(capture: Capture, size: str) -> Outcome:
     train = training_frames(capture)
     check_views_overlap(capture)
     count, height, width = capture.frames.shape[:3]
-    told = (f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out, "
-            f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}")
+    told = (
+        f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out, "
+        f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
+    )
     return Outcome(capture, notes=(told, *capture.notes))
 
 
@@ -126,8 +97,15 @@ def fitted_gaussians(
         start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
         check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
         notes = (f"the fit starts from {whence}",)
-    gaussians, _ = fit_gaussians(capture, steps=options.steps, key=jax.random.key(options.seed), start=start,
-                                 state=state, on_checkpoint=on_checkpoint, progress=progress)
+    gaussians, _ = fit_gaussians(
+        capture,
+        steps=options.steps,
+        key=jax.random.key(options.seed),
+        start=start,
+        state=state,
+        on_checkpoint=on_checkpoint,
+        progress=progress,
+    )
     return Outcome(gaussians, notes=notes)
 
 
@@ -138,9 +116,12 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
     seen = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
     share = float(jnp.mean(seen.sum(0) >= 2)) if gaussians.count else 0.0
     if share < least:
-        raise InputError(where, found=f"{share:.1%} of {gaussians.count} points in the view of two or more of the "
-                         f"{len(seen)} frames", expected="views that overlap, and a scene in the world of their poses",
-                         remedy="Check that the poses belong to these frames, and the .ply to this capture.")
+        raise InputError(
+            where,
+            found=f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames",
+            expected="views that overlap, and a scene in the world of their poses",
+            remedy="Check that the poses belong to these frames, and the .ply to this capture.",
+        )
 
 
 def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
@@ -154,8 +135,9 @@ def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussian
     segmenter = ClassicalSegmenter(depths=None if capture.depths is None else capture.depths[train])
     proposals = functools.cache(lambda t: segmenter(frames[t], t))
     tracker = GeometricTracker(gaussians, jax.tree.map(jnp.asarray, cameras), proposals)
-    labels = masklets(frames, lambda frame, t: proposals(t), tracker, iou_threshold=options.iou_threshold,
-                      progress=progress)
+    labels = masklets(
+        frames, lambda frame, t: proposals(t), tracker, iou_threshold=options.iou_threshold, progress=progress
+    )
     labels = clean_masklets(tracker.consistent(frames, labels))
     _require_regions(labels, str(options.capture))
     return Outcome(labels)
@@ -175,8 +157,12 @@ def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -
 
 def _require_regions(labels: np.ndarray, where: str) -> None:
     if labels.max(initial=-1) < 0:
-        raise InputError(where, found="no region in any frame", expected="at least one",
-                         remedy="Give masks (--masks DIR), or frames with more contrast.")
+        raise InputError(
+            where,
+            found="no region in any frame",
+            expected="at least one",
+            remedy="Give masks (--masks DIR), or frames with more contrast.",
+        )
 
 
 def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: Any, progress: Progress) -> Outcome:
@@ -184,22 +170,25 @@ def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: An
     from jsecon.language.regions import region_embeddings
 
     frames = capture.frames[training_frames(capture)]
-    return Outcome(region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting,
-                                     progress=progress))
+    return Outcome(
+        region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting, progress=progress)
+    )
 
 
 def codes(options: Options, found: Regions, progress: Progress) -> Outcome:
     """(codes (R, d), coder): the regions' embeddings, compressed only where they don't fit as they are."""
     from jsecon.language.autoencoder import Autoencoder, region_codes
 
-    table, coder, why = region_codes(found.embeddings, latent=options.latent, key=jax.random.key(options.seed),
-                                     progress=progress)
-    trained = isinstance(coder, Autoencoder)
+    table, coder, why = region_codes(
+        found.embeddings, latent=options.latent, key=jax.random.key(options.seed), progress=progress
+    )
+    trained, why = isinstance(coder, Autoencoder), why.partition(": ")[2] or why
     return Outcome((table, coder), {} if trained else {"autoencoder": why}, (f"autoencoder: {why}",) if trained else ())
 
 
-def votes(options: Options, capture: Capture, gaussians: Gaussians, labels: np.ndarray, num_regions: int,
-          progress: Progress) -> Outcome:
+def votes(
+    options: Options, capture: Capture, gaussians: Gaussians, labels: np.ndarray, num_regions: int, progress: Progress
+) -> Outcome:
     """The weight that each region casts on each Gaussian over the training frames."""
     from jsecon.language.votes import region_votes
 
@@ -217,15 +206,33 @@ def distil(options: Options, cast: Votes, table: np.ndarray) -> Outcome:
     return Outcome(distill_votes(cast, jnp.asarray(table), reduce=options.reduce))
 
 
-def assemble(capture: Capture, gaussians: Gaussians, found: Regions, table: np.ndarray, coder: Any, cast: Votes,
-             point_codes: np.ndarray, embedder: Any, provenance: str) -> LanguageField:
+def assemble(
+    capture: Capture,
+    gaussians: Gaussians,
+    found: Regions,
+    table: np.ndarray,
+    coder: Any,
+    cast: Votes,
+    point_codes: np.ndarray,
+    embedder: Any,
+    provenance: str,
+) -> LanguageField:
     """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
     pixels = np.zeros((found.count, len(capture.names)), np.int32)
     pixels[:, training_frames(capture)] = found.pixels
     return LanguageField(
-        gaussians=gaussians, codes=point_codes, votes=cast, regions=Regions(found.embeddings, pixels), region_codes=table,
-        autoencoder=coder, cameras=capture.cameras, canonical=np.asarray(embedder.canonical, np.float32),
-        to_source=np.asarray(capture.to_source), names=capture.names, embedder=embedder.name, provenance=provenance,
+        gaussians=gaussians,
+        codes=point_codes,
+        votes=cast,
+        regions=Regions(found.embeddings, pixels),
+        region_codes=table,
+        autoencoder=coder,
+        cameras=capture.cameras,
+        canonical=np.asarray(embedder.canonical, np.float32),
+        to_source=np.asarray(capture.to_source),
+        names=capture.names,
+        embedder=embedder.name,
+        provenance=provenance,
     )
 
 

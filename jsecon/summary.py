@@ -28,55 +28,89 @@ def write_run(run: Run, out: Path, reporter: Reporter) -> dict[str, Any]:
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     with reporter.progress("report"):
         parts = [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
-        write_text(out / "report.html", report.page(
-            f"Language field of {run.options.capture.resolve().name}", "Made by jsecon from posed frames.", parts))
+        write_text(
+            out / "report.html",
+            report.page(
+                f"Language field of {run.options.capture.resolve().name}", "Made by jsecon from posed frames.", parts
+            ),
+        )
     if len(run.psnr):
         reporter.say(f"held-out PSNR {metrics['held_out_psnr']:.2f} dB over {len(run.psnr)} frames")
-    reporter.say(f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
-                 f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB")
-    reporter.say(f"field   {out / 'field.npz'}\nreport  {out / 'report.html'}\nask it  jsecon query {out / 'field.npz'} "
-                 f"\"dark green bottle\" --out {out / 'answers'}")
+    reporter.say(
+        f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
+        f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB"
+    )
+    reporter.say(
+        f"field   {out / 'field.npz'}\nreport  {out / 'report.html'}\nask it  jsecon query {out / 'field.npz'} "
+        f'"dark green bottle" --out {out / "answers"}'
+    )
     return metrics
 
 
 def run_metrics(run: Run) -> dict[str, Any]:
     """The figures of a run, for metrics.json."""
     return {
-        "gaussians": run.field.gaussians.count, "regions": run.field.regions.count,
-        "code_size": int(run.field.region_codes.shape[1]), "frames": len(run.capture.names),
+        "gaussians": run.field.gaussians.count,
+        "regions": run.field.regions.count,
+        "code_size": int(run.field.region_codes.shape[1]),
+        "frames": len(run.capture.names),
         "size": [run.capture.cameras.width, run.capture.cameras.height],
         "held_out_psnr": round(float(np.mean(run.psnr)), 3) if len(run.psnr) else None,
-        "seconds": {name: round(value, 2) for name, value in run.seconds.items()}, "left_out": run.left_out,
+        "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
+        "left_out": run.left_out,
         "peak_memory_mib": round(peak_memory_mib(), 1),
     }
 
 
-def write_answers(field: LanguageField, answers: Sequence[answer.Answer], out: Path, reporter: Reporter, *, views: int) -> None:
+def write_answers(
+    field: LanguageField, answers: Sequence[answer.Answer], out: Path, reporter: Reporter, *, views: int
+) -> None:
     """The files of each answer, OUT/answers.html, and a line each."""
     renderer, parts = pictures.Renderer(field.gaussians, field.cameras), []
     for n, item in enumerate(answers):
         told = answer.write_answer(field, item, out, views=views)
-        place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})" if told["place"] else "nothing selected"
-        reporter.say(f"{item.question!r}: {told['count']} of {told['of']} Gaussians, score {told['score']:.3f}, "
-                     f"region {told['region']}, {place}")
+        place = (
+            f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
+            if told["place"]
+            else "nothing selected"
+        )
+        reporter.say(
+            f"{item.question!r}: {told['count']} of {told['of']} Gaussians, score {told['score']:.3f}, "
+            f"region {told['region']}, {place}"
+        )
         shown = answer.masks_of(field, item.mask, answer.best_frames(field, item, max(views, 1)))
-        parts.append(report.section(
-            item.question, f"{told['count']} of {told['of']} Gaussians by {item.by}; score {told['score']:.3f}; region "
-            f"{told['region']}; {told['outliers_dropped']} outliers dropped; {place}.",
-            report.grid([report.figure(pictures.selection_overlay(renderer.photo(t), mask), field.names[t])
-                         for t, mask in shown.items()], 3)))
+        parts.append(
+            report.section(
+                item.question,
+                f"{told['count']} of {told['of']} Gaussians by {item.by}; score {told['score']:.3f}; region "
+                f"{told['region']}; {told['outliers_dropped']} outliers dropped; {place}.",
+                report.grid(
+                    [
+                        report.figure(pictures.selection_overlay(renderer.photo(t), mask), field.names[t])
+                        for t, mask in shown.items()
+                    ],
+                    3,
+                ),
+            )
+        )
         with reporter.progress("answers") as progress:
             progress(n + 1, len(answers))
     write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
     reporter.say(f"pictures  {out / 'answers.html'}")
 
 
-def evaluate(field: LanguageField, embedder: Any, labels: Sequence[LabelledFrame], reporter: Reporter,
-             kinds: Sequence[str] = tuple(KINDS)) -> dict[str, tuple[list[Row], dict[str, Any]]]:
+def evaluate(
+    field: LanguageField,
+    embedder: Any,
+    labels: Sequence[LabelledFrame],
+    reporter: Reporter,
+    kinds: Sequence[str] = tuple(KINDS),
+) -> dict[str, tuple[list[Row], dict[str, Any]]]:
     """Rows and summary of each kind of query under the point-level rendered protocol."""
     cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
     found = {}
     for kind in kinds:
+
         def select(text: str, by: str = KINDS[kind]) -> Selection | None:
             try:
                 asked = answer.ask_text(field, embedder, text, by=by)
@@ -100,24 +134,40 @@ def write_evaluation(field: LanguageField, embedder: Any, folder: Path, out: Pat
 
 def pair(row: Row) -> dict[str, Any]:
     """A row without its mask, as plain values."""
-    return {"frame": row.frame, "query": row.query, "iou": round(row.iou, 4), "located": row.located,
-            "selected": row.selected, "region": row.region, "score": round(row.score, 4)}
+    return {
+        "frame": row.frame,
+        "query": row.query,
+        "iou": round(row.iou, 4),
+        "located": row.located,
+        "selected": row.selected,
+        "region": row.region,
+        "score": round(row.score, 4),
+    }
 
 
 def say_table(found: dict[str, tuple[list[Row], dict[str, Any]]], reporter: Reporter) -> None:
     """mIoU, mAcc@0.25 and localisation of each kind, with the protocol they were measured under."""
     first = next(iter(found.values()))[1]
-    reporter.say(f"{first['protocol']}\n{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames")
+    reporter.say(
+        f"{first['protocol']}\n{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
+    )
     reporter.say(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
     for kind, (_, told) in found.items():
-        reporter.say(f"  {kind:<14} {told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f} {told['missing']:>8}")
+        reporter.say(
+            f"  {kind:<14} {told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f} {told['missing']:>8}"
+        )
 
 
 def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
     psnr = metrics["held_out_psnr"]
-    return {"Gaussians": f"{metrics['gaussians']:,}", "regions": str(metrics["regions"]),
-            "numbers a code": str(metrics["code_size"]), "held-out PSNR": "none held out" if psnr is None else f"{psnr:.2f} dB",
-            "in all": f"{sum(metrics['seconds'].values()):.0f} s", "peak memory": f"{metrics['peak_memory_mib']:,.0f} MiB"}
+    return {
+        "Gaussians": f"{metrics['gaussians']:,}",
+        "regions": str(metrics["regions"]),
+        "numbers a code": str(metrics["code_size"]),
+        "held-out PSNR": "none held out" if psnr is None else f"{psnr:.2f} dB",
+        "in all": f"{sum(metrics['seconds'].values()):.0f} s",
+        "peak memory": f"{metrics['peak_memory_mib']:,.0f} MiB",
+    }
 
 
 def scene_parts(run: Run) -> list[str]:
@@ -129,21 +179,41 @@ def scene_parts(run: Run) -> list[str]:
     cells = []
     for t in (int(t) for t in shown):
         frame = np.asarray(run.capture.frames[t])
-        cells += [report.figure(frame, run.capture.names[t]),
-                  report.figure(pictures.label_overlay(frame, run.labels[place[t]]), "masklets", sharp=True),
-                  report.figure(renderer.colours(t, colours), "codes"),
-                  report.figure(renderer.photo(t), "the Gaussians' own colours")]
-    parts = [report.section(
-        "Frames, masklets, codes", "One colour is one region in every view. Codes are shown by their first three principal "
-        "components, as the Gaussians render them; grey is unknown.", report.grid(cells, 4))]
+        cells += [
+            report.figure(frame, run.capture.names[t]),
+            report.figure(pictures.label_overlay(frame, run.labels[place[t]]), "masklets", sharp=True),
+            report.figure(renderer.colours(t, colours), "codes"),
+            report.figure(renderer.photo(t), "the Gaussians' own colours"),
+        ]
+    parts = [
+        report.section(
+            "Frames, masklets, codes",
+            "One colour is one region in every view. Codes are shown by their first three principal "
+            "components, as the Gaussians render them; grey is unknown.",
+            report.grid(cells, 4),
+        )
+    ]
     if len(run.psnr):
         out = np.flatnonzero(run.capture.held_out)
         order = out[np.unique(np.linspace(0, len(out) - 1, 3).round().astype(int))]
         values = dict(zip(out.tolist(), run.psnr.tolist()))
-        parts.append(report.section("Held-out frames", "Never seen by any step; photograph and rendering.", report.grid(
-            [cell for t in order.tolist() for cell in (
-                report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]),
-                report.figure(renderer.photo(t), "rendered", strong=f"{values[t]:.2f} dB"))], 4)))
+        parts.append(
+            report.section(
+                "Held-out frames",
+                "Never seen by any step; photograph and rendering.",
+                report.grid(
+                    [
+                        cell
+                        for t in order.tolist()
+                        for cell in (
+                            report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]),
+                            report.figure(renderer.photo(t), "rendered", strong=f"{values[t]:.2f} dB"),
+                        )
+                    ],
+                    4,
+                ),
+            )
+        )
     return parts
 
 
@@ -151,9 +221,18 @@ def work_parts(run: Run) -> list[str]:
     """Seconds, plan, notes and where it all came from."""
     notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
     return [
-        report.section("Seconds of each stage", "Wall time of the computation, also where it happened in an earlier run.",
-                       report.bars(run.seconds)),
-        report.section("Plan", "What ran, and what was left out because this scene does not need it.",
-                       report.plan(run.steps), notes),
-        report.section("Where it came from", "", report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))),
+        report.section(
+            "Seconds of each stage",
+            "Wall time of the computation, also where it happened in an earlier run.",
+            report.bars(run.seconds),
+        ),
+        report.section(
+            "Plan",
+            "What ran, and what was left out because this scene does not need it.",
+            report.plan(run.steps),
+            notes,
+        ),
+        report.section(
+            "Where it came from", "", report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
+        ),
     ]

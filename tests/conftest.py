@@ -18,14 +18,19 @@ _UNCHECKED = {"types", "__init__", "__main__"}
 
 # jsecon.types is left out: pytrees are also built from tracers, shapes and None while jax transforms them.
 install_import_hook(
-    sorted({f"jsecon.{path.stem}" for path in (HOME / "jsecon").iterdir()
-            if path.stem not in _UNCHECKED and (path.suffix == ".py" or (path / "__init__.py").exists())}),
+    sorted(
+        {
+            f"jsecon.{path.stem}"
+            for path in (HOME / "jsecon").iterdir()
+            if path.stem not in _UNCHECKED and (path.suffix == ".py" or (path / "__init__.py").exists())
+        }
+    ),
     "beartype.beartype",
 )
 
-import numpy as np
+import numpy as np  # noqa: E402
 
-from jsecon.types import Camera, Gaussians
+from jsecon.types import Camera, Gaussians  # noqa: E402
 
 
 @pytest.fixture
@@ -89,7 +94,9 @@ def room(tmp_path_factory) -> Path:
     """The demo room on disk, as small as it can be and still have objects to find: 8 views of 80x60, 2 held out."""
     from jsecon.data.synthetic import write_room
 
-    return write_room(tmp_path_factory.mktemp("room") / "capture", 0, views=8, width=80, height=60, holdout=4, points=600)
+    return write_room(
+        tmp_path_factory.mktemp("room") / "capture", 0, views=8, width=80, height=60, holdout=4, points=600
+    )
 
 
 @pytest.fixture(scope="session")

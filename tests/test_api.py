@@ -7,8 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jsecon
 import pytest
+
+import jsecon
 from jsecon.__main__ import settings
 
 PACKAGE = Path(jsecon.__file__).parent
@@ -30,7 +31,9 @@ def test_names_that_outside_code_relies_on_are_there():
 def test_what_type_checkers_read_is_what_runs():
     tree = ast.parse((PACKAGE / "__init__.py").read_text())
     block = next(node for node in tree.body if isinstance(node, ast.If))
-    typed = {(node.module, alias.name) for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    typed = {
+        (node.module, alias.name) for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
     assert typed == {(module, name) for module, names in jsecon._CONTENTS.items() for name in names}
 
 
@@ -40,16 +43,23 @@ def test_unknown_name_is_an_attribute_error():
 
 
 def test_importing_the_package_starts_nothing_and_changes_no_environment():
-    code = ("import os, sys; before = dict(os.environ); import jsecon; "
-            "assert 'jax' not in sys.modules and 'numpy' not in sys.modules; "
-            "import jsecon.cli; assert dict(os.environ) == before")
+    code = (
+        "import os, sys; before = dict(os.environ); import jsecon; "
+        "assert 'jax' not in sys.modules and 'numpy' not in sys.modules; "
+        "import jsecon.cli; assert dict(os.environ) == before"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
 
 
 def test_rooms_import_downwards_only():
     """The order of DESIGN section 4: a room may import from rooms above it in this list, never from those below."""
-    floors = [("types", "numerics", "errors", "files"), ("splat", "vision", "data", "parallel", "backend"),
-              ("fit", "language"), ("query",), ("evaluate",)]
+    floors = [
+        ("types", "numerics", "errors", "files"),
+        ("splat", "vision", "data", "parallel", "backend"),
+        ("fit", "language"),
+        ("query",),
+        ("evaluate",),
+    ]
     above = {room: floor for floor, rooms in enumerate(floors) for room in rooms}
     for path in PACKAGE.rglob("*.py"):
         room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
@@ -84,8 +94,11 @@ def test_settings_ask_for_every_core_and_wide_vectors_only_where_there_are_any()
 
 
 def test_settings_give_way_to_the_user(tmp_path):
-    environ = {"XLA_FLAGS": "--xla_force_host_platform_device_count=1 --xla_cpu_prefer_vector_width=256",
-               "JAX_COMPILATION_CACHE_DIR": "/elsewhere", "HOME": str(tmp_path)}
+    environ = {
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=1 --xla_cpu_prefer_vector_width=256",
+        "JAX_COMPILATION_CACHE_DIR": "/elsewhere",
+        "HOME": str(tmp_path),
+    }
     assert settings(environ, 8, frozenset({"avx512f"})) == {"XLA_FLAGS": environ["XLA_FLAGS"]}
     kept = settings({"HOME": str(tmp_path)}, 1, frozenset())["JAX_COMPILATION_CACHE_DIR"]
     assert kept.startswith(str(tmp_path / ".cache" / "jsecon"))
@@ -99,7 +112,9 @@ def test_a_home_that_cannot_be_written_leaves_out_the_compiled_programs(tmp_path
 
 def test_help_runs_as_a_program():
     environ = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
-    text = subprocess.run([sys.executable, "-m", "jsecon", "--help"], check=True, capture_output=True, text=True, env=environ)
+    text = subprocess.run(
+        [sys.executable, "-m", "jsecon", "--help"], check=True, capture_output=True, text=True, env=environ
+    )
     for verb in ("demo", "run", "query", "eval"):
         assert verb in text.stdout
     importlib.import_module("jsecon.cli")

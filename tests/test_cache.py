@@ -6,6 +6,7 @@ import os
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jsecon import cache
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder, Rotation
@@ -13,10 +14,17 @@ from jsecon.stages import Outcome
 
 
 def _tree(scene, cameras):
-    return {"scene": scene, "cameras": cameras, "pair": (np.arange(3, dtype=np.int16), None), "list": [1, 2.5, "x", True],
-            "coder": Autoencoder({"params": {"Dense_0": {"kernel": np.ones((4, 2), np.float32)}}}, {"params": {}}),
-            "rotation": Rotation(np.eye(3, 2, dtype=np.float32)), "nan": float("nan"), "empty": np.zeros((0, 3)),
-            "outcome": Outcome(np.ones(2, bool), {"part": "why"}, ("a note",))}
+    return {
+        "scene": scene,
+        "cameras": cameras,
+        "pair": (np.arange(3, dtype=np.int16), None),
+        "list": [1, 2.5, "x", True],
+        "coder": Autoencoder({"params": {"Dense_0": {"kernel": np.ones((4, 2), np.float32)}}}, {"params": {}}),
+        "rotation": Rotation(np.eye(3, 2, dtype=np.float32)),
+        "nan": float("nan"),
+        "empty": np.zeros((0, 3)),
+        "outcome": Outcome(np.ones(2, bool), {"part": "why"}, ("a note",)),
+    }
 
 
 def _same(a, b):
@@ -46,7 +54,9 @@ def test_what_is_kept_comes_back(scene, cameras, tmp_path):
 
 
 def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
-    compute = lambda: {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")}
+    def compute():
+        return {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")}
+
     fresh = cache.fetch(tmp_path, "stage", "0" * 16, compute)
     again = cache.fetch(tmp_path, "stage", "0" * 16, lambda: pytest.fail("computed twice"))
     assert fresh.fresh
@@ -62,12 +72,16 @@ def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-@pytest.mark.parametrize("damage", [
-    lambda data: data[: len(data) // 2],
-    lambda data: b"",
-    lambda data: data[:200] + bytes(64) + data[264:],
-    lambda data: b"no archive at all",
-], ids=["cut", "empty", "overwritten", "other"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[: len(data) // 2],
+        lambda data: b"",
+        lambda data: data[:200] + bytes(64) + data[264:],
+        lambda data: b"no archive at all",
+    ],
+    ids=["cut", "empty", "overwritten", "other"],
+)
 def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
     value = np.random.default_rng(0).normal(size=500)
     cache.fetch(tmp_path, "stage", "k", lambda: value)
@@ -108,7 +122,10 @@ def test_only_records_of_jsecon_are_made():
 def test_keys_follow_stage_and_parts():
     key = cache.key_of("votes", {"a": 1, "b": [2, None]})
     assert key == cache.key_of("votes", {"b": [2, None], "a": 1})
-    assert len({key, cache.key_of("codes", {"a": 1, "b": [2, None]}), cache.key_of("votes", {"a": 1, "b": [3, None]})}) == 3
+    assert (
+        len({key, cache.key_of("codes", {"a": 1, "b": [2, None]}), cache.key_of("votes", {"a": 1, "b": [3, None]})})
+        == 3
+    )
 
 
 def test_files_digest_follows_names_sizes_and_times(tmp_path):

@@ -8,6 +8,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
+
 from jsecon import cli, pipeline
 from jsecon.console import Console
 from jsecon.data.ply import load_ply, save_ply
@@ -30,7 +31,20 @@ def capture(room, tmp_path):
 def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
     _, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
-    code = _run("run", room, "--out", tmp_path / "out", "--masks", room / "masks", "--holdout", 4, "--steps", 60, "--sh-degree", 0)
+    code = _run(
+        "run",
+        room,
+        "--out",
+        tmp_path / "out",
+        "--masks",
+        room / "masks",
+        "--holdout",
+        4,
+        "--steps",
+        60,
+        "--sh-degree",
+        0,
+    )
     told = capsys.readouterr().out
     assert code == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
@@ -89,7 +103,9 @@ def test_query_at_a_pixel_selects_the_object_under_it(room_run, room, tmp_path):
 
 
 def masks_of_all(room):
-    return np.concatenate([cv2.imread(str(p), cv2.IMREAD_UNCHANGED).ravel() for p in sorted((room / "masks").glob("*.png"))])
+    return np.concatenate(
+        [cv2.imread(str(p), cv2.IMREAD_UNCHANGED).ravel() for p in sorted((room / "masks").glob("*.png"))]
+    )
 
 
 def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, capsys):
@@ -168,8 +184,11 @@ def test_a_missing_image(capture, tmp_path, capsys):
     _refused_run(capsys, capture, tmp_path, says=[name])
 
 
-@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"x" * 200],
-                         ids=["empty", "cut", "other"])
+@pytest.mark.parametrize(
+    "damage",
+    [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: b"x" * 200],
+    ids=["empty", "cut", "other"],
+)
 def test_a_damaged_png(capture, tmp_path, capsys, damage):
     path = _image(capture)
     path.write_bytes(damage(path.read_bytes()))
@@ -180,20 +199,25 @@ def _transforms(room, tmp_path, change):
     """The tiny room as a nerfstudio capture, changed."""
     folder = tmp_path / "nerfstudio"
     shutil.copytree(room / "images", folder / "images")
-    frames = [{"file_path": f"images/{path.name}", "transform_matrix": np.eye(4).tolist()}
-              for path in sorted((folder / "images").iterdir())]
+    frames = [
+        {"file_path": f"images/{path.name}", "transform_matrix": np.eye(4).tolist()}
+        for path in sorted((folder / "images").iterdir())
+    ]
     scene = {"w": 80, "h": 60, "fl_x": 70.0, "fl_y": 70.0, "cx": 40.0, "cy": 30.0, "frames": frames}
     change(scene)
     (folder / "transforms.json").write_text(json.dumps(scene))
     return folder
 
 
-@pytest.mark.parametrize(("change", "says"), [
-    (lambda scene: scene.pop("frames"), "frames"),
-    (lambda scene: scene["frames"][1].pop("transform_matrix"), "transform_matrix"),
-    (lambda scene: scene["frames"][1].pop("file_path"), "file_path"),
-    (lambda scene: [scene.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
-])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda scene: scene.pop("frames"), "frames"),
+        (lambda scene: scene["frames"][1].pop("transform_matrix"), "transform_matrix"),
+        (lambda scene: scene["frames"][1].pop("file_path"), "file_path"),
+        (lambda scene: [scene.pop(key) for key in ("fl_x", "fl_y")], "fl_x"),
+    ],
+)
 def test_transforms_json_with_a_missing_key(room, tmp_path, capsys, change, says):
     _refused_run(capsys, _transforms(room, tmp_path, change), tmp_path, says=["transforms.json", says])
 
@@ -224,9 +248,11 @@ def test_views_that_do_not_overlap(room, tmp_path, capsys):
 
 
 def test_a_compressed_ply(capture, tmp_path, capsys):
-    header = ("ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
-              "property uint packed_position\nproperty uint packed_rotation\nproperty uint packed_scale\n"
-              "property uint packed_color\nend_header\n")
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+        "property uint packed_position\nproperty uint packed_rotation\nproperty uint packed_scale\n"
+        "property uint packed_color\nend_header\n"
+    )
     (tmp_path / "packed.ply").write_bytes(header.encode() + struct.pack("<f4I", 0, 0, 0, 0, 0))
     _refused_run(capsys, capture, tmp_path, "--gaussians", tmp_path / "packed.ply", says=["packed.ply", "compressed"])
 
@@ -257,17 +283,28 @@ def test_the_capture_itself_as_the_output_folder(capture, capsys):
 
 
 def test_a_text_that_is_not_understood_leaves_nothing_half_done(room_run, tmp_path, capsys):
-    _refused(capsys, "query", room_run[1] / "field.npz", "red ball", "the meaning of life", "--out", tmp_path / "answers",
-             says=["meaning of life"])
+    _refused(
+        capsys,
+        "query",
+        room_run[1] / "field.npz",
+        "red ball",
+        "the meaning of life",
+        "--out",
+        tmp_path / "answers",
+        says=["meaning of life"],
+    )
     assert list((tmp_path / "answers").iterdir()) == []
 
 
-@pytest.mark.parametrize(("options", "says"), [
-    (["--at", "nowhere", 3, 3], "nowhere"),
-    (["--at", 0, 80, 3], "79"),
-    (["--at", 0, "left", 3], "left"),
-    ([], "nothing to find"),
-])
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--at", "nowhere", 3, 3], "nowhere"),
+        (["--at", 0, 80, 3], "79"),
+        (["--at", 0, "left", 3], "left"),
+        ([], "nothing to find"),
+    ],
+)
 def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
     _refused(capsys, "query", room_run[1] / "field.npz", *options, "--out", tmp_path, says=[says])
 

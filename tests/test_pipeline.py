@@ -1,4 +1,4 @@
-"""A run: its plan, its cache, what it leaves out, what it never looks at, and that it survives being killed anywhere."""
+"""A run: its plan, its cache, what it leaves out, what it never looks at, and that it survives being killed."""
 
 import contextlib
 import dataclasses
@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+
 from jsecon import cache, pipeline
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
@@ -70,11 +71,14 @@ def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_
     assert again.left_out == run.left_out
 
 
-@pytest.mark.parametrize(("changes", "rerun"), [
-    ({"reduce": "mean"}, {"distil"}),
-    ({"latent": 3}, {"codes", "distil"}),
-    ({"top": 4}, {"votes", "distil"}),
-])
+@pytest.mark.parametrize(
+    ("changes", "rerun"),
+    [
+        ({"reduce": "mean"}, {"distil"}),
+        ({"latent": 3}, {"codes", "distil"}),
+        ({"top": 4}, {"votes", "distil"}),
+    ],
+)
 def test_a_changed_option_reruns_only_what_depends_on_it(room_run, tmp_path, changes, rerun):
     run, out = room_run
     shutil.copytree(out, tmp_path / "out")
@@ -99,7 +103,9 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, room, tmp_path):
     assert {"densification", "view-dependent colour", "segmenter", "tracker"} <= set(run.left_out)
     save_ply(tmp_path / "scene.ply", run.field.gaussians)
     reporter = Recorder()
-    given = pipeline.run(dataclasses.replace(run.options, gaussians=tmp_path / "scene.ply"), tmp_path / "out", reporter=reporter)
+    given = pipeline.run(
+        dataclasses.replace(run.options, gaussians=tmp_path / "scene.ply"), tmp_path / "out", reporter=reporter
+    )
     assert "scene.ply" in given.left_out["photometric fit"]
     assert reporter.planned["photometric fit"].status == "left out"
     assert reporter.planned["gaussians"].status == "run"
@@ -109,12 +115,14 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, room, tmp_path):
 
 def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
     """The same run with noise in place of the held-out frames and their masks gives the same field."""
-    run, out = room_run
+    run, _ = room_run
     shutil.copytree(room, tmp_path / "capture")
     rng = np.random.default_rng(0)
     for name, held in zip(run.capture.names, run.capture.held_out):
         if held:
-            cv2.imwrite(str(tmp_path / "capture" / "images" / f"{name}.png"), rng.integers(0, 255, (60, 80, 3)).astype(np.uint8))
+            cv2.imwrite(
+                str(tmp_path / "capture" / "images" / f"{name}.png"), rng.integers(0, 255, (60, 80, 3)).astype(np.uint8)
+            )
             (tmp_path / "capture" / "masks" / f"{name}.png").unlink()
     options = dataclasses.replace(run.options, capture=tmp_path / "capture", masks=tmp_path / "capture" / "masks")
     other = pipeline.run(options, tmp_path / "out")
@@ -143,15 +151,18 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     assert "segmenter" not in found.left_out
 
 
-@pytest.mark.parametrize(("changes", "where"), [
-    ({"capture": Path("nowhere")}, "nowhere"),
-    ({"gaussians": Path("nowhere.ply")}, "nowhere.ply"),
-    ({"masks": Path("nowhere")}, "nowhere"),
-    ({"steps": 0}, "--steps"),
-    ({"frames": 1}, "--frames"),
-    ({"downscale": 0.5}, "--downscale"),
-    ({"latent": 0}, "--latent"),
-])
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [
+        ({"capture": Path("nowhere")}, "nowhere"),
+        ({"gaussians": Path("nowhere.ply")}, "nowhere.ply"),
+        ({"masks": Path("nowhere")}, "nowhere"),
+        ({"steps": 0}, "--steps"),
+        ({"frames": 1}, "--frames"),
+        ({"downscale": 0.5}, "--downscale"),
+        ({"latent": 0}, "--latent"),
+    ],
+)
 def test_what_cannot_be_is_refused_before_any_work(room_run, tmp_path, changes, where):
     run, _ = room_run
     reporter = Recorder()
@@ -216,17 +227,28 @@ pipeline.run(pipeline.Options(room, holdout=4, steps=120, sh_degree=0), out)
 
 
 def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(room, tmp_path):
-    environ = os.environ | {"PYTHONPATH": str(Path(pipeline.__file__).parent.parent),
-                            "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "xla"),
-                            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    environ = os.environ | {
+        "PYTHONPATH": str(Path(pipeline.__file__).parent.parent),
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "xla"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
 
     def start(out, victim="nobody", nth=1):
-        return subprocess.run([sys.executable, "-c", DRIVER, str(room), str(out), victim, str(nth)], env=environ,
-                              capture_output=True, text=True).returncode
+        return subprocess.run(
+            [sys.executable, "-c", DRIVER, str(room), str(out), victim, str(nth)],
+            env=environ,
+            capture_output=True,
+            text=True,
+        ).returncode
 
     assert start(tmp_path / "straight") == 0
     out = tmp_path / "killed"
-    for victim, nth in [(".load-", 1), (".gaussians-checkpoint", 2), *((f".{stage}-", 1) for stage in STAGES[1:]), (".field", 1)]:
+    for victim, nth in [
+        (".load-", 1),
+        (".gaussians-checkpoint", 2),
+        *((f".{stage}-", 1) for stage in STAGES[1:]),
+        (".field", 1),
+    ]:
         assert start(out, victim.replace("-checkpoint", "-"), nth) == -signal.SIGKILL, victim
         for path in out.rglob("[!.]*.npz"):  # whatever has its final name is whole
             with contextlib.nullcontext() if path.name == "field.npz" else np.load(path) as file:

@@ -7,12 +7,13 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
+
 from jsecon import pictures, report
 from jsecon.plan import Step
 
 
 class _Reader(HTMLParser):
-    VOID = {"meta", "img"}
+    VOID = ("meta", "img")
 
     def __init__(self):
         super().__init__()
@@ -35,14 +36,20 @@ def _image(seed=0):
 
 @pytest.fixture(scope="module")
 def page():
-    return report.page("A <title> & more", "lead", [
-        report.tiles({"mIoU": "0.712"}),
-        report.section("Frames", "words", report.grid([report.figure(_image(), "<b>x</b>", strong="IoU 0.5", sharp=True)], 2)),
-        report.section("Plan", "", report.plan([Step("photometric fit", "left out", "a .ply is given")])),
-        report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0})),
-        report.table(["a", "b"], [[1, "<script>"]]),
-        report.preformatted("{}"),
-    ])
+    return report.page(
+        "A <title> & more",
+        "lead",
+        [
+            report.tiles({"mIoU": "0.712"}),
+            report.section(
+                "Frames", "words", report.grid([report.figure(_image(), "<b>x</b>", strong="IoU 0.5", sharp=True)], 2)
+            ),
+            report.section("Plan", "", report.plan([Step("photometric fit", "left out", "a .ply is given")])),
+            report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0})),
+            report.table(["a", "b"], [[1, "<script>"]]),
+            report.preformatted("{}"),
+        ],
+    )
 
 
 def test_the_page_is_well_formed_and_holds_all_it_shows(page):
@@ -69,7 +76,9 @@ def test_the_page_is_legible_in_light_and_dark(page):
 def test_pictures_inside_the_page_are_the_pictures_given(sharp):
     image = np.repeat(np.repeat(_image()[:6, :8], 8, 0), 8, 1)
     kind, data = report.data_uri(image, sharp=sharp).split(",")
-    back = cv2.cvtColor(cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    back = cv2.cvtColor(
+        cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB
+    )
     assert kind == ("data:image/png;base64" if sharp else "data:image/jpeg;base64")
     assert np.abs(back.astype(int) - image).mean() <= (0 if sharp else 25)
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import quaternion_of, transform_gaussians
 from jsecon.types import Gaussians
@@ -56,9 +57,11 @@ def test_there_and_back_is_where_it_began(scene):
 def test_quaternions_are_right_at_every_angle(angles):
     rotation = _rotation(angles)
     w, x, y, z = quaternion_of(rotation)
-    back = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    back = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
     np.testing.assert_allclose(back, rotation, atol=1e-12)
 
 

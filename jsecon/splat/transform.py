@@ -1,4 +1,4 @@
-"""Gaussians carried from one world into another by a similarity: turned, scaled and shifted, their colours with them."""
+"""Gaussians carried from one world into another by a similarity: turned, scaled and shifted, colours included."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +12,8 @@ from jsecon.types import Array, Gaussians
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
     """The Gaussians in the world that `similarity` (4, 4) leads to: x' = s R x + t, with R a rotation and s > 0.
 
-    Positions, sizes, orientations and the spherical harmonics all follow, so a camera that is carried along sees the same
-    image. The identity returns the Gaussians as they are. Raises ValueError for a matrix that is no similarity.
+    Positions, sizes, orientations and the spherical harmonics all follow, so a camera that is carried along sees the
+    same image. The identity returns the Gaussians as they are. Raises ValueError for a matrix that is no similarity.
     """
     matrix = np.asarray(similarity, np.float64)
     if np.array_equal(matrix, np.eye(4)):
@@ -21,8 +21,13 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     rotation = matrix[:3, :3] / scale if scale > 0 else np.zeros((3, 3))
     rigid = scale > 0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-    require(bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1])), "similarity", got=matrix.tolist(),
-            expected="a rotation, one positive scale and a shift", remedy="Shear, mirrors and unequal scales cannot be carried.")
+    require(
+        bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1])),
+        "similarity",
+        got=matrix.tolist(),
+        expected="a rotation, one positive scale and a shift",
+        remedy="Shear, mirrors and unequal scales cannot be carried.",
+    )
     dtype = gaussians.means.dtype
     means = jnp.asarray(gaussians.means) @ jnp.asarray(scale * rotation.T, dtype) + jnp.asarray(matrix[:3, 3], dtype)
     return Gaussians(
@@ -35,10 +40,16 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
 
 
 def quaternion_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Unit wxyz of a rotation matrix: the eigenvector of its largest eigenvalue (Bar-Itzhack 2000), stable at every angle."""
+    """Unit wxyz of a rotation matrix: an eigenvector (Bar-Itzhack 2000), stable at every angle."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
-    symmetric = np.array([[a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g],
-                          [c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e]])
+    symmetric = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
     return np.linalg.eigh(symmetric)[1][:, -1]
 
 
@@ -49,8 +60,10 @@ def _product(q: Array, r: Array) -> Array:
 
 
 def _sh_rotation(rotation: np.ndarray, bands: int) -> np.ndarray:
-    """(K, K) that turns coefficients: the basis at d must give what the old one gave at R^T d. Each degree is closed under
-    rotation, so that least squares over enough directions is exact."""
+    """(K, K) that turns coefficients: the basis at d must give what the old one gave at R^T d.
+
+    Each degree is closed under rotation, so that least squares over enough directions is exact.
+    """
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     after = np.asarray(sh_basis(jnp.asarray(directions), bands), np.float64)

@@ -1,0 +1,90 @@
+"""What a run is asked to do, and whether that can be done at all: checked before any work."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+from jsecon.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """All that the result of a run depends on, but for the files themselves."""
+
+    capture: Path
+    """folder: COLMAP (images/, sparse/0) or nerfstudio / instant-ngp (transforms.json)."""
+    gaussians: Path | None = None
+    """.ply (INRIA layout) of the scene; None: Gaussians are fitted to the frames."""
+    masks: Path | None = None
+    """folder of instance masks, one integer PNG a frame or LangSplat's `_s.npy`; None: found in the frames."""
+    downscale: float | None = None
+    """frames are made this many times smaller; None: so that the longer side is at most `long_side`."""
+    long_side: int = 480
+    """px."""
+    frames: int | None = None
+    """at most this many frames, evenly spaced; None: all."""
+    holdout: int = 8
+    """every so manieth frame is kept for measuring only; 0 = none."""
+    steps: int = 3000
+    """of the photometric fit."""
+    sh_degree: int = 1
+    """of the fitted colours, 0 to 3."""
+    iou_threshold: float = 0.5
+    """a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
+    weighting: str = "pixels"
+    """of the views in a region's embedding: pixels or uniform."""
+    latent: int = 16
+    """most numbers a code may have; 3 reproduces the paper."""
+    reduce: str = "mode"
+    """of a Gaussian's votes to its code: mode, median or mean."""
+    top: int = 8
+    """regions whose votes a Gaussian keeps."""
+    seed: int = 0
+    """of whatever is drawn at random."""
+
+
+def require_inputs(options: Options) -> None:
+    """Raises InputError where a file or folder that the options name is not there, or a number is out of its range."""
+    for path, what, remedy in (
+        (
+            options.capture,
+            "a folder with COLMAP's sparse/0 and images/, or a transforms.json",
+            "Give the capture's folder.",
+        ),
+        (
+            options.gaussians,
+            "a .ply of 3D Gaussians",
+            "Give the path of a .ply, or leave out --gaussians to fit the frames.",
+        ),
+        (options.masks, "a folder with one mask a frame", "Give the masks' folder, or leave out --masks to find them."),
+    ):
+        if path is not None and not path.exists():
+            raise InputError(path, found="nothing there", expected=what, remedy=remedy)
+    for name, least in (
+        ("downscale", 1.0),
+        ("frames", 2),
+        ("holdout", 0),
+        ("steps", 1),
+        ("latent", 1),
+        ("top", 1),
+        ("long_side", 16),
+    ):
+        value = getattr(options, name)
+        if value is not None and not value >= least:
+            raise InputError(
+                f"--{name.replace('_', '-')}", found=str(value), expected=f"at least {least}", remedy="Mend the option."
+            )
+
+
+def require_writable(folder: Path) -> None:
+    """Raises InputError where no file can be made in `folder`; makes the folder itself."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(
+            folder,
+            found=error.strerror or type(error).__name__,
+            expected="a folder that can be written",
+            remedy="Choose another output folder, or mend its permissions.",
+        ) from error

@@ -1,0 +1,188 @@
+"""The stages of a run in order, each with the key of its result and the step that computes it."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jsecon import cache, stages
+from jsecon.options import Options, require_inputs
+from jsecon.stages import Outcome
+from jsecon.types import Capture
+
+CHECKPOINT_SECONDS = 20.0
+"""between two records of a fit in progress: a stop loses at most this and one chunk of steps"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One step of a run."""
+
+    name: str
+    how: str
+    """for the plan."""
+    key: str
+    compute: Callable[..., Outcome]
+    """(the results so far by stage, progress) -> Outcome."""
+
+
+def left_out(options: Options) -> dict[str, str]:
+    """What the options alone make needless."""
+    left = {}
+    if options.gaussians is not None:
+        left["photometric fit"] = f"the scene's Gaussians are given ({options.gaussians.name})"
+    else:
+        left["densification"] = "the fit keeps the points that it starts from"
+        if options.sh_degree == 0:
+            left["view-dependent colour"] = "SH degree 0"
+    if options.masks is not None:
+        left["segmenter"] = left["tracker"] = f"masks are given ({options.masks.name})"
+    return left
+
+
+def stages_of(
+    options: Options, out: Path, folder: Path, embedder: Any, load: Callable[[], Capture] | None
+) -> list[Stage]:
+    """The stages in order, with their keys."""
+    require_inputs(options)
+    keys: dict[str, str] = {}
+    plan: list[Stage] = []
+
+    def add(
+        name: str,
+        how: str,
+        compute: Callable[..., Outcome],
+        *,
+        rooms: tuple[str, ...],
+        after: tuple[str, ...] = (),
+        given: dict[str, Any] | None = None,
+        files: Path | None = None,
+    ) -> None:
+        keys[name] = cache.key_of(
+            name,
+            {
+                "source": cache.source_digest((*rooms, "stages")),
+                "after": [keys[other] for other in after],
+                "given": given or {},
+                "files": None if files is None else cache.files_digest([files], leave_out=out),
+            },
+        )
+        plan.append(Stage(name, how, keys[name], compute))
+
+    size = (
+        f"long side <= {options.long_side} px" if options.downscale is None else f"{options.downscale:g} times smaller"
+    )
+    count = "all frames" if options.frames is None else f"at most {options.frames} frames"
+    add(
+        "load",
+        f"{count}, {size}, " + (f"1 in {options.holdout} held out" if options.holdout else "none held out"),
+        lambda r, p: stages.load_frames(options, p) if load is None else stages.checked(load(), "by its adapter"),
+        rooms=("data",),
+        files=options.capture,
+        given=_of(options, "downscale", "long_side", "frames", "holdout")
+        | {"loader": getattr(load, "__qualname__", None)},
+    )
+    if options.masks is not None:  # files first: what is wrong with them is said before the long fit
+        add(
+            "masklets",
+            f"read from {options.masks.name}",
+            lambda r, p: stages.masklets_from_disk(options, r["load"], p),
+            rooms=("data",),
+            after=("load",),
+            files=options.masks,
+        )
+    if options.gaussians is not None:
+        add(
+            "gaussians",
+            f"read from {options.gaussians.name}",
+            lambda r, p: stages.given_gaussians(options, r["load"]),
+            rooms=("data",),
+            after=("load",),
+            files=options.gaussians,
+        )
+    else:
+        add(
+            "gaussians",
+            f"fitted to the frames in {options.steps} steps, SH degree {options.sh_degree}",
+            lambda r, p: _fit(options, folder, keys["gaussians"], r["load"], p),
+            rooms=("fit", "splat"),
+            after=("load",),
+            given=_of(options, "steps", "sh_degree", "seed"),
+        )
+    if options.masks is None:
+        add(
+            "masklets",
+            "proposals by colour and texture, followed through the Gaussians",
+            lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], p),
+            rooms=("vision", "language.masklets", "language.votes", "splat"),
+            after=("load", "gaussians"),
+            given=_of(options, "iou_threshold"),
+        )
+    add(
+        "regions",
+        f"embedded by {embedder.name!r}, views weighted by {options.weighting}",
+        lambda r, p: stages.regions(options, r["load"], r["masklets"], embedder, p),
+        rooms=("vision", "language.regions"),
+        after=("load", "masklets"),
+        given=_of(options, "weighting"),
+    )
+    add(
+        "codes",
+        f"at most {options.latent} numbers a region",
+        lambda r, p: stages.codes(options, r["regions"], p),
+        rooms=("language.autoencoder",),
+        after=("regions",),
+        given=_of(options, "latent", "seed"),
+    )
+    add(
+        "votes",
+        f"the {options.top} strongest regions of each Gaussian",
+        lambda r, p: stages.votes(options, r["load"], r["gaussians"], r["masklets"], r["regions"].count, p),
+        rooms=("language.votes", "splat", "parallel"),
+        after=("load", "gaussians", "masklets"),
+        given=_of(options, "top"),
+    )
+    add(
+        "distil",
+        f"a Gaussian's code is its votes' {options.reduce}",
+        lambda r, p: stages.distil(options, r["votes"], r["codes"][0]),
+        rooms=("language.distill",),
+        after=("votes", "codes"),
+        given=_of(options, "reduce"),
+    )
+    add(
+        "held_out",
+        "PSNR of the rendered colours",
+        lambda r, p: stages.held_out_psnr(r["load"], r["gaussians"], p),
+        rooms=("fit", "splat"),
+        after=("load", "gaussians"),
+    )
+    return plan
+
+
+def _of(options: Options, *names: str) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in names}
+
+
+def record_of(folder: Path, stage: str, key: str) -> Path:
+    """Where a stage in progress keeps how far it has come; removed when its result is kept."""
+    return folder / f"{stage}-{key}.checkpoint.npz"
+
+
+def _fit(options: Options, folder: Path, key: str, capture: Capture, progress: Any) -> Outcome:
+    """The photometric fit, gone on with from its last record where there is one."""
+    record, state, last = record_of(folder, "gaussians", key), None, time.monotonic()
+    if record.exists():
+        # A record that cannot be read loses time and nothing else: the fit starts again, to the same result.
+        with contextlib.suppress(cache.CorruptCacheError):
+            state = cache.load(record)
+
+    def keep(current: Any) -> None:
+        nonlocal last
+        if time.monotonic() - last >= CHECKPOINT_SECONDS:
+            cache.save(record, current)
+            last = time.monotonic()
+
+    return stages.fitted_gaussians(options, capture, progress, state, keep)
