@@ -1,4 +1,4 @@
-"""The anchored query, by votes and by codes, against the definition in NumPy; the region under a pixel against a rendering."""
+"""The anchored query, by votes and by codes, against NumPy; the region under a pixel against a rendering."""
 
 import dataclasses
 
@@ -125,12 +125,14 @@ def test_regions_that_are_alike_count_as_one(field):
     embeddings = np.array(field.regions.embeddings)
     embeddings[4] = embeddings[1]
     twin = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels))
-    alone, both = query_anchored(twin, embeddings[1]), query_anchored(twin, embeddings[1], alike_threshold=0.99)
+    alone, both = query_anchored(twin, embeddings[1], alike_threshold=None), query_anchored(twin, embeddings[1])
     np.testing.assert_allclose(alone.similarity, exact_share(field.votes, [1]), atol=1e-6)
     np.testing.assert_allclose(both.similarity, exact_share(field.votes, [1, 4]), atol=1e-6)
-    by_code = query_anchored(twin, embeddings[1], alike_threshold=0.99, by="code")
-    expected = np.maximum(*(exact_cosine(field.codes, field.region_codes[r]) for r in (1, 4)))
-    np.testing.assert_allclose(by_code.similarity, expected, atol=1e-6)
+    np.testing.assert_allclose(query_region(twin, 4).similarity, exact_share(field.votes, [4]), atol=1e-6)
+    pointed = query_region(twin, 4, alike_threshold=0.95)
+    np.testing.assert_allclose(pointed.similarity, both.similarity, atol=1e-6)
+    unlike = query_anchored(twin, embeddings[1], alike_threshold=1.5)
+    np.testing.assert_allclose(unlike.similarity, alone.similarity, atol=1e-6)  # the anchor itself always counts
 
 
 def test_unlabelled_weight_says_how_much_unlabelled_pixels_count(field):

@@ -1,4 +1,4 @@
-"""The point-level rendered protocol: pairs, denominators, missing answers, sizes; on truths rendered from the scene itself."""
+"""The point-level rendered protocol: pairs, denominators, missing answers, sizes; truths rendered from the scene."""
 
 import dataclasses
 

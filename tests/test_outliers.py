@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from sklearn.cluster import DBSCAN
 
-from jsecon.query.clusters import dbscan
+from jsecon.query.clusters import dbscan, one_component
 from jsecon.query.outliers import default_eps, remove_outliers
 
 
@@ -41,6 +41,22 @@ def test_labels_are_scikit_learns_on_a_grid_of_ties():
         np.testing.assert_array_equal(
             dbscan(points, eps, min_samples), DBSCAN(eps=eps, min_samples=min_samples).fit_predict(points)
         )
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.sampled_from([0.1, 0.5, 1.0, 3.0]))
+def test_one_component_is_never_claimed_wrongly(seed, count, eps):
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    linked = DBSCAN(eps=eps, min_samples=1).fit_predict(points).max() == 0
+    assert linked or not one_component(points, eps)
+
+
+def test_one_component_is_seen_where_points_are_dense():
+    sphere = np.random.default_rng(0).normal(size=(4_000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    assert one_component(sphere, default_eps(sphere))
+    assert not one_component(np.concatenate([sphere, [[1.5, 0, 0]]]), default_eps(sphere))
+    assert one_component(sphere[:1], 0.1)
 
 
 def test_strays_at_the_end_of_the_world_cost_nothing():

@@ -243,7 +243,7 @@ def _epochs(
     shapes, _ = _shapes(units, plan)
 
     def difference(params, codes, x, weight):
-        out = decoder.apply({"params": params["decoder"]}, codes)
+        out: Any = decoder.apply({"params": params["decoder"]}, codes)
         alike = cosine(out, x) if plan.cosine_over == "features" else cosine(out.T, x.T)
         return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(alike))
 
@@ -253,7 +253,7 @@ def _epochs(
         codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
         return difference(params, codes, x, plan.cosine_weight), changed["batch_stats"]
 
-    def step(state, x):
+    def step(state, x) -> tuple[Any, None]:
         vector, stats, moments = state
         gradient, stats = jax.grad(loss, has_aux=True)(vector, stats, x)
         updates, moments = optimizer.update(gradient, moments)
@@ -336,12 +336,12 @@ def _widths(params: Any) -> tuple[int, ...]:
 
 @jax.jit
 def _encode(variables: Any, rows: Array) -> Array:
-    codes = _Encoder(_widths(variables["params"])).apply(variables, rows, train=False)
+    codes: Any = _Encoder(_widths(variables["params"])).apply(variables, rows, train=False)
     return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
 
 
 @jax.jit
-def _decode(variables: Any, rows: Array) -> Array:
+def _decode(variables: Any, rows: Array) -> Any:
     return _Decoder(_widths(variables["params"])).apply(variables, rows)
 
 

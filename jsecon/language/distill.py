@@ -8,6 +8,7 @@ casts on each Gaussian) hold what a closed form needs. The paper instead descend
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxtyping import Float, Int, PRNGKeyArray, UInt32
 
 from jsecon.errors import require
 from jsecon.numerics import normalize, safe_norm
-from jsecon.splat.render import render
+from jsecon.splat.render import is_traced, render
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Votes
 
@@ -167,7 +168,7 @@ def distill_l1(
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
-    if not isinstance(state.history, jax.core.Tracer):
+    if not is_traced(state.history):
         require(
             not bool(jnp.isnan(state.history).any()),
             "distill_l1",
@@ -253,7 +254,7 @@ def descend(
     return _descend(state, gaussians, cameras, labels, jnp.asarray(region_codes), until, learning_rate, capacity)
 
 
-def _optimizer(learning_rate: float | Array) -> optax.GradientTransformation:
+def _optimizer(learning_rate: Any) -> optax.GradientTransformation:
     return optax.adam(learning_rate, eps=ADAM_EPS)
 
 
@@ -275,9 +276,10 @@ def _descend(state, gaussians, cameras, labels, region_codes, until, learning_ra
     def step(index, state):
         (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])
         updates, moments = optimizer.update(gradient, state.moments)
+        features: Any = optax.apply_updates(state.features, updates)
         value = jnp.where(overflow > 0, jnp.nan, value)
         return Descent(
-            optax.apply_updates(state.features, updates),
+            features,
             moments,
             state.order,
             state.history.at[index].set(value),

@@ -5,11 +5,13 @@ put in cubic cells so small that any two of a cell are within eps: the points of
 points without a search, the core points of one cell are one cluster, and what is left is whether two cells touch.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jsecon.types import Array
 
@@ -31,7 +33,8 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     core = np.bincount(cell_of)[cell_of] >= min_samples
     rest = np.flatnonzero(~core)
     if len(rest):
-        distances = cKDTree(points).query(points[rest], k=[min_samples], distance_upper_bound=eps * (1 + 1e-9))[0][:, 0]
+        nth: Any = [min_samples]  # that neighbour alone
+        distances = KDTree(points).query(points[rest], k=nth, distance_upper_bound=eps * (1 + 1e-9))[0][:, 0]
         core[rest] = distances <= eps
     cores = np.flatnonzero(core)
     if not len(cores):
@@ -40,10 +43,21 @@ def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.
     border = np.flatnonzero(~core)
     if len(border):
         # Fewer than min_samples points lie within eps of each, so these lists are short.
-        near = cKDTree(points[cores]).query_ball_point(points[border], eps, return_sorted=False)
+        near = KDTree(points[cores]).query_ball_point(points[border], eps, return_sorted=False)
         core_labels = labels[cores]
         labels[border] = [core_labels[neighbours].min() if neighbours else -1 for neighbours in near]
     return labels
+
+
+def one_component(points: Float[Array, "m 3"], eps: float) -> bool:
+    """Whether steps of at most eps lead from each of the points (M, 3) to every other, as far as cells can tell.
+
+    Cells of which any two that touch hold points within eps: True is certain; False may leave one component unproved.
+    """
+    points = np.asarray(points, np.float64)
+    side = eps / np.sqrt(12) * (1 - 1e-9)
+    cells, _ = _distinct(np.floor((points - np.median(points, axis=0)) / side))
+    return len(cells) < 2 or bool(_join(len(cells), _close_pairs(cells, 1)).max() == 0)
 
 
 def _distinct(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +81,7 @@ def _components(points: np.ndarray, cells: np.ndarray, cell_of: np.ndarray, eps:
     places, count = cells[used], len(used)
     order = np.argsort(own, kind="stable")
     bounds = np.searchsorted(own[order], np.arange(count + 1))
-    pairs = _close_pairs(places)
+    pairs = _close_pairs(places, 2)
 
     # Most cells that touch are told by one point of each, the one nearest the middle of its cell's points.
     sums = np.stack([np.bincount(own, points[:, axis], count) for axis in range(3)], axis=1)
@@ -79,14 +93,14 @@ def _components(points: np.ndarray, cells: np.ndarray, cell_of: np.ndarray, eps:
     # The others are looked at point by point, and only where their parts are not one already.
     parents = list(range(part.max() + 1))
 
-    def root(a):
+    def root(a: int) -> int:
         while parents[a] != a:
             parents[a] = parents[parents[a]]
             a = parents[a]
         return a
 
     for a, b in pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]:
-        root_a, root_b = root(part[a]), root(part[b])
+        root_a, root_b = root(int(part[a])), root(int(part[b]))
         if root_a == root_b:
             continue
         few, many = sorted((points[order[bounds[c] : bounds[c + 1]]] for c in (a, b)), key=len)
@@ -97,11 +111,11 @@ def _components(points: np.ndarray, cells: np.ndarray, cell_of: np.ndarray, eps:
     return np.argsort(np.argsort(first))[named]
 
 
-def _close_pairs(places: np.ndarray) -> np.ndarray:
-    """(P, 2) pairs of cells, each once, that are at most two apart along each axis."""
+def _close_pairs(places: np.ndarray, apart: int) -> np.ndarray:
+    """(P, 2) pairs of cells, each once, that are at most `apart` apart along each axis."""
     if len(places) == 1:
         return np.empty((0, 2), int)
-    return cKDTree(places).query_pairs(2.5, p=np.inf, output_type="ndarray")
+    return KDTree(places).query_pairs(apart + 0.5, p=np.inf, output_type="ndarray")
 
 
 def _join(count: int, pairs: np.ndarray) -> np.ndarray:
@@ -113,4 +127,4 @@ def _within(few: np.ndarray, many: np.ndarray, eps: float) -> bool:
     """Whether some point of one is within eps of some point of the other."""
     if len(few) * len(many) <= 4096:
         return bool((((few[:, None] - many[None]) ** 2).sum(-1) <= eps * eps).any())
-    return bool((cKDTree(many).query(few, k=1, distance_upper_bound=eps * (1 + 1e-9))[0] <= eps).any())
+    return bool((KDTree(many).query(few, k=1, distance_upper_bound=eps * (1 + 1e-9))[0] <= eps).any())

@@ -2,10 +2,10 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jsecon.errors import require
-from jsecon.query.clusters import dbscan
+from jsecon.query.clusters import dbscan, one_component
 from jsecon.types import Array
 
 EPS_SPACINGS = 6.0
@@ -23,13 +23,13 @@ def remove_outliers(
     min_samples: int = MIN_SAMPLES,
     keep: str = "largest",
 ) -> Bool[np.ndarray, " n"]:
-    """The selection `mask` without what DBSCAN calls noise, and for keep="largest" without all clusters but the
-    largest.
+    """The selection `mask` without what DBSCAN calls noise and, for keep="largest", without the smaller clusters.
 
     means (N, 3), world units. eps: radius, world units; None takes `default_eps` of the selection. keep="all" keeps
     every cluster (several objects of one kind). Returned as it came, less centres that are not finite: a selection of
-    fewer than `min_samples` points, or one in which DBSCAN finds no cluster at all, as there is nothing for outliers to
-    lie outside of. Raises ValueError for options out of range.
+    fewer than `min_samples` points, one that is a single component (no gap of eps anywhere, nothing stands apart), and
+    one in which DBSCAN finds no cluster at all, as there is nothing for outliers to lie outside of. Raises ValueError
+    for options out of range.
     """
     require(
         keep in ("largest", "all"),
@@ -51,7 +51,10 @@ def remove_outliers(
     if len(chosen) < min_samples:
         return kept
     points = means[chosen].astype(np.float64)
-    labels = dbscan(points, default_eps(points) if eps is None else eps, min_samples)
+    eps = default_eps(points) if eps is None else eps
+    if one_component(points, eps):
+        return kept
+    labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
         return kept
     inside = labels == np.bincount(labels[labels >= 0]).argmax() if keep == "largest" else labels >= 0
@@ -71,7 +74,7 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
         if len(candidates) > 1:
             sample = candidates[:: -(-len(candidates) // 20_000)]
             neighbours = min(4, len(candidates))
-            spacing = np.median(cKDTree(candidates).query(sample, k=neighbours)[0][:, -1])
+            spacing = np.median(KDTree(candidates).query(sample, k=neighbours)[0][:, -1])
             if spacing > 0:
                 return float(spacings * spacing)
     return 1.0
