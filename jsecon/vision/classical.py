@@ -1,19 +1,27 @@
 """Region proposals without any weights: colour, texture and, where known, depth and normals, merged over a region graph.
 
 The frame is smoothed, cut into small regions that follow its edges (graph segmentation: Felzenszwalb & Huttenlocher
-2004), and neighbours are merged in order of dissimilarity (as in hierarchical grouping: Uijlings et al. 2013). Two
-neighbours are alike if the colours on both sides of their common border are, or if their means are: shading makes the
-means of one surface differ while its borders stay soft, and texture makes borders hard while the means agree.
+2004), and neighbours are merged in order of dissimilarity (as in hierarchical grouping: Uijlings et al. 2013), which
+mixes the step of colour across their common border with the difference of their means: shading makes the means of one
+surface differ while its borders stay soft, and texture makes borders hard while the means agree.
 """
 
 import dataclasses
 import heapq
+import math
 from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 
 from jsecon.errors import require
+
+BORDER_SHARE = 0.4
+"""of the step across the border in a dissimilarity; the rest is the difference of the means"""
+GROWN_AREA = 0.006
+"""share of the frame from which a region counts in full"""
+SMALLEST_FACTOR = 0.22
+"""least factor on the dissimilarity of a small region, which grows with the root of its area: texture is made of these"""
 
 Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | None
 """per-frame maps: a function of the frame's index, or an array or list with one map a frame, or None"""
@@ -23,10 +31,10 @@ Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | 
 class ClassicalSegmenter:
     """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units (a just noticeable step is ~2)."""
 
-    merge_distance: float = 13.0
+    merge_distance: float = 16.0
     """neighbours less dissimilar than this are one region, CIELAB units"""
-    lightness_weight: float = 0.5
-    """weight of L beside a and b: shading and soft shadows change L"""
+    lightness_weight: float = 1.0
+    """weight of L beside a and b: less joins more shading, and more things alike in hue"""
     smoothing: float = 20.0
     """colour radius of the mean-shift filter, 8-bit units; 0 leaves it out"""
     min_area: float = 0.0012
@@ -52,13 +60,11 @@ class ClassicalSegmenter:
         require(frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8, "frame", got=(frame.shape, frame.dtype),
                 expected="(H, W, 3) uint8", remedy="Give RGB frames as 8-bit arrays.")
         features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
-        depth = _map_of(self.depths, index, frame.shape[:2])
-        normal = _map_of(self.normals, index, (*frame.shape[:2], 3))
-        atoms = oversegment(features)
-        pairs, barrier, length = borders(atoms, features, depth, normal, merge_distance=self.merge_distance,
-                                         depth_jump=self.depth_jump, crease_degrees=self.crease_degrees)
+        shape = geometry_features(_map_of(self.depths, index, frame.shape[:2]), _map_of(self.normals, index, frame.shape),
+                                  unit=self.merge_distance, depth_jump=self.depth_jump, crease_degrees=self.crease_degrees)
+        atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
         minimum = self.min_area * frame.shape[0] * frame.shape[1]
-        return merge(atoms, features, pairs, barrier, length, distance=self.merge_distance, min_area=minimum)
+        return merge(atoms, features, borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum)
 
 
 def _map_of(maps: Maps, index: int, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -73,77 +79,129 @@ def _map_of(maps: Maps, index: int, shape: tuple[int, ...]) -> np.ndarray | None
 
 def colour_features(frame: np.ndarray, *, lightness_weight: float, smoothing: float) -> np.ndarray:
     """(H, W, 3) uint8 -> (H, W, 3) float32: weighted L, a and b of the smoothed frame, CIELAB units."""
-    smooth = frame
+    smooth = brightened(frame)
     if smoothing > 0:
-        smooth = cv2.pyrMeanShiftFiltering(np.ascontiguousarray(frame), 5, smoothing, maxLevel=0)
+        smooth = cv2.pyrMeanShiftFiltering(smooth, 5, smoothing, maxLevel=0)
         smooth = cv2.bilateralFilter(smooth, 7, 2.0 * smoothing, 3.0)
     lab = cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
+def brightened(frame: np.ndarray, *, target: float = 0.5, most: float = 4.0) -> np.ndarray:
+    """(H, W, 3) uint8 with more exposure, where the 90th percentile of linear luminance is below `target`.
+
+    CIELAB's steps are those of an eye adapted to the brightest white; in an underexposed photograph they are too small.
+    """
+    linear = (np.arange(256, dtype=np.float32) / 255.0) ** 2.2
+    luminance = linear[frame] @ np.asarray([0.2126, 0.7152, 0.0722], np.float32)
+    gain = min(max(target / max(float(np.percentile(luminance, 90.0)), 1e-6), 1.0), most)
+    table = np.round(255.0 * np.clip(gain * linear, 0.0, 1.0) ** (1.0 / 2.2)).astype(np.uint8)
+    return table[frame]
+
+
+def geometry_features(depth: np.ndarray | None, normal: np.ndarray | None, *, unit: float, depth_jump: float,
+                      crease_degrees: float) -> np.ndarray | None:
+    """(H, W, 1..4) channels in which a relative depth step of `depth_jump` and an angle of `crease_degrees` are `unit`.
+
+    Unknown pixels (0) take the value of the nearest known one, so that nothing known begins or ends at them. None where
+    nothing is known.
+    """
+    channels = []
+    if depth is not None and (depth > 0).any():
+        logarithm = np.log(np.maximum(_filled(depth, depth > 0), 1e-12))
+        channels.append(logarithm[..., None] * np.float32(unit / np.log1p(depth_jump)))
+    if normal is not None and normal.any():
+        chord = 2.0 * np.sin(np.radians(crease_degrees) / 2.0)
+        channels.append(_filled(normal, normal.any(-1)) * np.float32(unit / chord))
+    return np.concatenate(channels, -1).astype(np.float32) if channels else None
+
+
+def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    _, nearest = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    table = np.zeros(int(nearest.max()) + 1, np.int64)
+    table[nearest[known]] = np.flatnonzero(known)
+    return values.reshape(known.size, -1)[table[nearest.reshape(-1)]].reshape(values.shape)
+
+
 def oversegment(features: np.ndarray, *, scale: float = 30.0, min_size: int = 16) -> np.ndarray:
-    """(H, W, 3) -> (H, W) int32 small connected regions that follow the edges (Felzenszwalb & Huttenlocher 2004)."""
+    """(H, W, C) -> (H, W) int32 small connected regions that follow the edges (Felzenszwalb & Huttenlocher 2004)."""
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=scale, min_size=min_size)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
 
 
-def borders(atoms: np.ndarray, features: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None, *,
-            merge_distance: float, depth_jump: float, crease_degrees: float
-            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Neighbouring atoms (E, 2), the mean dissimilarity across their border (E,), CIELAB units, and its length (E,), px.
+@dataclasses.dataclass(frozen=True)
+class Borders:
+    """The region graph's edges: one row a pair of neighbours."""
 
-    A border's step is measured between pixels two to either side, so that the blur of an edge does not hide it.
+    pairs: np.ndarray
+    """(E, 2) atoms, the smaller number first."""
+    length: np.ndarray
+    """(E,) px of common border."""
+    colour: np.ndarray
+    """(E,) step of colour across the border, summed over its length, CIELAB units."""
+    shape: np.ndarray
+    """(E,) step of depth and normal, likewise; at most twice the unit a pixel; 0 where nothing is known."""
+
+
+def borders(atoms: np.ndarray, features: np.ndarray, shape: np.ndarray | None, *, most: float = 40.0) -> Borders:
+    """Who borders on whom, and how hard.
+
+    A step is measured between pixels two to either side of the border, so that the blur of an edge does not hide it. A
+    step of shape counts `most` at most: one far background does not outweigh the rest of an outline.
     """
-    first, second, step = [], [], []
+    keys, colours, shapes = [], [], []
     for axis in (0, 1):
         n = atoms.shape[axis]
         near, far = np.arange(n - 1), np.arange(1, n)
         inner, outer = np.maximum(near - 2, 0), np.minimum(far + 2, n - 1)
         a, b = np.take(atoms, near, axis), np.take(atoms, far, axis)
         cut = a != b
-        where_in, where_out = np.take(features, inner, axis), np.take(features, outer, axis)
-        jump = np.linalg.norm(where_out[cut] - where_in[cut], axis=-1)
-        if depth is not None:
-            d0, d1 = np.take(depth, inner, axis)[cut], np.take(depth, outer, axis)[cut]
-            known = (d0 > 0) & (d1 > 0)
-            relative = np.abs(d1 - d0) / np.where(known, np.minimum(d0, d1), 1.0)
-            jump = np.hypot(jump, np.where(known, np.minimum(relative / depth_jump, 2.0), 0.0) * merge_distance)
-        if normal is not None:
-            n0, n1 = np.take(normal, inner, axis)[cut], np.take(normal, outer, axis)[cut]
-            known = (np.abs(n0).sum(-1) > 0) & (np.abs(n1).sum(-1) > 0)
-            angle = np.degrees(np.arccos(np.clip((n0 * n1).sum(-1), -1.0, 1.0)))
-            jump = np.hypot(jump, np.where(known, np.minimum(angle / crease_degrees, 2.0), 0.0) * merge_distance)
-        first.append(np.minimum(a[cut], b[cut]))
-        second.append(np.maximum(a[cut], b[cut]))
-        step.append(jump)
-    keys = np.stack([np.concatenate(first), np.concatenate(second)], -1)
-    if len(keys) == 0:
-        return np.zeros((0, 2), np.int32), np.zeros(0), np.zeros(0)
-    pairs, inverse, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    total = np.bincount(inverse.reshape(-1), np.concatenate(step), len(pairs))
-    return pairs, total / counts, counts.astype(np.float64)
+
+        def step(values, axis=axis, inner=inner, outer=outer, cut=cut):
+            return np.linalg.norm(np.take(values, outer, axis)[cut] - np.take(values, inner, axis)[cut], axis=-1)
+
+        keys.append(np.sort(np.stack([a[cut], b[cut]], -1), axis=-1))
+        colours.append(step(features))
+        shapes.append(np.zeros(len(colours[-1])) if shape is None else np.minimum(step(shape), most))
+    pairs, inverse = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
+    inverse = inverse.reshape(-1)
+    return Borders(pairs, np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
+                   np.bincount(inverse, np.concatenate(colours), len(pairs)),
+                   np.bincount(inverse, np.concatenate(shapes), len(pairs)))
 
 
-def merge(atoms: np.ndarray, features: np.ndarray, pairs: np.ndarray, barrier: np.ndarray, length: np.ndarray, *,
-          distance: float, min_area: float) -> np.ndarray:
-    """Merges neighbours, the most alike first, until none is nearer than `distance`; then gives away what is too small.
+def merge(atoms: np.ndarray, features: np.ndarray, edges: Borders, *, distance: float, min_area: float) -> np.ndarray:
+    """Merges neighbours, the most alike first, until none is nearer than `distance`; then gives away what is too small
+    (below `min_area`, px) or too thin to its most alike neighbour.
 
-    Returns labels (H, W) int32 0 .. M-1.
+    Dissimilarity: the step of colour across the border and the difference of the mean colours, mixed, less for small
+    regions (they are what texture is made of); and the step of shape, as the other leg of a right triangle. Returns
+    labels (H, W) int32 0 .. M-1.
     """
-    count = int(atoms.max()) + 1
-    flat = atoms.reshape(-1)
+    # Numbered as a reader meets them, so that ties fall the same way whatever the atoms are called.
+    _, first, flat = np.unique(atoms.reshape(-1), return_index=True, return_inverse=True)
+    number = np.argsort(np.argsort(first))
+    flat = number[flat]
+    atoms, pairs = flat.reshape(atoms.shape), np.sort(number[edges.pairs], axis=-1)
+    sums_of = np.stack([edges.colour, edges.shape, edges.length], -1)
+    count = len(first)
     area = np.bincount(flat, minlength=count).astype(np.float64)
     sums = np.stack([np.bincount(flat, features[..., c].reshape(-1), count) for c in range(features.shape[-1])], -1)
-    links: list[dict[int, tuple[float, float]]] = [{} for _ in range(count)]  # neighbour -> (sum of steps, length)
-    for (a, b), step, border in zip(pairs.tolist(), barrier.tolist(), length.tolist()):
-        links[a][b] = links[b][a] = (step * border, border)
+    # neighbour -> sums of the step of colour, of the step of shape, and length of the border
+    links: list[dict[int, tuple[float, float, float]]] = [{} for _ in range(count)]
+    for row in np.lexsort((pairs[:, 1], pairs[:, 0])):
+        a, b = pairs[row].tolist()
+        links[a][b] = links[b][a] = tuple(sums_of[row].tolist())
     parent = np.arange(count)
     version = np.zeros(count, np.int64)
 
+    full = GROWN_AREA * atoms.size
+
     def dissimilarity(a: int, b: int) -> float:
-        steps, border = links[a][b]
+        colour, shape, border = links[a][b]
         gap = float(np.linalg.norm(sums[a] / area[a] - sums[b] / area[b]))
-        return 0.65 * steps / border + 0.35 * gap
+        grown = min(max((min(area[a], area[b]) / full) ** 0.5, SMALLEST_FACTOR), 1.0)
+        return math.hypot(grown * (BORDER_SHARE * colour / border + (1.0 - BORDER_SHARE) * gap), shape / border)
 
     def absorb(a: int, b: int) -> None:
         """b becomes part of a."""
@@ -151,12 +209,11 @@ def merge(atoms: np.ndarray, features: np.ndarray, pairs: np.ndarray, barrier: n
         area[a] += area[b]
         sums[a] += sums[b]
         version[a] += 1
-        for other, (steps, border) in links[b].items():
+        for other, (colour, shape, border) in links[b].items():
             del links[other][b]
-            if other == a:
-                continue
-            known = links[a].get(other, (0.0, 0.0))
-            links[a][other] = links[other][a] = (known[0] + steps, known[1] + border)
+            if other != a:
+                known = links[a].get(other, (0.0, 0.0, 0.0))
+                links[a][other] = links[other][a] = (known[0] + colour, known[1] + shape, known[2] + border)
         links[b] = {}
 
     heap = [(dissimilarity(a, b), a, b, 0, 0) for a in range(count) for b in links[a] if a < b]
@@ -172,18 +229,25 @@ def merge(atoms: np.ndarray, features: np.ndarray, pairs: np.ndarray, barrier: n
         absorb(a, b)
         for other in links[a]:
             heapq.heappush(heap, (dissimilarity(a, other), a, other, version[a], version[other]))
-    small = sorted((int(a) for a in np.flatnonzero((parent == np.arange(count)) & (area < min_area) & (area > 0))),
-                   key=lambda a: area[a])
-    for a in small:
-        if parent[a] == a and area[a] < min_area and links[a]:
+    thin = ~np.isin(np.arange(count), _cores(_roots(parent)[atoms]))
+    for a in sorted(np.flatnonzero((parent == np.arange(count)) & (area > 0)).tolist(), key=lambda a: area[a]):
+        if parent[a] == a and (area[a] < min_area or thin[a]) and links[a]:
             absorb(min(links[a], key=lambda other: dissimilarity(a, other)), a)
-    roots = parent
-    while True:  # pointer jumping: each pass halves the paths
-        further = roots[roots]
-        if np.array_equal(further, roots):
-            break
-        roots = further
-    return np.unique(roots[flat], return_inverse=True)[1].reshape(atoms.shape).astype(np.int32)
+    return np.unique(_roots(parent)[flat], return_inverse=True)[1].reshape(atoms.shape).astype(np.int32)
+
+
+def _roots(parent: np.ndarray) -> np.ndarray:
+    """Where each chain of parents ends; each pass halves the chains."""
+    while not np.array_equal(parent, parent[parent]):
+        parent = parent[parent]
+    return parent
+
+
+def _cores(labels: np.ndarray) -> np.ndarray:
+    """The labels that hold a 5x5 square: the others are slivers along an edge, blurred between its two sides."""
+    image = labels.astype(np.float32)
+    square = np.ones((5, 5), np.uint8)
+    return np.unique(labels[cv2.dilate(image, square) == cv2.erode(image, square)])
 
 
 def masks_best_first(frame: np.ndarray, labels: np.ndarray, *, max_regions: int, min_area: float) -> np.ndarray:

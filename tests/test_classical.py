@@ -1,0 +1,142 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from jsecon.language.masklets import iou_matrix
+from jsecon.vision.classical import ClassicalSegmenter, borders, merge, oversegment
+from jsecon.vision.protocols import Segmenter
+
+
+def desk(seed=0):
+    """A lit, shadowed and slightly noisy picture of five flat-coloured things on wood, and their masks."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:120, :160].astype(np.float32)
+    albedo = np.full((120, 160, 3), (178, 150, 110), np.float32)
+    albedo *= (1 + 0.05 * np.sin(rows / 3 + np.sin(columns / 17)))[..., None]
+    things = {(205, 32, 36): (30, 35, 18), (20, 84, 40): (35, 85, 16), (142, 214, 142): (40, 125, 17),
+              (36, 84, 196): (85, 50, 20), (240, 238, 236): (85, 115, 18)}  # fmt: skip
+    masks = []
+    light = 0.75 + 0.3 * columns / 160
+    for colour, (y, x, radius) in things.items():
+        shadow = np.exp(-(((rows - y - 12) ** 2 + (columns - x - 14) ** 2) / (2 * 13.0**2)))
+        light = light * (1 - 0.35 * shadow)
+    for colour, (y, x, radius) in things.items():
+        mask = (rows - y) ** 2 + (columns - x) ** 2 < radius**2
+        albedo[mask] = colour
+        out = 0.7 + 0.35 * np.sqrt(np.clip(1 - ((rows - y) ** 2 + (columns - x) ** 2) / radius**2, 0, 1)) - 0.2 * (columns - x) / radius
+        light = np.where(mask, out, light)
+        masks.append(mask)
+    picture = 255 * ((albedo / 255) ** 2.2 * light[..., None]).clip(0, 1) ** (1 / 2.2)
+    picture = cv2.GaussianBlur(picture, (3, 3), 0.6) + rng.normal(0, 3, picture.shape)
+    return picture.clip(0, 255).astype(np.uint8), np.stack(masks)
+
+
+def best_ious(truth, masks):
+    return iou_matrix(truth.reshape(len(truth), -1), masks.reshape(len(masks), -1)).max(1)
+
+
+def test_is_a_segmenter():
+    assert isinstance(ClassicalSegmenter(), Segmenter)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_thing_is_one_region_in_spite_of_shading_shadow_and_noise(seed):
+    frame, things = desk(seed)
+    masks = ClassicalSegmenter()(frame, 0)
+    assert (best_ious(things, masks) > 0.85).all()
+    assert len(masks) <= 12
+    assert (masks.sum(0) <= 1).all()  # a partition, but for specks
+    table = ~things.any(0)
+    assert best_ious(table[None], masks)[0] > 0.9
+
+
+def test_best_first_and_no_specks():
+    frame, things = desk()
+    segmenter = ClassicalSegmenter(max_regions=5)
+    masks = segmenter(frame, 0)
+    assert len(masks) == 5
+    assert (masks.sum((1, 2)) >= segmenter.min_area * frame[..., 0].size).all()
+    full = ClassicalSegmenter()(frame, 0)
+    np.testing.assert_array_equal(masks, full[:5])
+
+
+def test_the_same_frame_gives_the_same_masks_and_its_mirror_image_nearly_the_mirrored():
+    frame, things = desk()
+    first, again = ClassicalSegmenter()(frame, 0), ClassicalSegmenter()(frame, 7)
+    np.testing.assert_array_equal(first, again)
+    mirrored = ClassicalSegmenter()(np.ascontiguousarray(frame[:, ::-1]), 0)
+    assert (best_ious(things[:, :, ::-1], mirrored) > 0.85).all()
+
+
+def test_depth_and_normals_part_what_colour_does_not():
+    frame = np.full((60, 80, 3), 150, np.uint8)
+    depth = np.full((60, 80), 2.0, np.float32)
+    depth[20:40, 30:60] = 1.0
+    near = depth < 1.5
+    assert len(ClassicalSegmenter()(frame, 0)) == 1
+    by_depth = ClassicalSegmenter(depths=lambda index: depth)(frame, 0)
+    assert best_ious(near[None], by_depth)[0] > 0.8
+    normal = np.zeros((60, 80, 3), np.float32)
+    normal[..., 2] = -1.0
+    normal[near] = (1.0, 0.0, 0.0)
+    by_normal = ClassicalSegmenter(normals=normal[None])(frame, 0)
+    assert best_ious(near[None], by_normal)[0] > 0.8
+    unknown = ClassicalSegmenter(depths=lambda index: np.zeros((60, 80)), normals=lambda index: None)(frame, 0)
+    assert len(unknown) == 1
+    with pytest.raises(ValueError, match="map"):
+        ClassicalSegmenter(depths=depth[None, :-1])(frame, 0)
+
+
+@pytest.mark.parametrize("frame", [
+    np.zeros((40, 50, 3), np.uint8), np.full((40, 50, 3), 255, np.uint8), np.zeros((8, 8, 3), np.uint8),
+    np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8),
+])  # fmt: skip
+def test_flat_tiny_and_noisy_frames(frame):
+    labels = ClassicalSegmenter().partition(frame, 0)
+    assert labels.shape == frame.shape[:2]
+    np.testing.assert_array_equal(np.unique(labels), np.arange(labels.max() + 1))
+    masks = ClassicalSegmenter()(frame, 0)
+    assert masks.dtype == bool
+    assert masks.shape[1:] == frame.shape[:2]
+    assert len(masks) >= (frame.std() < 1)
+
+
+def test_bad_frames_are_refused():
+    for frame in (np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3), np.float32)):
+        with pytest.raises(ValueError, match="frame"):
+            ClassicalSegmenter()(frame, 0)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1))
+def test_merging_leaves_connected_regions_whatever_the_atoms_are_called(seed):
+    rng = np.random.default_rng(seed)
+    picture = cv2.resize(rng.uniform(0, 60, (4, 5, 3)).astype(np.float32), (30, 24), interpolation=cv2.INTER_NEAREST)
+    features = picture + rng.normal(0, 1, picture.shape).astype(np.float32)
+    atoms = oversegment(features, min_size=4)
+    results = []
+    for name in (np.arange(atoms.max() + 1), rng.permutation(atoms.max() + 1)):
+        named = name[atoms].astype(np.int32)
+        edges = borders(named, features, None)
+        assert (edges.pairs[:, 0] < edges.pairs[:, 1]).all()
+        assert (edges.colour >= 0).all()
+        assert not edges.shape.any()
+        merged = merge(named, features, edges, distance=10.0, min_area=8.0)
+        for region in range(merged.max() + 1):
+            assert cv2.connectedComponents((merged == region).astype(np.uint8), connectivity=8)[0] == 2
+        for atom in range(named.max() + 1):
+            assert len(np.unique(merged[named == atom])) == 1  # atoms are never cut
+        results.append(merged)
+    pairs = np.unique(np.stack([r.ravel() for r in results]), axis=1)
+    assert pairs.shape[1] == results[0].max() + 1 == results[1].max() + 1  # the same partition
+
+
+@pytest.mark.parametrize("path", ["captures/bonsai/images/DSCF5605.JPG", "captures/fox/images/0001.jpg"])
+def test_real_photographs_come_apart_into_tens_of_regions(shared, path):
+    picture = cv2.imread(str(shared / path))[..., ::-1]
+    frame = cv2.resize(picture, None, fx=400 / picture.shape[1], fy=400 / picture.shape[1], interpolation=cv2.INTER_AREA)
+    masks = ClassicalSegmenter()(frame, 0)
+    assert 8 <= len(masks) <= 64
+    assert masks.any(0).mean() > 0.9
+    assert masks.mean((1, 2)).max() < 0.6
