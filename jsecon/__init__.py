@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jsecon.query.outliers import remove_outliers as remove_outliers
     from jsecon.splat.project import project as project
     from jsecon.splat.render import render as render, render_depth as render_depth, render_rgb as render_rgb
+    from jsecon.splat.tiles import plan_capacity as plan_capacity
     from jsecon.types import (
         Camera as Camera,
         Capture as Capture,
@@ -67,6 +68,7 @@ _CONTENTS = {
     "jsecon.query.outliers": ("remove_outliers",),
     "jsecon.splat.project": ("project",),
     "jsecon.splat.render": ("render", "render_depth", "render_rgb"),
+    "jsecon.splat.tiles": ("plan_capacity",),
     "jsecon.types": ("Camera", "Capture", "Gaussians", "LanguageField", "Regions", "Rendering", "Selection", "Votes"),
 }
 _HOME = {name: module for module, names in _CONTENTS.items() for name in names}

@@ -64,7 +64,7 @@ def _demo(verbs) -> None:
     verb.add_argument(
         "--out", type=Path, default=Path("jsecon-demo"), help="folder for all of it (default ./jsecon-demo)"
     )
-    verb.add_argument("--steps", type=int, default=None, help="of the photometric fit (default 2000)")
+    verb.add_argument("--steps", type=int, default=None, help="of the photometric fit (default 700)")
     verb.set_defaults(act=_act_demo)
 
 

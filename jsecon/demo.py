@@ -22,7 +22,7 @@ from jsecon.plan import Reporter
 from jsecon.types import LanguageField
 
 HOLDOUT = 5
-STEPS = 2000
+STEPS = 700
 
 
 def demo(

@@ -1,0 +1,103 @@
+"""`jsecon demo`, whole, on a room as small as it can be: what it writes, and that a second call finds it all done."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jsecon import demo, pictures
+from jsecon.data.ply import load_ply
+from jsecon.language.field import load_field
+from jsecon.plan import Silent
+
+ROOM = {"views": 8, "width": 96, "height": 72, "points": 900, "holdout": 4}
+
+
+class Ears(Silent):
+    """Keeps what is said."""
+
+    def __init__(self):
+        self.said, self.fresh = [], {}
+
+    def say(self, text):
+        self.said.append(text)
+
+    def done(self, name, seconds, fresh):
+        self.fresh[name] = self.fresh.get(name, False) or fresh
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out, ears = tmp_path_factory.mktemp("demo"), Ears()
+    return demo.demo(out, steps=80, reporter=ears, room=ROOM), out, ears
+
+
+def test_metrics_have_every_figure_that_is_promised(finished):
+    metrics, out, _ = finished
+    assert json.loads((out / "metrics.json").read_text()) == metrics
+    for kind in ("anchored", "one_step", "true_masks"):
+        assert set(metrics[kind]) >= {"miou", "macc", "loc_acc"}
+        assert all(0 <= metrics[kind][name] <= 1 for name in ("miou", "macc", "loc_acc"))
+    assert metrics["true_masks"]["miou"] > 0.4  # a tiny room and a short fit: far from the figures, farther from chance
+    assert metrics["anchored"]["pairs"] == metrics["true_masks"]["pairs"] >= 15
+    assert all(value >= 0 for value in metrics["seconds"].values())
+    assert "densification" in metrics["left_out"]
+    assert metrics["peak_memory_mib"] > 100
+
+
+def test_the_fields_and_the_answers_are_on_disk(finished):
+    metrics, out, _ = finished
+    field = load_field(out / "field.npz")
+    assert field.regions.count == metrics["regions"]
+    assert load_field(out / "true_masks" / "field.npz").regions.count >= 10
+    told = [json.loads(path.read_text()) for path in (out / "queries").glob("*.json")]
+    assert len(told) >= 10
+    for answer in told:
+        if answer["count"]:
+            assert load_ply(out / "queries" / answer["ply"]).count == answer["count"]
+
+
+def test_the_two_runs_share_frames_and_gaussians(finished):
+    _, out, _ = finished
+    assert len(list((out / "cache").glob("gaussians-*.npz"))) == 1
+    assert len(list((out / "cache").glob("load-*.npz"))) == 1
+    a, b = (load_field(out / name / "field.npz").gaussians for name in (".", "true_masks"))
+    np.testing.assert_array_equal(a.means, b.means)
+
+
+def test_only_frames_poses_and_points_reach_the_default_run(finished):
+    """The default field knows nothing of masks, labels or names: its options name none of them."""
+    _, out, _ = finished
+    options = json.loads(load_field(out / "field.npz").provenance)["options"]
+    assert options["masks"] is None
+    assert options["gaussians"] is None
+
+
+def test_the_report_shows_every_query_and_stands_alone(finished):
+    _, out, _ = finished
+    page = (out / "report.html").read_text()
+    for path in (out / "queries").glob("*.json"):
+        assert json.loads(path.read_text())["query"] in page
+    for words in ("true masks given", "Seconds of each stage", "left out", "Held-out frames", "mAcc@0.25"):
+        assert words in page
+    assert "http" not in page
+
+
+def test_a_second_call_finds_it_all_done(finished):
+    metrics, out, _ = finished
+    before, ears = (out / "field.npz").read_bytes(), Ears()
+    again = demo.demo(out, steps=80, reporter=ears, room=ROOM)
+    assert {name for name, fresh in ears.fresh.items() if fresh} == {"field"}
+    assert (out / "field.npz").read_bytes() == before
+    assert again["anchored"] == metrics["anchored"]
+
+
+def test_codes_are_shown_in_colours_that_tell_regions_apart(finished):
+    _, out, _ = finished
+    field = load_field(out / "field.npz")
+    colours = pictures.code_colours(field)
+    known = np.abs(np.asarray(field.codes)).max(1) > 0
+    assert colours.shape == (field.gaussians.count, 3)
+    assert ((colours >= 0) & (colours <= 1)).all()
+    np.testing.assert_array_equal(colours[~known], np.full((int((~known).sum()), 3), pictures.UNKNOWN))
+    assert colours[known].std(0).max() > 0.05

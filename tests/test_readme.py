@@ -1,0 +1,91 @@
+"""The README is true: its Python runs, its command lines parse, and the CI finds the test command in it."""
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from jsecon import cli
+
+HOME = Path(__file__).resolve().parent.parent
+README = (HOME / "README.md").read_text()
+
+
+def _blocks(language, text=README):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, monkeypatch):
+    _, out = room_run
+    (tmp_path / "jsecon-demo").mkdir()
+    shutil.copy(out / "field.npz", tmp_path / "jsecon-demo")
+    (tmp_path / "jsecon-demo" / "capture").symlink_to(room)
+    monkeypatch.chdir(tmp_path)
+    blocks, names, told = _blocks("python"), {}, io.StringIO()
+    assert len(blocks) >= 3
+    with contextlib.redirect_stdout(told):
+        for block in blocks:
+            exec(compile(block, "README.md", "exec"), names)
+    lines = told.getvalue().splitlines()
+    assert re.match(r"[1-9]\d* of \d+ Gaussians, region \d+, score 0\.\d+", lines[0]), lines
+    assert len(lines) == 5
+    assert "left out: 0" in lines[2]
+
+
+def test_every_command_line_is_one_that_the_program_takes():
+    lines = [line for block in _blocks("bash") for line in block.splitlines() if line.startswith("jsecon")]
+    lines += [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", cli._EPILOG, re.MULTILINE)]
+    assert len(lines) >= 10
+    for line in lines:
+        with contextlib.redirect_stderr(io.StringIO()) as told:
+            try:
+                cli.parser().parse_args(shlex.split(line)[1:])
+            except SystemExit:
+                pytest.fail(f"{line}: {told.getvalue()}")
+
+
+def test_the_first_two_commands_do_everything():
+    first, second = _blocks("bash")[:2]
+    assert first.splitlines()[1:] == ["pip install .", "jsecon demo"]
+    assert second.splitlines()[1:] == ["pip install '.[dev]'", "pytest"]
+    assert README.index(second) < README.index("## ")
+
+
+def test_the_ci_runs_exactly_the_second_command():
+    script = (HOME / ".ci" / "run").read_text()
+    function = script[script.index("block_after()") : script.index("\nwork=")]
+    found = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", f'{function}\nblock_after "Run the tests:"'],
+        cwd=HOME, check=True, capture_output=True, text=True,
+    ).stdout  # fmt: skip
+    assert found == _blocks("bash")[1]
+    assert os.access(HOME / ".ci" / "run", os.X_OK)
+
+
+def test_the_experiments_named_are_there_and_all_are_named():
+    text = (HOME / "experiments" / "README.md").read_text()
+    named = set(re.findall(r"`(\w+\.py)`", text))
+    there = {
+        path.name for path in (HOME / "experiments").glob("*.py") if path.name not in ("__init__.py", "results.py")
+    }
+    assert named == there
+
+
+def test_the_package_says_what_it_needs():
+    project = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
+    needs = {re.split(r"[<>=\[]", line)[0] for line in project["dependencies"]}
+    tree = " ".join(path.read_text() for path in (HOME / "jsecon").rglob("*.py"))
+    used = {name for name in re.findall(r"^\s*(?:import|from) (\w+)", tree, re.MULTILINE)}
+    homes = {"cv2": "opencv-contrib-python-headless", "sklearn": "scikit-learn"}
+    outside = {homes.get(name, name) for name in used} & {
+        "jax", "optax", "flax", "numpy", "scipy", "scikit-learn", "onnxruntime", "opencv-contrib-python-headless",
+        "jaxtyping", "tqdm", "matplotlib", "beartype", "PIL", "torch", "pandas",
+    }  # fmt: skip
+    assert outside <= needs, f"imported but not required: {sorted(outside - needs)}"
