@@ -20,25 +20,28 @@ NEAR = 0.01
 """near plane, world units (0.2 reproduces INRIA)"""
 
 
-def tiny(dtype) -> float:
-    """Smallest number whose square is still normal in `dtype`: below it a length counts as zero."""
-    return float(jnp.finfo(dtype).tiny) ** 0.5
+def into_range(size: Array) -> Array:
+    """A power of two that brings numbers of this size to where squares neither overflow nor vanish.
+
+    Multiplied, not divided: XLA turns a division by a row's largest number into a product with its reciprocal, and that
+    of 1e38 is flushed to zero. A constant to the gradient, which stays exact: lengths are homogeneous, directions
+    invariant.
+    """
+    limit = jnp.finfo(size.dtype).maxexp
+    far, shift = limit * 5 // 16, limit * 21 // 32
+    factor = jnp.where(size > 2.0**far, 2.0**-shift, jnp.where(size < 2.0**-far, 2.0**shift, 1.0))
+    return jax.lax.stop_gradient(factor.astype(size.dtype))
 
 
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
-    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at zero.
-
-    The vector is scaled by its largest entry first, so that squares neither overflow nor vanish; the entry is treated
-    as a constant, which leaves the gradient exact because the length is homogeneous.
-    """
+    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at zero."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
-    scale = jnp.where(usable, largest, 1.0)
-    scaled = jnp.where(usable, x / scale, 0.0)
+    factor = into_range(largest)
+    scaled = jnp.where(usable, x * factor, 0.0)
     squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
-    length = scale * jnp.sqrt(jnp.where(usable, squares, 1.0))
-    length = jnp.where(usable, length, jnp.where(largest > 0, largest, jnp.where(largest == 0, 0.0, jnp.nan)))
+    length = jnp.where(usable, jnp.sqrt(jnp.where(usable, squares, 1.0)) * (1 / factor), largest)
     return length if keepdims else jnp.squeeze(length, axis)
 
 
@@ -47,10 +50,9 @@ def normalize(x: Array, axis: int = -1) -> Array:
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
-    scaled = jnp.where(usable, x / jnp.where(usable, largest, 1.0), 0.0)
+    scaled = jnp.where(usable, x * into_range(largest), 0.0)
     squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
     unit = scaled / jnp.sqrt(jnp.where(usable, squares, 1.0))
-    # A scale that is a constant drops out of x / |x|, so the gradient through `scaled` is the exact one.
     return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
 
 

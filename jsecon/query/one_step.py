@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.numerics import normalize
+from jsecon.numerics import into_range, normalize
 from jsecon.types import Array, Selection
 
 Number = float | int | Array
@@ -41,20 +41,9 @@ def similarities(codes: Float[Array, "n d"], code: Float[Array, " d"]) -> tuple[
     unit = normalize(code)
     largest = jnp.max(jnp.abs(codes), axis=-1, initial=0.0)
     known = (largest > 0) & jnp.isfinite(largest) & jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
-    scaled = codes * jnp.where(known, _into_range(largest), 0.0)[:, None]
+    scaled = codes * jnp.where(known, into_range(largest), 0.0)[:, None]
     dots, squares = jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
     return jnp.where(known, dots / jnp.sqrt(jnp.where(known, squares, 1.0)), 0.0), known
-
-
-def _into_range(size: Array) -> Array:
-    """A power of two that brings numbers of this size to where squares neither overflow nor vanish.
-
-    Multiplied, not divided: XLA turns a division by a row's largest number into a product with its reciprocal, and
-    that of 1e38 is flushed to zero.
-    """
-    limit = jnp.finfo(size.dtype).maxexp
-    far, shift = limit * 5 // 16, limit * 21 // 32
-    return jnp.where(size > 2.0**far, 2.0**-shift, jnp.where(size < 2.0**-far, 2.0**shift, 1.0)).astype(size.dtype)
 
 
 def best(similarity: Float[Array, " n"], known: Bool[Array, " n"]) -> Float[Array, ""]:
