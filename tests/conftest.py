@@ -91,11 +91,11 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def room(tmp_path_factory) -> Path:
-    """The demo room on disk, as small as it can be and still have objects to find: 8 views of 80x60, 2 held out."""
+    """The demo room on disk, as small as it can be and still have objects to find: 8 views of 160x120, 2 held out."""
     from jsecon.data.synthetic import write_room
 
     return write_room(
-        tmp_path_factory.mktemp("room") / "capture", 0, views=8, width=80, height=60, holdout=4, points=600
+        tmp_path_factory.mktemp("room") / "capture", 0, views=8, width=160, height=120, holdout=4, points=1200
     )
 
 

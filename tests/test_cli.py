@@ -83,7 +83,7 @@ def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, c
             np.testing.assert_allclose(means.mean(0), answer["place"]["centroid"], atol=1e-5)
             for file in answer["masks"].values():
                 mask = cv2.imread(str(tmp_path / file), cv2.IMREAD_UNCHANGED)
-                assert mask.shape == (60, 80)
+                assert mask.shape == (120, 160)
                 assert set(np.unique(mask)) <= {0, 255}
     assert "data:image/" in (tmp_path / "answers.html").read_text()
 
@@ -203,7 +203,7 @@ def _transforms(room, tmp_path, change):
         {"file_path": f"images/{path.name}", "transform_matrix": np.eye(4).tolist()}
         for path in sorted((folder / "images").iterdir())
     ]
-    scene = {"w": 80, "h": 60, "fl_x": 70.0, "fl_y": 70.0, "cx": 40.0, "cy": 30.0, "frames": frames}
+    scene = {"w": 160, "h": 120, "fl_x": 140.0, "fl_y": 140.0, "cx": 80.0, "cy": 60.0, "frames": frames}
     change(scene)
     (folder / "transforms.json").write_text(json.dumps(scene))
     return folder
@@ -266,8 +266,8 @@ def test_a_ply_with_missing_properties(capture, room_run, tmp_path, capsys):
 
 def test_a_mask_of_the_wrong_size(capture, tmp_path, capsys):
     for path in (capture / "masks").iterdir():
-        cv2.imwrite(str(path), np.ones((60, 60), np.uint8))
-    _refused_run(capsys, capture, tmp_path, "--masks", capture / "masks", says=["60x60", "80x60"])
+        cv2.imwrite(str(path), np.ones((100, 100), np.uint8))
+    _refused_run(capsys, capture, tmp_path, "--masks", capture / "masks", says=["100x100", "160x120"])
 
 
 def test_an_output_folder_that_cannot_be_written(capture, room_run, tmp_path, capsys):
@@ -300,7 +300,7 @@ def test_a_text_that_is_not_understood_leaves_nothing_half_done(room_run, tmp_pa
     ("options", "says"),
     [
         (["--at", "nowhere", 3, 3], "nowhere"),
-        (["--at", 0, 80, 3], "79"),
+        (["--at", 0, 160, 3], "159"),
         (["--at", 0, "left", 3], "left"),
         ([], "nothing to find"),
     ],

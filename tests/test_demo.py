@@ -10,7 +10,7 @@ from jsecon.data.ply import load_ply
 from jsecon.language.field import load_field
 from jsecon.plan import Silent
 
-ROOM = {"views": 8, "width": 96, "height": 72, "points": 900, "holdout": 4}
+ROOM = {"views": 8, "width": 160, "height": 120, "points": 1200, "holdout": 4}
 
 
 class Ears(Silent):

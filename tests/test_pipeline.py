@@ -56,7 +56,7 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     assert (np.asarray(field.regions.pixels)[:, run.capture.held_out] == 0).all()
     assert (np.asarray(field.regions.pixels)[:, ~run.capture.held_out].sum(1) > 0).all()
     assert set(run.seconds) == {*STAGES, "field"}
-    assert run.labels.shape == (6, 60, 80)
+    assert run.labels.shape == (6, 120, 160)
 
 
 def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_path):
@@ -120,7 +120,7 @@ def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
     for name, held in zip(run.capture.names, run.capture.held_out):
         if held:
             cv2.imwrite(
-                str(tmp_path / "capture" / "images" / f"{name}.png"), rng.integers(0, 255, (60, 80, 3)).astype(np.uint8)
+                str(tmp_path / "capture" / "images" / f"{name}.png"), rng.integers(0, 255, (120, 160, 3)).astype(np.uint8)
             )
             (tmp_path / "capture" / "masks" / f"{name}.png").unlink()
     options = dataclasses.replace(run.options, capture=tmp_path / "capture", masks=tmp_path / "capture" / "masks")
