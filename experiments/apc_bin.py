@@ -1,10 +1,12 @@
-"""Four objects in a shelf bin, RGB-D: masks of some views -> votes -> each object's Gaussians -> IoU in the other views.
+"""Four objects in a shelf bin, RGB-D: masks of some views -> votes -> each object's Gaussians -> IoU in the other
+views.
 
     python -m experiments.apc_bin [FOLDER]
 
-The capture is a scene of the MIT-Princeton APC 2016 data (15 views, 640x480). The Gaussians are the back-projected depths of
-the views that are not held out; their masks vote; a selection is rendered alone in the held-out views (alpha > 0.7) and
-compared with their masks there. The masks are the objects' models projected, so they also cover what the gripper hides.
+The capture is a scene of the MIT-Princeton APC 2016 data (15 views, 640x480). The Gaussians are the back-projected
+depths of the views that are not held out; their masks vote; a selection is rendered alone in the held-out views (alpha
+> 0.7) and compared with their masks there. The masks are the objects' models projected, so they also cover what the
+gripper hides.
 """
 
 import dataclasses
@@ -69,10 +71,18 @@ def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
             blocks.setdefault(title, []).append([float(v) for v in line.split()])
     intrinsics = next((m for t, m in blocks.items() if t.startswith("Color camera intrinsic")), None)
     poses = {t.rsplit("-", 1)[1]: m for t, m in blocks.items() if t.startswith("Camera-to-world")}
-    if intrinsics is None or np.shape(intrinsics) != (3, 3) or not poses or any(np.shape(m) != (4, 4) for m in poses.values()):
-        raise InputError("cam.info.txt", found=f"the matrices {sorted(blocks)}",
-                         expected="a 3x3 colour intrinsic matrix and a 4x4 camera-to-world matrix a frame",
-                         remedy="Give the file as the APC toolbox writes it.")
+    if (
+        intrinsics is None
+        or np.shape(intrinsics) != (3, 3)
+        or not poses
+        or any(np.shape(m) != (4, 4) for m in poses.values())
+    ):
+        raise InputError(
+            "cam.info.txt",
+            found=f"the matrices {sorted(blocks)}",
+            expected="a 3x3 colour intrinsic matrix and a 4x4 camera-to-world matrix a frame",
+            remedy="Give the file as the APC toolbox writes it.",
+        )
     return np.array(intrinsics), np.array([poses[k] for k in sorted(poses)])
 
 
@@ -94,8 +104,12 @@ def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tu
     try:
         intrinsics, poses = parse_cameras((folder / "cam.info.txt").read_text())
     except OSError as error:
-        raise InputError(folder / "cam.info.txt", found=str(error.strerror), expected="the cameras",
-                         remedy="Give the folder scene-0000 of apc_bin.") from error
+        raise InputError(
+            folder / "cam.info.txt",
+            found=str(error.strerror),
+            expected="the cameras",
+            remedy="Give the folder scene-0000 of apc_bin.",
+        ) from error
     names = tuple(f"frame-{t:06d}" for t in range(len(poses)))
     frames = np.stack([_image(folder / f"{n}.color.png", cv2.IMREAD_COLOR)[..., ::-1] for n in names])
     depths = np.stack([decode_depth(_image(folder / f"{n}.depth.png", cv2.IMREAD_UNCHANGED)) for n in names])
@@ -106,9 +120,13 @@ def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tu
         labels[segments == number] = index
     # The matrix counts pixel centres as integers (OpenCV), jsecon from the upper left corner: half a pixel more.
     count = len(names)
-    fx, fy, cx, cy = (np.full(count, v, np.float32) for v in
-                      (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2] + 0.5, intrinsics[1, 2] + 0.5))
-    cameras = Camera(np.linalg.inv(poses).astype(np.float32), fx, fy, cx, cy, width=frames.shape[2], height=frames.shape[1])
+    fx, fy, cx, cy = (
+        np.full(count, v, np.float32)
+        for v in (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2] + 0.5, intrinsics[1, 2] + 0.5)
+    )
+    cameras = Camera(
+        np.linalg.inv(poses).astype(np.float32), fx, fy, cx, cy, width=frames.shape[2], height=frames.shape[1]
+    )
     held_out = np.arange(count) % held_out_every == 1
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     return Capture(frames, cameras, *nothing, held_out, depths, np.eye(4), names), labels
@@ -120,12 +138,14 @@ def build_gaussians(capture: Capture, options: Options) -> Gaussians:
         depths = confirmed_depths(capture, tolerance=options.depth_tolerance, min_views=options.confirming_views)
         capture = dataclasses.replace(capture, depths=depths)
     points = points_from_depth(capture, voxel=options.voxel_m)
-    gaussians = gaussians_from_points(points.points, points.colors, opacity=options.opacity, scale=options.scale,
-                                      max_scale=3 * options.voxel_m)
+    gaussians = gaussians_from_points(
+        points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=3 * options.voxel_m
+    )
     if options.fit_steps:
         rates = LearningRates(means=0.0, quaternions=0.0)
-        gaussians, _ = fit_gaussians(capture, steps=options.fit_steps, key=jax.random.key(options.seed), start=gaussians,
-                                     rates=rates)
+        gaussians, _ = fit_gaussians(
+            capture, steps=options.fit_steps, key=jax.random.key(options.seed), start=gaussians, rates=rates
+        )
     return jax.tree.map(jnp.asarray, gaussians)
 
 
@@ -137,27 +157,50 @@ def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> L
     votes = region_votes(gaussians, cameras, jnp.asarray(labels[used]), count)
     codes = jnp.eye(count)
     pixels = np.stack([(labels[used] == r).sum((1, 2)) for r in range(count)]).astype(np.int32)
-    return LanguageField(gaussians=gaussians, codes=distill_votes(votes, codes, "mode"), votes=votes,
-                         regions=Regions(codes, jnp.asarray(pixels)), region_codes=codes, autoencoder=None, cameras=cameras,
-                         canonical=jnp.zeros((1, count)), to_source=jnp.eye(4),
-                         names=tuple(capture.names[t] for t in used), embedder="labels")
+    return LanguageField(
+        gaussians=gaussians,
+        codes=distill_votes(votes, codes, "mode"),
+        votes=votes,
+        regions=Regions(codes, jnp.asarray(pixels)),
+        region_codes=codes,
+        autoencoder=None,
+        cameras=cameras,
+        canonical=jnp.zeros((1, count)),
+        to_source=jnp.eye(4),
+        names=tuple(capture.names[t] for t in used),
+        embedder="labels",
+    )
 
 
-def evaluate(field: LanguageField, capture: Capture, labels: np.ndarray, options: Options) -> tuple[list[dict], dict]:
+WAYS = ("votes", "code", "votes + DBSCAN")
+
+
+def evaluate(
+    field: LanguageField, capture: Capture, labels: np.ndarray, options: Options, ways: tuple[str, ...] = WAYS
+) -> tuple[list[dict], dict]:
     """A row for each way to select, object and held-out view; and the predicted masks by (way, object, frame)."""
     rows, masks = [], {}
-    for way in ("votes", "code", "votes + DBSCAN"):
+    for way in ways:
         by = way.split()[0]
         for index, name in enumerate(OBJECTS.values()):
-            chosen = query_region(field, index, by=by, similarity_threshold=options.threshold if by == "votes" else None).mask
+            chosen = query_region(
+                field, index, by=by, similarity_threshold=options.threshold if by == "votes" else None
+            ).mask
             if way.endswith("DBSCAN"):
                 chosen = jnp.asarray(remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all"))
             for t in np.flatnonzero(capture.held_out):
                 camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
                 masks[way, index, int(t)] = np.asarray(selection_mask(field.gaussians, camera, chosen))
                 true = labels[t] == index
-                rows.append({"by": way, "object": name, "frame": capture.names[t], "selected": int(chosen.sum()),
-                             "iou": float(iou(masks[way, index, int(t)], true))})
+                rows.append(
+                    {
+                        "by": way,
+                        "object": name,
+                        "frame": capture.names[t],
+                        "selected": int(chosen.sum()),
+                        "iou": float(iou(masks[way, index, int(t)], true)),
+                    }
+                )
     return rows, masks
 
 
@@ -175,7 +218,9 @@ def draw(capture: Capture, labels: np.ndarray, masks: dict, way: str):
             picture[mask] = 0.4 * picture[mask] + 0.6 * colors[index]
         picture = np.ascontiguousarray(picture.astype(np.uint8))
         for index in range(len(OBJECTS)):
-            outline, _ = cv2.findContours((labels[t] == index).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+            outline, _ = cv2.findContours(
+                (labels[t] == index).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+            )
             cv2.drawContours(picture, outline, -1, (255, 255, 255), 2)
         axes = figure.add_subplot(1, len(held), column + 1)
         axes.imshow(picture)
@@ -184,7 +229,7 @@ def draw(capture: Capture, labels: np.ndarray, masks: dict, way: str):
     return figure
 
 
-def main(options: Options = Options()) -> dict:  # noqa: B008 - frozen
+def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
     seconds, began = {}, time.perf_counter()
 
@@ -200,17 +245,23 @@ def main(options: Options = Options()) -> dict:  # noqa: B008 - frozen
     lap("votes")
     rows, masks = evaluate(field, capture, labels, options)
     lap("select and render")
-    ways = list(dict.fromkeys(r["by"] for r in rows))
     metrics = {
-        "gaussians": gaussians.count, "held_out": [capture.names[t] for t in np.flatnonzero(capture.held_out)],
+        "gaussians": gaussians.count,
+        "held_out": [capture.names[t] for t in np.flatnonzero(capture.held_out)],
         "psnr_held_out_db": float(evaluate_psnr(gaussians, capture).mean()),
-        "miou": {way: mean_iou(r["iou"] for r in rows if r["by"] == way) for way in ways},
-        "macc_025": {way: accuracy_at([r["iou"] for r in rows if r["by"] == way]) for way in ways},
-        "objects": {way: {name: mean_iou(r["iou"] for r in rows if (r["by"], r["object"]) == (way, name))
-                          for name in OBJECTS.values()} for way in ways},
-        "seconds": seconds, "rows": rows,
+        "miou": {way: mean_iou(r["iou"] for r in rows if r["by"] == way) for way in WAYS},
+        "macc_025": {way: accuracy_at([r["iou"] for r in rows if r["by"] == way]) for way in WAYS},
+        "objects": {
+            way: {
+                name: mean_iou(r["iou"] for r in rows if (r["by"], r["object"]) == (way, name))
+                for name in OBJECTS.values()
+            }
+            for way in WAYS
+        },
+        "seconds": seconds,
+        "rows": rows,
     }
-    lines = [(way, *(metrics["objects"][way][n] for n in OBJECTS.values()), metrics["miou"][way]) for way in ways]
+    lines = [(way, *(metrics["objects"][way][n] for n in OBJECTS.values()), metrics["miou"][way]) for way in WAYS]
     table = results.table(("selected by", *OBJECTS.values(), "mean IoU"), lines)
     out = Path(options.out)
     results.save(out, options, metrics, table)

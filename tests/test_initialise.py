@@ -51,10 +51,14 @@ def test_gaussians_from_points_hold_the_colour_opacity_and_scale():
     np.testing.assert_allclose(0.5 + C0 * gaussians.sh[:, 0], colors / 255, atol=1e-6)
     assert not gaussians.sh[:, 1:].any()
     np.testing.assert_allclose(1 / (1 + np.exp(-gaussians.opacity_logits)), 0.3, rtol=1e-6)
-    np.testing.assert_allclose(np.exp(gaussians.log_scales), np.repeat(brute_distances(points)[:, None], 3, 1), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(gaussians.log_scales), np.repeat(brute_distances(points)[:, None], 3, 1), rtol=1e-5
+    )
     np.testing.assert_array_equal(gaussians.quaternions, np.tile([1, 0, 0, 0], (30, 1)))
     capped = gaussians_from_points(points, colors, max_scale=0.2, scale=0.5)
-    np.testing.assert_allclose(np.exp(capped.log_scales[:, 0]), np.minimum(0.5 * brute_distances(points), 0.2), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(capped.log_scales[:, 0]), np.minimum(0.5 * brute_distances(points), 0.2), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("wrong", [
@@ -84,9 +88,16 @@ def wall_capture(height=24, width=32, views=3):
         poses.append(pose)
     depths[0][:4] = 0  # unknown
     camera = Camera(np.array(poses), *(np.full(views, v) for v in (focal, focal, width / 2, height / 2)), width, height)
-    return Capture(np.array(frames), camera, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8),
-                   np.array([False] * (views - 1) + [True]), np.array(depths), np.eye(4),
-                   tuple(f"{t}" for t in range(views)))
+    return Capture(
+        np.array(frames),
+        camera,
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        np.array([False] * (views - 1) + [True]),
+        np.array(depths),
+        np.eye(4),
+        tuple(f"{t}" for t in range(views)),
+    )
 
 
 def test_points_from_depth_lie_on_the_wall_and_agree_between_views():

@@ -43,7 +43,9 @@ def test_blur_and_ssim_equal_their_definitions():
     np.testing.assert_allclose(jax.jit(ssim_map)(image, target), ssim_twin(image, target), atol=2e-4)
     with jax.enable_x64(True):
         image, target = images(dtype=np.float64)
-        np.testing.assert_allclose(ssim_map(jnp.asarray(image), jnp.asarray(target)), ssim_twin(image, target), atol=1e-12)
+        np.testing.assert_allclose(
+            ssim_map(jnp.asarray(image), jnp.asarray(target)), ssim_twin(image, target), atol=1e-12
+        )
 
 
 def test_ssim_of_an_image_with_itself_is_one_and_falls_with_noise():
@@ -83,7 +85,9 @@ def test_vmap_equals_a_loop_on_an_image_of_many_pixels():
     target = images((182, 181, 3))[1]
     together = jax.jit(jax.vmap(photometric_loss, in_axes=(0, None)))(batch, target)
     np.testing.assert_allclose(together, [photometric_loss(b, target) for b in batch], rtol=1e-5)
-    np.testing.assert_allclose(jax.jit(l1)(batch[0], target), np.abs(batch[0].astype(np.float64) - target).mean(), rtol=1e-5)
+    np.testing.assert_allclose(
+        jax.jit(l1)(batch[0], target), np.abs(batch[0].astype(np.float64) - target).mean(), rtol=1e-5
+    )
 
 
 def test_psnr():

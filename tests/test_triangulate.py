@@ -25,8 +25,12 @@ def look_at(centre, target):
 
 
 def poses(count):
-    return np.array([look_at(np.array([0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)]), np.zeros(3))
-                     for a in np.linspace(-0.5, 0.5, count)])
+    return np.array(
+        [
+            look_at(np.array([0.9 * np.sin(a), 0.1 * np.cos(3 * a), -2 * np.cos(a)]), np.zeros(3))
+            for a in np.linspace(-0.5, 0.5, count)
+        ]
+    )
 
 
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -50,8 +54,16 @@ def plane_capture(count=5, textured=True):
     held_out = np.zeros(count, bool)
     held_out[2] = True
     camera = Camera(pose, *(np.full(count, v) for v in (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)), WIDTH, HEIGHT)
-    return Capture(frames, camera, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), held_out, None, np.eye(4),
-                   tuple(map(str, range(count))))
+    return Capture(
+        frames,
+        camera,
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        held_out,
+        None,
+        np.eye(4),
+        tuple(map(str, range(count))),
+    )
 
 
 def test_exact_tracks_give_exact_points():
@@ -68,8 +80,13 @@ def test_exact_tracks_give_exact_points():
     assert error.max() < 1e-6
     np.testing.assert_allclose(depth, np.where(seen, camera[..., 2], np.inf).min(axis=1), atol=1e-8)
     assert (angle > 0.1).all()
-    points, error, _, _ = triangulate_tracks(pose, np.broadcast_to(INTRINSICS, (4, 3, 3)), views,
-                                             pixels + 3 * seen[..., None] * rng.standard_normal(pixels.shape), seen)
+    points, error, _, _ = triangulate_tracks(
+        pose,
+        np.broadcast_to(INTRINSICS, (4, 3, 3)),
+        views,
+        pixels + 3 * seen[..., None] * rng.standard_normal(pixels.shape),
+        seen,
+    )
     assert error[seen.sum(1) > 2].min() > 0.1  # a track that fits no point says so
 
 

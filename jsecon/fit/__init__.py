@@ -1,1 +1,2 @@
-"""Gaussians from images: where they start (initialise, triangulate), what they are fitted to (photometric), how (optimise)."""
+"""Gaussians from images: where they start (initialise, triangulate), what they are fitted to (photometric), how
+(optimise)."""

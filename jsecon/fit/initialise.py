@@ -1,4 +1,5 @@
-"""Where Gaussians start: on sparse points, on back-projected depth, or on points triangulated from the frames themselves."""
+"""Where Gaussians start: on sparse points, on back-projected depth, or on points triangulated from the frames
+themselves."""
 
 import math
 from typing import NamedTuple
@@ -63,10 +64,20 @@ def gaussians_from_points(
     is not finite, or an option is outside its range.
     """
     points, colors = np.asarray(points), np.asarray(colors)
-    require(len(points) > 0, "points", got="none", expected="at least one point",
-            remedy="Give points, or triangulate them from the frames (jsecon.fit.triangulate).")
-    require(bool(np.isfinite(points).all()), "points", got="a coordinate that is not finite", expected="finite coordinates",
-            remedy="Drop such points first.")
+    require(
+        len(points) > 0,
+        "points",
+        got="none",
+        expected="at least one point",
+        remedy="Give points, or triangulate them from the frames (jsecon.fit.triangulate).",
+    )
+    require(
+        bool(np.isfinite(points).all()),
+        "points",
+        got="a coordinate that is not finite",
+        expected="finite coordinates",
+        remedy="Drop such points first.",
+    )
     require(0 < opacity < 1, "opacity", got=opacity, expected="between 0 and 1", remedy="0.1 is usual, 0.9 on depth.")
     require(scale > 0, "scale", got=scale, expected="positive", remedy="1 is usual.")
     require(sh_degree in (0, 1, 2, 3), "sh_degree", got=sh_degree, expected="0 to 3", remedy="0 is colour alone.")
@@ -87,8 +98,12 @@ def gaussians_from_points(
 
 def _require_depths(capture: Capture) -> None:
     if capture.depths is None:
-        raise InputError("capture", found="no depth frames", expected="RGB-D frames",
-                         remedy="Start from sparse points (gaussians_from_points) or triangulate them.")
+        raise InputError(
+            "capture",
+            found="no depth frames",
+            expected="RGB-D frames",
+            remedy="Start from sparse points (gaussians_from_points) or triangulate them.",
+        )
 
 
 def _back_projected(capture: Capture, frame: int, stride: int):
@@ -110,8 +125,13 @@ def _voxel_ids(points: np.ndarray, voxel: float) -> tuple[np.ndarray, int]:
     """(S,) id of each point's voxel in 0..P-1, and P."""
     cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
     size = cells.max(axis=0) + 1
-    require(float(size[0]) * float(size[1]) * float(size[2]) < 2**62, "voxel", got=voxel,
-            expected=f"large enough for the extent {np.ptp(points, axis=0)}", remedy="Choose a larger voxel.")
+    require(
+        float(size[0]) * float(size[1]) * float(size[2]) < 2**62,
+        "voxel",
+        got=voxel,
+        expected=f"large enough for the extent {np.ptp(points, axis=0)}",
+        remedy="Choose a larger voxel.",
+    )
     keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
     unique, ids = np.unique(keys, return_inverse=True)
     return ids.reshape(-1), len(unique)
@@ -141,22 +161,32 @@ def points_from_depth(
 ) -> DepthPoints:
     """Back-projects the known depths and keeps the mean of each occupied voxel.
 
-    Give the voxel's edge in world units, or `max_points` and the edge is found (by bisection on a sample). Held-out
+    Give the voxel's edge in world units, or `max_points` and the edge is found. Held-out
     frames are left out unless `frames` names them. `stride` takes every so many pixels in each direction. Raises
     InputError where the capture has no depth, ValueError where neither or both of `voxel` and `max_points` are given.
     """
-    require((voxel is None) != (max_points is None), "voxel, max_points", got=(voxel, max_points),
-            expected="exactly one of the two", remedy="Give voxel in world units, or max_points.")
+    require(
+        (voxel is None) != (max_points is None),
+        "voxel, max_points",
+        got=(voxel, max_points),
+        expected="exactly one of the two",
+        remedy="Give voxel in world units, or max_points.",
+    )
     _require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
     parts = [_back_projected(capture, int(t), stride) for t in chosen]
     points = np.concatenate([p for p, _, _ in parts]) if parts else np.zeros((0, 3))
     if not len(points):
-        raise InputError("capture", found="no pixel with a known depth", expected="depths above 0",
-                         remedy="Check the depth frames' encoding and unit.")
+        raise InputError(
+            "capture",
+            found="no pixel with a known depth",
+            expected="depths above 0",
+            remedy="Check the depth frames' encoding and unit.",
+        )
     colors = np.concatenate([c for _, c, _ in parts])
-    pixels = np.concatenate([np.concatenate([np.full((len(p), 1), t), p], axis=1)
-                             for t, (_, _, p) in zip(chosen, parts, strict=True)])
+    pixels = np.concatenate(
+        [np.concatenate([np.full((len(p), 1), t), p], axis=1) for t, (_, _, p) in zip(chosen, parts, strict=True)]
+    )
     if voxel is None:
         assert max_points is not None
         voxel = voxel_for(points, max_points)
@@ -164,8 +194,14 @@ def points_from_depth(
     counts = np.bincount(ids, minlength=count)
     mean = np.stack([np.bincount(ids, points[:, a], minlength=count) for a in range(3)], axis=1) / counts[:, None]
     color = np.stack([np.bincount(ids, colors[:, a], minlength=count) for a in range(3)], axis=1) / counts[:, None]
-    return DepthPoints(mean.astype(np.float32), np.rint(color).astype(np.uint8), counts.astype(np.int32), float(voxel),
-                       pixels.astype(np.int32), ids.astype(np.int32))
+    return DepthPoints(
+        mean.astype(np.float32),
+        np.rint(color).astype(np.uint8),
+        counts.astype(np.int32),
+        float(voxel),
+        pixels.astype(np.int32),
+        ids.astype(np.int32),
+    )
 
 
 def confirmed_depths(
@@ -177,10 +213,10 @@ def confirmed_depths(
 ) -> Float[np.ndarray, "t h w"]:
     """The depths without those that the other views do not bear out: sensor noise, and pixels that mix two surfaces.
 
-    A depth stays where at least `min_views` other views measure the same point, to within `tolerance` (relative to their
-    depth), and no more views look past it than do; everything else becomes 0, unknown. Only `frames` are filtered and asked
-    (by default those that are not held out); the depths of the others are returned as they are. Raises InputError where the
-    capture has no depth.
+    A depth stays where at least `min_views` other views measure the same point, to within `tolerance` (relative to
+    their depth), and no more views look past it than do; everything else becomes 0, unknown. Only `frames` are filtered
+    and asked (by default those that are not held out); the depths of the others are returned as they are. Raises
+    InputError where the capture has no depth.
     """
     _require_depths(capture)
     depths = np.array(capture.depths, np.float32)
@@ -208,7 +244,8 @@ def confirmed_depths(
 
 
 def labels_of_points(points: DepthPoints, labels: Int[Array, "t h w"], num_labels: int) -> Int[np.ndarray, " p"]:
-    """(P,) int32 the label that most of each point's pixels carry; -1 where none is labelled. Ties go to the smaller."""
+    """(P,) int32 the label that most of each point's pixels carry; -1 where none is labelled. Ties go to the
+    smaller."""
     frame, row, column = points.sample_pixels.T
     sample = np.asarray(labels)[frame, row, column].astype(np.int64)
     known = sample >= 0

@@ -29,7 +29,8 @@ CAPACITY_MARGIN = 1.5
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LearningRates:
-    """Step sizes of Adam per group. Positions are in units of the cameras' extent and decay log-linearly over the fit."""
+    """Step sizes of Adam per group. Positions are in units of the cameras' extent and decay log-linearly over the
+    fit."""
 
     means: Any = 1.6e-4
     """at the first step, times the extent"""
@@ -67,7 +68,8 @@ def cameras_extent(cameras: Camera) -> float:
 
 
 def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
-    """The views of steps first..last-1: each round of `views` steps takes every view once, in an order drawn by `key`."""
+    """The views of steps first..last-1: each round of `views` steps takes every view once, in an order drawn by
+    `key`."""
     rounds = range(first // views, -(-last // views))
     order = [np.asarray(jax.random.permutation(jax.random.fold_in(key, r), views)) for r in rounds]
     start = first - (first // views) * views
@@ -99,23 +101,56 @@ def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, 
 
 @functools.partial(jax.jit, static_argnames=("ssim_weight", "capacity"))
 def _step(
-    state: FitState, camera: Camera, frame: UInt8[Array, "h w 3"], background: Float[Array, "3"], extent: Array,
-    rates: LearningRates, band_every: Array, *, ssim_weight: float, capacity: int,
+    current: tuple[Gaussians, optax.ScaleByAdamState],
+    camera: Camera,
+    frame: UInt8[Array, "h w 3"],
+    background: Float[Array, "3"],
+    extent: Array,
+    rates: LearningRates,
+    band_every: Array,
+    total: Array,
+    *,
+    ssim_weight: float,
+    capacity: int,
 ):
-    """One Adam step on one view. Returns the state and the pairs that overflowed."""
+    """One Adam step on one view. Returns the Gaussians and moments after it, the loss before it, the pairs that
+    overflowed."""
+    gaussians, moments = current
     target = frame.astype(jnp.float32) / 255.0
 
     def loss(gaussians):
         rendering = render_rgb(gaussians, camera, background=background, capacity=capacity)
         return photometric_loss(rendering.features, target, ssim_weight=ssim_weight), rendering.overflow
 
-    (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.gaussians)
-    moments = optax.ScaleByAdamState(count=state.step, mu=state.first_moment, nu=state.second_moment)
+    (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(gaussians)
+    step = moments.count
     update, moments = _ADAM.update(gradient, moments)
-    rate = _rates(state.gaussians, rates, extent, state.step / state.losses.shape[0], state.step, band_every)
-    gaussians = jax.tree.map(lambda p, u, r: p - r * u, state.gaussians, update, rate)
-    losses = state.losses.at[state.step].set(value)
-    return FitState(gaussians, moments.mu, moments.nu, state.step + 1, losses), overflow
+    rate = _rates(gaussians, rates, extent, step / total, step, band_every)
+    return (jax.tree.map(lambda p, u, r: p - r * u, gaussians, update, rate), moments), value, overflow
+
+
+def _chunk(
+    state: FitState, pictures: list, background: Array, extent: Array, rates: LearningRates, band_every: int, **static
+) -> tuple[FitState, int]:
+    """A step on each of `pictures`, (camera, frame) pairs; and the most pairs that overflowed in any of them."""
+    steps = state.losses.shape[0]
+    moments: Any = optax.ScaleByAdamState(state.step, _tree(state.first_moment), _tree(state.second_moment))
+    gaussians, losses, overflow = state.gaussians, [], jnp.int32(0)
+    for camera, frame in pictures:
+        (gaussians, moments), loss, missing = _step(
+            (gaussians, moments), camera, frame, background, extent, rates, band_every, steps, **static
+        )
+        losses.append(loss)
+        overflow = jnp.maximum(overflow, missing)
+    first = int(state.step)
+    taken = jnp.asarray(state.losses).at[first : first + len(losses)].set(jnp.stack(losses))
+    step = jnp.int32(first + len(losses))
+    return FitState(gaussians, moments.mu, moments.nu, step, taken), int(overflow)
+
+
+def _tree(record: Gaussians) -> Any:
+    """A record where optax's annotations ask for a tree of its own kinds."""
+    return record
 
 
 def _chunks(first: int, steps: int, chunk: int) -> Iterator[tuple[int, int]]:
@@ -133,7 +168,7 @@ def fit_gaussians(
     key: PRNGKeyArray,
     start: Gaussians | None = None,
     state: FitState | None = None,
-    rates: LearningRates = LearningRates(),  # noqa: B008 - frozen
+    rates: LearningRates = LearningRates(),
     ssim_weight: float = 0.2,
     background: Float[Array, "3"] | None = None,
     band_every: int = 1000,
@@ -144,49 +179,69 @@ def fit_gaussians(
     """Fits `start` (or goes on from `state`) to the frames that are not held out; returns the Gaussians and the losses.
 
     One view a step, all views once before any comes again, in an order drawn by `key`. The degree of the spherical
-    harmonics grows by one every `band_every` steps up to what `start.sh` holds. `background` (3,) rgb in [0, 1], black by
-    default. After every `chunk` steps `on_checkpoint` is given the state. A chunk in which a view overflowed its tile
-    lists is taken again with more room, so the result does not depend on the capacity. Raises ValueError where not exactly
-    one of `start` and `state` is given or the state is of another number of steps, InputError where every frame is held
-    out or the numbers stop being finite.
+    harmonics grows by one every `band_every` steps up to what `start.sh` holds. `background` (3,) rgb in [0, 1], black
+    by default. After every `chunk` steps `on_checkpoint` is given the state. A chunk in which a view overflowed its
+    tile lists is taken again with more room, so the result does not depend on the capacity. Raises ValueError where not
+    exactly one of `start` and `state` is given or the state is of another number of steps, InputError where every frame
+    is held out or the numbers stop being finite.
     """
-    require((start is None) != (state is None), "start, state", got=(start is not None, state is not None),
-            expected="exactly one of the two", remedy="Give start for a new fit, state to go on with one.")
+    require(
+        (start is None) != (state is None),
+        "start, state",
+        got=(start is not None, state is not None),
+        expected="exactly one of the two",
+        remedy="Give start for a new fit, state to go on with one.",
+    )
     used = np.flatnonzero(~np.asarray(capture.held_out))
     if not len(used):
-        raise InputError("capture", found="every frame held out", expected="frames to fit to",
-                         remedy="Hold out fewer frames.")
-    if state is None:
-        assert start is not None
-        state = start_state(start, steps)
-    require(state.losses.shape == (steps,), "state", got=f"a fit of {state.losses.shape[0]} steps", expected=f"{steps} steps",
-            remedy="Go on with the options that the fit was started with.")
-    state = jax.tree.map(jnp.asarray, state)
+        raise InputError(
+            "capture", found="every frame held out", expected="frames to fit to", remedy="Hold out fewer frames."
+        )
+    begun = start_state(start, steps) if start is not None else state
+    assert begun is not None
+    require(
+        begun.losses.shape == (steps,),
+        "state",
+        got=f"a fit of {begun.losses.shape[0]} steps",
+        expected=f"{steps} steps",
+        remedy="Go on with the options that the fit was started with.",
+    )
+    current: FitState = jax.tree.map(jnp.asarray, begun)
     cameras = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), capture.cameras[used])
     extent = jnp.float32(cameras_extent(cameras))
     backdrop = jnp.zeros(3) if background is None else jnp.asarray(background, jnp.float32)
-    capacity = plan_capacity(state.gaussians, cameras, margin=CAPACITY_MARGIN) if int(state.step) < steps else 0
-    for first, last in _chunks(int(state.step), steps, chunk):
-        order = view_order(key, len(used), first, last)
+    capacity = plan_capacity(current.gaussians, cameras, margin=CAPACITY_MARGIN) if int(current.step) < steps else 0
+    for first, last in _chunks(int(current.step), steps, chunk):
+        views = view_order(key, len(used), first, last)
+        pictures = [(cameras[int(v)], capture.frames[used[v]]) for v in views]
         while True:
-            after, overflow = state, jnp.int32(0)
-            for view in order:
-                after, missing = _step(after, cameras[int(view)], capture.frames[used[view]], backdrop, extent, rates,
-                                       band_every, ssim_weight=float(ssim_weight), capacity=capacity)
-                overflow = jnp.maximum(overflow, missing)
-            if int(overflow) == 0:
+            after, overflow = _chunk(
+                current,
+                pictures,
+                backdrop,
+                extent,
+                rates,
+                band_every,
+                ssim_weight=float(ssim_weight),
+                capacity=capacity,
+            )
+            if overflow == 0:
                 break
-            capacity = round_capacity(int(CAPACITY_MARGIN * (capacity + int(overflow))))
-        state = after
+            capacity = round_capacity(int(CAPACITY_MARGIN * (capacity + overflow)))
+        current = after
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        if not bool(finite(state.losses[last - 1], *jax.tree.leaves(state.gaussians))):
-            raise InputError("fit", found=f"numbers that are not finite after step {last}", expected="a fit that converges",
-                             remedy="Check the start, the poses and the intrinsics, or lower the learning rates.")
+        if not bool(finite(current.losses[last - 1], *jax.tree.leaves(current.gaussians))):
+            raise InputError(
+                "fit",
+                found=f"numbers that are not finite after step {last}",
+                expected="a fit that converges",
+                remedy="Check the start, the poses and the intrinsics, or lower the learning rates.",
+            )
         if on_checkpoint:
-            on_checkpoint(state)
+            on_checkpoint(current)
         if progress:
             progress(last, steps)
-    return state.gaussians, np.asarray(state.losses)
+    return current.gaussians, np.asarray(current.losses)
 
 
 def evaluate_psnr(
@@ -197,7 +252,8 @@ def evaluate_psnr(
     background: Float[Array, "3"] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, " f"]:
-    """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to [0, 1]."""
+    """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to [0,
+    1]."""
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
     values = []
     for n, t in enumerate(chosen):

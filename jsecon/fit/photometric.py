@@ -1,8 +1,12 @@
 """How far a rendered image is from a photograph: L1, SSIM, their mixture (the 3DGS loss), and PSNR.
 
-Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 with the constants that 3DGS training uses (REFERENCE A.6):
-an 11 x 11 Gaussian window of sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and channels.
+Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 with the constants that 3DGS training uses (REFERENCE
+A.6): an 11 x 11 Gaussian window of sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
+channels.
 """
+
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +36,8 @@ def _blur_once(image, axis: int):
     size = image.shape[axis]
     padding = [(RADIUS_PX, RADIUS_PX) if a == axis else (0, 0) for a in range(image.ndim)]
     padded = jnp.pad(image, padding)
-    return sum(float(w) * jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i, w in enumerate(_window()))
+    terms = (float(w) * jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i, w in enumerate(_window()))
+    return functools.reduce(operator.add, terms)
 
 
 @jax.custom_vjp
@@ -46,35 +51,46 @@ gaussian_blur.defvjp(lambda image: (gaussian_blur(image), None), lambda _, cotan
 
 
 def _same_shape(image, target) -> None:
-    require(image.shape == target.shape, "image and target", got=f"{image.shape} and {target.shape}",
-            expected="the same (H, W, C)", remedy="Render at the size of the photograph.")
+    require(
+        image.shape == target.shape,
+        "image and target",
+        got=f"{image.shape} and {target.shape}",
+        expected="the same (H, W, C)",
+        remedy="Render at the size of the photograph.",
+    )
 
 
-def l1(image: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, ""]:
+def l1(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
     """Mean absolute difference over pixels and channels."""
     _same_shape(image, target)
     return jnp.mean(jnp.abs(image - target))
 
 
-def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
-    """Structural similarity at each pixel and channel, in [-1, 1]; 1 where the windows are equal (Wang et al. 2004, eq. 13)."""
+def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, "h w c"]:
+    """Structural similarity at each pixel and channel, in [-1, 1]; 1 where the windows are equal (Wang et al. 2004, eq.
+    13)."""
     _same_shape(image, target)
-    # Five blurs rather than one of a stack: slicing the stack's gradient apart costs XLA four times the blurs themselves.
+    # Five blurs rather than one of a stack: slicing the stack's gradient apart costs XLA four times the blurs
+    # themselves.
     mean_i, mean_t = gaussian_blur(image), gaussian_blur(target)
-    square_i, square_t, product = gaussian_blur(image * image), gaussian_blur(target * target), gaussian_blur(image * target)
+    square_i, square_t, product = (
+        gaussian_blur(image * image),
+        gaussian_blur(target * target),
+        gaussian_blur(image * target),
+    )
     variance_i, variance_t = square_i - mean_i * mean_i, square_t - mean_t * mean_t
     covariance = product - mean_i * mean_t
     numerator = (2 * mean_i * mean_t + C1) * (2 * covariance + C2)
     return numerator / ((mean_i * mean_i + mean_t * mean_t + C1) * (variance_i + variance_t + C2))
 
 
-def ssim(image: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, ""]:
+def ssim(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
     """Mean of `ssim_map` over pixels and channels."""
     return jnp.mean(ssim_map(image, target))
 
 
 def photometric_loss(
-    image: Float[Array, "h w c"], target: Float[Array, "h w c"], *, ssim_weight: float = 0.2
+    image: Float[Array, "h w c"], target: Float[Array, "_ _ _"], *, ssim_weight: float = 0.2
 ) -> Float[Array, ""]:
     """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM), Kerbl et al. 2023, eq. 7."""
     if ssim_weight == 0:
@@ -82,8 +98,9 @@ def photometric_loss(
     return (1 - ssim_weight) * l1(image, target) + ssim_weight * (1 - ssim(image, target))
 
 
-def psnr(image: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio, dB, of images in [0, 1]; infinite where they are equal. Clamp the rendering before."""
+def psnr(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
+    """Peak signal-to-noise ratio, dB, of images in [0, 1]; infinite where they are equal. Clamp the rendering
+    before."""
     _same_shape(image, target)
     difference = image - target
     return -10.0 * jnp.log10(jnp.mean(difference * difference))

@@ -20,19 +20,24 @@ def starting_gaussians(
 ) -> tuple[Gaussians, str]:
     """The Gaussians that a fit of `capture` starts from, and one sentence on where they come from.
 
-    Depth frames come first (back-projected, voxel-subsampled to at most `max_depth_points`, at `depth_opacity`), then the
-    capture's own points, then points triangulated from the frames that are not held out. Raises InputError where the
-    capture has neither depth nor points and its views cannot be triangulated.
+    Depth frames come first (back-projected, voxel-subsampled to at most `max_depth_points`, at `depth_opacity`), then
+    the capture's own points, then points triangulated from the frames that are not held out. Raises InputError where
+    the capture has neither depth nor points and its views cannot be triangulated.
     """
     if capture.depths is not None:
         dense = points_from_depth(capture, max_points=max_depth_points, stride=2)
-        gaussians = gaussians_from_points(dense.points, dense.colors, opacity=depth_opacity, sh_degree=sh_degree,
-                                          max_scale=2 * dense.voxel)
-        return gaussians, f"{gaussians.count} points from the depth frames, one a voxel of {dense.voxel:.3g} world units"
+        gaussians = gaussians_from_points(
+            dense.points, dense.colors, opacity=depth_opacity, sh_degree=sh_degree, max_scale=2 * dense.voxel
+        )
+        return (
+            gaussians,
+            f"{gaussians.count} points from the depth frames, one a voxel of {dense.voxel:.3g} world units",
+        )
     count = len(capture.points)
     if count >= MIN_POINTS:
-        gaussians = gaussians_from_points(np.asarray(capture.points), np.asarray(capture.point_colors), opacity=opacity,
-                                          sh_degree=sh_degree)
+        gaussians = gaussians_from_points(
+            np.asarray(capture.points), np.asarray(capture.point_colors), opacity=opacity, sh_degree=sh_degree
+        )
         return gaussians, f"{count} sparse points of the capture"
     points, colors = triangulated_points(capture, progress=progress)
     gaussians = gaussians_from_points(points, colors, opacity=opacity, sh_degree=sh_degree)

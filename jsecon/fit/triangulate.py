@@ -1,7 +1,8 @@
 """Sparse points for a capture that has poses but no points: SIFT matches between posed views, triangulated.
 
-The poses are known, so a match needs no robust estimation: it has to lie on its epipolar line, and a track of matches has to
-reproject within a few pixels from a point in front of every camera with enough parallax (Hartley and Zisserman, ch. 12).
+The poses are known, so a match needs no robust estimation: it has to lie on its epipolar line, and a track of matches
+has to reproject within a few pixels from a point in front of every camera with enough parallax (Hartley and Zisserman,
+ch. 12).
 """
 
 from collections.abc import Callable
@@ -33,11 +34,14 @@ def _detect(frame: np.ndarray, max_features: int, contrast: float) -> _Features:
     height, width = frame.shape[:2]
     column = np.clip(np.rint(xy[:, 0]).astype(int), 0, width - 1)
     row = np.clip(np.rint(xy[:, 1]).astype(int), 0, height - 1)
-    return _Features(xy + 0.5, descriptors.astype(np.float32), frame[row, column])  # OpenCV's pixel centres are integers
+    return _Features(
+        xy + 0.5, descriptors.astype(np.float32), frame[row, column]
+    )  # OpenCV's pixel centres are integers
 
 
 def view_pairs(world_to_camera: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
-    """Each view with the `neighbours` that look most alike: near in place (in units of the median spacing) and direction."""
+    """Each view with the `neighbours` that look most alike: near in place (in units of the median spacing) and
+    direction."""
     rotation = world_to_camera[:, :3, :3]
     centres = -np.einsum("tji,tj->ti", rotation, world_to_camera[:, :3, 3])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
@@ -89,8 +93,9 @@ def _tracks(counts: list[int], matches: dict[tuple[int, int], np.ndarray]) -> li
         return []
     start, end = np.concatenate(edges, axis=1)
     total = int(offsets[-1])
-    _, component = connected_components(coo_array((np.ones(len(start), bool), (start, end)), shape=(total, total)),
-                                        directed=False)
+    _, component = connected_components(
+        coo_array((np.ones(len(start), bool), (start, end)), shape=(total, total)), directed=False
+    )
     order = np.argsort(component, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(component[order])) + 1)
     tracks = []
@@ -104,17 +109,25 @@ def _tracks(counts: list[int], matches: dict[tuple[int, int], np.ndarray]) -> li
 
 
 def triangulate_tracks(
-    world_to_camera: np.ndarray, intrinsics: np.ndarray, views: np.ndarray, pixels: np.ndarray, seen: np.ndarray,
-    *, iterations: int = 5,
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+    views: np.ndarray,
+    pixels: np.ndarray,
+    seen: np.ndarray,
+    *,
+    iterations: int = 5,
 ):
-    """Points from padded tracks: views (P, V), pixels (P, V, 2), seen (P, V) bool -> points (P, 3), largest error px (P,),
-    smallest depth (P,), largest angle between two rays in radians (P,). Linear start, then Gauss-Newton on the reprojection.
+    """Points from padded tracks: views (P, V), pixels (P, V, 2), seen (P, V) bool -> points (P, 3), largest error px
+    (P,), smallest depth (P,), largest angle between two rays in radians (P,). Linear start, then Gauss-Newton on the
+    reprojection.
     """
     projection = intrinsics @ world_to_camera[:, :3]
     p = projection[views]
     weight = seen.astype(np.float64)[..., None]
     # The linear system A (x, y, z, 1) = 0 (Hartley and Zisserman, 12.2), each row scaled to unit length.
-    rows = np.concatenate([pixels[..., :1] * p[:, :, 2] - p[:, :, 0], pixels[..., 1:] * p[:, :, 2] - p[:, :, 1]], axis=1)
+    rows = np.concatenate(
+        [pixels[..., :1] * p[:, :, 2] - p[:, :, 0], pixels[..., 1:] * p[:, :, 2] - p[:, :, 1]], axis=1
+    )
     rows /= np.maximum(np.linalg.norm(rows[..., :3], axis=-1, keepdims=True), 1e-12)
     rows *= np.concatenate([weight, weight], axis=1)
     normal = np.einsum("pra,prb->pab", rows[..., :3], rows[..., :3]) + 1e-12 * np.eye(3)
@@ -128,7 +141,9 @@ def triangulate_tracks(
     for _ in range(iterations):
         projected, depth = project(points)
         residual = (pixels - projected) * weight
-        jacobian = (p[:, :, :2, :3] - projected[..., None] * p[:, :, 2:, :3]) / depth[..., None, None] * weight[..., None]
+        jacobian = (
+            (p[:, :, :2, :3] - projected[..., None] * p[:, :, 2:, :3]) / depth[..., None, None] * weight[..., None]
+        )
         gram = np.einsum("pvka,pvkb->pab", jacobian, jacobian)
         damping = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-30
         step = np.einsum("pvka,pvk->pa", jacobian, residual)
@@ -155,15 +170,22 @@ def triangulated_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sparse points (P, 3) float32 and their colours (P, 3) uint8 from the frames that are not held out.
 
-    `contrast` is SIFT's threshold (its own default is 0.04; lower gives more points), `ratio` Lowe's, `error_px` bounds both
-    the distance to the epipolar line and the reprojection error, `min_angle_deg` the parallax. Deterministic. Raises
-    InputError where fewer than MIN_POINTS points remain: the views do not overlap, or the poses do not belong to them.
+    `contrast` is SIFT's threshold (its own default is 0.04; lower gives more points), `ratio` Lowe's, `error_px` bounds
+    both the distance to the epipolar line and the reprojection error, `min_angle_deg` the parallax. Deterministic.
+    Raises InputError where fewer than MIN_POINTS points remain: the views do not overlap, or the poses do not belong to
+    them.
     """
     used = np.flatnonzero(~np.asarray(capture.held_out))
     cameras = capture.cameras[used]
     poses = np.asarray(cameras.world_to_camera, np.float64)
     intrinsics = np.zeros((len(used), 3, 3))
-    for row, column, value in ((0, 0, cameras.fx), (1, 1, cameras.fy), (0, 2, cameras.cx), (1, 2, cameras.cy), (2, 2, 1.0)):
+    for row, column, value in (
+        (0, 0, cameras.fx),
+        (1, 1, cameras.fy),
+        (0, 2, cameras.cx),
+        (1, 2, cameras.cy),
+        (2, 2, 1.0),
+    ):
         intrinsics[:, row, column] = value
     pairs = view_pairs(poses, neighbours)
     total = len(used) + len(pairs)
@@ -192,8 +214,11 @@ def triangulated_points(
         good = (error < error_px) & (depth > 0) & (angle > np.deg2rad(min_angle_deg)) & np.isfinite(points).all(axis=1)
         points, colors = points[good], (shade.sum(axis=1) / seen.sum(axis=1, keepdims=True))[good]
     if len(points) < MIN_POINTS:
-        raise InputError("capture", found=f"{len(points)} points from {len(used)} views by matching their features",
-                         expected=f"at least {MIN_POINTS}",
-                         remedy="The views need to overlap and to have texture, and the poses to belong to them; or give "
-                                "Gaussians (--gaussians PLY) or a capture with points.")
+        raise InputError(
+            "capture",
+            found=f"{len(points)} points from {len(used)} views by matching their features",
+            expected=f"at least {MIN_POINTS}",
+            remedy="The views need to overlap and to have texture, and the poses to belong to them; or give "
+            "Gaussians (--gaussians PLY) or a capture with points.",
+        )
     return points.astype(np.float32), np.rint(colors).astype(np.uint8)
