@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse as sparse
 
 from jsecon.errors import require
 from jsecon.vision.protocols import Segmenter, Tracker
@@ -37,14 +38,14 @@ def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_thre
         require(masks.ndim == 3 and masks.shape[1:] == (height, width), "segment", got=masks.shape,
                 expected=f"(M, {height}, {width})", remedy="A segmenter returns masks of the frame's own size.")
         masks = masks[masks.sum((1, 2)) >= max(min_area * height * width, 1)]
-        proposals.add_at(t, masks)
-        prompts = _new(masks, layers.at(t), iou_threshold)[:max(max_masklets - layers.size(t), 0)]
+        proposals.add_masks(t, masks)
+        prompts = masks[_new(proposals.at(t), layers.at(t), iou_threshold)[:max(max_masklets - layers.size(t), 0)]]
         if len(prompts):
             labels = np.asarray(track(frames, t, prompts))
             require(labels.shape == (count, height, width), "track", got=labels.shape,
                     expected=str((count, height, width)), remedy="A tracker returns one label image a frame.")
             for other, image in enumerate(labels):
-                layers.add_at(other, image[None] == np.arange(len(prompts))[:, None, None])
+                layers.add_labels(other, image, len(prompts))
         if progress is not None:
             progress(t + 1, count)
     if not layers.size(0):
@@ -81,27 +82,30 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
 def _agreement(layers: "_Layers", proposals: "_Layers"
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support."""
-    together, both, area, support, views = 0.0, 0.0, 0.0, 0.0, 0.0
+    count = layers.size(0)
+    together, both = np.zeros((count, count)), np.zeros((count, count))
+    area, support, views = np.zeros(count), np.zeros(count), np.zeros(count)
     for t in range(layers.count):
-        masks, proposed = layers.flat(t), proposals.flat(t)
-        size = masks.sum(1)
-        shared = masks @ proposed.T  # (R, M)
-        shown = (size > 0).astype(np.float32)
+        size, shared, overlap = _overlaps(layers.at(t), proposals.at(t))
+        shown = (size > 0).astype(np.float64)
         covered = (shared > 0.5 * size[:, None]).astype(np.float32)
-        union = size[:, None] + proposed.sum(1) - shared
-        together = together + (covered @ covered.T > 0)
-        both = both + shown[:, None] * shown
+        together += covered @ covered.T > 0
+        both += shown[:, None] * shown
         area, views = area + size, views + shown
-        support = support + (shared / np.maximum(union, 1.0)).max(1, initial=0.0)
+        support += overlap.max(1, initial=0.0)
     return together, both, area / np.maximum(views, 1.0), support / np.maximum(views, 1.0)
 
 
 def iou_matrix(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """(A, P) and (B, P) bool masks over P pixels -> (A, B) intersection over union; 0 where both are empty."""
-    a, b = first.astype(np.float32), second.astype(np.float32)
-    shared = a @ b.T
-    union = a.sum(1)[:, None] + b.sum(1) - shared
-    return np.where(union > 0, shared / np.maximum(union, 1.0), 0.0)
+    return _overlaps(sparse.csr_matrix(first, dtype=np.float32), sparse.csr_matrix(second, dtype=np.float32))[2]
+
+
+def _overlaps(first: sparse.csr_matrix, second: sparse.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Areas (A,) of the first masks, shared pixels (A, B), IoU (A, B): one product of sparse one-hot rows."""
+    shared = (first @ second.T).toarray()
+    size, other = np.diff(first.indptr), np.diff(second.indptr)
+    return size, shared, shared / np.maximum(size[:, None] + other - shared, 1.0)
 
 
 def clean_masklets(labels: np.ndarray, *, min_area: float = 0.001, min_views: int = 2) -> np.ndarray:
@@ -123,55 +127,55 @@ def clean_masklets(labels: np.ndarray, *, min_area: float = 0.001, min_views: in
     return np.stack([row[image] for row, image in zip(table, labels)])
 
 
-def _new(masks: np.ndarray, known: np.ndarray, threshold: float) -> np.ndarray:
-    """The masks (M, H, W) whose IoU with all `known` (R, H, W), and with the better masks taken, is at most `threshold`."""
-    pixels = masks.shape[1] * masks.shape[2]
-    flat = masks.reshape(-1, pixels)
-    free = iou_matrix(flat, known.reshape(-1, pixels)).max(1, initial=0.0) <= threshold
-    among = iou_matrix(flat, flat)
+def _new(masks: sparse.csr_matrix, known: sparse.csr_matrix, threshold: float) -> np.ndarray:
+    """Rows (K,) of masks (M, P) whose IoU with all `known`, and with the better masks taken, is at most `threshold`."""
+    free = _overlaps(masks, known)[2].max(1, initial=0.0) <= threshold
+    among = _overlaps(masks, masks)[2]
     taken: list[int] = []
     for m in np.flatnonzero(free):
         if all(among[m, other] <= threshold for other in taken):
             taken.append(int(m))
-    return masks[taken]
+    return np.asarray(taken, np.int64)
 
 
 class _Layers:
-    """Masks of many things in every frame, free to overlap: one bit a pixel, since there are hundreds."""
+    """Masks of many things in every frame, free to overlap: a sparse (R, H W) matrix of ones a frame."""
 
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
-        self._bits = [np.zeros((0, -(-height * width // 8)), np.uint8) for _ in range(count)]
+        self._rows = [sparse.csr_matrix((0, height * width), dtype=np.float32) for _ in range(count)]
 
     def size(self, t: int) -> int:
-        return len(self._bits[t])
+        return self._rows[t].shape[0]
 
-    def add_at(self, t: int, masks: np.ndarray) -> None:
+    def at(self, t: int) -> sparse.csr_matrix:
+        """(R, H W) ones at frame t."""
+        return self._rows[t]
+
+    def add_masks(self, t: int, masks: np.ndarray) -> None:
         """Appends masks (M, H, W) bool to frame t."""
-        packed = np.packbits(masks.reshape(len(masks), self.shape[0] * self.shape[1]), axis=1)
-        self._bits[t] = np.concatenate([self._bits[t], packed])
+        flat = sparse.csr_matrix(masks.reshape(len(masks), self.shape[0] * self.shape[1]), dtype=np.float32)
+        self._rows[t] = sparse.vstack([self._rows[t], flat], format="csr")
 
-    def at(self, t: int) -> np.ndarray:
-        """(R, H, W) bool masks at frame t."""
-        bits = np.unpackbits(self._bits[t], axis=1, count=self.shape[0] * self.shape[1])
-        return bits.view(bool).reshape(-1, *self.shape)
-
-    def flat(self, t: int) -> np.ndarray:
-        """(R, H W) float32 masks at frame t, for matrix products."""
-        return self.at(t).reshape(self.size(t), -1).astype(np.float32)
+    def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
+        """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
+        pixels = np.flatnonzero((labels >= 0) & (labels < number))
+        ones = np.ones(len(pixels), np.float32)
+        rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
+        self._rows[t] = sparse.vstack([self._rows[t], rows], format="csr")
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """The layers with those of one group (R,) united, in the order of the groups."""
+        number = np.unique(groups, return_inverse=True)[1]
+        unite = sparse.csr_matrix((np.ones(len(groups), np.float32), (number, np.arange(len(groups)))))
         result = _Layers(self.count, *self.shape)
-        kept = np.unique(groups)
-        result._bits = [np.stack([np.bitwise_or.reduce(bits[groups == g], axis=0) for g in kept]) for bits in self._bits]
+        result._rows = [(unite @ rows).sign() for rows in self._rows]
         return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:
         """(T, H, W) int16 labels: the first in `best_first` that covers a pixel owns it."""
-        labels = np.full((self.count, *self.shape), -1, np.int16)
-        for t, image in enumerate(labels):
-            masks = self.at(t)
+        labels = np.full((self.count, self.shape[0] * self.shape[1]), -1, np.int16)
+        for image, rows in zip(labels, self._rows):
             for masklet in best_first[::-1]:
-                image[masks[masklet]] = masklet
-        return labels
+                image[rows.indices[rows.indptr[masklet]:rows.indptr[masklet + 1]]] = masklet
+        return labels.reshape(self.count, *self.shape)

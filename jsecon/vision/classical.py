@@ -87,15 +87,17 @@ def colour_features(frame: np.ndarray, *, lightness_weight: float, smoothing: fl
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
-def brightened(frame: np.ndarray, *, target: float = 0.5, most: float = 4.0) -> np.ndarray:
-    """(H, W, 3) uint8 with more exposure, where the 90th percentile of linear luminance is below `target`.
+def brightened(frame: np.ndarray, *, target: float = 0.22, most: float = 8.0) -> np.ndarray:
+    """(H, W, 3) uint8 with lifted shadows, where the median of linear luminance is below `target` (a mid grey).
 
-    CIELAB's steps are those of an eye adapted to the brightest white; in an underexposed photograph they are too small.
+    CIELAB's steps are those of an eye adapted to the scene's white; in a dark photograph those between dark things are
+    too small. x -> g x / (1 + (g - 1) x) multiplies the dark by g and leaves black and white where they are.
     """
     linear = (np.arange(256, dtype=np.float32) / 255.0) ** 2.2
     luminance = linear[frame] @ np.asarray([0.2126, 0.7152, 0.0722], np.float32)
-    gain = min(max(target / max(float(np.percentile(luminance, 90.0)), 1e-6), 1.0), most)
-    table = np.round(255.0 * np.clip(gain * linear, 0.0, 1.0) ** (1.0 / 2.2)).astype(np.uint8)
+    middle = max(float(np.median(luminance)), 1e-6)
+    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0), most)
+    table = np.round(255.0 * (gain * linear / (1.0 + (gain - 1.0) * linear)) ** (1.0 / 2.2)).astype(np.uint8)
     return table[frame]
 
 

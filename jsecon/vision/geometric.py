@@ -29,10 +29,12 @@ class _View:
 
     atoms: np.ndarray
     """(H, W) int32 atom of each pixel, 0 .. A-1."""
+    seen: np.ndarray
+    """(n,) the Gaussians that the frame shows."""
     votes: sparse.csr_matrix
-    """(N, A) sum of alpha T over the atom's pixels."""
+    """(n, A) sum of alpha T over the atom's pixels."""
     to_atoms: sparse.csr_matrix
-    """(A, N) the same, transposed."""
+    """(A, n) the same, transposed."""
     proposals: np.ndarray
     """(M, A) float32 share of each atom that lies in each proposal."""
 
@@ -80,12 +82,16 @@ class GeometricTracker:
             return labels
         start = self.view(frames, index)
         classes = self._with_rivals(labels[index], index, len(prompts))
-        evidence = start.votes @ _coverage(start.atoms, classes, start.votes.shape[1]).T
+        evidence = np.zeros((self.gaussians.means.shape[0], len(classes)), np.float32)
+        evidence[start.seen] = start.votes @ _coverage(start.atoms, classes, start.votes.shape[1]).T
         for t in sorted((t for t in range(count) if t != index), key=lambda t: (abs(t - index), t < index)):
             view = self.view(frames, t)
-            owner = self._match(view, evidence)
+            here = evidence[view.seen]
+            if not here[:, :len(prompts)].any():  # nothing of the prompts can be seen
+                continue
+            owner = self._match(view, here)
             labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[view.atoms]
-            evidence += view.votes @ (owner[:, None] == np.arange(len(classes))).astype(np.float32)
+            evidence[view.seen] = here + view.votes @ (owner[:, None] == np.arange(len(classes))).astype(np.float32)
         return labels
 
     def _with_rivals(self, labels: np.ndarray, index: int, count: int) -> np.ndarray:
@@ -112,7 +118,7 @@ class GeometricTracker:
             votes = np.zeros((self.gaussians.means.shape[0], count), np.float32)
             for t in range(len(frames)):
                 view = self.view(frames, t)
-                votes += (view.votes @ _label_shares(view.atoms, labels[t], view.votes.shape[1], count)).toarray()
+                votes[view.seen] += (view.votes @ _label_shares(view.atoms, labels[t], view.votes.shape[1], count)).toarray()
             owner = sparse.csr_matrix((np.ones(len(votes), np.float32), (np.arange(len(votes)), votes.argmax(1))),
                                       shape=votes.shape)
             cast = votes.T @ owner  # (R, R): row r's weight by the region that owns the Gaussian
@@ -135,11 +141,13 @@ class GeometricTracker:
             votes = region_votes(self.gaussians, self.cameras[t:t + 1], atoms[None].astype(np.int32), padded,
                                  top=12, capacity=self.capacity)
             matrix = _sparse(np.asarray(votes.regions), np.asarray(votes.weights), number)
-            self._views[t] = _View(atoms, matrix, matrix.T.tocsr(), _coverage(atoms, masks, number))
+            seen = np.flatnonzero(np.diff(matrix.indptr))
+            matrix = matrix[seen]
+            self._views[t] = _View(atoms, seen, matrix, matrix.T.tocsr(), _coverage(atoms, masks, number))
         return self._views[t]
 
     def _match(self, view: _View, evidence: np.ndarray) -> np.ndarray:
-        """The class (A,) that owns each atom of a view, -1 = none; evidence (N, B + C)."""
+        """The class (A,) that owns each atom of a view, -1 = none; evidence (n, B + C) of the Gaussians it shows."""
         seen = evidence.sum(1, keepdims=True)
         here = np.asarray(view.votes.sum(1), np.float32)
         # What a Gaussian has cast so far against what it casts here: one that was only glimpsed tells nothing yet.
