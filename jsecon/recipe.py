@@ -71,9 +71,10 @@ def stages_of(
         )
         plan.append(Stage(name, how, keys[name], compute))
 
-    size = (
-        f"long side <= {options.long_side} px" if options.downscale is None else f"{options.downscale:g} times smaller"
-    )
+    if options.downscale is None:
+        size = f"long side at most {options.long_side} px"
+    else:
+        size = "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
     add(
         "load",

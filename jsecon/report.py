@@ -30,7 +30,7 @@ th { font-weight: 600; color: var(--soft); font-size: .85rem; } td.n, th.n { tex
 @media (max-width: 720px) { .grid { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
 figure { margin: 0; } figure img { width: 100%; display: block; border-radius: 6px; background: #000; }
 figcaption { font-size: .85rem; color: var(--soft); padding-top: .25rem; } figcaption b { color: var(--ink); }
-.bar { background: var(--mark); height: .75rem; border-radius: 3px; min-width: 2px; }
+.bar { background: var(--mark); height: .75rem; margin-top: .3rem; border-radius: 3px; min-width: 2px; }
 pre { background: var(--card); border-radius: 8px; padding: .8rem 1rem; overflow-x: auto; font-size: .8rem;
   white-space: pre-wrap; }
 .scroll { overflow-x: auto; }

@@ -195,7 +195,7 @@ def scene_parts(run: Run) -> list[str]:
     ]
     if len(run.psnr):
         out = np.flatnonzero(run.capture.held_out)
-        order = out[np.unique(np.linspace(0, len(out) - 1, 3).round().astype(int))]
+        order = out[np.unique(np.linspace(0, len(out) - 1, 4).round().astype(int))]
         values = dict(zip(out.tolist(), run.psnr.tolist()))
         parts.append(
             report.section(
