@@ -96,7 +96,7 @@ def fitted_gaussians(
     if state is None:
         start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
         check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
-        notes = (f"the fit starts from {whence}",)
+        notes = (f"start of the fit: {whence}",)
     gaussians, _ = fit_gaussians(
         capture,
         steps=options.steps,
