@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.numerics import NEAR
 from jsecon.parallel import spread_over_devices
-from jsecon.splat.composite import UNROLL, advance, alphas, chunk, make_batches, to_tiles, walk
+from jsecon.splat.composite import advance, alphas, chunk, make_batches, to_tiles, walk
 from jsecon.splat.render import is_traced
 from jsecon.splat.splats import splats_of
 from jsecon.splat.tiles import plan_capacity
@@ -124,7 +124,7 @@ def _add_view(state: dict[str, Array], gaussians: Gaussians, camera: Camera, lab
                     weight, transmittance = advance(transmittance, alpha)
                     return transmittance, weight
 
-                transmittance, weights = lax.scan(step, transmittance, attributes, unroll=UNROLL)
+                transmittance, weights = lax.scan(step, transmittance, attributes)
                 weights = weights * covered[None]
                 cast = jnp.einsum("cbp,bps->cbs", weights, is_slot)
                 target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped

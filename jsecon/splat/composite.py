@@ -2,7 +2,8 @@
 
 Tiles of like length are batched; a batch walks down its lists in chunks of Gaussians and leaves early once every list
 has ended or every pixel has stopped. Inside a chunk a scan carries the transmittance, vectorised over the batch's
-pixels. Materialising cumulative products instead was measured 3 to 5 times slower (DESIGN section 3).
+pixels. Materialising cumulative products instead was measured 3 to 5 times slower (DESIGN section 3), and unrolling the
+scan twice as slow: XLA then computes the chain of transmittances anew for every output that needs it.
 
 The gradient walks front to back as well: with G = cotangent, dL/dalpha_i = T_i <G, f_i> - (S - S_i) / (1 - alpha_i),
 where S_i is the running sum of w <G, f> up to i and S its total, known from the image. Nothing is stored per pair.
@@ -23,8 +24,7 @@ from jsecon.types import Array
 
 # Speed only; measured on the garden scene (benchmarks/).
 BATCH = 64
-CHUNK = 16
-UNROLL = 8
+CHUNK = 32
 WIDE = 8
 """from this many channels on, a chunk's weights are kept and multiplied with its features as one matrix product"""
 
@@ -146,14 +146,14 @@ def composite(splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists:
                     weight, transmittance = advance(transmittance, alpha)
                     return (transmittance, total + weight[None] * item[1].T[:, :, None]), None
 
-                return lax.scan(step, state, (attributes, rows), unroll=UNROLL)[0]
+                return lax.scan(step, state, (attributes, rows))[0]
 
             def step(transmittance, item):
                 alpha, _ = alphas(item, x, y)
                 weight, transmittance = advance(transmittance, alpha)
                 return transmittance, weight
 
-            transmittance, weights = lax.scan(step, state[0], attributes, unroll=UNROLL)
+            transmittance, weights = lax.scan(step, state[0], attributes)
             return transmittance, state[1] + jnp.einsum("cbp,cbd->dbp", weights, rows)
 
         initial = (jnp.ones_like(x), jnp.zeros((channels, *x.shape), dtype))
@@ -185,7 +185,7 @@ def composite_features_vjp(splats: Float[Array, "n 6"], lists: TileLists, cotang
                 weight, transmittance = advance(transmittance, alpha)
                 return transmittance, weight
 
-            transmittance, weights = lax.scan(step, transmittance, attributes, unroll=UNROLL)
+            transmittance, weights = lax.scan(step, transmittance, attributes)
             return transmittance, gradient.at[ids].add(jnp.einsum("cbp,bpd->cbd", weights, local))
 
         state = walk(body, (jnp.ones_like(x), gradient), length, lambda state: state[0])
@@ -231,7 +231,7 @@ def composite_vjp(splats: Float[Array, "n 6"], features: Float[Array, "n d"], li
                 slope = jnp.maximum(transmittance, 0.0) * item[1] - (final - before) / (1 - alpha)
                 return (after, before), (weight, jnp.where(live, slope * unclamped, 0.0))
 
-            (transmittance, before), (weights, h) = lax.scan(step, (transmittance, before), (attributes, along), unroll=UNROLL)
+            (transmittance, before), (weights, h) = lax.scan(step, (transmittance, before), (attributes, along))
             by_feature = jnp.einsum("cbp,bpd->cbd", weights, local)
             by_attribute = _attribute_gradient(jnp.einsum("cbp,pk->cbk", h, moments), attributes, centre_x, centre_y)
             return transmittance, before, gradient.at[ids].add(jnp.concatenate([by_attribute, by_feature], axis=-1))
