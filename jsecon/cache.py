@@ -137,7 +137,7 @@ def load(path: Path) -> Any:
 def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float) -> None:
     description = np.frombuffer(json.dumps({"tree": tree, "seconds": seconds}).encode(), np.uint8)
     with written_whole(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **{_TREE: description}, **arrays)
+        np.savez(file, allow_pickle=False, **{_TREE: description}, **arrays)
         file.flush()
         os.fsync(file.fileno())  # a rename may reach the disk before the content does
 

@@ -3,6 +3,7 @@
 import dataclasses
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 from jsecon.errors import InputError
 
@@ -31,11 +32,11 @@ class Options:
     """of the fitted colours, 0 to 3."""
     iou_threshold: float = 0.5
     """a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
-    weighting: str = "pixels"
+    weighting: Literal["pixels", "uniform"] = "pixels"
     """of the views in a region's embedding: pixels or uniform."""
     latent: int = 16
     """most numbers a code may have; 3 reproduces the paper."""
-    reduce: str = "mode"
+    reduce: Literal["mode", "median", "mean"] = "mode"
     """of a Gaussian's votes to its code: mode, median or mean."""
     top: int = 8
     """regions whose votes a Gaussian keeps."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError
 from jsecon.options import Options
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
@@ -76,7 +76,7 @@ def given_gaussians(options: Options, capture: Capture) -> Outcome:
     """The Gaussians of the .ply, in the capture's world."""
     from jsecon.data.ply import load_ply
 
-    require(options.gaussians is not None, "gaussians", got=None, expected="the path of a .ply", remedy="Give one.")
+    assert options.gaussians is not None
     gaussians = load_ply(options.gaussians)
     check_overlap(gaussians, capture.cameras[training_frames(capture)], str(options.gaussians))
     return Outcome(gaussians)
@@ -131,12 +131,12 @@ def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussian
     from jsecon.vision.geometric import GeometricTracker
 
     train = training_frames(capture)
-    frames, cameras = capture.frames[train], capture.cameras[train]
-    segmenter = ClassicalSegmenter(depths=None if capture.depths is None else capture.depths[train])
+    frames, cameras = np.asarray(capture.frames)[train], capture.cameras[train]
+    segmenter = ClassicalSegmenter(depths=None if capture.depths is None else np.asarray(capture.depths)[train])
     proposals = functools.cache(lambda t: segmenter(frames[t], t))
     tracker = GeometricTracker(gaussians, jax.tree.map(jnp.asarray, cameras), proposals)
     labels = masklets(
-        frames, lambda frame, t: proposals(t), tracker, iou_threshold=options.iou_threshold, progress=progress
+        frames, lambda frame, index: proposals(index), tracker, iou_threshold=options.iou_threshold, progress=progress
     )
     labels = clean_masklets(tracker.consistent(frames, labels))
     _require_regions(labels, str(options.capture))
@@ -147,7 +147,7 @@ def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -
     """labels (T, H, W) int16 of the training frames, as the mask files have them."""
     from jsecon.data.labels import load_labels
 
-    require(options.masks is not None, "masks", got=None, expected="a folder of masks", remedy="Give one.")
+    assert options.masks is not None
     height, width = capture.frames.shape[1:3]
     names = [capture.names[t] for t in training_frames(capture)]
     found = load_labels(options.masks, names, (height, width), progress=progress)
@@ -169,7 +169,7 @@ def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: An
     """One embedding a region."""
     from jsecon.language.regions import region_embeddings
 
-    frames = capture.frames[training_frames(capture)]
+    frames = np.asarray(capture.frames)[training_frames(capture)]
     return Outcome(
         region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting, progress=progress)
     )
