@@ -9,9 +9,12 @@ import numpy as np
 from jsecon.numerics import cosine, cosine_matrix, normalize
 
 _ROWS = 40_000
-"""inside the window of row counts where the fused matrix-vector product goes wrong (about 32,769 to 43,000 in float32)"""
+"""inside the window of row counts where the fused matrix-vector product goes wrong (about 32,769 to 43,000 in
+float32)"""
 
-REMEDY = "Set XLA_FLAGS=--xla_cpu_experimental_ynn_fusion_type= (empty value) before jax starts, or use another jax release."
+REMEDY = (
+    "Set XLA_FLAGS=--xla_cpu_experimental_ynn_fusion_type= (empty value) before jax starts, or use another jax release."
+)
 
 
 class BackendReport(NamedTuple):
@@ -23,7 +26,8 @@ class BackendReport(NamedTuple):
     cosine_error: float
     """largest absolute error of jsecon's own cosines at 40,000 rows against NumPy float64"""
     matvec_error: float
-    """the same for `max(T @ normalised row)` under jit and vmap: above 1e-3 where jax issue 39103 is present. jsecon never
+    """the same for `max(T @ normalised row)` under jit and vmap: above 1e-3 where jax issue 39103 is present. jsecon
+    never
     uses that form; code that is composed with it may."""
 
     @property
@@ -39,7 +43,9 @@ def check_backend(*, strict: bool = False) -> BackendReport:
     """
     rng = np.random.default_rng(0)
     texts, rows = rng.normal(size=(2, 3)), rng.normal(size=(_ROWS, 3))
-    expected = (rows / np.linalg.norm(rows, axis=1, keepdims=True)) @ (texts / np.linalg.norm(texts, axis=1, keepdims=True)).T
+    expected = (rows / np.linalg.norm(rows, axis=1, keepdims=True)) @ (
+        texts / np.linalg.norm(texts, axis=1, keepdims=True)
+    ).T
     f, t = jnp.asarray(rows, jnp.float32), jnp.asarray(texts, jnp.float32)
     ours = [
         jax.jit(lambda f, t: cosine_matrix(f, t).max(1))(f, t),
@@ -52,9 +58,13 @@ def check_backend(*, strict: bool = False) -> BackendReport:
     matvec_error = float(np.abs(np.asarray(broken, np.float64) - expected.max(1)).max())
     report = BackendReport(jax.default_backend(), jax.__version__, cosine_error, matvec_error)
     if not cosine_error < 1e-5:
-        raise RuntimeError(f"check_backend: cosines are off by {cosine_error:.2g} on {report.platform} with jax {jax.__version__}, "
-                           f"expected at most 1e-5. {REMEDY}")
+        raise RuntimeError(
+            f"check_backend: cosines are off by {cosine_error:.2g} on {report.platform} with jax {jax.__version__}, "
+            f"expected at most 1e-5. {REMEDY}"
+        )
     if strict and report.has_jax_39103:
-        raise RuntimeError(f"check_backend: vmapped matrix-vector products are off by {matvec_error:.2g} with jax {jax.__version__} "
-                           f"(jax issue 39103), expected at most 1e-3. {REMEDY}")
+        raise RuntimeError(
+            f"check_backend: vmapped matrix-vector products are off by {matvec_error:.2g} with jax {jax.__version__} "
+            f"(jax issue 39103), expected at most 1e-3. {REMEDY}"
+        )
     return report

@@ -13,6 +13,7 @@ class InputError(ValueError):
 
 
 def require(condition: bool, name: str, *, got: object, expected: str, remedy: str) -> None:
-    """Raise ValueError(got, expected, remedy) unless `condition`: for what is known at trace time (shapes, dtypes, options)."""
+    """Raise ValueError(got, expected, remedy) unless `condition`: for what is known at trace time (shapes, dtypes,
+    options)."""
     if not condition:
         raise ValueError(f"{name}: got {got}, expected {expected}. {remedy}")

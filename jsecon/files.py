@@ -22,8 +22,12 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
     except OSError as error:
-        raise InputError(path, found=f"{error.strerror} on writing to {path.parent}", expected="a folder that can be written",
-                         remedy="Choose another output folder, or mend its permissions.") from error
+        raise InputError(
+            path,
+            found=f"{error.strerror} on writing to {path.parent}",
+            expected="a folder that can be written",
+            remedy="Choose another output folder, or mend its permissions.",
+        ) from error
     try:
         yield temporary
         os.replace(temporary, path)

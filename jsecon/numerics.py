@@ -34,7 +34,8 @@ def into_range(size: Array) -> Array:
 
 
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
-    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at zero."""
+    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at
+    zero."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
@@ -57,7 +58,8 @@ def normalize(x: Array, axis: int = -1) -> Array:
 
 
 def cosine(x: Array, y: Array) -> Array:
-    """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see STYLE trap 1 (jax 39103)."""
+    """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see STYLE trap 1 (jax
+    39103)."""
     return jnp.sum(normalize(x) * normalize(y), axis=-1)
 
 

@@ -10,9 +10,18 @@ from typing import Any
 import jax
 
 
-def spread_over_devices(step: Callable, start: Any, merge: Callable[[Any, Any], Any], common: Any, views: Any, *,
-                        static: tuple = (), progress: Callable[[int, int], None] | None = None) -> Any:
-    """Accumulates `state = step(state, common, view, *static)` over the leading axis of `views`, view t on device t mod D.
+def spread_over_devices(
+    step: Callable,
+    start: Any,
+    merge: Callable[[Any, Any], Any],
+    common: Any,
+    views: Any,
+    *,
+    static: tuple = (),
+    progress: Callable[[int, int], None] | None = None,
+) -> Any:
+    """Accumulates `state = step(state, common, view, *static)` over the leading axis of `views`, view t on device t
+    mod D.
 
     `start` is the neutral state of `merge`, which joins the devices' states pairwise in device order. Host code;
     dispatch is asynchronous, so the devices work side by side. `progress(done, total)` is called as views finish.

@@ -1,8 +1,10 @@
-"""The pytrees that flow through the pipeline: frozen dataclasses of arrays, one line a field (shape, unit, range, frame).
+"""The pytrees that flow through the pipeline: frozen dataclasses of arrays, one line a field (shape, unit, range,
+frame).
 
 Conventions, fixed here once: OpenCV camera axes (x right, y down, z forward); `world_to_camera` matrices; quaternions
 wxyz, normalised on use; pixel (row i, column j) is sampled at (x, y) = (j + 0.5, i + 0.5) and u = fx x/z + cx; metres
-where the data has them. Letters: N Gaussians, T frames, H x W pixels, R regions, E embedding, d code, D feature channels.
+where the data has them. Letters: N Gaussians, T frames, H x W pixels, R regions, E embedding, d code, D feature
+channels.
 """
 
 from __future__ import annotations

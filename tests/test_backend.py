@@ -10,7 +10,7 @@ def test_our_forms_are_right_here_and_the_report_says_what_it_measured():
     assert report.platform == "cpu"
     assert 0 < report.cosine_error < 1e-5
     if report.has_jax_39103:
-        with pytest.raises(RuntimeError, match="39103.*XLA_FLAGS"):
+        with pytest.raises(RuntimeError, match=r"39103.*XLA_FLAGS"):
             backend.check_backend(strict=True)
     else:
         assert backend.check_backend(strict=True).matvec_error < 1e-3

@@ -16,7 +16,9 @@ CAPACITY = 4096
 
 
 def to64(tree):
-    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float64) if jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else a, tree)
+    return jax.tree.map(
+        lambda a: jnp.asarray(a, jnp.float64) if jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else a, tree
+    )
 
 
 def random_features(count, channels, seed=1):
@@ -111,20 +113,36 @@ def test_every_gradient_equals_central_differences(x64, scene, camera):
         for _ in range(6):
             index = tuple(rng.integers(0, s) for s in parts[k].shape)
             estimates = [
-                central_difference(lambda a: value((*parts[:k], a, *parts[k + 1:]), camera64.world_to_camera, features), parts[k], index, h)
+                central_difference(
+                    lambda a, k=k: value((*parts[:k], a, *parts[k + 1 :]), camera64.world_to_camera, features),
+                    parts[k],
+                    index,
+                    h,
+                )
                 for h in (1e-6, 2e-6)
             ]
             if abs(estimates[0] - estimates[1]) > 1e-4 * (1 + abs(estimates[0])):
                 continue  # an alpha crosses a cut inside the step: no derivative there
             checked += 1
-            assert abs(analytic[0][k][index] - estimates[0]) <= 1e-6 * max(1.0, abs(float(estimates[0]))) + 1e-6, (name, index)
+            assert abs(analytic[0][k][index] - estimates[0]) <= 1e-6 * max(1.0, abs(float(estimates[0]))) + 1e-6, (
+                name,
+                index,
+            )
     for index in [(0, 1), (1, 3), (2, 2), (2, 3)]:
-        estimates = [central_difference(lambda a: value(parts, a, features), camera64.world_to_camera, index, h) for h in (1e-7, 2e-7)]
+        estimates = [
+            central_difference(lambda a: value(parts, a, features), camera64.world_to_camera, index, h)
+            for h in (1e-7, 2e-7)
+        ]
         if abs(estimates[0] - estimates[1]) <= 1e-4 * (1 + abs(estimates[0])):
             checked += 1
             np.testing.assert_allclose(analytic[1][index], estimates[0], rtol=1e-5)
     for index in [(0, 0), (5, 2), (23, 1)]:
-        np.testing.assert_allclose(analytic[2][index], central_difference(lambda a: value(parts, camera64.world_to_camera, a), features, index, 1e-4), rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(
+            analytic[2][index],
+            central_difference(lambda a: value(parts, camera64.world_to_camera, a), features, index, 1e-4),
+            rtol=1e-8,
+            atol=1e-9,
+        )
     assert checked >= 16
 
 
@@ -155,7 +173,9 @@ def test_vmapped_gradients_equal_a_loop(scene, cameras):
     loss = lambda camera, f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()
     batched = jax.jit(jax.vmap(jax.grad(loss, argnums=1), in_axes=(0, None)))(cameras, features)
     for t in range(4):
-        np.testing.assert_allclose(batched[t], jax.jit(jax.grad(loss, argnums=1))(cameras[t], features), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(
+            batched[t], jax.jit(jax.grad(loss, argnums=1))(cameras[t], features), rtol=1e-4, atol=1e-5
+        )
 
 
 def test_projection_equals_its_twin(scene, camera):
@@ -163,22 +183,37 @@ def test_projection_equals_its_twin(scene, camera):
     np.testing.assert_allclose(got.means_px, expected["means_px"], rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(got.depths, expected["depths"], rtol=1e-5)
     inverse = np.linalg.inv(expected["covariances"])
-    np.testing.assert_allclose(got.conics, np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(
+        got.conics, np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1), rtol=1e-3, atol=1e-5
+    )
     assert bool(got.visible.any())
 
 
 @pytest.mark.parametrize("count", [16385, 32769, 40000, 100000])
 def test_projection_at_the_sizes_where_jax_39103_strikes(count):
     rng = np.random.default_rng(count)
-    gaussians = Gaussians(rng.uniform(-1, 1, (count, 3)).astype(np.float32), rng.uniform(-5, -2, (count, 3)).astype(np.float32),
-                          rng.normal(size=(count, 4)).astype(np.float32), rng.normal(size=count).astype(np.float32),
-                          np.zeros((count, 1, 3), np.float32))  # fmt: skip
+    gaussians = Gaussians(
+        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        rng.uniform(-5, -2, (count, 3)).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(size=count).astype(np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )
     pose = look_at((0.3, -0.5, -3.0))
     camera = Camera(pose, np.float32(300), np.float32(310), np.float32(160), np.float32(120), 320, 240)
     in_camera = gaussians.means.astype(np.float64) @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3]
-    expected = np.stack([300 * in_camera[:, 0] / in_camera[:, 2] + 160, 310 * in_camera[:, 1] / in_camera[:, 2] + 120], -1)
-    for got in (jax.jit(project)(gaussians, camera),
-                jax.tree.map(lambda a: a[0], jax.jit(jax.vmap(project, in_axes=(None, 0)))(gaussians, jax.tree.map(lambda a: np.asarray(a)[None], camera)))):
+    expected = np.stack(
+        [300 * in_camera[:, 0] / in_camera[:, 2] + 160, 310 * in_camera[:, 1] / in_camera[:, 2] + 120], -1
+    )
+    for got in (
+        jax.jit(project)(gaussians, camera),
+        jax.tree.map(
+            lambda a: a[0],
+            jax.jit(jax.vmap(project, in_axes=(None, 0)))(
+                gaussians, jax.tree.map(lambda a: np.asarray(a)[None], camera)
+            ),
+        ),
+    ):
         np.testing.assert_allclose(got.means_px, expected, rtol=1e-4, atol=2e-3)
         np.testing.assert_allclose(got.depths, in_camera[:, 2], rtol=1e-5)
 
@@ -188,9 +223,15 @@ def test_colour_follows_the_view_and_depth_is_that_of_the_surface(scene, cameras
         rendering = render_rgb(scene, cameras[t])
         assert rendering.features.shape == (40, 48, 3)
         assert float(rendering.features.min()) >= 0
-    wall = Gaussians(np.stack(np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30), [0.0]), -1).reshape(-1, 3).astype(np.float32),
-                     np.full((900, 3), np.log(0.08), np.float32), np.tile(np.float32([1, 0, 0, 0]), (900, 1)), np.full(900, 6, np.float32),
-                     np.zeros((900, 1, 3), np.float32))  # fmt: skip
+    wall = Gaussians(
+        np.stack(np.meshgrid(np.linspace(-2, 2, 30), np.linspace(-2, 2, 30), [0.0]), -1)
+        .reshape(-1, 3)
+        .astype(np.float32),
+        np.full((900, 3), np.log(0.08), np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (900, 1)),
+        np.full(900, 6, np.float32),
+        np.zeros((900, 1, 3), np.float32),
+    )
     camera = Camera(look_at((0, 0, -2.0), up=(0, -1, 0)), *(np.float32(v) for v in (45, 45, 24, 20)), 48, 40)
     depth, alpha = render_depth(wall, camera)
     assert float(alpha[10:30, 12:36].min()) > 0.95
@@ -210,7 +251,10 @@ def test_nothing_to_see_and_nothing_at_all(scene, camera):
     rendering = render(nobody, camera, np.zeros((0, 3), np.float32))
     assert float(jnp.abs(rendering.features).max()) == 0
     assert float(rendering.alpha.max()) == 0
-    behind = Gaussians(scene.means + np.float32([0, 0, -50]), *(getattr(scene, k) for k in ("log_scales", "quaternions", "opacity_logits", "sh")))
+    behind = Gaussians(
+        scene.means + np.float32([0, 0, -50]),
+        *(getattr(scene, k) for k in ("log_scales", "quaternions", "opacity_logits", "sh")),
+    )
     assert float(render(behind, camera, random_features(scene.count, 3)).alpha.max()) == 0
 
 
@@ -224,5 +268,7 @@ def test_gaussians_that_are_not_finite_touch_nothing(scene, camera):
     features = random_features(scene.count, 3)
     rendering = render(broken, camera, features)
     assert bool(jnp.isfinite(rendering.features).all())
-    wide = Gaussians(*(getattr(broken, k)[kept] for k in ("means", "log_scales", "quaternions", "opacity_logits", "sh")))
+    wide = Gaussians(
+        *(getattr(broken, k)[kept] for k in ("means", "log_scales", "quaternions", "opacity_logits", "sh"))
+    )
     np.testing.assert_allclose(rendering.features, render(wide, camera, features[kept]).features, atol=1e-5)

@@ -64,7 +64,8 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
 
 def test_traced_is_eager(cast, scene, cameras, labels):
     capacity = plan_capacity(scene, cameras)
-    traced = jax.jit(lambda g, l: region_votes(g, cameras, l, REGIONS, top=REGIONS, capacity=capacity))(scene, labels)
+    cast_by = jax.jit(lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, capacity=capacity))
+    traced = cast_by(scene, labels)
     np.testing.assert_allclose(traced.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
 
 
@@ -107,7 +108,7 @@ def test_shapes_that_disagree_raise(scene, cameras, camera, labels):
     with pytest.raises(ValueError, match="labels"):
         region_votes(scene, cameras, labels[:2], REGIONS)
     with pytest.raises(ValueError, match="plan_capacity"):
-        jax.jit(lambda l: region_votes(scene, cameras, l, REGIONS))(labels)
+        jax.jit(lambda seen: region_votes(scene, cameras, seen, REGIONS))(labels)
 
 
 def test_votes_are_the_transpose_of_rendering(cast, scene, cameras, labels):

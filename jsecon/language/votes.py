@@ -1,7 +1,8 @@
 """Votes: the weight that each region casts on each Gaussian, W^T onto one-hot labels, in one pass over the views.
 
 With the geometry frozen, rendering is linear in the features (image = W f, W the alpha T weights), and the masklet
-targets take only R values. The N x R votes therefore hold all that distillation needs (DESIGN section 3; REFERENCE I.1).
+targets take only R values. The N x R votes therefore hold all that distillation needs (DESIGN section 3; REFERENCE
+I.1).
 """
 
 import functools
@@ -11,7 +12,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR
@@ -29,9 +30,17 @@ _DENSE_BYTES = 1 << 30
 """the dense N x R block that is accumulated at once; more regions take more passes over the views"""
 
 
-def region_votes(gaussians: Gaussians, cameras: Camera, labels: Int[Array, "t h w"], num_regions: int, *, top: int = 8,
-                 capacity: int | None = None, near: float = NEAR,
-                 progress: Callable[[int, int], None] | None = None) -> Votes:
+def region_votes(
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Int[Array, "t h w"],
+    num_regions: int,
+    *,
+    top: int = 8,
+    capacity: int | None = None,
+    near: float = NEAR,
+    progress: Callable[[int, int], None] | None = None,
+) -> Votes:
     """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
 
     Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). Outside a trace the views are
@@ -39,15 +48,30 @@ def region_votes(gaussians: Gaussians, cameras: Camera, labels: Int[Array, "t h 
     and `capacity` must be given. Raises ValueError on shapes that disagree.
     """
     views = cameras.world_to_camera.shape[0]
-    require(cameras.world_to_camera.ndim == 3, "cameras", got=cameras.world_to_camera.shape, expected="a batch (T, 4, 4)",
-            remedy="Add a leading axis to every array of a single camera.")
-    require(labels.shape == (views, cameras.height, cameras.width), "labels", got=labels.shape,
-            expected=f"({views}, {cameras.height}, {cameras.width})", remedy="Give one label image of the camera's size a view.")
+    require(
+        cameras.world_to_camera.ndim == 3,
+        "cameras",
+        got=cameras.world_to_camera.shape,
+        expected="a batch (T, 4, 4)",
+        remedy="Add a leading axis to every array of a single camera.",
+    )
+    require(
+        labels.shape == (views, cameras.height, cameras.width),
+        "labels",
+        got=labels.shape,
+        expected=f"({views}, {cameras.height}, {cameras.width})",
+        remedy="Give one label image of the camera's size a view.",
+    )
     require(num_regions >= 0, "num_regions", got=num_regions, expected=">= 0", remedy="Count the regions.")
     traced = is_traced((gaussians, cameras, labels))
     if capacity is None:
-        require(not traced, "capacity", got=None, expected="a static int inside jit",
-                remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras).")
+        require(
+            not traced,
+            "capacity",
+            got=None,
+            expected="a static int inside jit",
+            remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras).",
+        )
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     count = gaussians.means.shape[0]
     block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
@@ -61,11 +85,20 @@ def region_votes(gaussians: Gaussians, cameras: Camera, labels: Int[Array, "t h 
             state = lax.scan(lambda s, view: (step(s, gaussians, *view), None), start, (cameras, inside))[0]
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
-            state = spread_over_devices(_add_view_compiled, start, _merge, gaussians, (cameras, inside),
-                                        static=(capacity, near), progress=report)
+            state = spread_over_devices(
+                _add_view_compiled,
+                start,
+                _merge,
+                gaussians,
+                (cameras, inside),
+                static=(capacity, near),
+                progress=report,
+            )
         kept = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
         labelled = state["votes"].sum(-1) if b == 0 else labelled + state["votes"].sum(-1)
-    return Votes(kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions)
+    return Votes(
+        kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions
+    )
 
 
 def _labels_of_block(labels: Array, first: int, block: int) -> Array:
@@ -75,8 +108,13 @@ def _labels_of_block(labels: Array, first: int, block: int) -> Array:
 
 
 def _empty(count: int, regions: int, dtype) -> dict[str, Array]:
-    return {"votes": jnp.zeros((count, regions), dtype), "total": jnp.zeros(count, dtype), "peak": jnp.zeros(count, dtype),
-            "views": jnp.zeros(count, jnp.int32), "overflow": jnp.zeros((), jnp.int32)}
+    return {
+        "votes": jnp.zeros((count, regions), dtype),
+        "total": jnp.zeros(count, dtype),
+        "peak": jnp.zeros(count, dtype),
+        "views": jnp.zeros(count, jnp.int32),
+        "overflow": jnp.zeros((), jnp.int32),
+    }
 
 
 def _merge(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
@@ -92,8 +130,9 @@ def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int | Array,
     return jnp.where(weights > 0, jnp.take_along_axis(ids, place, axis=1), -1), weights
 
 
-def _add_view(state: dict[str, Array], gaussians: Gaussians, camera: Camera, labels: Array, *, capacity: int,
-              near: float) -> dict[str, Array]:
+def _add_view(
+    state: dict[str, Array], gaussians: Gaussians, camera: Camera, labels: Array, *, capacity: int, near: float
+) -> dict[str, Array]:
     """Adds one view's votes to the dense accumulators."""
     splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
     batches = make_batches(lists, camera.width, camera.height)
@@ -141,18 +180,28 @@ def _add_view(state: dict[str, Array], gaussians: Gaussians, camera: Camera, lab
 
     fresh = jnp.zeros_like(state["total"])
     (votes, total, peak), _ = lax.scan(one_batch, (state["votes"], fresh, state["peak"]), batches.tiles)
-    return {"votes": votes, "total": state["total"] + total, "peak": peak,
-            "views": state["views"] + (total > 0).astype(jnp.int32), "overflow": state["overflow"] + lists.overflow}
+    return {
+        "votes": votes,
+        "total": state["total"] + total,
+        "peak": peak,
+        "views": state["views"] + (total > 0).astype(jnp.int32),
+        "overflow": state["overflow"] + lists.overflow,
+    }
 
 
-_add_view_compiled = jax.jit(lambda state, gaussians, view, capacity, near: _add_view(
-    state, gaussians, *view, capacity=capacity, near=near), static_argnums=(3, 4), donate_argnums=(0,))  # fmt: skip
+_add_view_compiled = jax.jit(
+    lambda state, gaussians, view, capacity, near: _add_view(state, gaussians, *view, capacity=capacity, near=near),
+    static_argnums=(3, 4),
+    donate_argnums=(0,),
+)
 
 
 def _distinct(tiles: Int[Array, "n p"]) -> Int[Array, "n q"]:
     """Each tile's distinct labels, ascending and to the left; _NOBODY after them, padded by a pass's slots."""
     ordered = jnp.sort(tiles, axis=1)
-    new = jnp.concatenate([jnp.ones_like(ordered[:, :1], bool), ordered[:, 1:] != ordered[:, :-1]], axis=1) & (ordered >= 0)
+    new = jnp.concatenate([jnp.ones_like(ordered[:, :1], bool), ordered[:, 1:] != ordered[:, :-1]], axis=1) & (
+        ordered >= 0
+    )
     place = jnp.where(new, jnp.cumsum(new, axis=1) - 1, tiles.shape[1] + _SLOTS)
     table = jnp.full((tiles.shape[0], tiles.shape[1] + _SLOTS), _NOBODY, tiles.dtype)
     return table.at[jnp.arange(tiles.shape[0])[:, None], place].set(ordered, mode="drop")

@@ -11,7 +11,6 @@ where S_i is the running sum of w <G, f> up to i and S its total, known from the
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
@@ -57,8 +56,14 @@ def make_batches(lists: TileLists, width: int, height: int) -> Batches:
     count = -(-number // BATCH)
     order = jnp.concatenate([order, jnp.full(count * BATCH - number, number, jnp.int32)]).reshape(count, BATCH)
     empty = jnp.zeros(1, jnp.int32)
-    return Batches(order, jnp.concatenate([lists.starts[:-1], empty]), jnp.concatenate([lengths, empty]), across, number,
-                    lists.tile)
+    return Batches(
+        order,
+        jnp.concatenate([lists.starts[:-1], empty]),
+        jnp.concatenate([lengths, empty]),
+        across,
+        number,
+        lists.tile,
+    )
 
 
 def alphas(attributes: Array, x: Array, y: Array):
@@ -110,7 +115,9 @@ def _to_image(batched: Array, batches: Batches, width: int, height: int) -> Arra
     tile, channels = batches.tile, batched.shape[-1]
     slots = batches.tiles.reshape(-1)
     place = jnp.zeros(batches.number + 1, jnp.int32).at[slots].set(jnp.arange(slots.shape[0], dtype=jnp.int32))[:-1]
-    image = batched.reshape(slots.shape[0], tile, tile, channels)[place].reshape(down, batches.across, tile, tile, channels)
+    image = batched.reshape(slots.shape[0], tile, tile, channels)[place].reshape(
+        down, batches.across, tile, tile, channels
+    )
     image = image.transpose(0, 2, 1, 3, 4).reshape(down * tile, batches.across * tile, channels)
     return image[:height, :width]
 
@@ -125,7 +132,9 @@ def to_tiles(image: Array, tile: int) -> Array:
     return jnp.concatenate([tiles, jnp.zeros_like(tiles[:1])])
 
 
-def composite(splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists: TileLists, width: int, height: int) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
+def composite(
+    splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists: TileLists, width: int, height: int
+) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
     """Features (H, W, D) = sum of alpha T f, and final transmittance (H, W)."""
     batches = make_batches(lists, width, height)
     channels, dtype = features.shape[1], splats.dtype
@@ -164,7 +173,9 @@ def composite(splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists:
     return image[..., :-1], image[..., -1]
 
 
-def composite_features_vjp(splats: Float[Array, "n 6"], lists: TileLists, cotangent: Float[Array, "h w d"]) -> Float[Array, "n d"]:
+def composite_features_vjp(
+    splats: Float[Array, "n 6"], lists: TileLists, cotangent: Float[Array, "h w d"]
+) -> Float[Array, "n d"]:
     """Gradient with respect to the features alone: W^T cotangent. No gradient of the geometry is computed."""
     height, width, channels = cotangent.shape
     batches = make_batches(lists, width, height)
@@ -194,16 +205,26 @@ def composite_features_vjp(splats: Float[Array, "n 6"], lists: TileLists, cotang
     return lax.scan(one_batch, jnp.zeros((splats.shape[0], channels), dtype), batches.tiles)[0]
 
 
-def composite_vjp(splats: Float[Array, "n 6"], features: Float[Array, "n d"], lists: TileLists, image: Float[Array, "h w d"], transmittance: Float[Array, "h w"],
-                  cotangent: Float[Array, "h w d"], cotangent_transmittance: Float[Array, "h w"]) -> tuple[Array, Array]:
-    """Gradients with respect to the splats (N, 6) and the features (N, D). `image` and `transmittance` are what `composite` returned.
+def composite_vjp(
+    splats: Float[Array, "n 6"],
+    features: Float[Array, "n d"],
+    lists: TileLists,
+    image: Float[Array, "h w d"],
+    transmittance: Float[Array, "h w"],
+    cotangent: Float[Array, "h w d"],
+    cotangent_transmittance: Float[Array, "h w"],
+) -> tuple[Array, Array]:
+    """Gradients with respect to the splats (N, 6) and the features (N, D). `image` and `transmittance` are what
+    `composite` returned.
 
     The transmittance is 1 - sum of w, so its cotangent joins the others as minus a channel of constant feature 1.
     """
     height, width, channels = cotangent.shape
     batches = make_batches(lists, width, height)
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
-    packed = to_tiles(jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1), lists.tile)
+    packed = to_tiles(
+        jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1), lists.tile
+    )
     dtype = splats.dtype
     half = lists.tile / 2
     local_x = (jnp.tile(jnp.arange(lists.tile) + 0.5, lists.tile) - half).astype(dtype)
@@ -250,9 +271,21 @@ def _attribute_gradient(moments: Array, attributes: Array, centre_x: Array, cent
     # moments about the Gaussian's centre
     sx, sy = centre_x[None] - x, centre_y[None] - y
     dx, dy = mx + sx * m, my + sy * m
-    dxx, dxy, dyy = mxx + 2 * sx * mx + sx * sx * m, mxy + sx * my + sy * mx + sx * sy * m, myy + 2 * sy * my + sy * sy * m
+    dxx, dxy, dyy = (
+        mxx + 2 * sx * mx + sx * sx * m,
+        mxy + sx * my + sy * mx + sx * sy * m,
+        myy + 2 * sy * my + sy * sy * m,
+    )
     # h = alpha dL/dalpha; alpha = o exp(-(u^2 + v^2)), u = l11 dx + l21 dy, v = l22 dy
     u = l11 * dx + l21 * dy
-    return jnp.stack([2 * l11 * u, 2 * (l21 * u + l22 * l22 * dy), -2 * (l11 * dxx + l21 * dxy),
-                      -2 * (l11 * dxy + l21 * dyy), -2 * l22 * dyy,
-                      jnp.where(opacity > 0, m / jnp.where(opacity > 0, opacity, 1.0), 0.0)], axis=-1)  # fmt: skip
+    return jnp.stack(
+        [
+            2 * l11 * u,
+            2 * (l21 * u + l22 * l22 * dy),
+            -2 * (l11 * dxx + l21 * dxy),
+            -2 * (l11 * dxy + l21 * dyy),
+            -2 * l22 * dyy,
+            jnp.where(opacity > 0, m / jnp.where(opacity > 0, opacity, 1.0), 0.0),
+        ],
+        axis=-1,
+    )

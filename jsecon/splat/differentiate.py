@@ -44,7 +44,10 @@ def _splat_forward(splats, features, lists, width, height):
 
 def _splat_backward(width, height, residual, cotangents):
     splats, lists, saved = residual
-    bars = [jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar for bar in cotangents]
+    bars = [
+        jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar
+        for bar in cotangents
+    ]
     if saved is None:
         return jnp.zeros_like(splats), _features_backward(splats, bars[0], lists), None
     return *sequential_vmap(composite_vjp)(splats, saved[0], lists, saved[1], saved[2], *bars), None
@@ -57,8 +60,9 @@ def _forward(splats: Array, features: Array, lists: TileLists, width: int, heigh
     def one(splats, features, lists):
         return composite(splats, features, lists, width, height)
 
-    return _merging_channels(one, lambda out, sets: (_unmerge(out[0], sets), jnp.broadcast_to(out[1], (sets, *out[1].shape))))(
-        splats, features, lists)
+    return _merging_channels(
+        one, lambda out, sets: (_unmerge(out[0], sets), jnp.broadcast_to(out[1], (sets, *out[1].shape)))
+    )(splats, features, lists)
 
 
 def _features_backward(splats: Array, cotangent: Array, lists: TileLists) -> Array:
@@ -69,7 +73,8 @@ def _features_backward(splats: Array, cotangent: Array, lists: TileLists) -> Arr
 
 
 def _merging_channels(one: Callable, split: Callable) -> Callable:
-    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call, which
+    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call,
+    which
     `split(result, S)` takes apart; anything else runs one after another."""
     function = custom_vmap(one)
 
@@ -87,7 +92,9 @@ def _merging_channels(one: Callable, split: Callable) -> Callable:
 
 def _in_sequence(function: Callable, size: int, batched: tuple, *arguments):
     def pick(index):
-        take = lambda argument, is_batched: lax.dynamic_index_in_dim(argument, index, 0, keepdims=False) if is_batched else argument
+        take = lambda argument, is_batched: (
+            lax.dynamic_index_in_dim(argument, index, 0, keepdims=False) if is_batched else argument
+        )
         return jax.tree.map(take, arguments, batched)
 
     return lax.map(lambda index: function(*pick(index)), jnp.arange(size))

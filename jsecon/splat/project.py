@@ -58,16 +58,32 @@ def rotation_matrices(quaternions: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]
 def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
     """Raises ValueError where the arrays of `gaussians` disagree or `camera` is a batch."""
     n = gaussians.means.shape[0] if gaussians.means.ndim == 2 else -1
-    for name, expected in (("means", (n, 3)), ("log_scales", (n, 3)), ("quaternions", (n, 4)), ("opacity_logits", (n,))):
+    for name, expected in (
+        ("means", (n, 3)),
+        ("log_scales", (n, 3)),
+        ("quaternions", (n, 4)),
+        ("opacity_logits", (n,)),
+    ):
         got = getattr(gaussians, name).shape
-        require(got == expected, f"gaussians.{name}", got=got, expected=f"{expected} with N = {n}",
-                remedy="Every array of Gaussians has one row a Gaussian.")
-    require(camera.world_to_camera.shape == (4, 4), "camera.world_to_camera", got=camera.world_to_camera.shape,
-            expected="(4, 4), a single camera", remedy="Index the batch (cameras[t]) or use jax.vmap over it.")
+        require(
+            got == expected,
+            f"gaussians.{name}",
+            got=got,
+            expected=f"{expected} with N = {n}",
+            remedy="Every array of Gaussians has one row a Gaussian.",
+        )
+    require(
+        camera.world_to_camera.shape == (4, 4),
+        "camera.world_to_camera",
+        got=camera.world_to_camera.shape,
+        expected="(4, 4), a single camera",
+        remedy="Index the batch (cameras[t]) or use jax.vmap over it.",
+    )
 
 
 def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Projection:
-    """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023; conventions in DESIGN section 5).
+    """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023; conventions in DESIGN section
+    5).
 
     Differentiable in every array of both. Raises ValueError on shapes that disagree. Non-finite Gaussians come back
     invisible.
@@ -78,7 +94,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     means, width, height = gaussians.means, camera.width, camera.height
 
     # Written out rather than as a matrix product: exact float32 on every backend, and one fused loop.
-    x, y, z = (means[:, 0] * w2c[i, 0] + means[:, 1] * w2c[i, 1] + means[:, 2] * w2c[i, 2] + w2c[i, 3] for i in range(3))
+    x, y, z = (
+        means[:, 0] * w2c[i, 0] + means[:, 1] * w2c[i, 1] + means[:, 2] * w2c[i, 2] + w2c[i, 3] for i in range(3)
+    )
     in_front = z > near
     z_safe = jnp.where(in_front, z, 1.0)
     x_ratio, y_ratio = jnp.where(in_front, x, 0.0) / z_safe, jnp.where(in_front, y, 0.0) / z_safe
@@ -91,7 +109,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     y_ratio = jnp.clip(y_ratio, -camera.cy / camera.fy - margin_y, (height - camera.cy) / camera.fy + margin_y)
 
     scales = jnp.exp(jnp.minimum(gaussians.log_scales, _LARGEST_LOG_SCALE))
-    axes = (w2c[None, :3, :3, None] * rotation_matrices(gaussians.quaternions)[:, None, :, :]).sum(2) * scales[:, None, :]
+    axes = (w2c[None, :3, :3, None] * rotation_matrices(gaussians.quaternions)[:, None, :, :]).sum(2) * scales[
+        :, None, :
+    ]
     row_1 = (camera.fx / z_safe)[:, None] * (axes[:, 0] - x_ratio[:, None] * axes[:, 2])
     row_2 = (camera.fy / z_safe)[:, None] * (axes[:, 1] - y_ratio[:, None] * axes[:, 2])
     widest = jnp.maximum(jnp.max(jnp.abs(row_1), axis=1), jnp.max(jnp.abs(row_2), axis=1))
@@ -100,13 +120,23 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
 
     norm_1, norm_2 = (row_1 * row_1).sum(1), (row_2 * row_2).sum(1)
     cov_xx, cov_xy, cov_yy = norm_1 + BLUR_PX2, (row_1 * row_2).sum(1), norm_2 + BLUR_PX2
-    cross = jnp.stack([row_1[:, 1] * row_2[:, 2] - row_1[:, 2] * row_2[:, 1],
-                       row_1[:, 2] * row_2[:, 0] - row_1[:, 0] * row_2[:, 2],
-                       row_1[:, 0] * row_2[:, 1] - row_1[:, 1] * row_2[:, 0]], -1)  # fmt: skip
+    cross = jnp.stack(
+        [
+            row_1[:, 1] * row_2[:, 2] - row_1[:, 2] * row_2[:, 1],
+            row_1[:, 2] * row_2[:, 0] - row_1[:, 0] * row_2[:, 2],
+            row_1[:, 0] * row_2[:, 1] - row_1[:, 1] * row_2[:, 0],
+        ],
+        -1,
+    )
     # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels, and the
     # division comes first so that the product of two large variances is never formed.
     cross = cross / jnp.sqrt(cov_yy)[:, None]
-    x_given_y = (cross * cross).sum(1) + BLUR_PX2 * (norm_1 / cov_yy) + BLUR_PX2 * (norm_2 / cov_yy) + BLUR_PX2 * (BLUR_PX2 / cov_yy)
+    x_given_y = (
+        (cross * cross).sum(1)
+        + BLUR_PX2 * (norm_1 / cov_yy)
+        + BLUR_PX2 * (norm_2 / cov_yy)
+        + BLUR_PX2 * (BLUR_PX2 / cov_yy)
+    )
     l11 = jax.lax.rsqrt(x_given_y)
     whitening = jnp.stack([l11, -(cov_xy / cov_yy) * l11, jax.lax.rsqrt(cov_yy)], axis=-1)
 
@@ -116,7 +146,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     extents = extents * (1 + 1e-5) + 1e-3  # covers the rounding of the box against that of the exponent
     centres = jax.lax.stop_gradient(means_px)
     touching = ((centres + extents > 0) & (centres - extents < jnp.asarray([[width, height]], centres.dtype))).all(1)
-    numbers = jnp.concatenate([centres, extents, jax.lax.stop_gradient(whitening), z[:, None], opacities[:, None]], axis=1)
+    numbers = jnp.concatenate(
+        [centres, extents, jax.lax.stop_gradient(whitening), z[:, None], opacities[:, None]], axis=1
+    )
     visible = in_front & (opacities >= MIN_ALPHA) & touching & jnp.isfinite(numbers).all(1)
     return Projection(means_px, whitening, opacities, z, extents, visible)
 

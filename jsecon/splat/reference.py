@@ -7,14 +7,22 @@ from jsecon.types import Camera, Gaussians
 
 
 def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> dict[str, np.ndarray]:
-    """means_px (N, 2), covariances (N, 2, 2) px^2, depths (N,), opacities (N,), in_front (N,), one Gaussian at a time."""
-    means, log_scales, quaternions, logits = (np.asarray(a, np.float64) for a in (
-        gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits))  # fmt: skip
+    """means_px (N, 2), covariances (N, 2, 2) px^2, depths (N,), opacities (N,), in_front (N,), one Gaussian at a
+    time."""
+    means, log_scales, quaternions, logits = (
+        np.asarray(a, np.float64)
+        for a in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
+    )
     w2c = np.asarray(camera.world_to_camera, np.float64)
     fx, fy, cx, cy = (float(a) for a in (camera.fx, camera.fy, camera.cx, camera.cy))
     count = len(means)
-    out = {"means_px": np.zeros((count, 2)), "covariances": np.zeros((count, 2, 2)), "depths": np.zeros(count),
-           "opacities": np.zeros(count), "in_front": np.zeros(count, bool)}
+    out = {
+        "means_px": np.zeros((count, 2)),
+        "covariances": np.zeros((count, 2, 2)),
+        "depths": np.zeros(count),
+        "opacities": np.zeros(count),
+        "in_front": np.zeros(count, bool),
+    }
     for i in range(count):
         x, y, z = w2c[:3, :3] @ means[i] + w2c[:3, 3]
         out["depths"][i], out["in_front"][i] = z, z > near
@@ -22,7 +30,10 @@ def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
         if not z > near:
             continue
         out["means_px"][i] = fx * x / z + cx, fy * y / z + cy
-        margin_x, margin_y = (FRUSTUM_MARGIN - 1) * 0.5 * camera.width / fx, (FRUSTUM_MARGIN - 1) * 0.5 * camera.height / fy
+        margin_x, margin_y = (
+            (FRUSTUM_MARGIN - 1) * 0.5 * camera.width / fx,
+            (FRUSTUM_MARGIN - 1) * 0.5 * camera.height / fy,
+        )
         tx = z * np.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
         ty = z * np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
         jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
@@ -34,9 +45,13 @@ def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(quaternion)
     w, x, y, z = quaternion / length if length > 0 else (1.0, 0.0, 0.0, 0.0)
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                     [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def weights_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> np.ndarray:
@@ -60,7 +75,9 @@ def weights_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
     return weights
 
 
-def render_reference(gaussians: Gaussians, camera: Camera, features: np.ndarray, *, near: float = NEAR) -> tuple[np.ndarray, np.ndarray]:
+def render_reference(
+    gaussians: Gaussians, camera: Camera, features: np.ndarray, *, near: float = NEAR
+) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, D) features and (H, W) alpha in float64: W f, and the sum of W."""
     weights = weights_reference(gaussians, camera, near=near)
     return weights @ np.asarray(features, np.float64), weights.sum(-1)

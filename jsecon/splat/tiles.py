@@ -127,7 +127,9 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
     one compilation. `margin` leaves room for Gaussians that still move.
     """
     views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
-    pairs = max((float(_pairs_in_view(gaussians, views[t])) for t in range(views.world_to_camera.shape[0])), default=0.0)
+    pairs = max(
+        (float(_pairs_in_view(gaussians, views[t])) for t in range(views.world_to_camera.shape[0])), default=0.0
+    )
     return round_capacity(int(np.ceil(pairs * margin)))
 
 
