@@ -27,8 +27,7 @@ class BackendReport(NamedTuple):
     """largest absolute error of jsecon's own cosines at 40,000 rows against NumPy float64"""
     matvec_error: float
     """the same for `max(T @ normalised row)` under jit and vmap: above 1e-3 where jax issue 39103 is present. jsecon
-    never
-    uses that form; code that is composed with it may."""
+    never uses that form; code that is composed with it may."""
 
     @property
     def has_jax_39103(self) -> bool:

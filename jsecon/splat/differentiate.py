@@ -74,8 +74,7 @@ def _features_backward(splats: Array, cotangent: Array, lists: TileLists) -> Arr
 
 def _merging_channels(one: Callable, split: Callable) -> Callable:
     """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call,
-    which
-    `split(result, S)` takes apart; anything else runs one after another."""
+    which `split(result, S)` takes apart; anything else runs one after another."""
     function = custom_vmap(one)
 
     @function.def_vmap

@@ -46,8 +46,7 @@ def render(
     Exact by definition (DESIGN section 5): equal to the brute-force sum over all Gaussians, whatever the tiling.
     Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. Outside a trace the
     capacity is planned from the data; inside one pass the static `capacity` (see `plan_capacity`): pairs that do not
-    fit
-    are counted in `.overflow`, never dropped unsaid.
+    fit are counted in `.overflow`, never dropped unsaid.
 
     `background` (D,) is added with weight 1 - alpha. Raises ValueError on shapes that disagree.
     """
