@@ -19,6 +19,8 @@ from jsecon.language.votes import region_votes
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians
 
+_SMALLEST = 12
+"""px: smaller pieces are taken for slivers along an edge"""
 _CHUNK = 64
 """atoms are counted in multiples of this, so that few shapes are compiled"""
 
@@ -37,6 +39,15 @@ class _View:
     """(A, n) the same, transposed."""
     proposals: np.ndarray
     """(M, A) float32 share of each atom that lies in each proposal."""
+    clarity: np.ndarray | None = None
+    """(n,) in (0, 1]: the cross-section that is seen of each, against the frame that sees most of it."""
+    clear: sparse.csr_matrix | None = None
+    """(n, A) the votes times the clarity: a Gaussian seen from its side, over an outline, says little."""
+
+    @property
+    def totals(self) -> np.ndarray:
+        """(n,) weight that each Gaussian casts in the frame."""
+        return np.asarray(self.votes.sum(1)).ravel()
 
 
 class GeometricTracker:
@@ -45,27 +56,32 @@ class GeometricTracker:
     gaussians: the scene. cameras: batch of T, one a frame. proposals: a function of a frame's index, or a sequence with
     one entry a frame, giving masks (M, H, W) bool; they may overlap.
 
-    From the prompts' frame the track goes outward, t+1, t-1, t+2, ..., and every frame adds what it shows: evidence
-    e_ib (weight that Gaussian i casts on masks of prompt b) over the weight s_ib that it casts at all in the frames where
-    b was found; ownership q = e / s. In the next frame a proposal goes to the prompt that owns the largest part of its
-    known weight, if that is at least `proposal_share`; an atom of it is cut off where the known ownership contradicts
-    (below `contradiction`), and an atom that no proposal brings goes to a prompt that owns at least `atom_share` of it.
-    A frame in which a prompt finds nothing leaves its evidence as it is (occluded, outside the view, or lost).
+    The prompts are tracked against their rivals: the other proposals of their frame, and the rest of it. From that frame
+    the track goes outward, always on to the frame that shares the most with one already visited, and every frame adds what
+    it shows: evidence e_ib, the weight that Gaussian i casts on the masks of b; ownership is e_ib^2 / sum_b e_ib^2. In the
+    next frame a proposal goes to the one that owns the largest part of its known weight, if that is at least
+    `proposal_share`. If the proposal also holds at least `merger` of what is seen of others, each of its atoms goes to whom
+    of them owns most of it. An atom that no proposal brings goes to whom owns at least `atom_share` of it. Nothing is decided where less than
+    `known_share` of the weight is known, nor on atoms that the Gaussians cover by less than `covered`. Occlusion is that
+    of the full scene's compositing. A Gaussian counts as known in proportion to the best look that a visited frame had of
+    it, in full from `glimpse` times what the frame at hand sees.
     """
 
     def __init__(self, gaussians: Gaussians, cameras: Camera, proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
                  *, atoms_per_frame: int = 256, proposal_share: float = 0.4, atom_share: float = 0.6,
-                 contradiction: float = 0.2, known_share: float = 0.3, capacity: int | None = None):
+                 merger: float = 0.5, known_share: float = 0.5, covered: float = 0.2,
+                 glimpse: float = 0.5, capacity: int | None = None):
         require(0 < atoms_per_frame, "atoms_per_frame", got=atoms_per_frame, expected="at least 1",
                 remedy="Use about 200 for small frames.")
         self.gaussians, self.cameras = gaussians, cameras
         # Planned once for all views: one compiled shape.
         self.capacity = plan_capacity(gaussians, cameras) if capacity is None else capacity
         self.proposal_share, self.atom_share = proposal_share, atom_share
-        self.contradiction, self.known_share, self.glimpse = contradiction, known_share, 0.5
+        self.merger, self.known_share, self.covered, self.glimpse = merger, known_share, covered, glimpse
         self.atoms_per_frame = atoms_per_frame
         self._propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: dict[int, _View] = {}
+        self._shared: np.ndarray | None = None
 
     def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
         """frames (T, H, W, 3) uint8, masks `prompts` (B, H, W) bool of frame `index` -> labels (T, H, W) int16.
@@ -80,18 +96,27 @@ class GeometricTracker:
             labels[index][prompts[b]] = b
         if not len(prompts):
             return labels
-        start = self.view(frames, index)
+        views = self._prepare(frames)
         classes = self._with_rivals(labels[index], index, len(prompts))
         evidence = np.zeros((self.gaussians.means.shape[0], len(classes)), np.float32)
-        evidence[start.seen] = start.votes @ _coverage(start.atoms, classes, start.votes.shape[1]).T
-        for t in sorted((t for t in range(count) if t != index), key=lambda t: (abs(t - index), t < index)):
-            view = self.view(frames, t)
+        best = np.zeros(len(evidence), np.float32)
+        start = views[index]
+        evidence[start.seen] = start.clear @ _coverage(start.atoms, classes, start.votes.shape[1]).T
+        best[start.seen] = start.clarity
+        owners = {}
+        order = self._outward(index)
+        for t in order * 2:  # once outward, and once more with what all other frames say
+            view = views[t]
             here = evidence[view.seen]
-            if not here[:, :len(prompts)].any():  # nothing of the prompts can be seen
+            if t in owners:
+                here -= view.clear @ _one_hot(owners[t], len(classes))
+            if not (here[:, :len(prompts)] > 1e-3).any():  # nothing of the prompts can be seen
                 continue
-            owner = self._match(view, here)
-            labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[view.atoms]
-            evidence[view.seen] = here + view.votes @ (owner[:, None] == np.arange(len(classes))).astype(np.float32)
+            owners[t] = self._match(view, here, best[view.seen])
+            evidence[view.seen] = here + view.clear @ _one_hot(owners[t], len(classes))
+            best[view.seen] = np.maximum(best[view.seen], view.clarity)
+        for t, owner in owners.items():
+            labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].atoms]
         return labels
 
     def _with_rivals(self, labels: np.ndarray, index: int, count: int) -> np.ndarray:
@@ -113,8 +138,8 @@ class GeometricTracker:
         owns most of it. Numbers of regions are kept, so some may end without a pixel.
         """
         labels = np.array(labels)
-        for _ in range(4):  # what is given away may tip another region; seldom more than two rounds
-            count = int(labels.max(initial=-1)) + 1
+        count = int(labels.max(initial=-1)) + 1
+        for _ in range(4 if count else 0):  # what is given away may tip another region; seldom more than two rounds
             votes = np.zeros((self.gaussians.means.shape[0], count), np.float32)
             for t in range(len(frames)):
                 view = self.view(frames, t)
@@ -146,33 +171,69 @@ class GeometricTracker:
             self._views[t] = _View(atoms, seen, matrix, matrix.T.tocsr(), _coverage(atoms, masks, number))
         return self._views[t]
 
-    def _match(self, view: _View, evidence: np.ndarray) -> np.ndarray:
-        """The class (A,) that owns each atom of a view, -1 = none; evidence (n, B + C) of the Gaussians it shows."""
-        seen = evidence.sum(1, keepdims=True)
-        here = np.asarray(view.votes.sum(1), np.float32)
-        # What a Gaussian has cast so far against what it casts here: one that was only glimpsed tells nothing yet.
-        known = np.minimum(seen / np.maximum(self.glimpse * here, 1e-3), 1.0)
+    def _prepare(self, frames: np.ndarray) -> list[_View]:
+        """All views, each with how clearly it sees its Gaussians, and what any two of them share."""
+        views = [self.view(frames, t) for t in range(len(frames))]
+        if self._shared is None:
+            looks = np.zeros((len(views), self.gaussians.means.shape[0]), np.float32)
+            for t, view in enumerate(views):
+                camera = self.cameras[t]
+                pose = np.asarray(camera.world_to_camera)
+                depths = np.asarray(self.gaussians.means)[view.seen] @ pose[2, :3] + pose[2, 3]
+                looks[t, view.seen] = view.totals * depths**2 / float(camera.fx * camera.fy)
+            highest = np.maximum(looks.max(0), 1e-30)
+            for t, view in enumerate(views):
+                clarity = looks[t, view.seen] / highest[view.seen]
+                clear = sparse.csr_matrix(view.votes.multiply(clarity[:, None]))
+                self._views[t] = dataclasses.replace(view, clarity=clarity, clear=clear)
+            looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-30)
+            self._shared = looks @ looks.T
+        return [self._views[t] for t in range(len(frames))]
+
+    def _outward(self, index: int) -> list[int]:
+        """The other frames in the order in which a maximum spanning tree of what they share grows from `index` (Prim)."""
+        nearest, order = self._shared[index].copy(), []
+        left = set(range(len(nearest))) - {index}
+        while left:
+            order.append(max(left, key=lambda t: (nearest[t], -abs(t - index), t)))
+            left.remove(order[-1])
+            nearest = np.maximum(nearest, self._shared[order[-1]])
+        return order
+
+    def _match(self, view: _View, evidence: np.ndarray, best: np.ndarray) -> np.ndarray:
+        """The class (A,) that owns each atom of a view, -1 = none; evidence (n, B + C) of the Gaussians it shows, and
+        the clarity (n,) of the best look at each in the frames that the evidence is from."""
+        # On an outline a Gaussian leans over the neighbours and is counted with them, in view after view. So one tells
+        # something only once some view has seen about as much of it as this one does, and assigned what it saw.
+        assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)
+        known = np.minimum(np.minimum(best / np.maximum(view.clarity, 1e-6), assigned) / self.glimpse, 1.0)
+        known = np.square(known).astype(np.float32)[:, None]
         # Gaussians on an outline lean into the neighbours: squares side with the majority.
         owned = np.square(evidence)
         owned *= known / np.maximum(owned.sum(1, keepdims=True), 1e-12)
         mass, known_mass = view.to_atoms @ owned, view.to_atoms @ known  # (A, B + C), (A, 1)
         total = np.asarray(view.to_atoms.sum(1), np.float32)  # (A, 1)
         atom_share = mass / np.maximum(known_mass, 1e-6)
-        atom_sure = (known_mass >= self.known_share * total)[:, 0]
-        share = (view.proposals @ mass) / np.maximum(view.proposals @ known_mass, 1e-6)  # (M, B + C)
-        sure = (view.proposals @ known_mass >= self.known_share * (view.proposals @ total))[:, 0]
+        area = np.bincount(view.atoms.reshape(-1), minlength=len(total))
+        atom_sure = (known_mass >= self.known_share * total)[:, 0] & (total[:, 0] >= self.covered * area)
+        inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, B + C), (M, 1)
+        share = inside / np.maximum(known_inside, 1e-6)
+        sure = (known_inside >= self.known_share * (view.proposals @ total))[:, 0]
+        # A proposal that holds most of what is seen of several classes is a merger of them.
+        merged = (inside >= self.merger * mass.sum(0)) & (inside >= _SMALLEST)
 
         owner = np.where(atom_sure & (atom_share.max(1) >= self.atom_share), atom_share.argmax(1), -1)
         strongest = np.where(sure, share.max(1), 0.0) if len(share) else np.zeros(0)
         for m in np.argsort(strongest, kind="stable"):
-            b = share[m].argmax()
             if strongest[m] >= self.proposal_share:
-                against = atom_sure & (atom_share[:, b] < self.contradiction) & (atom_share.max(1) >= self.atom_share)
-                owner[(view.proposals[m] > 0.5) & ~against] = b
+                winner = share[m].argmax()
+                merged[m, winner] = True
+                contest = np.where(atom_sure, np.where(merged[m], atom_share, -1.0).argmax(1), winner)
+                owner = np.where(view.proposals[m] > 0.5, contest, owner)
         return owner
 
 
-def image_atoms(frame: np.ndarray, masks: np.ndarray, *, count: int, smallest: int = 12) -> np.ndarray:
+def image_atoms(frame: np.ndarray, masks: np.ndarray, *, count: int, smallest: int = _SMALLEST) -> np.ndarray:
     """About `count` superpixels (SLICO, Achanta et al. 2012) of a frame, cut by the masks' outlines.
 
     frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under `smallest` pixels go to the
@@ -200,6 +261,11 @@ def _coverage(atoms: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:
     area = np.bincount(atoms.reshape(-1), minlength=count)
     inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
+
+
+def _one_hot(owner: np.ndarray, count: int) -> np.ndarray:
+    """(A,) class of each atom, -1 = none -> (A, count) float32."""
+    return (owner[:, None] == np.arange(count)).astype(np.float32)
 
 
 def _label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> sparse.csr_matrix:
