@@ -34,9 +34,9 @@ def demo(
     """
     require_writable(out)
     capture = _capture(out / "capture", seed, {"holdout": HOLDOUT} | (room or {}), reporter)
-    options = Options(capture, holdout=HOLDOUT, steps=steps, downscale=1, seed=seed)
+    options = Options(capture, holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
     found = pipeline.run(options, out, reporter=reporter)
-    true_masks = Options(capture, masks=capture / "masks", holdout=HOLDOUT, steps=steps, downscale=1, seed=seed)
+    true_masks = Options(capture, masks=capture / "masks", holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
     given = pipeline.run(true_masks, out / "true_masks", reporter=reporter, cache_folder=out / "cache")
 
     labels = load_lerf_labels(capture / "label")
