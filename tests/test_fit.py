@@ -9,7 +9,15 @@ import pytest
 
 from jsecon.errors import InputError
 from jsecon.fit import optimise
-from jsecon.fit.optimise import LearningRates, cameras_extent, evaluate_psnr, fit_gaussians, start_state, view_order
+from jsecon.fit.optimise import (
+    INRIA_RATES,
+    LearningRates,
+    cameras_extent,
+    evaluate_psnr,
+    fit_gaussians,
+    start_state,
+    view_order,
+)
 from jsecon.splat.render import render_rgb
 from jsecon.types import Camera, Capture, Gaussians
 from tests.conftest import look_at
@@ -157,8 +165,8 @@ def test_view_order_takes_every_view_once_a_round_and_can_be_entered_anywhere():
 
 def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
     """Adam's first update is rate * sign(gradient), whatever the gradient's size: this pins each group's rate."""
-    rates, extent = LearningRates(), cameras_extent(capture.cameras[np.array([0, 1, 3, 4])])
-    after, _ = fit_gaussians(capture, steps=1, key=KEY, start=start, rates=rates)
+    rates, extent = INRIA_RATES, cameras_extent(capture.cameras[np.array([0, 1, 3, 4])])
+    after, _ = fit_gaussians(capture, steps=1, key=KEY, start=start, rates=rates, band_every=1000)
     moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), after, start_state(start, 1).gaussians)
     assert float(moved.means) == pytest.approx(1.6e-4 * extent, rel=1e-2)
     assert float(moved.log_scales) == pytest.approx(5e-3, rel=1e-2)
@@ -166,7 +174,7 @@ def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
     assert float(moved.opacity_logits) == pytest.approx(5e-2, rel=1e-2)
     assert np.abs(after.sh[:, 0] - start.sh[:, 0]).max() == pytest.approx(2.5e-3, rel=1e-2)
     assert not np.asarray(after.sh[:, 1:]).any()  # degree 1 waits for its turn
-    opened, _ = fit_gaussians(capture, steps=2, key=KEY, start=start, band_every=1)
+    opened, _ = fit_gaussians(capture, steps=2, key=KEY, start=start, rates=rates, band_every=1)
     assert np.abs(opened.sh[:, 1:]).max() == pytest.approx(2.5e-3 / 20, rel=0.1)
 
 
@@ -186,3 +194,20 @@ def test_wrong_fits_are_refused(capture, start):
     astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
     with pytest.raises(InputError, match="not finite"):
         fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, chunk=1)
+
+
+def test_halved_views_are_block_means_seen_by_cameras_of_half_the_size(capture):
+    cameras = jax.tree.map(jnp.asarray, capture.cameras)
+    frames = np.ascontiguousarray(capture.frames[:, :23, :31])  # odd: the last row and column are left out
+    half, mean = optimise._halved(dataclasses.replace(cameras, width=31, height=23), frames)
+    assert (half.width, half.height) == (15, 11)
+    assert mean.shape == (VIEWS, 11, 15, 3)
+    expected = frames[:, :22, :30].reshape(VIEWS, 11, 2, 15, 2, 3).mean(axis=(2, 4))
+    np.testing.assert_allclose(mean, expected, atol=0.51)
+    np.testing.assert_allclose(half.cx, cameras.cx / 2)
+    np.testing.assert_allclose(half.fy, cameras.fy / 2)
+
+
+def test_wrong_shares_of_coarse_steps_are_refused(capture, start):
+    with pytest.raises(ValueError, match="coarse"):
+        fit_gaussians(capture, steps=STEPS, key=KEY, start=start, coarse=1.5)

@@ -29,18 +29,34 @@ CAPACITY_MARGIN = 1.5
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LearningRates:
-    """Step sizes of Adam per group. Positions are in units of the cameras' extent and decay log-linearly over the
-    fit."""
+    """Step sizes of Adam per group, for fits of hundreds to a few thousand steps; `INRIA_RATES` are for 30,000.
 
-    means: Any = 1.6e-4
+    Positions are in units of the cameras' extent. All decay log-linearly over the fit.
+    """
+
+    means: Any = 2e-3
     """at the first step, times the extent"""
-    means_last: Any = 1.6e-6
+    means_last: Any = 2e-5
     """at the last step, times the extent"""
-    log_scales: Any = 5e-3
-    quaternions: Any = 1e-3
+    log_scales: Any = 2e-2
+    quaternions: Any = 1e-2
     opacity_logits: Any = 5e-2
-    colors: Any = 2.5e-3
+    colors: Any = 1.5e-2
     """of the constant band of the spherical harmonics; the higher bands take a twentieth"""
+    rest_last: Any = 0.3
+    """what the other rates have decayed to at the last step, log-linearly too, as a share of their first"""
+
+
+INRIA_RATES = LearningRates(
+    means=1.6e-4,
+    means_last=1.6e-6,
+    log_scales=5e-3,
+    quaternions=1e-3,
+    opacity_logits=5e-2,
+    colors=2.5e-3,
+    rest_last=1.0,
+)
+"""Kerbl et al. 2023 (REFERENCE A.6)"""
 
 
 @jax.tree_util.register_dataclass
@@ -96,7 +112,10 @@ def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, 
     # Log-linear; written so that a rate of 0 (frozen positions) stays 0.
     decay = jnp.where(rates.means > 0, rates.means_last / jnp.where(rates.means > 0, rates.means, 1.0), 0.0)
     means = extent * rates.means * decay**progress
-    return Gaussians(means, rates.log_scales, rates.quaternions, rates.opacity_logits, sh[None, :, None])
+    rest = rates.rest_last**progress
+    return Gaussians(
+        means, rest * rates.log_scales, rest * rates.quaternions, rest * rates.opacity_logits, rest * sh[None, :, None]
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("ssim_weight", "capacity"))
@@ -153,12 +172,21 @@ def _tree(record: Gaussians) -> Any:
     return record
 
 
-def _chunks(first: int, steps: int, chunk: int) -> Iterator[tuple[int, int]]:
-    """Ranges that end at multiples of `chunk`, so that a fit gone on with takes the same chunks."""
+def _chunks(first: int, steps: int, chunk: int, switch: int) -> Iterator[tuple[int, int]]:
+    """Ranges that end at multiples of `chunk` and at `switch`, so that a fit gone on with takes the same chunks."""
     while first < steps:
-        last = min((first // chunk + 1) * chunk, steps)
+        last = min((first // chunk + 1) * chunk, steps, switch if first < switch else steps)
         yield first, last
         first = last
+
+
+def _halved(cameras: Camera, frames: np.ndarray) -> tuple[Camera, np.ndarray]:
+    """The views at half their size, each pixel the mean of four; an odd last row or column is left out."""
+    height, width = frames.shape[1] // 2, frames.shape[2] // 2
+    corners = [frames[:, i : 2 * height : 2, j : 2 * width : 2].astype(np.uint16) for i in (0, 1) for j in (0, 1)]
+    mean = ((corners[0] + corners[1] + corners[2] + corners[3] + 2) // 4).astype(np.uint8)
+    focal = cameras.fx / 2, cameras.fy / 2
+    return Camera(cameras.world_to_camera, *focal, cameras.cx / 2, cameras.cy / 2, width, height), mean
 
 
 def fit_gaussians(
@@ -171,19 +199,21 @@ def fit_gaussians(
     rates: LearningRates = LearningRates(),
     ssim_weight: float = 0.2,
     background: Float[Array, "3"] | None = None,
-    band_every: int = 1000,
+    band_every: int | None = None,
+    coarse: float = 0.5,
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Gaussians, Float[np.ndarray, " steps"]]:
     """Fits `start` (or goes on from `state`) to the frames that are not held out; returns the Gaussians and the losses.
 
-    One view a step, all views once before any comes again, in an order drawn by `key`. The degree of the spherical
-    harmonics grows by one every `band_every` steps up to what `start.sh` holds. `background` (3,) rgb in [0, 1], black
-    by default. After every `chunk` steps `on_checkpoint` is given the state. A chunk in which a view overflowed its
-    tile lists is taken again with more room, so the result does not depend on the capacity. Raises ValueError where not
-    exactly one of `start` and `state` is given or the state is of another number of steps, InputError where every frame
-    is held out or the numbers stop being finite.
+    One view a step, all views once before any comes again, in an order drawn by `key`; the first `coarse` of the steps
+    on frames of half the size, which costs a quarter and moves what is large first. The degree of the spherical
+    harmonics grows by one every `band_every` steps (by default 1000, in a short fit a quarter of it) up to what
+    `start.sh` holds. `background` (3,) rgb in [0, 1], black by default. After every `chunk` steps `on_checkpoint` is
+    given the state. A chunk in which a view overflowed its tile lists is taken again with more room, so the result does
+    not depend on the capacity. Raises ValueError where not exactly one of `start` and `state` is given or the state is
+    of another number of steps, InputError where every frame is held out or the numbers stop being finite.
     """
     require(
         (start is None) != (state is None),
@@ -199,6 +229,7 @@ def fit_gaussians(
         )
     begun = start_state(start, steps) if start is not None else state
     assert begun is not None
+    require(0 <= coarse <= 1, "coarse", got=coarse, expected="between 0 and 1", remedy="0 keeps the frames' size.")
     require(
         begun.losses.shape == (steps,),
         "state",
@@ -210,10 +241,17 @@ def fit_gaussians(
     cameras = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), capture.cameras[used])
     extent = jnp.float32(cameras_extent(cameras))
     backdrop = jnp.zeros(3) if background is None else jnp.asarray(background, jnp.float32)
-    capacity = plan_capacity(current.gaussians, cameras, margin=CAPACITY_MARGIN) if int(current.step) < steps else 0
-    for first, last in _chunks(int(current.step), steps, chunk):
+    switch = int(coarse * steps)
+    every = max(1, min(1000, steps // 4)) if band_every is None else band_every
+    whole = cameras, np.asarray(capture.frames[used])
+    sized, capacity = whole if switch == 0 else _halved(*whole), 0
+    for first, last in _chunks(int(current.step), steps, chunk, switch):
+        if first >= switch > 0:
+            sized, capacity, switch = whole, 0, 0
+        if capacity == 0:
+            capacity = plan_capacity(current.gaussians, sized[0], margin=CAPACITY_MARGIN)
         views = view_order(key, len(used), first, last)
-        pictures = [(cameras[int(v)], capture.frames[used[v]]) for v in views]
+        pictures = [(sized[0][int(v)], sized[1][int(v)]) for v in views]
         while True:
             after, overflow = _chunk(
                 current,
@@ -221,7 +259,7 @@ def fit_gaussians(
                 backdrop,
                 extent,
                 rates,
-                band_every,
+                every,
                 ssim_weight=float(ssim_weight),
                 capacity=capacity,
             )
