@@ -18,13 +18,17 @@ def desk(seed=0):
               (36, 84, 196): (85, 50, 20), (240, 238, 236): (85, 115, 18)}  # fmt: skip
     masks = []
     light = 0.75 + 0.3 * columns / 160
-    for colour, (y, x, radius) in things.items():
+    for y, x, _ in things.values():
         shadow = np.exp(-(((rows - y - 12) ** 2 + (columns - x - 14) ** 2) / (2 * 13.0**2)))
         light = light * (1 - 0.35 * shadow)
     for colour, (y, x, radius) in things.items():
         mask = (rows - y) ** 2 + (columns - x) ** 2 < radius**2
         albedo[mask] = colour
-        out = 0.7 + 0.35 * np.sqrt(np.clip(1 - ((rows - y) ** 2 + (columns - x) ** 2) / radius**2, 0, 1)) - 0.2 * (columns - x) / radius
+        out = (
+            0.7
+            + 0.35 * np.sqrt(np.clip(1 - ((rows - y) ** 2 + (columns - x) ** 2) / radius**2, 0, 1))
+            - 0.2 * (columns - x) / radius
+        )
         light = np.where(mask, out, light)
         masks.append(mask)
     picture = 255 * ((albedo / 255) ** 2.2 * light[..., None]).clip(0, 1) ** (1 / 2.2)
@@ -52,7 +56,7 @@ def test_each_thing_is_one_region_in_spite_of_shading_shadow_and_noise(seed):
 
 
 def test_best_first_and_no_specks():
-    frame, things = desk()
+    frame, _ = desk()
     segmenter = ClassicalSegmenter(max_regions=5)
     masks = segmenter(frame, 0)
     assert len(masks) == 5
@@ -135,7 +139,9 @@ def test_merging_leaves_connected_regions_whatever_the_atoms_are_called(seed):
 @pytest.mark.parametrize("path", ["captures/bonsai/images/DSCF5605.JPG", "captures/fox/images/0001.jpg"])
 def test_real_photographs_come_apart_into_tens_of_regions(shared, path):
     picture = cv2.imread(str(shared / path))[..., ::-1]
-    frame = cv2.resize(picture, None, fx=400 / picture.shape[1], fy=400 / picture.shape[1], interpolation=cv2.INTER_AREA)
+    frame = cv2.resize(
+        picture, None, fx=400 / picture.shape[1], fy=400 / picture.shape[1], interpolation=cv2.INTER_AREA
+    )
     masks = ClassicalSegmenter()(frame, 0)
     assert 8 <= len(masks) <= 64
     assert masks.any(0).mean() > 0.9

@@ -4,7 +4,8 @@ from conftest import look_at
 
 from jsecon.language.masklets import clean_masklets, iou_matrix, masklets
 from jsecon.types import Camera, Gaussians
-from jsecon.vision.geometric import GeometricTracker, image_atoms
+from jsecon.vision.atoms import image_atoms
+from jsecon.vision.geometric import GeometricTracker
 from jsecon.vision.protocols import Tracker
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 24
@@ -18,7 +19,8 @@ def sphere(rng, centre, radius, count):
 
 @pytest.fixture(scope="module")
 def world():
-    """Three balls on a disc (their Gaussians lie inside, so that what is rendered ends at the outline), seen from a ring of 24 cameras; one hides another in some views. Labels by ray casting."""
+    """Three balls on a disc (their Gaussians lie inside, so that what is rendered ends at the outline), seen
+    from a ring of 24 cameras; one hides another in some views. Labels by ray casting."""
     rng = np.random.default_rng(0)
     balls = [((0.0, -0.3, 0.0), 0.3), ((0.75, -0.25, 0.1), 0.25), ((-0.5, -0.2, 0.6), 0.2)]
     turn, away = rng.uniform(0, 2 * np.pi, 2500), 1.6 * np.sqrt(rng.uniform(0, 1, 2500))
@@ -27,9 +29,12 @@ def world():
     scales = np.concatenate([np.full(2500, 0.035), *(np.full(1500, 0.055 * radius) for _, radius in balls)])
     count = len(points)
     gaussians = Gaussians(
-        means=points.astype(np.float32), log_scales=np.log(np.repeat(scales[:, None], 3, 1)).astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)), opacity_logits=np.full(count, 3.0, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32))
+        means=points.astype(np.float32),
+        log_scales=np.log(np.repeat(scales[:, None], 3, 1)).astype(np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        opacity_logits=np.full(count, 3.0, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
     centres = [(2.2 * np.sin(a), -1.0, -2.2 * np.cos(a)) for a in 2 * np.pi * np.arange(VIEWS) / VIEWS]
     poses = np.stack([look_at(centre, (0.0, -0.2, 0.0)) for centre in centres])
     ones = np.ones(VIEWS, np.float32)

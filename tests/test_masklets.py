@@ -88,8 +88,10 @@ def test_an_object_that_enters_late_is_prompted_where_it_enters():
 def test_the_iou_threshold_decides_what_is_new():
     truth = squares(frames=3, step=0)
     shifted = np.roll(truth, 3, axis=2)  # IoU of the squares with themselves: 9 / 15 = 0.6
+
     def segment(frame, index):
         return (truth if index == 0 else shifted)[index][None] == np.arange(2)[:, None, None]
+
     for threshold, calls in ((0.5, [(0, 2)]), (0.59, [(0, 2)]), (0.61, [(0, 2), (1, 2), (2, 2)])):
         track = tracker(truth)
         masklets(frames_of(truth), segment, track, iou_threshold=threshold)
@@ -102,14 +104,17 @@ def test_a_fragment_found_once_gives_way_and_a_part_found_always_stays():
     half = square.copy()
     half[:, :, 12:] = False
     for frames_with_half, regions in (({2}, 3), (set(range(6)), 4)):
+
         def segment(frame, index, split=frames_with_half):
             parts = [half[index], square[index] & ~half[index]] if index in split else [square[index]]
             return np.stack([truth[index] == 0, truth[index] == 2, *parts])
+
         def track(frames, index, prompts):
             labels = np.full(truth.shape, -1, np.int16)
             for b, prompt in enumerate(prompts):
                 labels[:, prompt] = b  # nothing moves
             return labels
+
         labels = masklets(frames_of(truth), segment, track)
         assert len(np.unique(labels[labels >= 0])) == regions
         np.testing.assert_array_equal(labels[2] == labels[2, 30, 8], (square if regions == 3 else half)[2])
@@ -121,14 +126,18 @@ def test_parts_that_most_frames_hold_together_are_joined():
     square = truth[0] == 1
     half = square.copy()
     half[:, 12:] = False
+
     def track(frames, index, prompts):
         labels = np.full(truth.shape, -1, np.int16)
         for b, prompt in enumerate(prompts):
             labels[:, prompt] = b
         return labels
+
     for split, rate, regions in ((2, 0.5, 2), (6, 0.5, 3), (2, 1.0, 3)):
+
         def segment(frame, index, split=split):
             return np.stack([truth[index] == 0, *([half, square & ~half] if index < split else [square])])
+
         labels = masklets(frames_of(truth), segment, track, join_rate=rate, min_support=0.0)
         assert len(np.unique(labels[labels >= 0])) == regions, (split, rate)
 

@@ -28,8 +28,10 @@ def slow(frames, labels, count, weighting):
 
 def sequence(seed, count=5, frames=4):
     rng = np.random.default_rng(seed)
-    return (rng.integers(0, 256, (frames, 6, 7, 3)).astype(np.uint8),
-            rng.integers(-1, count, (frames, 6, 7)).astype(np.int16))
+    return (
+        rng.integers(0, 256, (frames, 6, 7, 3)).astype(np.uint8),
+        rng.integers(-1, count, (frames, 6, 7)).astype(np.int16),
+    )
 
 
 @settings(deadline=None, max_examples=20)
@@ -85,7 +87,9 @@ def test_progress_counts_frames():
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-@pytest.mark.parametrize(("options", "word"), [({"weighting": "area"}, "weighting"), ({"num_regions": 2}, "num_regions")])
+@pytest.mark.parametrize(
+    ("options", "word"), [({"weighting": "area"}, "weighting"), ({"num_regions": 2}, "num_regions")]
+)
 def test_bad_options_are_refused(options, word):
     frames, labels = sequence(0)
     with pytest.raises(Exception, match=word):

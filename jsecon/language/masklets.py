@@ -1,26 +1,40 @@
 """Masklets: one identity an object through all frames (Algorithm 1 of the paper), over any segmenter and tracker."""
 
 from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import numpy as np
-import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int, Int16
+from scipy import sparse
 
 from jsecon.errors import require
 from jsecon.vision.protocols import Segmenter, Tracker
 
+Sparse: TypeAlias = Any
+"""scipy.sparse.csr_matrix, of which type checkers know too little"""
 Progress = Callable[[int, int], None]
 
 
-def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_threshold: float = 0.5, min_area: float = 0.001,
-             max_masklets: int = 1000, min_views: int = 2, min_support: float = 0.5, join_rate: float = 0.5,
-             progress: Progress | None = None) -> np.ndarray:
+def masklets(
+    frames: np.ndarray,
+    segment: Segmenter,
+    track: Tracker,
+    *,
+    iou_threshold: float = 0.5,
+    min_area: float = 0.001,
+    max_masklets: int = 1000,
+    min_views: int = 2,
+    min_support: float = 0.5,
+    join_rate: float = 0.5,
+    progress: Progress | None = None,
+) -> Int16[np.ndarray, "t h w"]:
     """Labels (T, H, W) int16 of the masklets of a sequence, -1 = none.
 
     frames (T, H, W, 3) uint8. For each frame t in order, each proposal that fills at least `min_area` (share of the
-    frame) and whose IoU with every masklet's mask at t is at most `iou_threshold` (the paper's kappa; IoU taken at frame
-    t itself, REFERENCE 0.1) becomes a prompt, and the frame's prompts are tracked through the whole sequence. Proposals
-    of one frame that repeat each other (IoU above kappa) count once, the better first. At most `max_masklets`, the first
-    found, are tracked. `progress(done, total)` counts frames.
+    frame) and whose IoU with every masklet's mask at t is at most `iou_threshold` (the paper's kappa; IoU taken at
+    frame t itself, REFERENCE 0.1) becomes a prompt, and the frame's prompts are tracked through the whole sequence.
+    Proposals of one frame that repeat each other (IoU above kappa) count once, the better first. At most
+    `max_masklets`, the first found, are tracked. `progress(done, total)` counts frames.
 
     Parts: of the frames that show two masklets, if more than `join_rate` hold both in one proposal, they are joined
     (`joined`; 1 leaves that out). Overlaps: a masklet's support is the mean, over the frames that show it, of its best
@@ -28,22 +42,37 @@ def masklets(frames: np.ndarray, segment: Segmenter, track: Tracker, *, iou_thre
     least `min_support`, else to the best supported one. So what the segmenter finds again and again is cut out of what
     surrounds it, and a fragment or a merger that it found once gives way. Last, `clean_masklets`.
     """
-    require(frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8, "frames",
-            got=(frames.shape, frames.dtype), expected="(T, H, W, 3) uint8", remedy="Stack RGB frames of one size.")
+    require(
+        frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8,
+        "frames",
+        got=(frames.shape, frames.dtype),
+        expected="(T, H, W, 3) uint8",
+        remedy="Stack RGB frames of one size.",
+    )
     count, height, width = frames.shape[:3]
     proposals = _Layers(count, height, width)
     layers = _Layers(count, height, width)
     for t in range(count):
         masks = np.asarray(segment(frames[t], t), bool)
-        require(masks.ndim == 3 and masks.shape[1:] == (height, width), "segment", got=masks.shape,
-                expected=f"(M, {height}, {width})", remedy="A segmenter returns masks of the frame's own size.")
+        require(
+            masks.ndim == 3 and masks.shape[1:] == (height, width),
+            "segment",
+            got=masks.shape,
+            expected=f"(M, {height}, {width})",
+            remedy="A segmenter returns masks of the frame's own size.",
+        )
         masks = masks[masks.sum((1, 2)) >= max(min_area * height * width, 1)]
         proposals.add_masks(t, masks)
-        prompts = masks[_new(proposals.at(t), layers.at(t), iou_threshold)[:max(max_masklets - layers.size(t), 0)]]
+        prompts = masks[_new(proposals.at(t), layers.at(t), iou_threshold)[: max(max_masklets - layers.size(t), 0)]]
         if len(prompts):
             labels = np.asarray(track(frames, t, prompts))
-            require(labels.shape == (count, height, width), "track", got=labels.shape,
-                    expected=str((count, height, width)), remedy="A tracker returns one label image a frame.")
+            require(
+                labels.shape == (count, height, width),
+                "track",
+                got=labels.shape,
+                expected=str((count, height, width)),
+                remedy="A tracker returns one label image a frame.",
+            )
             for other, image in enumerate(labels):
                 layers.add_labels(other, image, len(prompts))
         if progress is not None:
@@ -79,8 +108,7 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
         layers = layers.grouped(groups)
 
 
-def _agreement(layers: "_Layers", proposals: "_Layers"
-               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _agreement(layers: "_Layers", proposals: "_Layers") -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support."""
     count = layers.size(0)
     together, both = np.zeros((count, count)), np.zeros((count, count))
@@ -96,19 +124,21 @@ def _agreement(layers: "_Layers", proposals: "_Layers"
     return together, both, area / np.maximum(views, 1.0), support / np.maximum(views, 1.0)
 
 
-def iou_matrix(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def iou_matrix(first: Bool[np.ndarray, "a p"], second: Bool[np.ndarray, "b p"]) -> Float[np.ndarray, "a b"]:
     """(A, P) and (B, P) bool masks over P pixels -> (A, B) intersection over union; 0 where both are empty."""
     return _overlaps(sparse.csr_matrix(first, dtype=np.float32), sparse.csr_matrix(second, dtype=np.float32))[2]
 
 
-def _overlaps(first: sparse.csr_matrix, second: sparse.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _overlaps(first: Sparse, second: Sparse) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Areas (A,) of the first masks, shared pixels (A, B), IoU (A, B): one product of sparse one-hot rows."""
     shared = (first @ second.T).toarray()
     size, other = np.diff(first.indptr), np.diff(second.indptr)
     return size, shared, shared / np.maximum(size[:, None] + other - shared, 1.0)
 
 
-def clean_masklets(labels: np.ndarray, *, min_area: float = 0.001, min_views: int = 2) -> np.ndarray:
+def clean_masklets(
+    labels: Int[np.ndarray, "t h w"], *, min_area: float = 0.001, min_views: int = 2
+) -> Int16[np.ndarray, "t h w"]:
     """labels (T, H, W) -> int16 labels without the masklets that fewer than `min_views` frames show, renumbered.
 
     A frame shows a masklet where it fills at least `min_area` of it; a smaller remnant is removed from that frame.
@@ -120,14 +150,14 @@ def clean_masklets(labels: np.ndarray, *, min_area: float = 0.001, min_views: in
     shown = areas >= max(min_area * labels[0].size, 1)
     kept = shown.sum(0) >= min_views
     first = np.where(kept, shown.argmax(0), len(labels))
-    order = np.lexsort((np.arange(count), first))[:kept.sum()]
+    order = np.lexsort((np.arange(count), first))[: kept.sum()]
     number = np.full(count + 1, -1, np.int16)  # the last entry answers for label -1
     number[order] = np.arange(len(order))
     table = np.where(np.concatenate([shown, np.zeros((len(labels), 1), bool)], 1), number, -1).astype(np.int16)
     return np.stack([row[image] for row, image in zip(table, labels)])
 
 
-def _new(masks: sparse.csr_matrix, known: sparse.csr_matrix, threshold: float) -> np.ndarray:
+def _new(masks: Sparse, known: Sparse, threshold: float) -> np.ndarray:
     """Rows (K,) of masks (M, P) whose IoU with all `known`, and with the better masks taken, is at most `threshold`."""
     free = _overlaps(masks, known)[2].max(1, initial=0.0) <= threshold
     among = _overlaps(masks, masks)[2]
@@ -143,12 +173,12 @@ class _Layers:
 
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
-        self._rows = [sparse.csr_matrix((0, height * width), dtype=np.float32) for _ in range(count)]
+        self._rows: list[Sparse] = [sparse.csr_matrix((0, height * width), dtype=np.float32) for _ in range(count)]
 
     def size(self, t: int) -> int:
         return self._rows[t].shape[0]
 
-    def at(self, t: int) -> sparse.csr_matrix:
+    def at(self, t: int) -> Sparse:
         """(R, H W) ones at frame t."""
         return self._rows[t]
 
@@ -167,7 +197,7 @@ class _Layers:
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """The layers with those of one group (R,) united, in the order of the groups."""
         number = np.unique(groups, return_inverse=True)[1]
-        unite = sparse.csr_matrix((np.ones(len(groups), np.float32), (number, np.arange(len(groups)))))
+        unite: Sparse = sparse.csr_matrix((np.ones(len(groups), np.float32), (number, np.arange(len(groups)))))
         result = _Layers(self.count, *self.shape)
         result._rows = [(unite @ rows).sign() for rows in self._rows]
         return result
@@ -177,5 +207,5 @@ class _Layers:
         labels = np.full((self.count, self.shape[0] * self.shape[1]), -1, np.int16)
         for image, rows in zip(labels, self._rows):
             for masklet in best_first[::-1]:
-                image[rows.indices[rows.indptr[masklet]:rows.indptr[masklet + 1]]] = masklet
+                image[rows.indices[rows.indptr[masklet] : rows.indptr[masklet + 1]]] = masklet
         return labels.reshape(self.count, *self.shape)

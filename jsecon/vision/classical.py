@@ -1,4 +1,5 @@
-"""Region proposals without any weights: colour, texture and, where known, depth and normals, merged over a region graph.
+"""Region proposals without any weights: colour, texture and, where known, depth and normals, merged over a region
+graph.
 
 The frame is smoothed, cut into small regions that follow its edges (graph segmentation: Felzenszwalb & Huttenlocher
 2004), and neighbours are merged in order of dissimilarity (as in hierarchical grouping: Uijlings et al. 2013), which
@@ -13,6 +14,7 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import require
 
@@ -21,7 +23,8 @@ BORDER_SHARE = 0.4
 GROWN_AREA = 0.006
 """share of the frame from which a region counts in full"""
 SMALLEST_FACTOR = 0.22
-"""least factor on the dissimilarity of a small region, which grows with the root of its area: texture is made of these"""
+"""least factor on the dissimilarity of a small region, which grows with the root of its area: texture is made of
+these"""
 
 Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | None
 """per-frame maps: a function of the frame's index, or an array or list with one map a frame, or None"""
@@ -29,7 +32,8 @@ Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | 
 
 @dataclasses.dataclass(frozen=True)
 class ClassicalSegmenter:
-    """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units (a just noticeable step is ~2)."""
+    """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units (a just noticeable step is
+    ~2)."""
 
     merge_distance: float = 16.0
     """neighbours less dissimilar than this are one region, CIELAB units"""
@@ -50,18 +54,28 @@ class ClassicalSegmenter:
     crease_degrees: float = 50.0
     """angle between normals that counts as much as `merge_distance`"""
 
-    def __call__(self, frame: np.ndarray, index: int) -> np.ndarray:
+    def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
         """frame (H, W, 3) uint8 -> masks (M, H, W) bool, a partition of the frame but for specks, best first."""
         labels = self.partition(frame, index)
         return masks_best_first(frame, labels, max_regions=self.max_regions, min_area=self.min_area)
 
-    def partition(self, frame: np.ndarray, index: int) -> np.ndarray:
+    def partition(self, frame: np.ndarray, index: int) -> Int32[np.ndarray, "h w"]:
         """frame (H, W, 3) uint8 -> labels (H, W) int32, 0 .. M-1, every pixel labelled, each label connected."""
-        require(frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8, "frame", got=(frame.shape, frame.dtype),
-                expected="(H, W, 3) uint8", remedy="Give RGB frames as 8-bit arrays.")
+        require(
+            frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8,
+            "frame",
+            got=(frame.shape, frame.dtype),
+            expected="(H, W, 3) uint8",
+            remedy="Give RGB frames as 8-bit arrays.",
+        )
         features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
-        shape = geometry_features(_map_of(self.depths, index, frame.shape[:2]), _map_of(self.normals, index, frame.shape),
-                                  unit=self.merge_distance, depth_jump=self.depth_jump, crease_degrees=self.crease_degrees)
+        shape = geometry_features(
+            _map_of(self.depths, index, frame.shape[:2]),
+            _map_of(self.normals, index, frame.shape),
+            unit=self.merge_distance,
+            depth_jump=self.depth_jump,
+            crease_degrees=self.crease_degrees,
+        )
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
         minimum = self.min_area * frame.shape[0] * frame.shape[1]
         return merge(atoms, features, borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum)
@@ -72,12 +86,19 @@ def _map_of(maps: Maps, index: int, shape: tuple[int, ...]) -> np.ndarray | None
     if found is None:
         return None
     found = np.asarray(found, np.float32)
-    require(found.shape == shape, "depth or normal map", got=found.shape, expected=str(shape),
-            remedy="Give one map a frame, of the frame's own size.")
+    require(
+        found.shape == shape,
+        "depth or normal map",
+        got=found.shape,
+        expected=str(shape),
+        remedy="Give one map a frame, of the frame's own size.",
+    )
     return found
 
 
-def colour_features(frame: np.ndarray, *, lightness_weight: float, smoothing: float) -> np.ndarray:
+def colour_features(
+    frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
+) -> Float32[np.ndarray, "h w 3"]:
     """(H, W, 3) uint8 -> (H, W, 3) float32: weighted L, a and b of the smoothed frame, CIELAB units."""
     smooth = brightened(frame)
     if smoothing > 0:
@@ -87,7 +108,9 @@ def colour_features(frame: np.ndarray, *, lightness_weight: float, smoothing: fl
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
-def brightened(frame: np.ndarray, *, target: float = 0.22, most: float = 8.0) -> np.ndarray:
+def brightened(
+    frame: UInt8[np.ndarray, "h w 3"], *, target: float = 0.22, most: float = 8.0
+) -> UInt8[np.ndarray, "h w 3"]:
     """(H, W, 3) uint8 with lifted shadows, where the median of linear luminance is below `target` (a mid grey).
 
     CIELAB's steps are those of an eye adapted to the scene's white; in a dark photograph those between dark things are
@@ -101,8 +124,14 @@ def brightened(frame: np.ndarray, *, target: float = 0.22, most: float = 8.0) ->
     return table[frame]
 
 
-def geometry_features(depth: np.ndarray | None, normal: np.ndarray | None, *, unit: float, depth_jump: float,
-                      crease_degrees: float) -> np.ndarray | None:
+def geometry_features(
+    depth: Float32[np.ndarray, "h w"] | None,
+    normal: Float32[np.ndarray, "h w 3"] | None,
+    *,
+    unit: float,
+    depth_jump: float,
+    crease_degrees: float,
+) -> Float32[np.ndarray, "h w c"] | None:
     """(H, W, 1..4) channels in which a relative depth step of `depth_jump` and an angle of `crease_degrees` are `unit`.
 
     Unknown pixels (0) take the value of the nearest known one, so that nothing known begins or ends at them. None where
@@ -110,7 +139,7 @@ def geometry_features(depth: np.ndarray | None, normal: np.ndarray | None, *, un
     """
     channels = []
     if depth is not None and (depth > 0).any():
-        logarithm = np.log(np.maximum(_filled(depth, depth > 0), 1e-12))
+        logarithm = np.log(np.maximum(_filled(depth, np.asarray(depth > 0)), 1e-12))
         channels.append(logarithm[..., None] * np.float32(unit / np.log1p(depth_jump)))
     if normal is not None and normal.any():
         chord = 2.0 * np.sin(np.radians(crease_degrees) / 2.0)
@@ -119,13 +148,18 @@ def geometry_features(depth: np.ndarray | None, normal: np.ndarray | None, *, un
 
 
 def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    _, nearest = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(nearest, np.int64)
     table = np.zeros(int(nearest.max()) + 1, np.int64)
     table[nearest[known]] = np.flatnonzero(known)
     return values.reshape(known.size, -1)[table[nearest.reshape(-1)]].reshape(values.shape)
 
 
-def oversegment(features: np.ndarray, *, scale: float = 30.0, min_size: int = 16) -> np.ndarray:
+def oversegment(
+    features: Float32[np.ndarray, "h w c"], *, scale: float = 30.0, min_size: int = 16
+) -> Int32[np.ndarray, "h w"]:
     """(H, W, C) -> (H, W) int32 small connected regions that follow the edges (Felzenszwalb & Huttenlocher 2004)."""
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=scale, min_size=min_size)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
@@ -145,7 +179,13 @@ class Borders:
     """(E,) step of depth and normal, likewise; at most twice the unit a pixel; 0 where nothing is known."""
 
 
-def borders(atoms: np.ndarray, features: np.ndarray, shape: np.ndarray | None, *, most: float = 40.0) -> Borders:
+def borders(
+    atoms: Int32[np.ndarray, "h w"],
+    features: Float32[np.ndarray, "h w 3"],
+    shape: Float32[np.ndarray, "h w c"] | None,
+    *,
+    most: float = 40.0,
+) -> Borders:
     """Who borders on whom, and how hard.
 
     A step is measured between pixels two to either side of the border, so that the blur of an edge does not hide it. A
@@ -167,12 +207,22 @@ def borders(atoms: np.ndarray, features: np.ndarray, shape: np.ndarray | None, *
         shapes.append(np.zeros(len(colours[-1])) if shape is None else np.minimum(step(shape), most))
     pairs, inverse = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
     inverse = inverse.reshape(-1)
-    return Borders(pairs, np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
-                   np.bincount(inverse, np.concatenate(colours), len(pairs)),
-                   np.bincount(inverse, np.concatenate(shapes), len(pairs)))
+    return Borders(
+        pairs,
+        np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
+        np.bincount(inverse, np.concatenate(colours), len(pairs)),
+        np.bincount(inverse, np.concatenate(shapes), len(pairs)),
+    )
 
 
-def merge(atoms: np.ndarray, features: np.ndarray, edges: Borders, *, distance: float, min_area: float) -> np.ndarray:
+def merge(
+    atoms: Int32[np.ndarray, "h w"],
+    features: Float32[np.ndarray, "h w 3"],
+    edges: Borders,
+    *,
+    distance: float,
+    min_area: float,
+) -> Int32[np.ndarray, "h w"]:
     """Merges neighbours, the most alike first, until none is nearer than `distance`; then gives away what is too small
     (below `min_area`, px) or too thin to its most alike neighbour.
 
@@ -252,14 +302,15 @@ def _cores(labels: np.ndarray) -> np.ndarray:
     return np.unique(labels[cv2.dilate(image, square) == cv2.erode(image, square)])
 
 
-def masks_best_first(frame: np.ndarray, labels: np.ndarray, *, max_regions: int, min_area: float) -> np.ndarray:
+def masks_best_first(
+    frame: UInt8[np.ndarray, "h w 3"], labels: Int32[np.ndarray, "h w"], *, max_regions: int, min_area: float
+) -> Bool[np.ndarray, "m h w"]:
     """labels (H, W) -> masks (M, H, W) bool, the most contrasted and the larger first; specks dropped.
 
     A region's rank is the mean edge strength along its border times the square root of its area: a long clear outline.
     """
     lab = cv2.cvtColor(frame.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-    gradient = sum(np.hypot(cv2.Sobel(lab[..., c], cv2.CV_32F, 1, 0), cv2.Sobel(lab[..., c], cv2.CV_32F, 0, 1))
-                   for c in range(3))
+    gradient = np.hypot(cv2.Sobel(lab, cv2.CV_32F, 1, 0), cv2.Sobel(lab, cv2.CV_32F, 0, 1)).sum(-1)
     count = int(labels.max()) + 1
     area = np.bincount(labels.reshape(-1), minlength=count)
     edge = np.zeros(labels.shape, bool)

@@ -11,10 +11,12 @@ import re
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, require
 
 # name -> sRGB of a typical matt object of that name. A name of two words is a variant of the basic term in it.
+# fmt: off
 PALETTE: dict[str, tuple[int, int, int]] = {
     "black": (22, 22, 24), "dark grey": (72, 72, 74), "grey": (128, 128, 128), "light grey": (190, 190, 190),
     "white": (242, 242, 240),
@@ -35,25 +37,66 @@ PALETTE: dict[str, tuple[int, int, int]] = {
     "magenta": (216, 36, 168), "burgundy": (112, 18, 46), "rose": (236, 96, 136), "bronze": (150, 106, 46),
     "copper": (184, 106, 62), "silver": (192, 194, 198), "ivory": (246, 240, 222), "charcoal": (52, 54, 58),
 }
+# fmt: on
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
-_SYNONYMS = {"gray": "grey", "azure": "sky", "scarlet": "red", "aqua": "cyan", "fuchsia": "magenta", "golden": "gold",
-             "silvery": "silver", "aquamarine": "turquoise", "amber": "gold", "chocolate": "dark brown", "mauve": "lilac",
-             "plum": "dark purple", "ochre": "mustard", "rust": "dark orange", "emerald": "green", "ruby": "dark red",
-             "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy",
-             "rosy": "rose", "creamy": "cream", "rusty": "dark orange", "peachy": "peach"}
+_SYNONYMS = {
+    "gray": "grey",
+    "azure": "sky",
+    "scarlet": "red",
+    "aqua": "cyan",
+    "fuchsia": "magenta",
+    "golden": "gold",
+    "silvery": "silver",
+    "aquamarine": "turquoise",
+    "amber": "gold",
+    "chocolate": "dark brown",
+    "mauve": "lilac",
+    "plum": "dark purple",
+    "ochre": "mustard",
+    "rust": "dark orange",
+    "emerald": "green",
+    "ruby": "dark red",
+    "sapphire": "blue",
+    "ebony": "black",
+    "snowy": "white",
+    "sandy": "tan",
+    "wine": "burgundy",
+    "rosy": "rose",
+    "creamy": "cream",
+    "rusty": "dark orange",
+    "peachy": "peach",
+}
 _DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
 _PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
 _NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
 # Words of what surrounds the things in a room; they turn the extent's coordinate towards large regions.
-_SURROUNDINGS = {"wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "table",
-                 "tabletop", "tablecloth", "curtain", "curtains", "desk", "counter", "countertop", "lawn"}
+_SURROUNDINGS = {
+    "wall",
+    "walls",
+    "floor",
+    "ceiling",
+    "ground",
+    "carpet",
+    "rug",
+    "background",
+    "table",
+    "tabletop",
+    "tablecloth",
+    "curtain",
+    "curtains",
+    "desk",
+    "counter",
+    "countertop",
+    "lawn",
+}
 # A colour word names a range: its point, and a darker and a lighter neighbour.
-_SPREAD = np.float32([[0, 0, 0], [-10, 0, 0], [10, 0, 0]])
-_SPREAD_WEIGHTS = np.float32([0.7, 0.15, 0.15])
+_SPREAD = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
+_SPREAD_WEIGHTS = np.asarray([0.7, 0.15, 0.15], np.float32)
 
 KERNEL_WIDTH = 22.0
-"""CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or light"""
+"""CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or
+light"""
 LIGHTNESS_WEIGHT = 0.8
 """of L beside a and b in the kernel's distance: lighting changes L, and names depend on it all the same"""
 EXTENT_WEIGHT = 0.12
@@ -62,7 +105,7 @@ EXTENT_FULL = 0.25
 """share of the frame from which a region counts as surroundings and not as a thing"""
 
 
-def lab_of(rgb: np.ndarray) -> np.ndarray:
+def lab_of(rgb: np.ndarray) -> Float32[np.ndarray, "n 3"]:
     """(n, 3) sRGB 0..255 -> (n, 3) float32 CIELAB (D65)."""
     pixels = np.asarray(rgb, np.float32).reshape(-1, 1, 3) / 255.0
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(-1, 3)
@@ -71,10 +114,10 @@ def lab_of(rgb: np.ndarray) -> np.ndarray:
 class ColourEmbedder:
     """Embedder (jsecon.vision.protocols) over named colours; see the module for the space.
 
-    What it understands of a text: colour names, their dark and light variants, `-ish` and compound forms (`bluish-green`),
-    several colours of one thing (`red and white striped box`: each counts alike), and whether the thing is part of the
-    surroundings (wall, floor, table ...). Nouns otherwise carry no meaning, shapes and materials neither.
-
+    What it understands of a text: colour names, their dark and light variants, `-ish` and compound forms
+    (`bluish-green`), several colours of one thing (`red and white striped box`: each counts alike), and whether
+    the thing is part of the surroundings (wall, floor, table ...). Nouns otherwise carry no meaning, shapes and
+    materials neither.
     An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
     coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
 
@@ -100,10 +143,17 @@ class ColourEmbedder:
         colours += [self._mean(point[None], np.ones(1)) for point in neutral]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
 
-    def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    def embed_regions(
+        self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
+    ) -> Float32[np.ndarray, "m e"]:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
-        require(masks.ndim == 3 and masks.shape[1:] == frame.shape[:2], "masks", got=masks.shape,
-                expected=f"(M, {frame.shape[0]}, {frame.shape[1]})", remedy="Give masks of the frame's own size.")
+        require(
+            masks.shape[1:] == frame.shape[:2],
+            "masks",
+            got=masks.shape,
+            expected=f"(M, {frame.shape[0]}, {frame.shape[1]})",
+            remedy="Give masks of the frame's own size.",
+        )
         lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
         out = np.zeros((len(masks), self.dim), np.float32)
         for row, mask in zip(out, masks.astype(bool)):
@@ -113,14 +163,16 @@ class ColourEmbedder:
                 row[:] = _joined(self._mean(pixels, np.ones(len(pixels))), mask.mean() / EXTENT_FULL)
         return out
 
-    def embed_text(self, texts: list[str]) -> np.ndarray:
+    def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
         """Q texts -> (Q, E) float32 unit. Raises InputError for a text without a colour word, or with a negation."""
         out = np.zeros((len(texts), self.dim), np.float32)
         for row, text in zip(out, texts):
             points = np.stack([self._colour(phrase) for phrase in self._phrases(text)])  # (colours, 3)
             spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
             weights = np.tile(_SPREAD_WEIGHTS, len(points))
-            row[:] = _joined(self._mean(spread.astype(np.float32), weights), float(bool(_SURROUNDINGS & set(_words(text)))))
+            row[:] = _joined(
+                self._mean(spread.astype(np.float32), weights), float(bool(_SURROUNDINGS & set(_words(text))))
+            )
         return out
 
     def _mean(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -133,8 +185,12 @@ class ColourEmbedder:
         """Splits a text into runs of modifiers and colour words, one run a colour."""
         words = _words(text, separators=True)
         if _NEGATION & set(words):
-            raise InputError(f"query {text!r}", found="a negation", expected="the colours that the thing has",
-                             remedy="Say what colour it is, instead of what it is not.")
+            raise InputError(
+                f"query {text!r}",
+                found="a negation",
+                expected="the colours that the thing has",
+                remedy="Say what colour it is, instead of what it is not.",
+            )
         phrases: list[list[str]] = []
         modifiers: list[str] = []
         run_open = False  # the last word was a colour
@@ -151,11 +207,14 @@ class ColourEmbedder:
                 modifiers, run_open = [], False
         if not phrases:
             raise InputError(
-                f"query {text!r}", found="no colour word",
+                f"query {text!r}",
+                found="no colour word",
                 expected="a text that names a colour, such as 'dark green bottle' or 'red and white box'",
-                remedy="The embedder in use knows things by their colours only (" + ", ".join(
-                    sorted({n for n in self.names if " " not in n})) + "; dark, light, -ish). Name the thing's colour, "
-                "or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights.")
+                remedy="The embedder in use knows things by their colours only ("
+                + ", ".join(sorted({n for n in self.names if " " not in n}))
+                + "; dark, light, -ish). Name the thing's colour, "
+                "or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights.",
+            )
         return phrases
 
     def _base(self, word: str) -> tuple[str | None, bool]:
@@ -182,20 +241,22 @@ class ColourEmbedder:
         for base, ish in names:
             shaded = self._by_name.get(prefix + base)
             if shaded is None:
-                shaded = self._by_name[base] + np.float32([-22.0 if dark else 22.0 if light else 0.0, 0.0, 0.0])
+                shaded = self._by_name[base] + np.asarray(
+                    [-22.0 if dark else 22.0 if light else 0.0, 0.0, 0.0], np.float32
+                )
             points.append(shaded)
             # 'bluish green' is more green than blue; 'navy blue' is navy, its basic term only says what kind navy is.
             weights.append(0.25 if base in BASIC and weights and names[0][0] not in BASIC else 0.5 if ish else 1.0)
         weight = np.asarray(weights, np.float32)[:, None]
         mixed = (np.stack(points) * weight).sum(0) / weight.sum()
         if all(ish for _, ish in names):
-            mixed = mixed * np.float32([1.0, 0.7, 0.7])  # 'greenish' is greener than grey, not green
+            mixed = mixed * np.asarray([1.0, 0.7, 0.7], np.float32)  # 'greenish' is greener than grey, not green
         return mixed.astype(np.float32)
 
 
 def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n, 3), (m, 3) CIELAB -> (n, m) Gaussian likeness, 1 for equal colours."""
-    scale = np.float32([LIGHTNESS_WEIGHT, 1.0, 1.0]) / KERNEL_WIDTH
+    scale = np.asarray([LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32) / KERNEL_WIDTH
     x, y = x * scale, y * scale
     squared = (x * x).sum(-1)[:, None] + (y * y).sum(-1) - 2.0 * (x @ y.T)
     return np.exp(-0.5 * np.maximum(squared, 0.0))
@@ -204,13 +265,15 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
     """Unit colour vector and extent (0 thing .. 1 surroundings) -> unit vector of the joint space."""
     angle = 0.5 * np.pi * min(max(float(extent), 0.0), 1.0)
-    both = np.concatenate([np.sqrt(1.0 - EXTENT_WEIGHT) * colour,
-                           np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])])
+    both = np.concatenate(
+        [np.sqrt(1.0 - EXTENT_WEIGHT) * colour, np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])]
+    )
     return both.astype(np.float32)
 
 
 def _inside(mask: np.ndarray) -> np.ndarray:
-    """The mask without its one-pixel rim, whose colours mix with the neighbours'; the mask itself where nothing is left."""
+    """The mask without its one-pixel rim, whose colours mix with the neighbours'; the mask itself where nothing is
+    left."""
     core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE).astype(bool)
     return core if core.sum() >= 0.3 * mask.sum() else mask
 

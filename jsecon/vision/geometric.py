@@ -10,17 +10,16 @@ prompt costs a render. Masks come out cut along atoms, which follow the image's 
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import cv2
 import numpy as np
-import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int, Int16, UInt8
+from scipy import sparse
 
 from jsecon.errors import require
 from jsecon.language.votes import region_votes
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians
+from jsecon.vision.atoms import SMALLEST, Sparse, coverage, image_atoms, label_shares
 
-_SMALLEST = 12
-"""px: smaller pieces are taken for slivers along an edge"""
 _CHUNK = 64
 """atoms are counted in multiples of this, so that few shapes are compiled"""
 
@@ -33,15 +32,15 @@ class _View:
     """(H, W) int32 atom of each pixel, 0 .. A-1."""
     seen: np.ndarray
     """(n,) the Gaussians that the frame shows."""
-    votes: sparse.csr_matrix
+    votes: Sparse
     """(n, A) sum of alpha T over the atom's pixels."""
-    to_atoms: sparse.csr_matrix
+    to_atoms: Sparse
     """(A, n) the same, transposed."""
     proposals: np.ndarray
     """(M, A) float32 share of each atom that lies in each proposal."""
-    clarity: np.ndarray | None = None
+    clarity: np.ndarray
     """(n,) in (0, 1]: the cross-section that is seen of each, against the frame that sees most of it."""
-    clear: sparse.csr_matrix | None = None
+    clear: Sparse
     """(n, A) the votes times the clarity: a Gaussian seen from its side, over an outline, says little."""
 
     @property
@@ -56,23 +55,39 @@ class GeometricTracker:
     gaussians: the scene. cameras: batch of T, one a frame. proposals: a function of a frame's index, or a sequence with
     one entry a frame, giving masks (M, H, W) bool; they may overlap.
 
-    The prompts are tracked against their rivals: the other proposals of their frame, and the rest of it. From that frame
-    the track goes outward, always on to the frame that shares the most with one already visited, and every frame adds what
-    it shows: evidence e_ib, the weight that Gaussian i casts on the masks of b; ownership is e_ib^2 / sum_b e_ib^2. In the
-    next frame a proposal goes to the one that owns the largest part of its known weight, if that is at least
-    `proposal_share`. If the proposal also holds at least `merger` of what is seen of others, each of its atoms goes to whom
-    of them owns most of it. An atom that no proposal brings goes to whom owns at least `atom_share` of it. Nothing is decided where less than
-    `known_share` of the weight is known, nor on atoms that the Gaussians cover by less than `covered`. Occlusion is that
-    of the full scene's compositing. A Gaussian counts as known in proportion to the best look that a visited frame had of
-    it, in full from `glimpse` times what the frame at hand sees.
+    The prompts are tracked against their rivals: the other proposals of their frame, and the rest of it. From that
+    frame the track goes outward, always on to the frame that shares the most with one already visited, and every frame
+    adds what it shows: evidence e_ib, the weight that Gaussian i casts on the masks of b; ownership is e_ib^2 / sum_b
+    e_ib^2. In the next frame a proposal goes to the one that owns the largest part of its known weight, if that is at
+    least `proposal_share`. If the proposal also holds at least `merger` of what is seen of others, each of its atoms
+    goes to whom of them owns most of it. An atom that no proposal brings goes to whom owns at least `atom_share` of it.
+    Nothing is decided where less than `known_share` of the weight is known, nor on atoms that the Gaussians cover by
+    less than `covered`. Occlusion is that of the full scene's compositing. A Gaussian counts as known in proportion to
+    the best look that a visited frame had of it, in full from `glimpse` times what the frame at hand sees.
     """
 
-    def __init__(self, gaussians: Gaussians, cameras: Camera, proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
-                 *, atoms_per_frame: int = 256, proposal_share: float = 0.4, atom_share: float = 0.6,
-                 merger: float = 0.5, known_share: float = 0.5, covered: float = 0.2,
-                 glimpse: float = 0.5, capacity: int | None = None):
-        require(0 < atoms_per_frame, "atoms_per_frame", got=atoms_per_frame, expected="at least 1",
-                remedy="Use about 200 for small frames.")
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        cameras: Camera,
+        proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
+        *,
+        atoms_per_frame: int = 256,
+        proposal_share: float = 0.4,
+        atom_share: float = 0.6,
+        merger: float = 0.5,
+        known_share: float = 0.5,
+        covered: float = 0.2,
+        glimpse: float = 0.5,
+        capacity: int | None = None,
+    ):
+        require(
+            atoms_per_frame > 0,
+            "atoms_per_frame",
+            got=atoms_per_frame,
+            expected="at least 1",
+            remedy="Use about 200 for small frames.",
+        )
         self.gaussians, self.cameras = gaussians, cameras
         # Planned once for all views: one compiled shape.
         self.capacity = plan_capacity(gaussians, cameras) if capacity is None else capacity
@@ -81,16 +96,30 @@ class GeometricTracker:
         self.atoms_per_frame = atoms_per_frame
         self._propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: dict[int, _View] = {}
-        self._shared: np.ndarray | None = None
+        self._shared = np.zeros((0, 0), np.float32)
 
-    def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
+    def __call__(
+        self, frames: UInt8[np.ndarray, "t h w 3"], index: int, prompts: Bool[np.ndarray, "b _ _"]
+    ) -> Int16[np.ndarray, "t h w"]:
         """frames (T, H, W, 3) uint8, masks `prompts` (B, H, W) bool of frame `index` -> labels (T, H, W) int16.
 
         The labels at `index` are the prompts themselves (the earlier one where they overlap).
         """
         count, height, width = frames.shape[:3]
-        require(prompts.ndim == 3 and prompts.shape[1:] == (height, width), "prompts", got=prompts.shape,
-                expected=f"(B, {height}, {width})", remedy="Give masks of the frame's own size.")
+        require(
+            (*self.cameras.fx.shape, self.cameras.height, self.cameras.width) == (count, height, width),
+            "frames",
+            got=frames.shape,
+            expected=f"{(*self.cameras.fx.shape, self.cameras.height, self.cameras.width, 3)}",
+            remedy="Give the frames of the tracker's own cameras, the same at every call.",
+        )
+        require(
+            prompts.shape[1:] == (height, width),
+            "prompts",
+            got=prompts.shape,
+            expected=f"(B, {height}, {width})",
+            remedy="Give masks of the frame's own size.",
+        )
         labels = np.full((count, height, width), -1, np.int16)
         for b in reversed(range(len(prompts))):
             labels[index][prompts[b]] = b
@@ -101,7 +130,7 @@ class GeometricTracker:
         evidence = np.zeros((self.gaussians.means.shape[0], len(classes)), np.float32)
         best = np.zeros(len(evidence), np.float32)
         start = views[index]
-        evidence[start.seen] = start.clear @ _coverage(start.atoms, classes, start.votes.shape[1]).T
+        evidence[start.seen] = start.clear @ coverage(start.atoms, classes, start.votes.shape[1]).T
         best[start.seen] = start.clarity
         owners = {}
         order = self._outward(index)
@@ -110,7 +139,7 @@ class GeometricTracker:
             here = evidence[view.seen]
             if t in owners:
                 here -= view.clear @ _one_hot(owners[t], len(classes))
-            if not (here[:, :len(prompts)] > 1e-3).any():  # nothing of the prompts can be seen
+            if not (here[:, : len(prompts)] > 1e-3).any():  # nothing of the prompts can be seen
                 continue
             owners[t] = self._match(view, here, best[view.seen])
             evidence[view.seen] = here + view.clear @ _one_hot(owners[t], len(classes))
@@ -119,7 +148,7 @@ class GeometricTracker:
             labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].atoms]
         return labels
 
-    def _with_rivals(self, labels: np.ndarray, index: int, count: int) -> np.ndarray:
+    def _with_rivals(self, labels: Int16[np.ndarray, "h w"], index: int, count: int) -> Bool[np.ndarray, "c h w"]:
         """(B + C, H, W) bool: the prompts, and what they share the frame with: its other proposals, and the rest."""
         classes = [labels == b for b in range(count)]
         free = labels < 0
@@ -130,7 +159,9 @@ class GeometricTracker:
                 free &= ~rival
         return np.stack([*classes, free])
 
-    def consistent(self, frames: np.ndarray, labels: np.ndarray, *, least_own: float = 0.5) -> np.ndarray:
+    def consistent(
+        self, frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"], *, least_own: float = 0.5
+    ) -> Int[np.ndarray, "t h w"]:
         """labels (T, H, W) with every region given away whose Gaussians belong to another one in the sum of all views.
 
         A region is kept if at least `least_own` of the weight that it casts falls on Gaussians on which no other region
@@ -140,13 +171,18 @@ class GeometricTracker:
         labels = np.array(labels)
         count = int(labels.max(initial=-1)) + 1
         for _ in range(4 if count else 0):  # what is given away may tip another region; seldom more than two rounds
-            votes = np.zeros((self.gaussians.means.shape[0], count), np.float32)
+            entries = []
             for t in range(len(frames)):
                 view = self.view(frames, t)
-                votes[view.seen] += (view.votes @ _label_shares(view.atoms, labels[t], view.votes.shape[1], count)).toarray()
-            owner = sparse.csr_matrix((np.ones(len(votes), np.float32), (np.arange(len(votes)), votes.argmax(1))),
-                                      shape=votes.shape)
-            cast = votes.T @ owner  # (R, R): row r's weight by the region that owns the Gaussian
+                shares = label_shares(view.atoms, labels[t], view.votes.shape[1], count)
+                cast = (view.votes @ shares).tocoo()
+                entries.append((cast.data, view.seen[cast.row], cast.col))
+            weights, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
+            shape = (self.gaussians.means.shape[0], count)
+            votes = sparse.csr_matrix((weights, (rows, columns)), shape=shape)  # sums what repeats
+            winner = np.asarray(votes.argmax(axis=1)).reshape(-1)
+            owner = sparse.csr_matrix((np.ones(shape[0], np.float32), (np.arange(shape[0]), winner)), shape=shape)
+            cast = (votes.T @ owner).toarray()  # (R, R): row r's weight by the region that owns the Gaussian
             heir = cast.argmax(1)
             total = np.maximum(cast.sum(1), 1e-12)
             lost = (heir != np.arange(count)) & (np.diagonal(cast) < least_own * total)
@@ -156,25 +192,41 @@ class GeometricTracker:
             labels = table[labels]
         return labels
 
-    def view(self, frames: np.ndarray, t: int) -> _View:
+    def view(self, frames: UInt8[np.ndarray, "t h w 3"], t: int) -> _View:
         """The frame's atoms and votes; computed once."""
         if t not in self._views:
             masks = np.asarray(self._propose(t), bool)
             atoms = image_atoms(frames[t], masks, count=self.atoms_per_frame)
             number = int(atoms.max()) + 1
             padded = -(-number // _CHUNK) * _CHUNK
-            votes = region_votes(self.gaussians, self.cameras[t:t + 1], atoms[None].astype(np.int32), padded,
-                                 top=12, capacity=self.capacity)
+            votes = region_votes(
+                self.gaussians,
+                self.cameras[t : t + 1],
+                atoms[None].astype(np.int32),
+                padded,
+                top=12,
+                capacity=self.capacity,
+            )
+            require(
+                int(votes.overflow) == 0,
+                "capacity",
+                got=f"{self.capacity}, {int(votes.overflow)} pairs too few in frame {t}",
+                expected="room for every (tile, Gaussian) pair",
+                remedy="Leave capacity out: it is planned then.",
+            )
             matrix = _sparse(np.asarray(votes.regions), np.asarray(votes.weights), number)
             seen = np.flatnonzero(np.diff(matrix.indptr))
             matrix = matrix[seen]
-            self._views[t] = _View(atoms, seen, matrix, matrix.T.tocsr(), _coverage(atoms, masks, number))
+            # How clearly it sees them is known once all views are: see _prepare.
+            clear = np.ones(len(seen), np.float32)
+            within = coverage(atoms, masks, number)
+            self._views[t] = _View(atoms, seen, matrix, matrix.T.tocsr(), within, clear, matrix)
         return self._views[t]
 
-    def _prepare(self, frames: np.ndarray) -> list[_View]:
+    def _prepare(self, frames: UInt8[np.ndarray, "t h w 3"]) -> list[_View]:
         """All views, each with how clearly it sees its Gaussians, and what any two of them share."""
         views = [self.view(frames, t) for t in range(len(frames))]
-        if self._shared is None:
+        if not self._shared.size:
             looks = np.zeros((len(views), self.gaussians.means.shape[0]), np.float32)
             for t, view in enumerate(views):
                 camera = self.cameras[t]
@@ -191,7 +243,8 @@ class GeometricTracker:
         return [self._views[t] for t in range(len(frames))]
 
     def _outward(self, index: int) -> list[int]:
-        """The other frames in the order in which a maximum spanning tree of what they share grows from `index` (Prim)."""
+        """The other frames in the order in which a maximum spanning tree of what they share grows from `index`
+        (Prim)."""
         nearest, order = self._shared[index].copy(), []
         left = set(range(len(nearest))) - {index}
         while left:
@@ -200,7 +253,9 @@ class GeometricTracker:
             nearest = np.maximum(nearest, self._shared[order[-1]])
         return order
 
-    def _match(self, view: _View, evidence: np.ndarray, best: np.ndarray) -> np.ndarray:
+    def _match(
+        self, view: _View, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " a"]:
         """The class (A,) that owns each atom of a view, -1 = none; evidence (n, B + C) of the Gaussians it shows, and
         the clarity (n,) of the best look at each in the frames that the evidence is from."""
         # On an outline a Gaussian leans over the neighbours and is counted with them, in view after view. So one tells
@@ -220,7 +275,7 @@ class GeometricTracker:
         share = inside / np.maximum(known_inside, 1e-6)
         sure = (known_inside >= self.known_share * (view.proposals @ total))[:, 0]
         # A proposal that holds most of what is seen of several classes is a merger of them.
-        merged = (inside >= self.merger * mass.sum(0)) & (inside >= _SMALLEST)
+        merged = (inside >= self.merger * mass.sum(0)) & (inside >= SMALLEST)
 
         owner = np.where(atom_sure & (atom_share.max(1) >= self.atom_share), atom_share.argmax(1), -1)
         strongest = np.where(sure, share.max(1), 0.0) if len(share) else np.zeros(0)
@@ -233,49 +288,12 @@ class GeometricTracker:
         return owner
 
 
-def image_atoms(frame: np.ndarray, masks: np.ndarray, *, count: int, smallest: int = _SMALLEST) -> np.ndarray:
-    """About `count` superpixels (SLICO, Achanta et al. 2012) of a frame, cut by the masks' outlines.
-
-    frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under `smallest` pixels go to the
-    nearest other piece.
-    """
-    lab = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2LAB)
-    size = max(int(round(np.sqrt(frame.shape[0] * frame.shape[1] / count))), 4)
-    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLICO, size)
-    slic.iterate(6)
-    pieces = np.asarray(slic.getLabels(), np.int64)
-    for mask in masks:
-        pieces = np.unique(pieces * 2 + mask, return_inverse=True)[1].reshape(mask.shape)
-    areas = np.bincount(pieces.reshape(-1))
-    small = areas[pieces] < smallest
-    if small.any() and not small.all():
-        _, nearest = cv2.distanceTransformWithLabels(small.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-        table = np.zeros(int(nearest.max()) + 1, np.int64)
-        table[nearest[~small]] = pieces[~small]
-        pieces = np.where(small, table[nearest], pieces)
-    return np.unique(pieces, return_inverse=True)[1].reshape(pieces.shape).astype(np.int32)
-
-
-def _coverage(atoms: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:
-    """(M, A) float32 share of each atom's pixels that lie in each mask."""
-    area = np.bincount(atoms.reshape(-1), minlength=count)
-    inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
-    return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
-
-
 def _one_hot(owner: np.ndarray, count: int) -> np.ndarray:
     """(A,) class of each atom, -1 = none -> (A, count) float32."""
     return (owner[:, None] == np.arange(count)).astype(np.float32)
 
 
-def _label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> sparse.csr_matrix:
-    """(A, R) float32 share of each atom's pixels that carry each label."""
-    inside = labels >= 0
-    weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
-    return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
-
-
-def _sparse(regions: np.ndarray, weights: np.ndarray, columns: int, *, negligible: float = 0.005) -> sparse.csr_matrix:
+def _sparse(regions: np.ndarray, weights: np.ndarray, columns: int, *, negligible: float = 0.005) -> Sparse:
     """(N, K) strongest regions and weights -> (N, columns), without what is a negligible share of its row."""
     keep = (regions >= 0) & (weights > negligible * weights.sum(1, keepdims=True))
     rows, slots = np.nonzero(keep)

@@ -1,4 +1,5 @@
-"""What looks at pixels, behind three small protocols, so that OpenCV, SAM, SAM 2, CLIP or files from disk can take each place.
+"""What looks at pixels, behind three small protocols, so that OpenCV, SAM, SAM 2, CLIP or files from disk can take each
+place.
 
 Everything here lives on the host: NumPy in, NumPy out. Frames are uint8 RGB.
 """
