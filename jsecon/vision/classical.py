@@ -143,7 +143,7 @@ def geometry_features(
         channels.append(logarithm[..., None] * np.float32(unit / np.log1p(depth_jump)))
     if normal is not None and normal.any():
         chord = 2.0 * np.sin(np.radians(crease_degrees) / 2.0)
-        channels.append(_filled(normal, normal.any(-1)) * np.float32(unit / chord))
+        channels.append(_filled(normal, np.asarray(normal.any(-1))) * np.float32(unit / chord))
     return np.concatenate(channels, -1).astype(np.float32) if channels else None
 
 

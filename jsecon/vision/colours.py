@@ -118,6 +118,7 @@ class ColourEmbedder:
     (`bluish-green`), several colours of one thing (`red and white striped box`: each counts alike), and whether
     the thing is part of the surroundings (wall, floor, table ...). Nouns otherwise carry no meaning, shapes and
     materials neither.
+
     An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
     coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
 
