@@ -264,11 +264,9 @@ def main(options: Options = Options()) -> dict:
     lines = [(way, *(metrics["objects"][way][n] for n in OBJECTS.values()), metrics["miou"][way]) for way in WAYS]
     table = results.table(("selected by", *OBJECTS.values(), "mean IoU"), lines)
     out = Path(options.out)
-    results.save(out, options, metrics, table)
-    # The picture shows photographs of the capture, which stay out of the project: it lies beside the committed results.
-    with_pictures = out / "pictures"
-    with_pictures.mkdir(parents=True, exist_ok=True)
-    draw(capture, labels, masks, "votes").savefig(with_pictures / "held_out.png", dpi=110, bbox_inches="tight")
+    series = {way: [metrics["objects"][way][name] for name in OBJECTS.values()] for way in WAYS}
+    results.save(out, options, metrics, table, results.bars(list(OBJECTS.values()), series, "IoU, held-out views"))
+    results.save_picture(out, "held_out.png", draw(capture, labels, masks, "votes"))
     print(table)
     return metrics
 

@@ -226,7 +226,11 @@ def main(options: Options = Options()) -> dict:
             for r in rows
         ],
     )
-    results.save(Path(options.out), options, metrics, table, draw(np.asarray(points.points), truth, nearest))
+    reductions = ("mode", "median", "mean")
+    series = {f"d = {d}": [r["accuracy"] for r in rows if r["latent"] == d] for d in options.latents}
+    out = Path(options.out)
+    results.save(out, options, metrics, table, results.bars(list(reductions), series, "point accuracy"))
+    results.save_picture(out, "from_above.png", draw(np.asarray(points.points), truth, nearest))
     print(table)
     return metrics
 

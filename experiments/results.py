@@ -28,3 +28,25 @@ def table(header: tuple[str, ...], rows: list[tuple]) -> str:
     for row in rows:
         lines.append("| " + " | ".join(f"{v:.3f}" if isinstance(v, float) else str(v) for v in row) + " |")
     return "\n".join(lines)
+
+
+def bars(labels: list[str], series: dict[str, list[float]], ylabel: str):
+    """Grouped bars, one group a label and one colour a series: numbers only, nothing of a capture."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(1.6 * len(labels) + 2, 3.2))
+    axes = figure.add_subplot()
+    width = 0.8 / len(series)
+    for n, (name, values) in enumerate(series.items()):
+        axes.bar([i + (n - (len(series) - 1) / 2) * width for i in range(len(labels))], values, width, label=name)
+    axes.set_xticks(range(len(labels)), labels)
+    axes.set_ylim(0, 1)
+    axes.set_ylabel(ylabel)
+    axes.legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def save_picture(folder: Path, name: str, figure: Any) -> None:
+    """A picture that shows a capture's own pixels, points or labels: into folder/pictures, which git ignores."""
+    with written_whole(folder / "pictures" / name) as temporary:
+        figure.savefig(temporary, dpi=110, bbox_inches="tight")
