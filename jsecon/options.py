@@ -20,13 +20,13 @@ class Options:
     """folder of instance masks, one integer PNG a frame or LangSplat's `_s.npy`; None: found in the frames."""
     downscale: float | None = None
     """frames are made this many times smaller; None: so that the longer side is at most `long_side`."""
-    long_side: int = 480
+    long_side: int = 400
     """px."""
     frames: int | None = None
     """at most this many frames, evenly spaced; None: all."""
     holdout: int = 8
     """every so manieth frame is kept for measuring only; 0 = none."""
-    steps: int = 3000
+    steps: int = 1500
     """of the photometric fit."""
     sh_degree: int = 1
     """of the fitted colours, 0 to 3."""
