@@ -111,5 +111,5 @@ def room_run(room, tmp_path_factory):
     from jsecon import pipeline
 
     out = tmp_path_factory.mktemp("run")
-    options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=60, sh_degree=0)
+    options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150, sh_degree=0)
     return pipeline.run(options, out), out

@@ -41,7 +41,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
         "--holdout",
         4,
         "--steps",
-        60,
+        150,
         "--sh-degree",
         0,
     )
