@@ -103,7 +103,7 @@ def _run(verbs) -> None:
         "--downscale",
         type=float,
         metavar="K",
-        help="make frames K times smaller (default: so that the longer side is at most 480 px)",
+        help=f"make frames K times smaller (default: so that the longer side is at most {Options.long_side} px)",
     )
     verb.add_argument("--frames", type=int, metavar="N", help="use at most N frames, evenly spaced (default: all)")
     verb.add_argument(

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, normalize
@@ -151,8 +151,3 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     )
     visible = in_front & (opacities >= MIN_ALPHA) & touching & jnp.isfinite(numbers).all(1)
     return Projection(means_px, whitening, opacities, z, extents, visible)
-
-
-def visible_in(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:
-    """(N,) bool: `project(...).visible`."""
-    return project(gaussians, camera).visible
