@@ -135,11 +135,33 @@ def _run(verbs) -> None:
         help="from a Gaussian's votes to its code (default %(default)s)",
     )
     verb.add_argument(
+        "--granularity",
+        choices=("fine", "medium", "coarse"),
+        default=Options.granularity,
+        help="of the proposals, without masks: fine parts things; coarse joins the colours of one thing, and tells "
+        "things apart by the depth that the Gaussians render (default %(default)s)",
+    )
+    verb.add_argument(
+        "--association",
+        choices=("consensus", "tracking"),
+        default=Options.association,
+        help="of the frames' proposals: what most views agree on, or Algorithm 1 of the paper with a tracker through "
+        "the Gaussians (default %(default)s)",
+    )
+    verb.add_argument(
+        "--agreement",
+        type=float,
+        default=Options.agreement,
+        metavar="SHARE",
+        help="consensus: share of the views that must put two things into one proposal; less joins more (default "
+        "%(default)s)",
+    )
+    verb.add_argument(
         "--iou-threshold",
         type=float,
         default=Options.iou_threshold,
         metavar="KAPPA",
-        help="a proposal that overlaps a masklet by more is not new (default %(default)s)",
+        help="tracking: a proposal that overlaps a masklet by more is not new (default %(default)s)",
     )
     verb.add_argument(
         "--seed", type=int, default=Options.seed, help="of whatever is drawn at random (default %(default)s)"

@@ -30,8 +30,14 @@ class Options:
     """of the photometric fit."""
     sh_degree: int = 1
     """of the fitted colours, 0 to 3."""
+    granularity: Literal["fine", "medium", "coarse"] = "medium"
+    """of the proposals: fine parts things, coarse joins colours that no jump of depth parts."""
+    association: Literal["consensus", "tracking"] = "consensus"
+    """of the frames' proposals: what most views agree on, or Algorithm 1 with a tracker."""
+    agreement: float = 0.4
+    """consensus: share of the views that must put two things into one proposal."""
     iou_threshold: float = 0.5
-    """a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
+    """tracking: a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
     weighting: Literal["pixels", "uniform"] = "pixels"
     """of the views in a region's embedding: pixels or uniform."""
     latent: int = 16
@@ -75,6 +81,13 @@ def require_inputs(options: Options) -> None:
             raise InputError(
                 f"--{name.replace('_', '-')}", found=str(value), expected=f"at least {least}", remedy="Mend the option."
             )
+    if not 0 < options.agreement <= 1:
+        raise InputError(
+            "--agreement",
+            found=str(options.agreement),
+            expected="a share above 0 and at most 1",
+            remedy="Leave it out, or use 0.3 to 0.6.",
+        )
 
 
 def require_writable(folder: Path) -> None:

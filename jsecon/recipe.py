@@ -38,7 +38,7 @@ def left_out(options: Options) -> dict[str, str]:
         if options.sh_degree == 0:
             left["view-dependent colour"] = "SH degree 0"
     if options.masks is not None:
-        left["segmenter"] = left["tracker"] = f"masks are given ({options.masks.name})"
+        left["segmenter"] = left["association"] = f"masks are given ({options.masks.name})"
     return left
 
 
@@ -113,13 +113,16 @@ def stages_of(
             given=_of(options, "steps", "sh_degree", "seed"),
         )
     if options.masks is None:
+        consensus = options.association == "consensus"
         add(
             "masklets",
-            "proposals by colour and texture, followed through the Gaussians",
+            f"{options.granularity} proposals by colour and texture, "
+            + ("what the views agree on" if consensus else "followed through the Gaussians"),
             lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], p),
-            rooms=("vision", "language.masklets", "language.votes", "splat"),
+            rooms=("vision", "language.masklets", "language.grouping", "language.votes", "splat"),
             after=("load", "gaussians"),
-            given=_of(options, "iou_threshold"),
+            given=_of(options, "granularity", *(("agreement", "seed") if consensus else ("iou_threshold",)))
+            | {"association": options.association},
         )
     add(
         "regions",

@@ -125,22 +125,62 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 
 
 def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
-    """labels (T, H, W) int16 of the training frames: proposals of each, followed through the scene's own Gaussians."""
+    """labels (T, H, W) int16 of the training frames: the proposals of each, brought together over the frames by what
+    the scene's own Gaussians say, by consensus or by tracking."""
     from jsecon.language.masklets import clean_masklets, masklets
-    from jsecon.vision.classical import ClassicalSegmenter
+    from jsecon.vision.consensus import consensus_masklets
     from jsecon.vision.geometric import GeometricTracker
+    from jsecon.vision.views import SceneViews
 
     train = training_frames(capture)
-    frames, cameras = np.asarray(capture.frames)[train], capture.cameras[train]
-    segmenter = ClassicalSegmenter(depths=None if capture.depths is None else np.asarray(capture.depths)[train])
-    proposals = functools.cache(lambda t: segmenter(frames[t], t))
-    tracker = GeometricTracker(gaussians, jax.tree.map(jnp.asarray, cameras), proposals)
-    labels = masklets(
-        frames, lambda frame, index: proposals(index), tracker, iou_threshold=options.iou_threshold, progress=progress
-    )
-    labels = clean_masklets(tracker.consistent(frames, labels))
+    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    proposals = proposals_of(options, capture, gaussians)
+    if options.association == "consensus":
+        scene = SceneViews(gaussians, cameras, proposals)
+        labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
+    else:
+        tracker = GeometricTracker(gaussians, cameras, proposals)
+        labels = masklets(
+            frames,
+            lambda frame, index: proposals(index),
+            tracker,
+            iou_threshold=options.iou_threshold,
+            progress=progress,
+        )
+        labels = tracker.consistent(frames, labels)
+    labels = clean_masklets(labels)
     _require_regions(labels, str(options.capture))
     return Outcome(labels)
+
+
+def proposals_of(options: Options, capture: Capture, gaussians: Gaussians) -> Callable[[int], np.ndarray]:
+    """masks (M, H, W) bool of the t-th training frame, by the classical segmenter at the granularity asked for.
+
+    Depth comes from the capture; where there is none, the coarse one takes what the Gaussians render. (The finer ones
+    do not: rendered depth costs them more outline than it tells.)
+    """
+    from jsecon.splat.render import render_depth
+    from jsecon.splat.tiles import plan_capacity
+    from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
+    from jsecon.vision.relief import steadied_depth
+
+    train = training_frames(capture)
+    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    setting = GRANULARITIES[options.granularity]
+    if capture.depths is not None:
+        segmenter = ClassicalSegmenter(**setting, depths=np.asarray(capture.depths)[train])
+    elif options.granularity == "coarse":
+        capacity = plan_capacity(gaussians, cameras)
+        draw = jax.jit(lambda camera: render_depth(gaussians, camera, capacity=capacity))
+
+        def rendered(t: int) -> np.ndarray:
+            depth, alpha = (np.asarray(image) for image in draw(cameras[t]))
+            return steadied_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
+
+        segmenter = ClassicalSegmenter(**setting, depths=rendered)
+    else:
+        segmenter = ClassicalSegmenter(**setting)
+    return functools.cache(lambda t: segmenter(frames[t], t))
 
 
 def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -> Outcome:

@@ -171,7 +171,7 @@ def test_votes_of_a_view_are_the_rendered_weights(world, tracker):
     from jsecon.splat.render import render
 
     gaussians, cameras, frames, _, _ = world
-    view = tracker.view(frames, 5)
+    view = tracker.views.view(frames, 5)
     alpha = np.asarray(render(gaussians, cameras[5], np.zeros((len(gaussians.means), 1), np.float32)).alpha)
     expected = np.bincount(view.atoms.ravel(), alpha.ravel(), view.votes.shape[1])
     np.testing.assert_allclose(np.asarray(view.votes.sum(0)).ravel(), expected, rtol=0.02, atol=0.1)

@@ -99,7 +99,7 @@ def test_a_damaged_stage_is_said_and_computed_again_to_the_same_field(room_run, 
 
 def test_the_plan_says_what_is_left_out_and_why(room_run, room, tmp_path):
     run, _ = room_run
-    assert {"densification", "view-dependent colour", "segmenter", "tracker"} <= set(run.left_out)
+    assert {"densification", "view-dependent colour", "segmenter", "association"} <= set(run.left_out)
     save_ply(tmp_path / "scene.ply", run.field.gaussians)
     reporter = Recorder()
     given = pipeline.run(

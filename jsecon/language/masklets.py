@@ -1,17 +1,15 @@
 """Masklets: one identity an object through all frames (Algorithm 1 of the paper), over any segmenter and tracker."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16
 from scipy import sparse
 
 from jsecon.errors import require
+from jsecon.vision.atoms import Sparse
 from jsecon.vision.protocols import Segmenter, Tracker
 
-Sparse: TypeAlias = Any
-"""scipy.sparse.csr_matrix, of which type checkers know too little"""
 Progress = Callable[[int, int], None]
 
 

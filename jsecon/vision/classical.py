@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import require
+from jsecon.vision.relief import geometry_features
 
 BORDER_SHARE = 0.4
 """of the step across the border in a dissimilarity; the rest is the difference of the means"""
@@ -26,6 +27,13 @@ SMALLEST_FACTOR = 0.22
 """least factor on the dissimilarity of a small region, which grows with the root of its area: texture is made of
 these"""
 
+GRANULARITIES: dict[str, dict[str, float]] = {
+    "fine": {"merge_distance": 10.0},
+    "medium": {"merge_distance": 16.0},
+    "coarse": {"merge_distance": 28.0, "depth_jump": 0.06},
+}
+"""settings of ClassicalSegmenter by how large its regions are; the coarse one joins the colours of one thing, and so
+needs depth to part things"""
 Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | None
 """per-frame maps: a function of the frame's index, or an array or list with one map a frame, or None"""
 
@@ -122,39 +130,6 @@ def brightened(
     gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0), most)
     table = np.round(255.0 * (gain * linear / (1.0 + (gain - 1.0) * linear)) ** (1.0 / 2.2)).astype(np.uint8)
     return table[frame]
-
-
-def geometry_features(
-    depth: Float32[np.ndarray, "h w"] | None,
-    normal: Float32[np.ndarray, "h w 3"] | None,
-    *,
-    unit: float,
-    depth_jump: float,
-    crease_degrees: float,
-) -> Float32[np.ndarray, "h w c"] | None:
-    """(H, W, 1..4) channels in which a relative depth step of `depth_jump` and an angle of `crease_degrees` are `unit`.
-
-    Unknown pixels (0) take the value of the nearest known one, so that nothing known begins or ends at them. None where
-    nothing is known.
-    """
-    channels = []
-    if depth is not None and (depth > 0).any():
-        logarithm = np.log(np.maximum(_filled(depth, np.asarray(depth > 0)), 1e-12))
-        channels.append(logarithm[..., None] * np.float32(unit / np.log1p(depth_jump)))
-    if normal is not None and normal.any():
-        chord = 2.0 * np.sin(np.radians(crease_degrees) / 2.0)
-        channels.append(_filled(normal, np.asarray(normal.any(-1))) * np.float32(unit / chord))
-    return np.concatenate(channels, -1).astype(np.float32) if channels else None
-
-
-def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    _, nearest = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    nearest = np.asarray(nearest, np.int64)
-    table = np.zeros(int(nearest.max()) + 1, np.int64)
-    table[nearest[known]] = np.flatnonzero(known)
-    return values.reshape(known.size, -1)[table[nearest.reshape(-1)]].reshape(values.shape)
 
 
 def oversegment(
