@@ -25,15 +25,15 @@ def group_by_consensus(
     weights: Float[np.ndarray, " n"],
     means: Float[np.ndarray, "n 3"],
     *,
-    agreement: float = 0.5,
+    agreement: float = 0.4,
     pieces: int = 3000,
     least_shared: float = 0.02,
     seed: int = 0,
 ) -> Int[np.ndarray, " n"]:
     """Object (N,) of each Gaussian, 0 .. R-1, -1 = never seen.
 
-    membership (N, M): share of the Gaussian's weight, in a mask's frame, that lies in the mask; M masks of all frames.
-    visible (N, T): 1 where a frame sees the Gaussian well enough to tell. weights (N,): how much is seen of each.
+    visible (N, T): how well a frame sees the Gaussian, 0 to 1. membership (N, M): share of the Gaussian that lies in a
+    mask, times how well the mask's frame sees it; M masks of all frames. weights (N,): how much is seen of each.
     means (N, 3): centres, world units.
 
     The Gaussians are first gathered into at most `pieces` small pieces (`scene_pieces`), then the pieces are joined by
