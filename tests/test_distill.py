@@ -119,6 +119,14 @@ def test_extremes(reduce):
     assert not np.isfinite(got[6]).all() or (got[6] == 0).all()  # a NaN code never passes for a code
 
 
+def test_what_is_mostly_unlabelled_is_unknown():
+    votes = dataclasses.replace(make_votes([[0, 1]] * 3, [[2.0, 1.0]] * 3, 2), total=jnp.asarray([3.0, 6.0, 7.0]))
+    codes = jnp.eye(2)
+    np.testing.assert_array_equal(distill_votes(votes, codes), [[1, 0], [1, 0], [0, 0]])
+    np.testing.assert_array_equal(distill_votes(votes, codes, least_labelled=0.0), [[1, 0]] * 3)
+    np.testing.assert_array_equal(distill_votes(votes, codes, least_labelled=0.9), [[1, 0], [0, 0], [0, 0]])
+
+
 def test_no_regions_at_all():
     votes = make_votes(np.zeros((7, 0)), np.zeros((7, 0)), 0)
     assert (np.asarray(distill_votes(votes, np.zeros((0, 3), np.float32))) == np.zeros((7, 3))).all()
