@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.query.one_step import Number, similarities
 from jsecon.query.pixel import region_at, region_shares_at
+from jsecon.query.shares import weight_inside
 from jsecon.types import Array, LanguageField, Selection
 
 __all__ = [
@@ -192,8 +193,7 @@ def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_w
         chosen |= known & (alike >= alike_threshold)
     seen = parts.views > 0
     if by == "votes":
-        inside = (parts.regions >= 0) & (parts.regions < count) & chosen[jnp.clip(parts.regions, 0, count - 1)]
-        weight = jnp.sum(jnp.where(inside, parts.weights, 0.0), axis=-1)
+        weight = weight_inside(parts.regions, parts.weights, chosen)
         seen_weight = parts.labelled + unlabelled_weight * jnp.maximum(parts.total - parts.labelled, 0.0)
         known = seen & (seen_weight > 0) & jnp.isfinite(seen_weight) & jnp.isfinite(weight)
         similarity = jnp.clip(weight / jnp.where(known, seen_weight, 1.0), 0.0, 1.0)

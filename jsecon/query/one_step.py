@@ -1,5 +1,7 @@
 """The one-step query: the text's code against every Gaussian's code (the paper's baseline)."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
@@ -7,6 +9,9 @@ from jaxtyping import Bool, Float
 from jsecon.errors import require
 from jsecon.numerics import into_range, normalize
 from jsecon.types import Array, Selection
+
+NARROW = 32
+"""codes of at most so many numbers are compared column by column"""
 
 Number = float | int | Array
 """a threshold: a Python number, or () under a trace"""
@@ -37,13 +42,31 @@ def _one_step(codes: Array, text_code: Array, threshold: Number) -> Selection:
 
 def similarities(codes: Float[Array, "n d"], code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     """Cosines (N,) of rows with one code, and where they mean something: both finite and not zero; 0 elsewhere."""
-    # Multiply and sum: a matrix-vector product here can be silently wrong under jit and vmap (STYLE trap 1).
     unit = normalize(code)
-    largest = jnp.max(jnp.abs(codes), axis=-1, initial=0.0)
-    known = (largest > 0) & jnp.isfinite(largest) & jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
-    scaled = codes * jnp.where(known, into_range(largest), 0.0)[:, None]
-    dots, squares = jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
+    sound = jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
+    narrow = codes.shape[1] <= NARROW
+    largest, dots, squares = (_by_column if narrow else _by_row)(codes, unit)
+    known = (largest > 0) & jnp.isfinite(largest) & sound
     return jnp.where(known, dots / jnp.sqrt(jnp.where(known, squares, 1.0)), 0.0), known
+
+
+def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
+    """Of each row: the largest size, and dot product and square once it is brought into range. Column by column: a
+    reduction over a short row does not vectorise (1 million rows of 3: 17 ms against 0.7)."""
+    columns = [codes[:, k] for k in range(codes.shape[1])]
+    zero = jnp.zeros(codes.shape[0], codes.dtype)
+    largest = functools.reduce(jnp.maximum, (jnp.abs(column) for column in columns), zero)
+    factor = jnp.where(jnp.isfinite(largest), into_range(largest), 0.0)
+    scaled = [column * factor for column in columns]
+    dots = sum((column * unit[k] for k, column in enumerate(scaled)), start=zero)
+    return largest, dots, sum((column * column for column in scaled), start=zero)
+
+
+def _by_row(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
+    # Multiply and sum: a matrix-vector product here can be silently wrong under jit and vmap (STYLE trap 1).
+    largest = jnp.max(jnp.abs(codes), axis=-1, initial=0.0)
+    scaled = codes * jnp.where(jnp.isfinite(largest), into_range(largest), 0.0)[:, None]
+    return largest, jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
 
 
 def best(similarity: Float[Array, " n"], known: Bool[Array, " n"]) -> Float[Array, ""]:
