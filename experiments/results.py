@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,21 @@ CAPTURES = HOME.parent.parent / "shared" / "captures"
 
 
 def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = None) -> None:
-    """Writes the options (a dataclass), the metrics, a table in Markdown and a matplotlib figure into `folder`."""
-    write_text(folder / "config.json", json.dumps(dataclasses.asdict(options), indent=2, default=str) + "\n")
+    """Writes the options (a dataclass), the metrics, a table in Markdown and a matplotlib figure into `folder`. Paths
+    are written from the checkout on, so that results look alike wherever they were made."""
+    config = {name: _from_checkout(value) for name, value in dataclasses.asdict(options).items()}
+    write_text(folder / "config.json", json.dumps(config, indent=2, default=str) + "\n")
     write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     write_text(folder / "table.md", table + "\n")
     if figure is not None:
         with written_whole(folder / "figure.png") as temporary:
             figure.savefig(temporary, dpi=110, bbox_inches="tight")
+
+
+def _from_checkout(value: Any) -> Any:
+    if not isinstance(value, str | Path) or not Path(value).is_absolute():
+        return value
+    return os.path.relpath(value, HOME.parent)
 
 
 def table(header: tuple[str, ...], rows: list[tuple]) -> str:
