@@ -23,7 +23,7 @@ from experiments import results
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import point_accuracy, point_class_means
 from jsecon.fit.initialise import gaussians_from_points, labels_of_points, points_from_depth
-from jsecon.language.autoencoder import region_codes
+from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.votes import region_votes
 from jsecon.numerics import cosine_matrix

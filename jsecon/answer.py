@@ -14,7 +14,7 @@ import numpy as np
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError, require
 from jsecon.files import write_text, written_whole
-from jsecon.language.autoencoder import encode
+from jsecon.language.codes import encode
 from jsecon.query.anchored import query_anchored, query_region, region_at
 from jsecon.query.canonical import query_canonical
 from jsecon.query.clusters import one_component

@@ -123,10 +123,11 @@ def _run(verbs) -> None:
     )
     verb.add_argument(
         "--latent",
-        type=int,
+        type=_code_size,
         default=Options.latent,
         metavar="D",
-        help="most numbers a code may have; 3 as in the paper (default %(default)s)",
+        help="most numbers a code may have; 3 as in the paper; auto for as few as keep the regions apart (default "
+        "%(default)s)",
     )
     verb.add_argument(
         "--reduce",
@@ -167,6 +168,10 @@ def _run(verbs) -> None:
         "--seed", type=int, default=Options.seed, help="of whatever is drawn at random (default %(default)s)"
     )
     verb.set_defaults(act=_act_run)
+
+
+def _code_size(text: str) -> int | str:
+    return text if text == "auto" else int(text)
 
 
 def _query(verbs) -> None:

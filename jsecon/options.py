@@ -40,8 +40,8 @@ class Options:
     """tracking: a proposal that overlaps a masklet by more is not new (the paper's kappa)."""
     weighting: Literal["pixels", "uniform"] = "pixels"
     """of the views in a region's embedding: pixels or uniform."""
-    latent: int = 16
-    """most numbers a code may have; 3 reproduces the paper."""
+    latent: int | Literal["auto"] = 16
+    """most numbers a code may have; 3 reproduces the paper; auto: as few as keep the regions apart."""
     reduce: Literal["mode", "median", "mean"] = "mode"
     """of a Gaussian's votes to its code: mode, median or mean."""
     top: int = 8
@@ -77,7 +77,7 @@ def require_inputs(options: Options) -> None:
         ("long_side", 16),
     ):
         value = getattr(options, name)
-        if value is not None and not value >= least:
+        if value not in (None, "auto") and not value >= least:
             raise InputError(
                 f"--{name.replace('_', '-')}", found=str(value), expected=f"at least {least}", remedy="Mend the option."
             )

@@ -119,7 +119,7 @@ def stages_of(
             f"{options.granularity} proposals by colour and texture, "
             + ("what the views agree on" if consensus else "followed through the Gaussians"),
             lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], p),
-            rooms=("vision", "language.masklets", "language.grouping", "language.votes", "splat"),
+            rooms=("vision", "language.masklets", "language.consensus", "language.grouping", "language.votes", "splat"),
             after=("load", "gaussians"),
             given=_of(options, "granularity", *(("agreement", "seed") if consensus else ("iou_threshold",)))
             | {"association": options.association},
@@ -134,9 +134,11 @@ def stages_of(
     )
     add(
         "codes",
-        f"at most {options.latent} numbers a region",
+        "as few numbers a region as keep them apart"
+        if options.latent == "auto"
+        else f"at most {options.latent} numbers a region",
         lambda r, p: stages.codes(options, r["regions"], p),
-        rooms=("language.autoencoder",),
+        rooms=("language.autoencoder", "language.codes"),
         after=("regions",),
         given=_of(options, "latent", "seed"),
     )

@@ -127,8 +127,8 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
     """labels (T, H, W) int16 of the training frames: the proposals of each, brought together over the frames by what
     the scene's own Gaussians say, by consensus or by tracking."""
+    from jsecon.language.consensus import consensus_masklets
     from jsecon.language.masklets import clean_masklets, masklets
-    from jsecon.vision.consensus import consensus_masklets
     from jsecon.vision.geometric import GeometricTracker
     from jsecon.vision.views import SceneViews
 
@@ -217,7 +217,8 @@ def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: An
 
 def codes(options: Options, found: Regions, progress: Progress) -> Outcome:
     """(codes (R, d), coder): the regions' embeddings, compressed only where they don't fit as they are."""
-    from jsecon.language.autoencoder import Autoencoder, region_codes
+    from jsecon.language.autoencoder import Autoencoder
+    from jsecon.language.codes import region_codes
 
     table, coder, why = region_codes(
         found.embeddings, latent=options.latent, key=jax.random.key(options.seed), progress=progress

@@ -176,7 +176,7 @@ class LanguageField:
     region_codes: Array
     """(R, d) unit codes of the regions."""
     autoencoder: Any
-    """Autoencoder or Rotation (jsecon.language.autoencoder), or None where the codes are the embeddings themselves."""
+    """Coder of jsecon.language.codes, or None where the codes are the embeddings themselves."""
     cameras: Camera
     """batch of T: the capture's views, for masks and for `--at`."""
     canonical: Array

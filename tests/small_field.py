@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.language.autoencoder import region_codes
+from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.votes import region_votes
 from jsecon.splat.render import render

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_field import unit_rows
 
-from jsecon.language.autoencoder import Autoencoder, Rotation, encode, region_codes, train_autoencoder
+from jsecon.language.autoencoder import train_autoencoder
 from jsecon.numerics import cosine
 
 KEY = jax.random.key(0)
@@ -169,43 +169,3 @@ def test_codes_of_other_sizes_are_told(trained):
         coder.encode(np.ones((2, 47), np.float32))
     with pytest.raises(ValueError, match="size 3"):
         coder.decode(np.ones((2, 4), np.float32))
-
-
-def test_no_coder_where_embeddings_are_short():
-    embeddings = 2 * unit_rows(np.random.default_rng(0), 9, 6)
-    codes, coder, reason = region_codes(embeddings, latent=6, key=KEY)
-    assert coder is None
-    np.testing.assert_allclose(codes, embeddings / 2, atol=1e-6)
-    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
-    assert "left out" in reason
-
-
-@pytest.mark.parametrize(("regions", "latent"), [(0, 3), (1, 3), (2, 3), (5, 5), (5, 16)])
-def test_a_rotation_keeps_every_cosine(regions, latent):
-    embeddings = unit_rows(np.random.default_rng(regions), regions, 512)
-    codes, coder, reason = region_codes(embeddings, latent=latent, key=KEY)
-    assert isinstance(coder, Rotation)
-    assert "without loss" in reason
-    assert codes.shape == (regions, latent)
-    np.testing.assert_allclose(np.asarray(codes) @ np.asarray(codes).T, embeddings @ embeddings.T, atol=2e-6)
-    np.testing.assert_allclose(coder.decode(codes), embeddings, atol=2e-6)
-    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
-
-
-def test_equal_and_unknown_embeddings_fit_in_one_number():
-    embeddings = np.repeat(unit_rows(np.random.default_rng(0), 1, 32), 70, axis=0)
-    embeddings[5] = 0
-    codes, coder, _ = region_codes(embeddings, latent=1, key=KEY)
-    assert isinstance(coder, Rotation)
-    assert (np.asarray(codes[5]) == 0).all()
-    np.testing.assert_allclose(np.abs(np.delete(np.asarray(codes), 5, axis=0)), 1, atol=1e-6)
-
-
-def test_an_autoencoder_where_regions_do_not_fit():
-    embeddings = unit_rows(np.random.default_rng(0), 12, 40)
-    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50, cosine_over="batch")
-    assert isinstance(coder, Autoencoder)
-    assert reason.startswith("run")
-    np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
-    with pytest.raises(ValueError, match="not finite"):
-        region_codes(np.full((3, 40), np.inf, np.float32), latent=3, key=KEY)

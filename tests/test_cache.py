@@ -9,7 +9,8 @@ import pytest
 
 from jsecon import cache
 from jsecon.errors import InputError
-from jsecon.language.autoencoder import Autoencoder, Rotation
+from jsecon.language.autoencoder import Autoencoder
+from jsecon.language.codes import Rotation
 from jsecon.stages import Outcome
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 
-from jsecon.vision.consensus import consensus_masklets, mask_signatures
+from jsecon.language.consensus import consensus_masklets, mask_signatures
 from jsecon.vision.views import SceneViews, claim_atoms
 
 

@@ -1,9 +1,4 @@
-"""Region embeddings to small codes: LangSplat's autoencoder, and a rotation where that loses nothing.
-
-`region_codes` chooses: the embeddings themselves where they are no longer than the code, a rotation into the regions'
-own span where that span fits, else the autoencoder. What it returns beside the codes has `.encode` and `.decode` for
-texts.
-"""
+"""Region embeddings to small codes by LangSplat's autoencoder; jsecon.language.codes says when it is needed."""
 
 import dataclasses
 import functools
@@ -26,12 +21,7 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 """LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it."""
 MIN_STEPS = 1_000
 """LangSplat's 100 epochs run over tens of thousands of crops; a few masklets need more epochs to see as many steps."""
-MAX_COSINE_LOSS = 1e-4
-"""a rotation counts as lossless when no cosine between two regions moves by more than this"""
-
 Key = PRNGKeyArray | UInt32[Array, "2"]
-Coder = Any
-"""Autoencoder, Rotation, or None (codes are the embeddings): whatever `encode` below takes."""
 
 
 @jax.tree_util.register_dataclass
@@ -78,28 +68,6 @@ class Autoencoder:
         codes = jnp.asarray(codes)
         rows = _decode(self.decoder, codes.reshape(-1, self.latent))
         return rows.reshape(*codes.shape[:-1], self.dim)
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Rotation:
-    """Codes as coordinates in an orthonormal basis: cosines inside its span are kept as they are."""
-
-    basis: Array
-    """(E, d) orthonormal columns, or zero columns where the span has fewer than d dimensions."""
-
-    def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-        """(..., E) -> (..., d) unit codes: the part of the embedding inside the span, brought to unit length."""
-        return normalize(normalize(jnp.asarray(embeddings)) @ self.basis)
-
-    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
-        """(..., d) -> (..., E) unit embeddings inside the span."""
-        return normalize(jnp.asarray(codes) @ jnp.asarray(self.basis).T)
-
-
-def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
-    """Codes of embeddings (of a text, say) under a field's coder; with None the codes are the unit embeddings."""
-    return normalize(jnp.asarray(embeddings)) if coder is None else coder.encode(embeddings)
 
 
 def train_autoencoder(
@@ -276,56 +244,6 @@ def _epochs(
         return state, jax.lax.cond(index >= judged_from, judge, lambda best: best, best)
 
     return jax.lax.fori_loop(start, stop, epoch, carry)
-
-
-def region_codes(
-    embeddings: Float[Array, "r e"], *, latent: int, key: Key, **training: Any
-) -> tuple[Float[Array, "r d"], Coder, str]:
-    """The cheapest code of at most `latent` numbers a region that keeps the regions' cosines, and why that one.
-
-    embeddings: (R, E); a zero row (never embedded) gets a zero code. `training` goes to `train_autoencoder`.
-    Returns (codes (R, d) of unit length, coder, reason), d = min(latent, E):
-    E <= latent: the unit embeddings, coder None; regions whose span has at most `latent` dimensions: coordinates in it,
-    a `Rotation`, no cosine moved by more than 1e-4; else the codes of an `Autoencoder` trained on them.
-    Raises ValueError for numbers that are not finite.
-    """
-    require(latent >= 1, "region_codes", got=f"latent={latent}", expected="at least 1", remedy="3 is LangSplat's.")
-    require(
-        bool(np.isfinite(np.asarray(embeddings)).all()),
-        "region_codes",
-        got="embeddings that are not finite",
-        expected="finite numbers",
-        remedy="Find the regions whose crops gave NaN and leave them out.",
-    )
-    units = normalize(jnp.asarray(embeddings))
-    count, dim = units.shape
-    if dim <= latent:
-        return units, None, f"left out: the embeddings have {dim} numbers, no more than the {latent} of a code"
-    rotation, loss = _rotation(units, latent)
-    if loss <= MAX_COSINE_LOSS:
-        return rotation.encode(units), rotation, f"left out: {count} regions fit in {latent} dimensions without loss"
-    coder = train_autoencoder(units, latent=latent, key=key, **training)
-    return (
-        coder.encode(units),
-        coder,
-        f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}",
-    )
-
-
-def _rotation(units: Array, latent: int) -> tuple[Rotation, float]:
-    """The principal directions (not centred: cosines, not distances, are to be kept) and the largest cosine error."""
-    exact = np.asarray(units, np.float64)
-    _, sizes, directions = np.linalg.svd(exact, full_matrices=False)
-    rank = int(np.sum(sizes > 1e-6 * max(sizes.max(initial=0.0), 1e-300)))
-    basis = np.zeros((exact.shape[1], latent))
-    kept = directions[: min(rank, latent)].T
-    signs = np.sign(kept[np.abs(kept).argmax(0), np.arange(kept.shape[1])])  # an SVD's signs are arbitrary: fix them
-    basis[:, : kept.shape[1]] = kept * signs
-    codes = exact @ basis
-    lengths = np.linalg.norm(codes, axis=1, keepdims=True)
-    codes = np.divide(codes, lengths, out=np.zeros_like(codes), where=lengths > 0)
-    loss = float(np.abs(codes @ codes.T - exact @ exact.T).max(initial=0.0))
-    return Rotation(jnp.asarray(basis, units.dtype)), loss
 
 
 def _widths(params: Any) -> tuple[int, ...]:

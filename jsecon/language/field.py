@@ -18,11 +18,14 @@ import numpy as np
 
 from jsecon.errors import InputError, require
 from jsecon.files import written_whole
-from jsecon.language.autoencoder import Autoencoder, Rotation
+from jsecon.language.autoencoder import Autoencoder
+from jsecon.language.codes import Rotation, Spread
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
 FORMAT, VERSION = "jsecon-field", 1
-_RECORDS = {cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Camera, Autoencoder, Rotation)}
+_RECORDS = {
+    cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Camera, Autoencoder, Rotation, Spread)
+}
 _REMEDY = "Make the field again with `jsecon run`."
 
 

@@ -1,0 +1,243 @@
+"""Small codes for the regions: which kind, of how many numbers, and why.
+
+A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact where the regions' span fits), `Spread`
+(a code a region, placed on the sphere so that distinct regions stay apart), LangSplat's `Autoencoder`
+(jsecon.language.autoencoder), or None (the embeddings themselves). `region_codes` chooses.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Bool, Float, PRNGKeyArray, UInt32
+
+from jsecon.errors import require
+from jsecon.language.autoencoder import train_autoencoder
+from jsecon.numerics import cosine_matrix, normalize
+from jsecon.types import Array
+
+MAX_COSINE_LOSS = 1e-4
+"""a rotation counts as lossless when no cosine between two regions moves by more than this"""
+SEPARATION = 0.9
+"""cosine of two codes from which a query by code takes one for the other (query.anchored.CODE_THRESHOLD)"""
+ALIKE = 0.95
+"""cosine of two embeddings from which two regions are one thing seen twice, and may share a code"""
+LATENTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""sizes of code that "auto" tries"""
+SHARPNESS = 40.0
+"""of the softmax over regions with which `Spread` places a text among their codes"""
+
+Key = PRNGKeyArray | UInt32[Array, "2"]
+Coder = Any
+"""Autoencoder, Rotation, Spread, or None: whatever `encode` below takes"""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rotation:
+    """Codes as coordinates in an orthonormal basis: cosines inside its span are kept as they are."""
+
+    basis: Array
+    """(E, d) orthonormal columns, or zero columns where the span has fewer than d dimensions."""
+
+    def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+        """(..., E) -> (..., d) unit codes: the part of the embedding inside the span, brought to unit length."""
+        return normalize(normalize(jnp.asarray(embeddings)) @ self.basis)
+
+    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
+        """(..., d) -> (..., E) unit embeddings inside the span."""
+        return normalize(jnp.asarray(codes) @ jnp.asarray(self.basis).T)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """A table: each region's embedding and its code. Anything else lies among the regions that it is most similar to,
+    by a softmax over their cosines."""
+
+    embeddings: Array
+    """(R, E) unit embeddings of the regions; zero rows have no code."""
+    codes: Array
+    """(R, d) their unit codes."""
+
+    def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+        """(..., E) -> (..., d) unit codes; a zero embedding gets a zero code."""
+        return _among(jnp.asarray(embeddings), jnp.asarray(self.embeddings), jnp.asarray(self.codes))
+
+    def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
+        """(..., d) -> (..., E) unit embeddings."""
+        return _among(jnp.asarray(codes), jnp.asarray(self.codes), jnp.asarray(self.embeddings))
+
+
+def _among(x: Array, keys: Array, values: Array) -> Array:
+    """Rows x (..., A) -> unit rows (..., B): the values (R, B) of the keys (R, A) most similar to each."""
+    rows = x.reshape(-1, x.shape[-1])
+    known = jnp.any(keys != 0, axis=-1)
+    similarity = jnp.where(known[None], SHARPNESS * cosine_matrix(rows, keys), -jnp.inf)
+    share = jax.nn.softmax(similarity, axis=-1)
+    share = jnp.where(jnp.any(known), share, 0.0)
+    found = normalize(share @ values)
+    found = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), found, 0.0)
+    return found.reshape(*x.shape[:-1], values.shape[-1])
+
+
+def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
+    """Codes of embeddings (of a text, say) under a field's coder; with None the codes are the unit embeddings."""
+    return normalize(jnp.asarray(embeddings)) if coder is None else coder.encode(embeddings)
+
+
+def region_codes(
+    embeddings: Float[Array, "r e"], *, latent: int | str, key: Key, **training: Any
+) -> tuple[Float[Array, "r d"], Coder, str]:
+    """The cheapest code of at most `latent` numbers a region that keeps the regions' cosines, and why that one.
+
+    embeddings: (R, E); a zero row (never embedded) gets a zero code. `training` goes to `train_autoencoder`.
+    Returns (codes (R, d) of unit length, coder, reason), d = min(latent, E):
+    E <= latent: the unit embeddings, coder None; regions whose span has at most `latent` dimensions: coordinates in it,
+    a `Rotation`, no cosine moved by more than 1e-4; else the codes of an `Autoencoder` trained on them.
+    latent="auto": the smallest of `LATENTS`, and of a `Rotation` and `Spread` codes the first, that keeps every pair of
+    distinct regions (embeddings' cosine below `ALIKE`) apart at a query's threshold (codes' cosine below `SEPARATION`);
+    None where no code shorter than the embeddings does.
+    Raises ValueError for numbers that are not finite.
+    """
+    require(
+        latent == "auto" or (isinstance(latent, int) and latent >= 1),
+        "region_codes",
+        got=f"latent={latent!r}",
+        expected="at least 1, or 'auto'",
+        remedy="3 is LangSplat's.",
+    )
+    require(
+        bool(np.isfinite(np.asarray(embeddings)).all()),
+        "region_codes",
+        got="embeddings that are not finite",
+        expected="finite numbers",
+        remedy="Find the regions whose crops gave NaN and leave them out.",
+    )
+    units = normalize(jnp.asarray(embeddings))
+    if latent == "auto":
+        return _smallest_codes(units)
+    assert isinstance(latent, int)
+    count, dim = units.shape
+    if dim <= latent:
+        return units, None, f"left out: the embeddings have {dim} numbers, no more than the {latent} of a code"
+    codes, rotation = _rotated(units, latent)
+    exact = np.asarray(units, np.float64)
+    coded = np.asarray(codes, np.float64)
+    loss = float(np.abs(coded @ coded.T - exact @ exact.T).max(initial=0.0))
+    if loss <= MAX_COSINE_LOSS:
+        return codes, rotation, f"left out: {count} regions fit in {latent} dimensions without loss"
+    coder = train_autoencoder(units, latent=latent, key=key, **training)
+    return (
+        coder.encode(units),
+        coder,
+        f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}",
+    )
+
+
+def _smallest_codes(units: Array) -> tuple[Array, Coder, str]:
+    count, dim = units.shape
+    distinct = int(distinct_pairs(units).sum()) // 2
+    for latent in (size for size in LATENTS if size < dim):
+        for kind, make in (("a rotation", _rotated), ("spread codes", _spread_out)):
+            codes, coder = make(units, latent)
+            if not confused_pairs(units, codes):
+                told = f"{kind} of {latent} numbers: all {distinct} pairs of {count} regions stay apart"
+                return codes, coder, f"left out: {told} (cosine below {SEPARATION:g})"
+    return units, None, f"left out: no code shorter than {dim} numbers keeps all {distinct} pairs of regions apart"
+
+
+def _rotated(units: Array, latent: int) -> tuple[Array, Rotation]:
+    rotation = principal_rotation(units, latent)
+    return rotation.encode(units), rotation
+
+
+def _spread_out(units: Array, latent: int) -> tuple[Array, Spread]:
+    codes = spread_codes(units, latent)
+    return codes, Spread(units, codes)
+
+
+def distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
+    """(R, R) where two regions with an embedding are two things: their cosine is below `ALIKE`."""
+    exact = np.asarray(units, np.float64)
+    known = np.any(exact != 0, axis=1)
+    return (exact @ exact.T < ALIKE) & known[:, None] & known[None]
+
+
+def confused_pairs(units: Float[Array, "r e"], codes: Float[Array, "r d"], *, separation: float = SEPARATION) -> int:
+    """Pairs of distinct regions whose unit codes have a cosine of at least `separation`."""
+    exact = np.asarray(codes, np.float64)
+    return int((distinct_pairs(units) & (exact @ exact.T >= separation)).sum()) // 2
+
+
+def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
+    """The `latent` principal directions of unit rows (R, E); not centred: cosines, not distances, are to be kept."""
+    exact = np.asarray(units, np.float64)
+    _, sizes, directions = np.linalg.svd(exact, full_matrices=False)
+    rank = int(np.sum(sizes > 1e-6 * max(sizes.max(initial=0.0), 1e-300)))
+    basis = np.zeros((exact.shape[1], latent))
+    kept = directions[: min(rank, latent)].T
+    signs = np.sign(kept[np.abs(kept).argmax(0), np.arange(kept.shape[1])])  # an SVD's signs are arbitrary: fix them
+    basis[:, : kept.shape[1]] = kept * signs
+    return Rotation(jnp.asarray(basis, units.dtype))
+
+
+def spread_codes(
+    units: Float[Array, "r e"], latent: int, *, separation: float = SEPARATION, steps: int = 400
+) -> Float[Array, "r d"]:
+    """Unit codes (R, d) whose cosines are those of the regions (R, E) as far as that leaves distinct ones apart.
+
+    From the principal directions, by Adam on: the mean squared error of the cosines, centred (what all regions have in
+    common tells none from another), and the squares by which distinct pairs exceed `separation` and alike ones fall
+    short of it. Deterministic. A zero row keeps a zero code.
+    """
+    exact = np.asarray(units, np.float64)
+    known = np.any(exact != 0, axis=1)
+    centred = np.where(known[:, None], exact - exact[known].mean(0), 0.0) if known.any() else exact
+    target = np.asarray(cosine_matrix(jnp.asarray(centred, units.dtype), jnp.asarray(centred, units.dtype)))
+    start = np.zeros((len(exact), latent))
+    left, sizes, _ = np.linalg.svd(centred, full_matrices=False)
+    kept = min(latent, len(sizes))
+    start[:, :kept] = (left * sizes)[:, :kept]
+    # Equal rows, and rows of fewer directions than numbers, part by a little that depends on nothing but their place.
+    start += 1e-3 * np.random.default_rng(0).standard_normal(start.shape)
+    distinct = distinct_pairs(units)
+    alike = ~distinct & known[:, None] & known[None]
+    codes = _spread(
+        jnp.asarray(start, units.dtype),
+        jnp.asarray(target, units.dtype),
+        jnp.asarray(distinct),
+        jnp.asarray(alike),
+        separation,
+        steps,
+    )
+    return jnp.where(jnp.asarray(known)[:, None], codes, 0.0)
+
+
+@functools.partial(jax.jit, static_argnames="steps")
+def _spread(start: Array, target: Array, distinct: Array, alike: Array, separation: Array | float, steps: int) -> Array:
+    pairs = jnp.maximum(jnp.sum(distinct | alike), 1)
+
+    def loss(points):
+        codes = normalize(points)
+        cosines = codes @ codes.T
+        error = jnp.where(distinct | alike, cosines - target, 0.0)
+        too_near = jnp.where(distinct, jnp.maximum(cosines - (separation - 0.03), 0.0), 0.0)
+        too_far = jnp.where(alike, jnp.maximum(separation + 0.03 - cosines, 0.0), 0.0)
+        # A pair that is confused weighs as much as all cosines together, however many regions there are.
+        return jnp.sum(error**2) / pairs + 10.0 * jnp.sum(too_near**2 + 0.1 * too_far**2)
+
+    optimizer = optax.adam(optax.cosine_decay_schedule(0.05, steps))
+
+    def step(state, _):
+        points, moments = state
+        updates, moments = optimizer.update(jax.grad(loss)(points), moments)
+        return (optax.apply_updates(points, updates), moments), None
+
+    start = normalize(start)
+    (points, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), None, length=steps)
+    return normalize(points)
