@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap, sequential_vmap
 
-from jsecon.splat.composite import composite, composite_features_vjp, composite_vjp
+from jsecon.splat.composite import composite, composite_features_vjp
+from jsecon.splat.gradient import composite_vjp
 from jsecon.splat.project import Projection
 from jsecon.splat.tiles import TILE, TileLists, tile_lists
 from jsecon.types import Array

@@ -1,0 +1,125 @@
+"""The gradient of compositing with respect to everything, by hand.
+
+It walks front to back as the image did: with G the cotangent, dL/dalpha_i = T_i <G, f_i> - (S - S_i) / (1 - alpha_i),
+where S_i is the running sum of w <G, f> up to i and S its total, known from the image. Nothing is stored per pair.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from jsecon.numerics import MAX_ALPHA
+from jsecon.parallel import over_batches
+from jsecon.splat.batches import make_batches, to_tiles
+from jsecon.splat.tiles import TileLists
+from jsecon.splat.walk import ATTRIBUTES, make_table, pixel_centres, running, stored, walk, weights
+from jsecon.types import Array
+
+_UNROLLED = 8
+"""up to this many channels are summed in one kernel, more as a matrix product"""
+
+
+def composite_vjp(
+    splats: Float[Array, "n 6"],
+    features: Float[Array, "n d"],
+    lists: TileLists,
+    image: Float[Array, "h w d"],
+    transmittance: Float[Array, "h w"],
+    cotangent: Float[Array, "h w d"],
+    cotangent_transmittance: Float[Array, "h w"],
+    mesh: Mesh | None = None,
+) -> tuple[Array, Array]:
+    """Gradients with respect to the splats (N, 6) and the features (N, D). `image` and `transmittance` are what
+    `composite` returned.
+
+    The transmittance is 1 - sum of w, so its cotangent joins the others as minus a channel of constant feature 1.
+    """
+    height, width, channels = cotangent.shape
+    batches = make_batches(lists, width, height, shares=1 if mesh is None else mesh.size)
+    total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
+    packed = to_tiles(
+        jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1), lists.tile
+    )
+
+    x, y = (centres - lists.tile / 2 for centres in pixel_centres(lists.tile, splats.dtype))
+    # All sums over a tile's pixels are moments of one quantity, h = alpha dL/dalpha, about the tile's centre.
+    monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+    def local(share, table, lists, packed):
+        def one_batch(gradient, tiles):
+            values = packed[tiles]
+            local, along_transmittance, final = values[..., :channels], values[..., channels], values[..., channels + 1]
+            corners = batches.corners(tiles, table.dtype)
+
+            def body(transmittance, state, chunk):
+                before, gradient = state
+                weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+                slope, before = stored(
+                    chunk.always,
+                    _slopes,
+                    weight,
+                    chunk.alpha,
+                    _along(chunk.columns, local) - along_transmittance[:, None],
+                    before,
+                    final,
+                )
+                moments = jnp.einsum("bcp,pm->bcm", slope, monomials)
+                by_attribute = _attribute_gradient(moments, chunk.attributes, corners, lists.tile / 2)
+                by_feature = jnp.einsum("bcp,bpd->bcd", weight, local)
+                rows = jnp.concatenate([by_attribute, by_feature], axis=-1)
+                return transmittance, (before, gradient.at[chunk.ids].add(rows))
+
+            state = (jnp.zeros_like(final), gradient)
+            return walk(table, lists, batches, tiles, body, state)[1], None
+
+        start = jnp.zeros((splats.shape[0], ATTRIBUTES + channels), splats.dtype)
+        return lax.scan(one_batch, start, share)[0]
+
+    gradient = over_batches(local, batches.tiles, (make_table(splats, features), lists, packed), mesh, total=True)
+    return gradient[:, :ATTRIBUTES], gradient[:, ATTRIBUTES:]
+
+
+def _along(features: Array, cotangent: Array) -> Array:
+    """(BATCH, CHUNK, D), (BATCH, pixels, D) -> (BATCH, CHUNK, pixels), the sum over the channels."""
+    if features.shape[-1] > _UNROLLED:
+        return jnp.einsum("bcd,bpd->bcp", features, cotangent)
+    terms = [features[..., d, None] * cotangent[:, None, :, d] for d in range(features.shape[-1])]
+    return sum(terms[1:], terms[0])
+
+
+def _slopes(weight: Array, alpha: Array, along: Array, before: Array, final: Array) -> tuple[Array, Array]:
+    """alpha dL/dalpha of a chunk (BATCH, CHUNK, pixels), and the running sum of w <G, f> behind it (BATCH, pixels)."""
+    share = weight * along
+    until, after = running(jnp.add, before, share)
+    rest = final[:, None] - (until + share)
+    live = (weight > 0) & (alpha < MAX_ALPHA)
+    return jnp.where(live, share - rest * (alpha / (1 - alpha)), 0.0), after
+
+
+def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array, Array], half: float) -> Array:
+    """(BATCH, CHUNK, 6) gradient from the six moments of h = alpha dL/dalpha about the tile's centre."""
+    m, mx, my, mxx, mxy, myy = (moments[..., k] for k in range(6))
+    x, y, l11, l21, l22, opacity = (attributes[..., k] for k in range(6))
+    # moments about the Gaussian's centre
+    sx, sy = corners[0][:, None] + half - x, corners[1][:, None] + half - y
+    dx, dy = mx + sx * m, my + sy * m
+    dxx, dxy, dyy = (
+        mxx + 2 * sx * mx + sx * sx * m,
+        mxy + sx * my + sy * mx + sx * sy * m,
+        myy + 2 * sy * my + sy * sy * m,
+    )
+    # alpha = o exp(-(u^2 + v^2)), u = l11 dx + l21 dy, v = l22 dy
+    u = l11 * dx + l21 * dy
+    return jnp.stack(
+        [
+            2 * l11 * u,
+            2 * (l21 * u + l22 * l22 * dy),
+            -2 * (l11 * dxx + l21 * dxy),
+            -2 * (l11 * dxy + l21 * dyy),
+            -2 * l22 * dyy,
+            jnp.where(opacity > 0, m / jnp.where(opacity > 0, opacity, 1.0), 0.0),
+        ],
+        axis=-1,
+    )

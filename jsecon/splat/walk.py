@@ -1,0 +1,168 @@
+"""The walk down a batch of tiles' lists: Gaussians in chunks, front to back, until nothing is left to be seen.
+
+Arrays of a walk are (tiles, ..., pixels): a tile's pixels lie innermost and fill the vectors; what belongs to a
+Gaussian is a number that a whole row of pixels shares.
+
+What XLA's CPU backend makes of this decides the speed; all of it measured on garden (benchmarks/results.md):
+- A scan over single Gaussians starts four kernels for each and reads its slices unvectorised; a chunk at a time, the
+  recurrence written out inside one kernel, took a third of that.
+- Fusion recomputes cheap arithmetic for every reader, and a chunk's exponentials written as a polynomial are cheap to
+  it. Only a conditional whose outcome it can't know makes it store them once: `stored`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float
+
+from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from jsecon.splat.batches import Batches
+from jsecon.splat.tiles import TileLists
+from jsecon.types import Array
+
+CHUNK = 16
+"""Gaussians of each list at a time; speed only"""
+_GROUP = 4
+"""recurrences over a chunk run within and over groups of this many"""
+ATTRIBUTES = 6
+"""columns of splats (N, 6): centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see splats.py"""
+
+# 2^f on [-1/2, 1/2] to a relative error of 7.5e-8 (minimax, by iterated reweighting), highest power first.
+_EXP2 = (
+    1.3276472064403862e-3,
+    9.675541407375587e-3,
+    5.550713273907222e-2,
+    2.4022119722496582e-1,
+    6.931469670641166e-1,
+    1.000000071654955,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Chunk:
+    """CHUNK Gaussians of each tile of a batch."""
+
+    ids: Array
+    """(BATCH, CHUNK) Gaussian ids; past a list's end anything, with alpha 0."""
+    columns: Array
+    """(BATCH, CHUNK, K) the columns of the table that were asked for."""
+    attributes: Array
+    """(BATCH, CHUNK, 6) the columns of splats."""
+    alpha: Array
+    """(BATCH, CHUNK, pixels), 0 below the cut."""
+    always: Array
+    """() bool, true: for `stored`."""
+
+
+def make_table(splats: Float[Array, "n 6"], *columns: Array) -> Float[Array, "n k"]:
+    """What a walk gathers for each Gaussian: its splat, the binary logarithm of its opacity, and `columns` (N, ...)."""
+    opacity = splats[:, 5:]
+    binary = jnp.where(opacity > 0, jnp.log2(jnp.where(opacity > 0, opacity, 1.0)), -jnp.inf)
+    return jnp.concatenate([splats, binary, *columns], axis=1)
+
+
+def _exp2(e: Array) -> Array:
+    """2^e where -64 < e < 64, anything elsewhere; float64 takes the library's."""
+    if e.dtype != jnp.float32:
+        return jnp.exp2(e)
+    whole = lax.round(e, lax.RoundingMethod.TO_NEAREST_EVEN)
+    fraction = e - whole
+    power = jnp.float32(_EXP2[0])
+    for coefficient in _EXP2[1:]:
+        power = power * fraction + jnp.float32(coefficient)
+    # 1.5 * 2^23 + n holds the integer n in its low bits; added to the exponent's bits it multiplies by 2^n.
+    shift = lax.bitcast_convert_type(whole + jnp.float32(12582912.0), jnp.int32) << 23
+    return lax.bitcast_convert_type(lax.bitcast_convert_type(power, jnp.int32) + shift, jnp.float32)
+
+
+def pixel_centres(tile: int, dtype) -> tuple[Array, Array]:
+    """x and y (pixels,) of a tile's pixels from its upper left corner."""
+    local = (np.arange(tile) + 0.5).astype(dtype)
+    return np.tile(local, tile), np.repeat(local, tile)
+
+
+def _alphas(coefficients: Array, tile: int) -> Array:
+    """(BATCH, CHUNK, pixels) from l11, l21, c1, l22, c2, e (BATCH, CHUNK, 6): with x, y from the tile's corner,
+    u = l11 x + l21 y + c1, v = l22 y + c2, alpha = 2^(e - u^2 - v^2)."""
+    l11, l21, c1, l22, c2, e = (coefficients[..., i, None] for i in range(6))
+    x, y = pixel_centres(tile, coefficients.dtype)
+    u, v = l11 * x + (l21 * y + c1), l22 * y + c2
+    exponent = e - u * u - v * v
+    cut = np.log2(MIN_ALPHA).astype(exponent.dtype)
+    return jnp.where(exponent >= cut, jnp.minimum(_exp2(exponent), MAX_ALPHA), 0.0)
+
+
+def stored(always: Array, compute: Callable, *operands: Array) -> Any:
+    """`compute(*operands)`, computed once and kept in memory whatever reads it; `always` is true, unknown to the
+    compiler."""
+    shapes = jax.eval_shape(compute, *operands)
+    nothing = lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    return lax.cond(always, compute, nothing, *operands)
+
+
+def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
+    """Along the second axis of `values` (BATCH, CHUNK, pixels): `start` (BATCH, pixels) combined with all values before
+    each, and with all.
+
+    Written out in groups, so that each value is read a handful of times rather than CHUNK times by a fused kernel.
+    """
+    groups = values.reshape(values.shape[0], -1, _GROUP, values.shape[-1])
+    whole = functools.reduce(combine, [groups[:, :, k] for k in range(_GROUP)])
+    starts = [start]
+    for g in range(groups.shape[1]):
+        starts.append(combine(starts[-1], whole[:, g]))
+    before = [jnp.stack(starts[:-1], axis=1)]
+    for k in range(_GROUP - 1):
+        before.append(combine(before[-1], groups[:, :, k]))
+    return jnp.stack(before, axis=2).reshape(values.shape), starts[-1]
+
+
+def weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
+    """alpha T of a chunk (BATCH, CHUNK, pixels), and the transmittance behind it (BATCH, pixels).
+
+    The transmittance is the plain product of 1 - alpha: it only falls, so a pixel has stopped before the first
+    Gaussian that would take it to MIN_TRANSMITTANCE exactly where the product is still above.
+    """
+    before, after = running(jnp.multiply, transmittance, 1 - alpha)
+    weight = before * alpha
+    return jnp.where(before - weight > MIN_TRANSMITTANCE, weight, 0.0), after
+
+
+def walk(table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any) -> Any:
+    """Applies `transmittance, state = body(transmittance, state, chunk)` chunk by chunk down the lists of one batch of
+    `tiles` (BATCH,), until the longest has ended or every pixel has stopped; returns the last state.
+
+    transmittance (BATCH, pixels) starts at 1. `table` is `make_table`'s.
+    """
+    start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
+    corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))
+    longest = length.max()
+    scale = np.sqrt(1 / np.log(2)).astype(table.dtype)  # from natural to binary exponents
+
+    def unfinished(carry):
+        first, transmittance, _ = carry
+        return (first < longest) & (transmittance.max() > MIN_TRANSMITTANCE)
+
+    def step(carry):
+        first, transmittance, state = carry
+        index = first + lax.iota(jnp.int32, CHUNK)
+        ids = lists.gaussians[jnp.minimum(start + index, lists.gaussians.shape[0] - 1)]
+        rows = table[ids]
+        x, y = rows[..., 0] - corner_x, rows[..., 1] - corner_y
+        l11, l21, l22 = (rows[..., i] * scale for i in (2, 3, 4))
+        exponent = jnp.where(index < length, rows[..., ATTRIBUTES], -jnp.inf)
+        coefficients = jnp.stack([l11, l21, -(l11 * x + l21 * y), l22, -(l22 * y), exponent], axis=-1)
+        always = first < longest
+        alpha = stored(always, functools.partial(_alphas, tile=batches.tile), coefficients)
+        chunk = Chunk(ids, rows[..., ATTRIBUTES + 1 :], rows[..., :ATTRIBUTES], alpha, always)
+        transmittance, state = body(transmittance, state, chunk)
+        return first + CHUNK, transmittance, state
+
+    pixels = jnp.ones((tiles.shape[0], batches.tile**2), table.dtype)
+    return lax.while_loop(unfinished, step, (jnp.int32(0), pixels, state))[2]
