@@ -17,10 +17,12 @@ from jaxtyping import Int
 from jsecon.errors import require
 from jsecon.numerics import NEAR
 from jsecon.parallel import spread_over_devices
-from jsecon.splat.composite import advance, alphas, chunk, make_batches, to_tiles, walk
-from jsecon.splat.render import is_traced
+from jsecon.splat.batches import make_batches, to_tiles
+from jsecon.splat.plan import is_traced
 from jsecon.splat.splats import splats_of
+from jsecon.splat.stored import stored
 from jsecon.splat.tiles import plan_capacity
+from jsecon.splat.walk import make_table, walk, weights
 from jsecon.types import Array, Camera, Gaussians, Votes
 
 # A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
@@ -141,9 +143,9 @@ def _add_view(
     dtype = splats.dtype
     in_image = to_tiles(jnp.ones(labels.shape, dtype), lists.tile)
 
+    table = make_table(splats)
+
     def one_batch(carry, ids_of_tiles):
-        start, length = batches.starts[ids_of_tiles], batches.lengths[ids_of_tiles]
-        x, y = batches.pixels(ids_of_tiles, dtype)
         local, names, covered = tiles[ids_of_tiles], distinct[ids_of_tiles], in_image[ids_of_tiles]
         # how many slots this batch needs: empty slots are -2 or -1 (pixels without label)
         needed = (names >= 0).sum(1).max()
@@ -154,26 +156,19 @@ def _add_view(
             is_slot = jnp.where(slots[:, None, :] >= 0, local[:, :, None] == slots[:, None, :], False).astype(dtype)
             first_pass = done == 0
 
-            def body(first, inner):
-                transmittance, votes, total, peak = inner
-                ids, attributes = chunk(splats, lists, start, length, first)
-
-                def step(transmittance, item):
-                    alpha, _ = alphas(item, x, y)
-                    weight, transmittance = advance(transmittance, alpha)
-                    return transmittance, weight
-
-                transmittance, weights = lax.scan(step, transmittance, attributes)
-                weights = weights * covered[None]
-                cast = jnp.einsum("cbp,bps->cbs", weights, is_slot)
+            def body(transmittance, inner, chunk):
+                votes, total, peak = inner
+                weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+                weight = weight * covered[:, None]
+                cast = jnp.einsum("bcp,bps->bcs", weight, is_slot)
                 target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped
-                votes = votes.at[ids[:, :, None], target[None]].add(cast, mode="drop")
-                total = total.at[ids].add(jnp.where(first_pass, weights.sum(-1), 0.0))
-                peak = peak.at[ids].max(weights.max(-1))
-                return transmittance, votes, total, peak
+                votes = votes.at[chunk.ids[:, :, None], target[:, None]].add(cast, mode="drop")
+                total = total.at[chunk.ids].add(jnp.where(first_pass, weight.sum(-1), 0.0))
+                peak = peak.at[chunk.ids].max(weight.max(-1))
+                return transmittance, (votes, total, peak)
 
-            inner = walk(body, (jnp.ones_like(x), votes, total, peak), length, lambda state: state[0])
-            return done + _SLOTS, *inner[1:]
+            inner = walk(table, lists, batches, ids_of_tiles, body, (votes, total, peak))
+            return done + _SLOTS, *inner
 
         carry = lax.while_loop(lambda c: (c[0] == 0) | (c[0] < needed), one_pass, (jnp.int32(0), *carry))
         return carry[1:], None

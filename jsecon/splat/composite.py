@@ -12,8 +12,9 @@ from jaxtyping import Float
 from jsecon.numerics import MIN_TRANSMITTANCE
 from jsecon.parallel import over_batches
 from jsecon.splat.batches import make_batches, to_image, to_tiles
+from jsecon.splat.stored import stored
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import CHUNK, make_table, stored, walk, weights
+from jsecon.splat.walk import CHUNK, make_table, walk, weights
 from jsecon.types import Array
 
 # `splats` (N, 6) throughout: centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see splats.py.

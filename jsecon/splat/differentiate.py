@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap, sequential_vmap
+from jax.sharding import Mesh
 
 from jsecon.splat.composite import composite, composite_features_vjp
 from jsecon.splat.gradient import composite_vjp
@@ -28,47 +29,50 @@ def view_lists(projection: Projection, width: int, height: int, *, capacity: int
     return lists(jax.tree.map(lax.stop_gradient, projection))
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
-def splat(splats: Array, features: Array, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
+def splat(
+    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
+) -> tuple[Array, Array]:
     """Image (H, W, D) and final transmittance (H, W) of `splats` (N, 6) with `features` (N, D); see composite.py."""
-    return _forward(splats, features, lists, width, height)
+    return _forward(splats, features, lists, width, height, mesh)
 
 
-def _splat_forward(splats, features, lists, width, height):
+def _splat_forward(splats, features, lists, width, height, mesh):
     wants_geometry = splats.perturbed
     splats, features = splats.value, features.value
     lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
-    image, transmittance = _forward(splats, features, lists, width, height)
+    image, transmittance = _forward(splats, features, lists, width, height, mesh)
     saved = (features, image, transmittance) if wants_geometry else None
     return (image, transmittance), (splats, lists, saved)
 
 
-def _splat_backward(width, height, residual, cotangents):
+def _splat_backward(width, height, mesh, residual, cotangents):
     splats, lists, saved = residual
     bars = [
         jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar
         for bar in cotangents
     ]
     if saved is None:
-        return jnp.zeros_like(splats), _features_backward(splats, bars[0], lists), None
-    return *sequential_vmap(composite_vjp)(splats, saved[0], lists, saved[1], saved[2], *bars), None
+        return jnp.zeros_like(splats), _features_backward(splats, bars[0], lists, mesh), None
+    vjp = sequential_vmap(functools.partial(composite_vjp, mesh=mesh))
+    return *vjp(splats, saved[0], lists, saved[1], saved[2], *bars), None
 
 
 splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
 
 
-def _forward(splats: Array, features: Array, lists: TileLists, width: int, height: int) -> tuple[Array, Array]:
+def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array]:
     def one(splats, features, lists):
-        return composite(splats, features, lists, width, height)
+        return composite(splats, features, lists, width, height, mesh)
 
     return _merging_channels(
         one, lambda out, sets: (_unmerge(out[0], sets), jnp.broadcast_to(out[1], (sets, *out[1].shape)))
     )(splats, features, lists)
 
 
-def _features_backward(splats: Array, cotangent: Array, lists: TileLists) -> Array:
+def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: Mesh | None) -> Array:
     def one(splats, cotangent, lists):
-        return composite_features_vjp(splats, lists, cotangent)
+        return composite_features_vjp(splats, lists, cotangent, mesh)
 
     return _merging_channels(one, _unmerge)(splats, cotangent, lists)
 

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from jsecon.numerics import MAX_ALPHA
 from jsecon.parallel import over_batches
 from jsecon.splat.batches import make_batches, to_tiles
+from jsecon.splat.stored import stored
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import ATTRIBUTES, make_table, pixel_centres, running, stored, walk, weights
+from jsecon.splat.walk import ATTRIBUTES, make_table, pixel_centres, running, walk, weights
 from jsecon.types import Array
 
 _UNROLLED = 8

@@ -1,13 +1,14 @@
 """From 3D Gaussians to 2D splats: EWA projection with a determinant that does not cancel and tight, exact extents."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, normalize
+from jsecon.splat.stored import stored, surely
 from jsecon.types import Array, Camera, Gaussians, Leaf
 
 # A splat wider than this (px) is flat over any image; larger axes are shrunk to it, so that squares stay in float32.
@@ -43,16 +44,45 @@ class Projection:
         return jnp.stack([l11 * l11, l11 * l21, l21 * l21 + l22 * l22], axis=-1)
 
 
-def rotation_matrices(quaternions: Float[Array, "n 4"]) -> Float[Array, "n 3 3"]:
-    """Rotation matrices of wxyz quaternions of any length (the zero quaternion gives the identity)."""
-    unit = normalize(quaternions)
-    w, x, y, z = unit[:, 0], unit[:, 1], unit[:, 2], unit[:, 3]
-    rows = [
-        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+def _rotation(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
+    """The entries (N,) of the rotation matrices of unit quaternions, row by row; the zero quaternion turns nothing."""
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack(rows, axis=-2)
+
+
+def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tuple) -> tuple[list[Array], list[Array]]:
+    """The rows, three (N,) each, of the 2x3 matrix M = J R S whose M M^T is the 2D covariance: J is the ray's Jacobian,
+    R turns the Gaussian's axes into the camera's, S scales them."""
+    rotation = _rotation(*unit)
+    x_ratio, y_ratio, focal_x, focal_y = rays
+    row_1, row_2 = [], []
+    for axis in range(3):
+        scale = jnp.exp(jnp.minimum(log_scales[:, axis], _LARGEST_LOG_SCALE))
+        along = [sum(w2c[i, k] * rotation[k][axis] for k in range(3)) * scale for i in range(3)]
+        row_1.append(focal_x * (along[0] - x_ratio * along[2]))
+        row_2.append(focal_y * (along[1] - y_ratio * along[2]))
+    widest = functools.reduce(jnp.maximum, [jnp.abs(entry) for entry in (*row_1, *row_2)])
+    shrink = jax.lax.stop_gradient(jnp.where(widest > _WIDEST_PX, _WIDEST_PX / widest, 1.0))
+    return [entry * shrink for entry in row_1], [entry * shrink for entry in row_2]
+
+
+def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
+    """(N,) variances of x and y, blur included, and l11, l21, l22 of the inverse covariance's root."""
+    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    norm_1, norm_2 = dot(row_1, row_1), dot(row_2, row_2)
+    cov_xx, cov_xy, cov_yy = norm_1 + BLUR_PX2, dot(row_1, row_2), norm_2 + BLUR_PX2
+    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels, and the
+    # division comes first so that the product of two large variances is never formed.
+    l22 = jax.lax.rsqrt(cov_yy)
+    cross = [
+        (row_1[(i + 1) % 3] * row_2[(i + 2) % 3] - row_1[(i + 2) % 3] * row_2[(i + 1) % 3]) * l22 for i in range(3)
+    ]
+    x_given_y = dot(cross, cross) + BLUR_PX2 * (norm_1 / cov_yy + norm_2 / cov_yy + BLUR_PX2 / cov_yy)
+    l11 = jax.lax.rsqrt(x_given_y)
+    return cov_xx, cov_yy, l11, -(cov_xy / cov_yy) * l11, l22
 
 
 def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
@@ -91,16 +121,16 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     check_shapes(gaussians, camera)
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
     w2c = camera.world_to_camera
-    means, width, height = gaussians.means, camera.width, camera.height
+    width, height = camera.width, camera.height
 
-    # Written out rather than as a matrix product: exact float32 on every backend, and one fused loop.
-    x, y, z = (
-        means[:, 0] * w2c[i, 0] + means[:, 1] * w2c[i, 1] + means[:, 2] * w2c[i, 2] + w2c[i, 3] for i in range(3)
-    )
+    # A number a row, written out: exact float32 on every backend, and loops over rows that XLA makes vectors of.
+    # Matrices of 3x3 as arrays took five times as long.
+    mean_x, mean_y, mean_z = (gaussians.means[:, i] for i in range(3))
+    x, y, z = (mean_x * w2c[i, 0] + mean_y * w2c[i, 1] + mean_z * w2c[i, 2] + w2c[i, 3] for i in range(3))
     in_front = z > near
     z_safe = jnp.where(in_front, z, 1.0)
     x_ratio, y_ratio = jnp.where(in_front, x, 0.0) / z_safe, jnp.where(in_front, y, 0.0) / z_safe
-    means_px = jnp.stack([camera.fx * x_ratio + camera.cx, camera.fy * y_ratio + camera.cy], axis=-1)
+    mean_px, mean_py = camera.fx * x_ratio + camera.cx, camera.fy * y_ratio + camera.cy
 
     # Inside the Jacobian only, the ray is kept to a multiple of the field of view, on each side of the principal point.
     margin_x = (FRUSTUM_MARGIN - 1) * 0.5 * width / camera.fx
@@ -108,46 +138,30 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     x_ratio = jnp.clip(x_ratio, -camera.cx / camera.fx - margin_x, (width - camera.cx) / camera.fx + margin_x)
     y_ratio = jnp.clip(y_ratio, -camera.cy / camera.fy - margin_y, (height - camera.cy) / camera.fy + margin_y)
 
-    scales = jnp.exp(jnp.minimum(gaussians.log_scales, _LARGEST_LOG_SCALE))
-    axes = (w2c[None, :3, :3, None] * rotation_matrices(gaussians.quaternions)[:, None, :, :]).sum(2) * scales[
-        :, None, :
-    ]
-    row_1 = (camera.fx / z_safe)[:, None] * (axes[:, 0] - x_ratio[:, None] * axes[:, 2])
-    row_2 = (camera.fy / z_safe)[:, None] * (axes[:, 1] - y_ratio[:, None] * axes[:, 2])
-    widest = jnp.maximum(jnp.max(jnp.abs(row_1), axis=1), jnp.max(jnp.abs(row_2), axis=1))
-    shrink = jax.lax.stop_gradient(jnp.where(widest > _WIDEST_PX, _WIDEST_PX / widest, 1.0))[:, None]
-    row_1, row_2 = row_1 * shrink, row_2 * shrink
-
-    norm_1, norm_2 = (row_1 * row_1).sum(1), (row_2 * row_2).sum(1)
-    cov_xx, cov_xy, cov_yy = norm_1 + BLUR_PX2, (row_1 * row_2).sum(1), norm_2 + BLUR_PX2
-    cross = jnp.stack(
-        [
-            row_1[:, 1] * row_2[:, 2] - row_1[:, 2] * row_2[:, 1],
-            row_1[:, 2] * row_2[:, 0] - row_1[:, 0] * row_2[:, 2],
-            row_1[:, 0] * row_2[:, 1] - row_1[:, 1] * row_2[:, 0],
-        ],
-        -1,
-    )
-    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels, and the
-    # division comes first so that the product of two large variances is never formed.
-    cross = cross / jnp.sqrt(cov_yy)[:, None]
-    x_given_y = (
-        (cross * cross).sum(1)
-        + BLUR_PX2 * (norm_1 / cov_yy)
-        + BLUR_PX2 * (norm_2 / cov_yy)
-        + BLUR_PX2 * (BLUR_PX2 / cov_yy)
-    )
-    l11 = jax.lax.rsqrt(x_given_y)
-    whitening = jnp.stack([l11, -(cov_xy / cov_yy) * l11, jax.lax.rsqrt(cov_yy)], axis=-1)
+    # Each stage once, not once for every reader of its results: above all the gradient gains (4 times).
+    always = surely(gaussians.means[0, 0]) if gaussians.means.shape[0] else jnp.asarray(True)
+    unit = stored(always, lambda q: [normalize(q)[:, i] for i in range(4)], gaussians.quaternions)
+    rays = (x_ratio, y_ratio, camera.fx / z_safe, camera.fy / z_safe)
+    row_1, row_2 = stored(always, _covariance_root, w2c, unit, gaussians.log_scales, rays)
+    cov_xx, cov_yy, l11, l21, l22 = stored(always, _whitening, row_1, row_2)
 
     opacities = jax.nn.sigmoid(gaussians.opacity_logits)
-    reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))[:, None]
-    extents = jax.lax.stop_gradient(reach * jnp.sqrt(jnp.stack([cov_xx, cov_yy], axis=-1)))
-    extents = extents * (1 + 1e-5) + 1e-3  # covers the rounding of the box against that of the exponent
-    centres = jax.lax.stop_gradient(means_px)
-    touching = ((centres + extents > 0) & (centres - extents < jnp.asarray([[width, height]], centres.dtype))).all(1)
-    numbers = jnp.concatenate(
-        [centres, extents, jax.lax.stop_gradient(whitening), z[:, None], opacities[:, None]], axis=1
+    reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))
+    # widened to cover the rounding of the box against that of the exponent
+    extent_x, extent_y = (
+        jax.lax.stop_gradient(reach * jnp.sqrt(variance)) * (1 + 1e-5) + 1e-3 for variance in (cov_xx, cov_yy)
     )
-    visible = in_front & (opacities >= MIN_ALPHA) & touching & jnp.isfinite(numbers).all(1)
-    return Projection(means_px, whitening, opacities, z, extents, visible)
+    centre_x, centre_y = jax.lax.stop_gradient((mean_px, mean_py))
+    touching = (centre_x + extent_x > 0) & (centre_x - extent_x < width)
+    touching &= (centre_y + extent_y > 0) & (centre_y - extent_y < height)
+    visible = in_front & (opacities >= MIN_ALPHA) & touching
+    for number in jax.lax.stop_gradient((centre_x, centre_y, extent_x, extent_y, l11, l21, l22, z, opacities)):
+        visible &= jnp.isfinite(number)
+    return Projection(
+        jnp.stack([mean_px, mean_py], axis=-1),
+        jnp.stack([l11, l21, l22], axis=-1),
+        opacities,
+        z,
+        jnp.stack([extent_x, extent_y], axis=-1),
+        visible,
+    )

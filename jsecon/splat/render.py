@@ -2,34 +2,15 @@
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR
-from jsecon.splat.differentiate import splat
+from jsecon.splat.plan import default_capacity, is_traced as is_traced, plan_view, render_plan
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.sh import colours_from_sh
-from jsecon.splat.splats import splats_of
-from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Rendering
-
-
-def is_traced(tree) -> bool:
-    """Whether any leaf of `tree` is being traced (jit, grad, vmap)."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
-
-
-def default_capacity(gaussians: Gaussians, camera: Camera) -> int:
-    """(tile, Gaussian) pairs to allow for: planned from the data; under a trace, where there is none, it must be
-    given."""
-    require(
-        not is_traced((gaussians, camera)),
-        "capacity",
-        got=None,
-        expected="a static int inside jit, grad or vmap",
-        remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras), and check Rendering.overflow == 0.",
-    )
-    return plan_capacity(gaussians, camera, margin=1.0)
 
 
 def render(
@@ -40,13 +21,18 @@ def render(
     background: Array | None = None,
     capacity: int | None = None,
     near: float = NEAR,
+    mesh: Mesh | None = None,
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) into one view: sum over the depth-sorted Gaussians of alpha T f.
 
     Exact by definition (DESIGN section 5): equal to the brute-force sum over all Gaussians, whatever the tiling.
     Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. Outside a trace the
     capacity is planned from the data; inside one pass the static `capacity` (see `plan_capacity`): pairs that do not
-    fit are counted in `.overflow`, never dropped unsaid.
+    fit are counted in `.overflow`, never dropped unsaid. With frozen geometry, `plan_view` once and `render_plan`.
+
+    `mesh` (`jsecon.parallel.host_mesh()`) spreads the tiles over several devices of this process, in value and
+    gradient: a program that sets XLA_FLAGS=--xla_force_host_platform_device_count=2 before jax starts has both cores
+    of a CPU that way. Without it, one device.
 
     `background` (D,) is added with weight 1 - alpha. Raises ValueError on shapes that disagree.
     """
@@ -60,11 +46,11 @@ def render(
     )
     if capacity is None:
         capacity = default_capacity(gaussians, camera)
-        return _render_compiled(gaussians, camera, features, background, capacity, near)
-    return _render(gaussians, camera, features, background, capacity, near)
+        return _render_compiled(gaussians, camera, features, background, capacity, near, mesh)
+    return _render(gaussians, camera, features, background, capacity, near, mesh)
 
 
-def _render(gaussians, camera, features, background, capacity, near) -> Rendering:
+def _render(gaussians, camera, features, background, capacity, near, mesh) -> Rendering:
     gaussians, camera, features = jax.tree.map(jnp.asarray, (gaussians, camera, features))
     if gaussians.means.shape[0] == 0:
         image, alpha = (
@@ -73,14 +59,11 @@ def _render(gaussians, camera, features, background, capacity, near) -> Renderin
         )
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0))
-    splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
-    image, transmittance = splat(splats, features.astype(splats.dtype), lists, camera.width, camera.height)
-    if background is not None:
-        image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
-    return Rendering(image, 1 - transmittance, lists.overflow)
+    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+    return render_plan(plan, features, background=background, mesh=mesh)
 
 
-_render_compiled = jax.jit(_render, static_argnums=(4, 5))
+_render_compiled = jax.jit(_render, static_argnums=(4, 6))
 
 
 def render_rgb(
@@ -90,20 +73,21 @@ def render_rgb(
     background: Array | None = None,
     capacity: int | None = None,
     near: float = NEAR,
+    mesh: Mesh | None = None,
 ) -> Rendering:
     """Renders colour from spherical harmonics: features (H, W, 3), not clamped above 1. See `render`."""
     check_shapes(gaussians, camera)
     if capacity is None:
         capacity = default_capacity(gaussians, camera)
-        return _render_rgb_compiled(gaussians, camera, background, capacity, near)
-    return _render_rgb(gaussians, camera, background, capacity, near)
+        return _render_rgb_compiled(gaussians, camera, background, capacity, near, mesh)
+    return _render_rgb(gaussians, camera, background, capacity, near, mesh)
 
 
-def _render_rgb(gaussians, camera, background, capacity, near):
-    return _render(gaussians, camera, colours_from_sh(gaussians, camera), background, capacity, near)
+def _render_rgb(gaussians, camera, background, capacity, near, mesh):
+    return _render(gaussians, camera, colours_from_sh(gaussians, camera), background, capacity, near, mesh)
 
 
-_render_rgb_compiled = jax.jit(_render_rgb, static_argnums=(3, 4))
+_render_rgb_compiled = jax.jit(_render_rgb, static_argnums=(3, 5))
 
 
 def render_depth(

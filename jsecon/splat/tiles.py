@@ -8,6 +8,7 @@ the ellipses leave a fifth fewer pairs than boxes.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.splat.project import Projection, project
+from jsecon.splat.stored import stored
 from jsecon.types import Array, Camera, Gaussians, Leaf
 
 TILE = 8
@@ -150,7 +152,10 @@ def tile_lists(projection: Projection, width: int, height: int, *, capacity: int
     depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), nowhere))
     blocks, owner = _sorted_pairs(blocks, owner, depths, number)
 
-    reached = jnp.where(blocks < number, _reached_tiles(projection, owner, blocks, across, tile), jnp.uint32(0))
+    always = ends[-1] >= 0
+    reach = functools.partial(_reached_tiles, across=across, number=number, tile=tile)
+    ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
+    reached = stored(always, reach, lax.stop_gradient(jnp.concatenate(ellipses, axis=1)), owner, blocks)
     # For each word of 32 pairs and each tile of the block: which of the 32 reach it, and how many pairs before the
     # word do, counted tile position after tile position, so that the lists follow one another without gaps.
     words = reached.reshape(-1, _WORD)
@@ -187,16 +192,15 @@ def tile_lists(projection: Projection, width: int, height: int, *, capacity: int
     )
 
 
-def _reached_tiles(projection: Projection, owner: Array, blocks: Array, across: int, tile: int) -> Array:
-    """(pairs,) uint32: bit (row * BLOCK + column) is set where the ellipse alpha >= 1/255 reaches a pixel centre's
-    bounding rectangle of that tile.
+def _reached_tiles(ellipses: Array, owner: Array, blocks: Array, *, across: int, number: int, tile: int) -> Array:
+    """(pairs,) uint32: bit (row * BLOCK + column) is set where the ellipse alpha >= 1/255 reaches the rectangle between
+    that tile's pixel centres; 0 for the block `number`. `ellipses` (N, 6) are centre, whitening and opacity.
 
     Exact up to a slack that only adds tiles: within a row of tiles the ellipse is convex, so the interval of x that it
     covers ends where its rim is widest, or at the row's edge if that lies beyond. Comparisons are written so that a NaN
     counts as reached.
     """
-    columns = [projection.means_px, projection.whitening, projection.opacities[:, None]]
-    x, y, l11, l21, l22, opacity = jnp.moveaxis(lax.stop_gradient(jnp.concatenate(columns, axis=1))[owner], 1, 0)
+    x, y, l11, l21, l22, opacity = jnp.moveaxis(ellipses[owner], 1, 0)
     radius2 = 2 * jnp.log(jnp.maximum(opacity * 255, 1.0)) * (1 + 1e-4) + 1e-4
     radius, slope = jnp.sqrt(radius2), l21 / l11
     highest = radius / l22
@@ -218,7 +222,7 @@ def _reached_tiles(projection: Projection, owner: Array, blocks: Array, across: 
                 left + (column * tile + 0.5) - slack > rims[1]
             )
             bits |= jnp.where(missed | beside, jnp.uint32(0), jnp.uint32(1 << (row * BLOCK + column)))
-    return bits
+    return jnp.where(blocks < number, bits, jnp.uint32(0))
 
 
 def _saturating_cumsum(areas: Array) -> Array:

@@ -15,7 +15,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -23,6 +22,7 @@ from jaxtyping import Float
 
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.batches import Batches
+from jsecon.splat.stored import stored
 from jsecon.splat.tiles import TileLists
 from jsecon.types import Array
 
@@ -96,14 +96,6 @@ def _alphas(coefficients: Array, tile: int) -> Array:
     exponent = e - u * u - v * v
     cut = np.log2(MIN_ALPHA).astype(exponent.dtype)
     return jnp.where(exponent >= cut, jnp.minimum(_exp2(exponent), MAX_ALPHA), 0.0)
-
-
-def stored(always: Array, compute: Callable, *operands: Array) -> Any:
-    """`compute(*operands)`, computed once and kept in memory whatever reads it; `always` is true, unknown to the
-    compiler."""
-    shapes = jax.eval_shape(compute, *operands)
-    nothing = lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
-    return lax.cond(always, compute, nothing, *operands)
 
 
 def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:

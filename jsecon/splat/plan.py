@@ -1,0 +1,103 @@
+"""A view's plan: what repeated renders of frozen geometry share, so that they skip projection and sorting."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from jsecon.errors import require
+from jsecon.numerics import NEAR
+from jsecon.splat.differentiate import splat
+from jsecon.splat.project import check_shapes
+from jsecon.splat.splats import splats_of
+from jsecon.splat.tiles import TileLists, plan_capacity
+from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ViewPlan:
+    """The splats and tile lists of one view: a pytree, so it passes through jit and is stacked by vmap."""
+
+    splats: Leaf
+    """(N, 6) centre x, y (px), whitening l11, l21, l22 (1/px, times sqrt(1/2)), opacity; zero where invisible."""
+    lists: TileLists
+    """which Gaussians reach which tile, front to back."""
+    width: int = dataclasses.field(metadata={"static": True})
+    """px."""
+    height: int = dataclasses.field(metadata={"static": True})
+    """px."""
+
+    @property
+    def overflow(self) -> Array:
+        """() int32 pairs that did not fit the capacity; 0 means that renders of the plan are exact."""
+        return self.lists.overflow
+
+
+def is_traced(tree) -> bool:
+    """Whether any leaf of `tree` is being traced (jit, grad, vmap)."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def default_capacity(gaussians: Gaussians, camera: Camera) -> int:
+    """(block, Gaussian) pairs to allow for: planned from the data; under a trace, where there is none, it must be
+    given."""
+    require(
+        not is_traced((gaussians, camera)),
+        "capacity",
+        got=None,
+        expected="a static int inside jit, grad or vmap",
+        remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras), and check Rendering.overflow == 0.",
+    )
+    return plan_capacity(gaussians, camera, margin=1.0)
+
+
+def plan_view(
+    gaussians: Gaussians, camera: Camera, *, capacity: int | None = None, near: float | Array = NEAR
+) -> ViewPlan:
+    """Projects and lists one view once, for any number of `render_plan(plan, features)`.
+
+    Differentiable like `render`; where only features are to be differentiated, make the plan outside of what is, and
+    no gradient of the geometry is computed. `capacity` as for `render`. Raises ValueError on shapes that disagree.
+    """
+    check_shapes(gaussians, camera)
+    if capacity is None:
+        return _plan_compiled(gaussians, camera, default_capacity(gaussians, camera), near)
+    return _plan(gaussians, camera, capacity, near)
+
+
+def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array) -> ViewPlan:
+    gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
+    splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
+    return ViewPlan(splats, lists, camera.width, camera.height)
+
+
+_plan_compiled = jax.jit(_plan, static_argnums=(2,))
+
+
+def render_plan(
+    plan: ViewPlan,
+    features: Float[Array, "n d"],
+    *,
+    background: Array | None = None,
+    mesh: Mesh | None = None,
+) -> Rendering:
+    """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
+
+    Differentiable, under jit, grad and vmap; `background` and `mesh` as for `render`. Raises ValueError on shapes that
+    disagree.
+    """
+    require(
+        features.ndim == 2 and features.shape[0] == plan.splats.shape[0],
+        "features",
+        got=features.shape,
+        expected=f"({plan.splats.shape[0]}, D)",
+        remedy="Give one row of features a Gaussian.",
+    )
+    features = jnp.asarray(features, plan.splats.dtype)
+    image, transmittance = splat(plan.splats, features, plan.lists, plan.width, plan.height, mesh)
+    if background is not None:
+        image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
+    return Rendering(image, 1 - transmittance, plan.overflow)
