@@ -111,7 +111,7 @@ def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
     )
 
 
-def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Projection:
+def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR) -> Projection:
     """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023; conventions in DESIGN section
     5).
 

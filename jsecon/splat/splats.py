@@ -11,7 +11,9 @@ from jsecon.splat.tiles import TileLists
 from jsecon.types import Array, Camera, Gaussians
 
 
-def splats_of(gaussians: Gaussians, camera: Camera, *, capacity: int, near: float = NEAR) -> tuple[Array, TileLists]:
+def splats_of(
+    gaussians: Gaussians, camera: Camera, *, capacity: int, near: float | Array = NEAR
+) -> tuple[Array, TileLists]:
     """(N, 6) attributes as `composite.Splats` holds them, and the tile lists of one view."""
     projection = project(gaussians, camera, near=near)
     lists = view_lists(projection, camera.width, camera.height, capacity=capacity)
