@@ -64,8 +64,9 @@ def plan_view(
     """
     check_shapes(gaussians, camera)
     if capacity is None:
-        return _plan_compiled(gaussians, camera, default_capacity(gaussians, camera), near)
-    return _plan(gaussians, camera, capacity, near)
+        capacity = default_capacity(gaussians, camera)
+    run = _plan if is_traced((gaussians, camera, near)) else _plan_compiled
+    return run(gaussians, camera, capacity, near)
 
 
 def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array) -> ViewPlan:
@@ -96,8 +97,16 @@ def render_plan(
         expected=f"({plan.splats.shape[0]}, D)",
         remedy="Give one row of features a Gaussian.",
     )
+    run = _render_plan if is_traced((plan, features, background)) else _render_plan_compiled
+    return run(plan, features, background, mesh)
+
+
+def _render_plan(plan: ViewPlan, features: Array, background: Array | None, mesh: Mesh | None) -> Rendering:
     features = jnp.asarray(features, plan.splats.dtype)
     image, transmittance = splat(plan.splats, features, plan.lists, plan.width, plan.height, mesh)
     if background is not None:
         image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
     return Rendering(image, 1 - transmittance, plan.overflow)
+
+
+_render_plan_compiled = jax.jit(_render_plan, static_argnums=(3,))

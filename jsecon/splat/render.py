@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR
-from jsecon.splat.plan import default_capacity, is_traced as is_traced, plan_view, render_plan
+from jsecon.splat.plan import default_capacity, is_traced, plan_view, render_plan
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
@@ -46,8 +46,8 @@ def render(
     )
     if capacity is None:
         capacity = default_capacity(gaussians, camera)
-        return _render_compiled(gaussians, camera, features, background, capacity, near, mesh)
-    return _render(gaussians, camera, features, background, capacity, near, mesh)
+    run = _render if is_traced((gaussians, camera, features, background, near)) else _render_compiled
+    return run(gaussians, camera, features, background, capacity, near, mesh)
 
 
 def _render(gaussians, camera, features, background, capacity, near, mesh) -> Rendering:
@@ -79,8 +79,8 @@ def render_rgb(
     check_shapes(gaussians, camera)
     if capacity is None:
         capacity = default_capacity(gaussians, camera)
-        return _render_rgb_compiled(gaussians, camera, background, capacity, near, mesh)
-    return _render_rgb(gaussians, camera, background, capacity, near, mesh)
+    run = _render_rgb if is_traced((gaussians, camera, background, near)) else _render_rgb_compiled
+    return run(gaussians, camera, background, capacity, near, mesh)
 
 
 def _render_rgb(gaussians, camera, background, capacity, near, mesh):

@@ -1,0 +1,103 @@
+"""Plans of frozen geometry, and one view spread over several devices: the same image and the same gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.parallel import host_mesh
+from jsecon.splat.plan import plan_view, render_plan
+from jsecon.splat.render import render
+from jsecon.splat.walk import _exp2, running
+
+CAPACITY = 1024
+
+
+def features_of(count: int, channels: int) -> jax.Array:
+    return jnp.asarray(np.random.default_rng(2).normal(size=(count, channels)), jnp.float32)
+
+
+@pytest.mark.parametrize("channels", [3, 16])
+def test_a_planned_render_is_a_render(scene, camera, channels):
+    features, background = features_of(scene.count, channels), jnp.arange(channels, dtype=jnp.float32)
+    plan = plan_view(scene, camera)
+    got, expected = render_plan(plan, features, background=background), render(scene, camera, features)
+    assert int(plan.overflow) == 0
+    left = (1 - expected.alpha)[..., None] * background
+    np.testing.assert_allclose(got.features, expected.features + left, atol=2e-6 * channels)
+    np.testing.assert_allclose(got.alpha, expected.alpha, atol=1e-6)
+
+    loss = lambda features, draw: (draw(features).features ** 2).sum()
+    by_plan = jax.jit(jax.grad(lambda f: loss(f, lambda f: render_plan(plan, f))))(features)
+    whole = jax.jit(jax.grad(lambda f: loss(f, lambda f: render(scene, camera, f, capacity=CAPACITY))))(features)
+    np.testing.assert_allclose(by_plan, whole, rtol=1e-4, atol=1e-4)
+
+
+def test_plans_are_stacked_and_differentiated_through(scene, cameras):
+    features = features_of(scene.count, 3)
+    plans = jax.jit(jax.vmap(lambda camera: plan_view(scene, camera, capacity=CAPACITY)))(cameras)
+    images = jax.jit(jax.vmap(lambda plan: render_plan(plan, features).features))(plans)
+    for t in range(4):
+        np.testing.assert_allclose(images[t], render(scene, cameras[t], features).features, atol=1e-5)
+
+    def through_plan(gaussians):
+        return (render_plan(plan_view(gaussians, cameras[0], capacity=CAPACITY), features).features ** 2).sum()
+
+    def directly(gaussians):
+        return (render(gaussians, cameras[0], features, capacity=CAPACITY).features ** 2).sum()
+
+    got, expected = jax.jit(jax.grad(through_plan))(scene), jax.jit(jax.grad(directly))(scene)
+    np.testing.assert_allclose(got.means, expected.means, rtol=1e-4, atol=1e-5)
+
+
+def test_a_plan_says_what_it_lacks(scene, camera):
+    with pytest.raises(ValueError, match="capacity"):
+        jax.jit(lambda g: plan_view(g, camera))(scene)
+    with pytest.raises(ValueError, match="one row"):
+        render_plan(plan_view(scene, camera), features_of(scene.count + 1, 3))
+    assert int(plan_view(scene, camera, capacity=32).overflow) > 0
+
+
+@pytest.mark.parametrize("channels", [3, 16])
+def test_several_devices_give_what_one_gives(scene, camera, channels):
+    mesh = host_mesh()
+    assert mesh is not None
+    assert mesh.size == 2
+    features = features_of(scene.count, channels)
+
+    def value_and_gradient(mesh):
+        def loss(gaussians, features):
+            rendering = render(gaussians, camera, features, capacity=CAPACITY, mesh=mesh)
+            return (rendering.features**2).sum() + rendering.alpha.sum(), rendering
+
+        return jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))(scene, features)
+
+    (_, one), gradient_one = value_and_gradient(None)
+    (_, two), gradient_two = value_and_gradient(mesh)
+    np.testing.assert_array_equal(one.features, two.features)
+    np.testing.assert_array_equal(one.alpha, two.alpha)
+    for a, b in zip(jax.tree.leaves(gradient_one), jax.tree.leaves(gradient_two), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+    alone = lambda mesh: jax.jit(
+        jax.grad(lambda f: (render(scene, camera, f, capacity=CAPACITY, mesh=mesh).features ** 2).sum())
+    )(features)
+    np.testing.assert_allclose(alone(None), alone(mesh), rtol=1e-4, atol=1e-4)
+    # outside jit too, and mixed with arrays of one device afterwards
+    image = render(scene, camera, features, mesh=mesh).features
+    assert float(jnp.abs(image - one.features).max()) < 1e-5
+
+
+def test_powers_of_two_over_their_range():
+    exponents = np.linspace(-9, 1, 100_001, dtype=np.float32)
+    np.testing.assert_allclose(jax.jit(_exp2)(exponents), np.exp2(exponents.astype(np.float64)), rtol=3e-7)
+
+
+def test_running_products_and_sums():
+    values = np.random.default_rng(0).uniform(0.5, 1.5, (3, 16, 5)).astype(np.float32)
+    start = np.float32([[1.0], [2.0], [3.0]]) * np.ones(5, np.float32)
+    for combine, cumulate in ((jnp.multiply, np.cumprod), (jnp.add, np.cumsum)):
+        before, after = running(combine, jnp.asarray(start), jnp.asarray(values))
+        expected = cumulate(np.concatenate([start[:, None], values], axis=1).astype(np.float64), axis=1)
+        np.testing.assert_allclose(before, expected[:, :-1], rtol=1e-5)
+        np.testing.assert_allclose(after, expected[:, -1], rtol=1e-5)
