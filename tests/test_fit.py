@@ -131,7 +131,7 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitte
     asked = []
 
     def narrow(gaussians, cameras, *, margin):
-        return 64
+        return 32
 
     inner = optimise._step
 
@@ -142,8 +142,8 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitte
     monkeypatch.setattr(optimise, "plan_capacity", narrow)
     monkeypatch.setattr(optimise, "_step", counted)
     gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10)
-    assert asked[0] == 64
-    assert asked[-1] > 64
+    assert asked[0] == 32
+    assert asked[-1] > 32
     assert asked.count(asked[-1]) == 20
     assert np.isfinite(losses).all()
     # The schedule of the positions depends on the number of steps, so the twin is a fit of 20 steps with room enough.
