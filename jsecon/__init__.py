@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jsecon.language.masklets import masklets as masklets
     from jsecon.language.regions import region_embeddings as region_embeddings
     from jsecon.language.votes import region_votes as region_votes
+    from jsecon.parallel import host_mesh as host_mesh
     from jsecon.query.anchored import (
         query_anchored as query_anchored,
         query_region as query_region,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from jsecon.query.masks import selection_mask as selection_mask
     from jsecon.query.one_step import query_one_step as query_one_step
     from jsecon.query.outliers import remove_outliers as remove_outliers
+    from jsecon.splat.plan import plan_view as plan_view, render_plan as render_plan
     from jsecon.splat.project import project as project
     from jsecon.splat.render import render as render, render_depth as render_depth, render_rgb as render_rgb
     from jsecon.splat.tiles import plan_capacity as plan_capacity
@@ -61,11 +63,13 @@ _CONTENTS = {
     "jsecon.language.masklets": ("masklets",),
     "jsecon.language.regions": ("region_embeddings",),
     "jsecon.language.votes": ("region_votes",),
+    "jsecon.parallel": ("host_mesh",),
     "jsecon.query.anchored": ("query_anchored", "query_region", "region_at"),
     "jsecon.query.canonical": ("query_canonical",),
     "jsecon.query.masks": ("selection_mask",),
     "jsecon.query.one_step": ("query_one_step",),
     "jsecon.query.outliers": ("remove_outliers",),
+    "jsecon.splat.plan": ("plan_view", "render_plan"),
     "jsecon.splat.project": ("project",),
     "jsecon.splat.render": ("render", "render_depth", "render_rgb"),
     "jsecon.splat.tiles": ("plan_capacity",),
