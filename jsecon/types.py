@@ -113,7 +113,9 @@ class Rendering:
     alpha: Array
     """(H, W) sum of alpha T, in [0, 1); 0 on pixels that no Gaussian covers."""
     overflow: Array
-    """() int32: (tile, Gaussian) pairs that did not fit the capacity and were left out; 0 means the image is exact."""
+    """() int32: pairs that did not fit the capacity and were left out; 0 means the image is exact."""
+    depth: Array | None = None
+    """(H, W) expected z-depth, world units, 0 where nothing is covered; or None where it was not asked for."""
 
 
 @_record

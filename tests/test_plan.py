@@ -7,7 +7,8 @@ import pytest
 
 from jsecon.parallel import host_mesh
 from jsecon.splat.plan import plan_view, render_plan
-from jsecon.splat.render import render
+from jsecon.splat.reference import project_reference, weights_reference
+from jsecon.splat.render import render, render_depth
 from jsecon.splat.walk import _exp2, running
 
 CAPACITY = 1024
@@ -101,3 +102,16 @@ def test_running_products_and_sums():
         expected = cumulate(np.concatenate([start[:, None], values], axis=1).astype(np.float64), axis=1)
         np.testing.assert_allclose(before, expected[:, :-1], rtol=1e-5)
         np.testing.assert_allclose(after, expected[:, -1], rtol=1e-5)
+
+
+def test_depth_in_the_same_pass_is_the_depth_of_its_own(scene, camera):
+    features = features_of(scene.count, 3)
+    together = render(scene, camera, features, depth=True)
+    depth, alpha = render_depth(scene, camera)
+    np.testing.assert_allclose(together.depth, depth, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(together.alpha, alpha, atol=1e-6)
+    np.testing.assert_allclose(together.features, render(scene, camera, features).features, atol=1e-5)
+    weights = weights_reference(scene, camera)
+    expected = weights @ project_reference(scene, camera)["depths"] / np.maximum(weights.sum(-1), 1e-12)
+    assert np.mean(np.abs(depth - expected) > 1e-4) < 0.02
+    assert render(scene, camera, features).depth is None

@@ -18,8 +18,7 @@ from jsecon.errors import require
 from jsecon.numerics import NEAR
 from jsecon.parallel import spread_over_devices
 from jsecon.splat.batches import make_batches, to_tiles
-from jsecon.splat.plan import is_traced
-from jsecon.splat.splats import splats_of
+from jsecon.splat.plan import is_traced, plan_view
 from jsecon.splat.stored import stored
 from jsecon.splat.tiles import plan_capacity
 from jsecon.splat.walk import make_table, walk, weights
@@ -136,7 +135,8 @@ def _add_view(
     state: dict[str, Array], gaussians: Gaussians, camera: Camera, labels: Array, *, capacity: int, near: float
 ) -> dict[str, Array]:
     """Adds one view's votes to the dense accumulators."""
-    splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
+    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+    splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, camera.width, camera.height)
     tiles = to_tiles(labels + 1, lists.tile) - 1
     distinct = _distinct(tiles)

@@ -17,7 +17,7 @@ from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import CHUNK, make_table, walk, weights
 from jsecon.types import Array
 
-# `splats` (N, 6) throughout: centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see splats.py.
+# `splats` (N, 6) throughout: centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity.
 
 WIDE = 6
 """from this many channels on, a chunk's weights are computed once and kept; below, anew for each channel"""

@@ -1,6 +1,7 @@
 """A view's plan: what repeated renders of frozen geometry share, so that they skip projection and sorting."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,8 @@ from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR
-from jsecon.splat.differentiate import splat
-from jsecon.splat.project import check_shapes
-from jsecon.splat.splats import splats_of
+from jsecon.splat.differentiate import splat, view_lists
+from jsecon.splat.project import check_shapes, project
 from jsecon.splat.tiles import TileLists, plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering
 
@@ -23,6 +23,8 @@ class ViewPlan:
 
     splats: Leaf
     """(N, 6) centre x, y (px), whitening l11, l21, l22 (1/px, times sqrt(1/2)), opacity; zero where invisible."""
+    depths: Leaf
+    """(N,) z in the camera, world units; zero where invisible."""
     lists: TileLists
     """which Gaussians reach which tile, front to back."""
     width: int = dataclasses.field(metadata={"static": True})
@@ -71,8 +73,13 @@ def plan_view(
 
 def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array) -> ViewPlan:
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
-    return ViewPlan(splats, lists, camera.width, camera.height)
+    projection = project(gaussians, camera, near=near)
+    lists = view_lists(projection, camera.width, camera.height, capacity=capacity)
+    columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
+    # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
+    splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
+    depths = jnp.where(projection.visible, projection.depths, 0.0)
+    return ViewPlan(splats, depths, lists, camera.width, camera.height)
 
 
 _plan_compiled = jax.jit(_plan, static_argnums=(2,))
@@ -83,12 +90,13 @@ def render_plan(
     features: Float[Array, "n d"],
     *,
     background: Array | None = None,
+    depth: bool = False,
     mesh: Mesh | None = None,
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
 
-    Differentiable, under jit, grad and vmap; `background` and `mesh` as for `render`. Raises ValueError on shapes that
-    disagree.
+    Differentiable, under jit, grad and vmap; `background`, `depth` and `mesh` as for `render`. Raises ValueError on
+    shapes that disagree.
     """
     require(
         features.ndim == 2 and features.shape[0] == plan.splats.shape[0],
@@ -98,15 +106,21 @@ def render_plan(
         remedy="Give one row of features a Gaussian.",
     )
     run = _render_plan if is_traced((plan, features, background)) else _render_plan_compiled
-    return run(plan, features, background, mesh)
+    return run(plan, features, background, depth, mesh)
 
 
-def _render_plan(plan: ViewPlan, features: Array, background: Array | None, mesh: Mesh | None) -> Rendering:
+def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool, mesh: Mesh | None):
     features = jnp.asarray(features, plan.splats.dtype)
-    image, transmittance = splat(plan.splats, features, plan.lists, plan.width, plan.height, mesh)
+    columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
+    image, transmittance = splat(plan.splats, columns, plan.lists, plan.width, plan.height, mesh)
+    alpha, expected = 1 - transmittance, None
+    if depth:
+        covered = alpha > 0
+        expected = jnp.where(covered, image[..., -1] / jnp.where(covered, alpha, 1.0), 0.0)
+        image = image[..., :-1]
     if background is not None:
         image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
-    return Rendering(image, 1 - transmittance, plan.overflow)
+    return Rendering(image, alpha, plan.overflow, expected)
 
 
-_render_plan_compiled = jax.jit(_render_plan, static_argnums=(3,))
+_render_plan_compiled = jax.jit(_render_plan, static_argnums=(3, 4))

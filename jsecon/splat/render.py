@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jsecon.errors import require
 from jsecon.numerics import NEAR
 from jsecon.splat.plan import default_capacity, is_traced, plan_view, render_plan
-from jsecon.splat.project import check_shapes, project
+from jsecon.splat.project import check_shapes
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
@@ -21,6 +21,7 @@ def render(
     background: Array | None = None,
     capacity: int | None = None,
     near: float = NEAR,
+    depth: bool = False,
     mesh: Mesh | None = None,
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) into one view: sum over the depth-sorted Gaussians of alpha T f.
@@ -34,7 +35,8 @@ def render(
     gradient: a program that sets XLA_FLAGS=--xla_force_host_platform_device_count=2 before jax starts has both cores
     of a CPU that way. Without it, one device.
 
-    `background` (D,) is added with weight 1 - alpha. Raises ValueError on shapes that disagree.
+    `background` (D,) is added with weight 1 - alpha. With `depth` the same pass also gives `.depth`, the expected
+    z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
     """
     check_shapes(gaussians, camera)
     require(
@@ -47,10 +49,10 @@ def render(
     if capacity is None:
         capacity = default_capacity(gaussians, camera)
     run = _render if is_traced((gaussians, camera, features, background, near)) else _render_compiled
-    return run(gaussians, camera, features, background, capacity, near, mesh)
+    return run(gaussians, camera, features, background, capacity, near, depth, mesh)
 
 
-def _render(gaussians, camera, features, background, capacity, near, mesh) -> Rendering:
+def _render(gaussians, camera, features, background, capacity, near, depth, mesh) -> Rendering:
     gaussians, camera, features = jax.tree.map(jnp.asarray, (gaussians, camera, features))
     if gaussians.means.shape[0] == 0:
         image, alpha = (
@@ -58,12 +60,12 @@ def _render(gaussians, camera, features, background, capacity, near, mesh) -> Re
             for rest in ((features.shape[1],), ())
         )
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
-        return Rendering(image, alpha, jnp.int32(0))
+        return Rendering(image, alpha, jnp.int32(0), alpha if depth else None)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-    return render_plan(plan, features, background=background, mesh=mesh)
+    return render_plan(plan, features, background=background, depth=depth, mesh=mesh)
 
 
-_render_compiled = jax.jit(_render, static_argnums=(4, 6))
+_render_compiled = jax.jit(_render, static_argnums=(4, 6, 7))
 
 
 def render_rgb(
@@ -84,7 +86,7 @@ def render_rgb(
 
 
 def _render_rgb(gaussians, camera, background, capacity, near, mesh):
-    return _render(gaussians, camera, colours_from_sh(gaussians, camera), background, capacity, near, mesh)
+    return _render(gaussians, camera, colours_from_sh(gaussians, camera), background, capacity, near, False, mesh)
 
 
 _render_rgb_compiled = jax.jit(_render_rgb, static_argnums=(3, 5))
@@ -94,10 +96,7 @@ def render_depth(
     gaussians: Gaussians, camera: Camera, *, capacity: int | None = None, near: float = NEAR
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Expected z-depth (H, W) = sum(w z) / sum(w), world units, 0 where nothing is covered; and alpha (H, W)."""
-    depths = project(gaussians, camera, near=near).depths
-    depths = jnp.where(jnp.isfinite(depths), depths, 0.0)
-    rendering = render(gaussians, camera, depths[:, None], capacity=capacity, near=near)
-    covered = rendering.alpha > 0
-    return jnp.where(
-        covered, rendering.features[..., 0] / jnp.where(covered, rendering.alpha, 1.0), 0.0
-    ), rendering.alpha
+    nothing = jnp.zeros((gaussians.means.shape[0], 0), jnp.asarray(gaussians.means).dtype)
+    rendering = render(gaussians, camera, nothing, capacity=capacity, near=near, depth=True)
+    assert rendering.depth is not None
+    return rendering.depth, rendering.alpha

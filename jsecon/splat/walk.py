@@ -31,7 +31,7 @@ CHUNK = 16
 _GROUP = 4
 """recurrences over a chunk run within and over groups of this many"""
 ATTRIBUTES = 6
-"""columns of splats (N, 6): centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see splats.py"""
+"""columns of splats (N, 6): centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see plan.py"""
 
 # 2^f on [-1/2, 1/2] to a relative error of 7.5e-8 (minimax, by iterated reweighting), highest power first.
 _EXP2 = (
