@@ -7,11 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require
-from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, normalize
+from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, finite, normalize, sigmoid
+from jsecon.splat.sound import usable
 from jsecon.types import Array, Camera, Gaussians, Leaf
 
-# A splat wider than this (px) is flat over any image; larger axes are shrunk to it, so that squares stay in float32.
+# An axis longer than this (px) is flat over any image; it is shrunk to it, so that squares stay in float32.
 _WIDEST_PX = 1e15
+# No splat reaches back from here (px): its axes end at _WIDEST_PX.
+_FARTHEST_PX = 1e17
 # exp(60) is beyond any scene and its products with a focal length over a depth still fit float32.
 _LARGEST_LOG_SCALE = 60.0
 
@@ -22,7 +25,7 @@ class Projection:
     """N splats of one view."""
 
     means_px: Leaf
-    """(N, 2) centres, px."""
+    """(N, 2) centres, px. This and the following mean nothing where `visible` is False."""
     whitening: Leaf
     """(N, 3) l11, l21, l22 of the lower-triangular L with inverse covariance = L L^T, 1/px: with d = pixel - centre,
     the squared Mahalanobis distance is (l11 dx + l21 dy)^2 + (l22 dy)^2, never negative and without the cancellation
@@ -34,7 +37,8 @@ class Projection:
     extents: Leaf
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
     visible: Leaf
-    """(N,) bool: in front of the near plane, able to reach alpha 1/255, box touching the image, all numbers finite."""
+    """(N,) bool: usable (see `sound.usable`), in front of the near plane, able to reach alpha 1/255, box touching the
+    image."""
 
     @property
     def conics(self) -> Array:
@@ -85,11 +89,11 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023; conventions in DESIGN section
     5).
 
-    Differentiable in every array of both. Raises ValueError on shapes that disagree. Non-finite Gaussians come back
-    invisible.
+    Differentiable in every array of both. Raises ValueError on shapes that disagree. Gaussians that are not usable
+    (NaN, infinite) come back invisible, with gradient zero; before a camera that is not finite, all do.
     """
     check_shapes(gaussians, camera)
-    gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
+    gaussians, camera, drawn = _guarded(*jax.tree.map(jnp.asarray, (gaussians, camera)))
     w2c = camera.world_to_camera
     means, width, height = gaussians.means, camera.width, camera.height
 
@@ -97,7 +101,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     x, y, z = (
         means[:, 0] * w2c[i, 0] + means[:, 1] * w2c[i, 1] + means[:, 2] * w2c[i, 2] + w2c[i, 3] for i in range(3)
     )
-    in_front = z > near
+    # What lies aside beyond all measure is hidden here, before its ratio overflows.
+    farthest = _FARTHEST_PX * z
+    in_front = drawn & (z > near) & (jnp.abs(camera.fx * x) < farthest) & (jnp.abs(camera.fy * y) < farthest)
     z_safe = jnp.where(in_front, z, 1.0)
     x_ratio, y_ratio = jnp.where(in_front, x, 0.0) / z_safe, jnp.where(in_front, y, 0.0) / z_safe
     means_px = jnp.stack([camera.fx * x_ratio + camera.cx, camera.fy * y_ratio + camera.cy], axis=-1)
@@ -114,12 +120,19 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     ]
     row_1 = (camera.fx / z_safe)[:, None] * (axes[:, 0] - x_ratio[:, None] * axes[:, 2])
     row_2 = (camera.fy / z_safe)[:, None] * (axes[:, 1] - y_ratio[:, None] * axes[:, 2])
-    widest = jnp.maximum(jnp.max(jnp.abs(row_1), axis=1), jnp.max(jnp.abs(row_2), axis=1))
-    shrink = jax.lax.stop_gradient(jnp.where(widest > _WIDEST_PX, _WIDEST_PX / widest, 1.0))[:, None]
+    longest = jnp.maximum(jnp.abs(row_1), jnp.abs(row_2))
+    shrink = jax.lax.stop_gradient(jnp.where(longest > _WIDEST_PX, _WIDEST_PX / longest, 1.0))
     row_1, row_2 = row_1 * shrink, row_2 * shrink
 
     norm_1, norm_2 = (row_1 * row_1).sum(1), (row_2 * row_2).sum(1)
-    cov_xx, cov_xy, cov_yy = norm_1 + BLUR_PX2, (row_1 * row_2).sum(1), norm_2 + BLUR_PX2
+    cov_xx, cov_yy = norm_1 + BLUR_PX2, norm_2 + BLUR_PX2
+    # In y, the unit is from here on the splat's own height (constant to the gradient: it cancels): 1 / cov_yy^2, which
+    # the derivative of a quotient contains, would vanish in float32 from heights of 1e9 px on.
+    height_px = jax.lax.stop_gradient(jnp.sqrt(cov_yy))
+    row_2 = row_2 / height_px[:, None]
+    blur_y = BLUR_PX2 / height_px / height_px
+    norm_2 = (row_2 * row_2).sum(1)
+    own_yy = norm_2 + blur_y
     cross = jnp.stack(
         [
             row_1[:, 1] * row_2[:, 2] - row_1[:, 2] * row_2[:, 1],
@@ -128,19 +141,13 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
         ],
         -1,
     )
-    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels, and the
-    # division comes first so that the product of two large variances is never formed.
-    cross = cross / jnp.sqrt(cov_yy)[:, None]
-    x_given_y = (
-        (cross * cross).sum(1)
-        + BLUR_PX2 * (norm_1 / cov_yy)
-        + BLUR_PX2 * (norm_2 / cov_yy)
-        + BLUR_PX2 * (BLUR_PX2 / cov_yy)
-    )
+    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels.
+    x_given_y = ((cross * cross).sum(1) + blur_y * norm_1 + BLUR_PX2 * own_yy) / own_yy
     l11 = jax.lax.rsqrt(x_given_y)
-    whitening = jnp.stack([l11, -(cov_xy / cov_yy) * l11, jax.lax.rsqrt(cov_yy)], axis=-1)
+    slope = (row_1 * row_2).sum(1) / own_yy / height_px
+    whitening = jnp.stack([l11, -slope * l11, jax.lax.rsqrt(own_yy) / height_px], axis=-1)
 
-    opacities = jax.nn.sigmoid(gaussians.opacity_logits)
+    opacities = sigmoid(gaussians.opacity_logits)
     reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))[:, None]
     extents = jax.lax.stop_gradient(reach * jnp.sqrt(jnp.stack([cov_xx, cov_yy], axis=-1)))
     extents = extents * (1 + 1e-5) + 1e-3  # covers the rounding of the box against that of the exponent
@@ -151,3 +158,24 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Proj
     )
     visible = in_front & (opacities >= MIN_ALPHA) & touching & jnp.isfinite(numbers).all(1)
     return Projection(means_px, whitening, opacities, z, extents, visible)
+
+
+def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
+    """Both with harmless numbers in place of bad ones, and (N,) bool the Gaussians that are themselves: a bad number
+    must be gone before the first product, or its gradient, zero times NaN, is NaN and reaches the pose."""
+    sound = finite(*jax.tree.leaves(camera))
+    drawn = usable(gaussians) & sound
+    keep = lambda array, other: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, other)
+    harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)
+    harmless = dataclasses.replace(harmless, world_to_camera=jnp.eye(4, dtype=camera.world_to_camera.dtype))
+    return (
+        dataclasses.replace(
+            gaussians,
+            means=keep(gaussians.means, 0.0),
+            log_scales=keep(gaussians.log_scales, 0.0),
+            quaternions=keep(gaussians.quaternions, 0.0),
+            opacity_logits=keep(gaussians.opacity_logits, 0.0),
+        ),
+        jax.tree.map(lambda a, b: jnp.where(sound, a, b), camera, harmless),
+        drawn,
+    )

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require
-from jsecon.numerics import NEAR
-from jsecon.splat.differentiate import splat
+from jsecon.numerics import NEAR, finite
+from jsecon.splat.contain import splat_contained
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.splats import splats_of
@@ -46,7 +46,9 @@ def render(
     Exact by definition (DESIGN section 5): equal to the brute-force sum over all Gaussians, whatever the tiling.
     Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. Outside a trace the
     capacity is planned from the data; inside one pass the static `capacity` (see `plan_capacity`): pairs that do not
-    fit are counted in `.overflow`, never dropped unsaid.
+    fit are counted in `.overflow`, never dropped unsaid. Gaussians with NaN or infinite numbers are hidden, and a
+    feature that is not finite makes NaN of the pixels that its Gaussian touches; neither has a gradient, nor spoils
+    another's (`sound.count_non_finite` counts them). A camera that is not finite sees NaN.
 
     `background` (D,) is added with weight 1 - alpha. Raises ValueError on shapes that disagree.
     """
@@ -74,7 +76,10 @@ def _render(gaussians, camera, features, background, capacity, near) -> Renderin
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0))
     splats, lists = splats_of(gaussians, camera, capacity=capacity, near=near)
-    image, transmittance = splat(splats, features.astype(splats.dtype), lists, camera.width, camera.height)
+    image, transmittance = splat_contained(splats, features.astype(splats.dtype), lists, camera.width, camera.height)
+    # A camera that is not finite touches every pixel.
+    sound = finite(*jax.tree.leaves(camera))
+    image, transmittance = (jnp.where(sound, a, jnp.nan) for a in (image, transmittance))
     if background is not None:
         image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
     return Rendering(image, 1 - transmittance, lists.overflow)
