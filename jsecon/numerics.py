@@ -57,6 +57,16 @@ def normalize(x: Array, axis: int = -1) -> Array:
     return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
 
 
+@jax.custom_jvp
+def sigmoid(x: Array) -> Array:
+    """1 / (1 + exp(-x)), with a derivative right to the last digits where it is nearly 1: as s(x) s(-x), for 1 - s(x)
+    cancels (jax.nn.sigmoid's is off by 5e-4 at x = 10, and 0 from 17 on, in float32)."""
+    return jax.nn.sigmoid(x)
+
+
+sigmoid.defjvps(lambda tangent, value, x: tangent * value * jax.nn.sigmoid(-x))
+
+
 def cosine(x: Array, y: Array) -> Array:
     """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see STYLE trap 1 (jax
     39103)."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from jsecon.numerics import cosine, cosine_matrix, finite, normalize, safe_norm
+from jsecon.numerics import cosine, cosine_matrix, finite, normalize, safe_norm, sigmoid
 
 vectors = hnp.arrays(np.float32, (3,), elements=st.floats(-(2.0**126), 2.0**126, width=32))
 
@@ -57,6 +57,14 @@ def test_gradients_equal_central_differences(x64, scale):
             h = 1e-6 * scale
             estimate = (function(x.at[i].add(h)) - function(x.at[i].add(-h))) / (2 * h)
             np.testing.assert_allclose(gradient[i], estimate, rtol=1e-6, atol=1e-8 / scale)
+
+
+def test_sigmoid_and_its_derivative_over_the_float_range():
+    x = np.float32([-np.inf, -1e4, -80, -30, -5, -1e-30, 0, 1, 5, 10, 17, 30, 80, 1e4, np.inf])
+    value, slope = jax.vmap(jax.value_and_grad(sigmoid))(x)
+    half = np.exp(-np.abs(x.astype(np.float64)))
+    np.testing.assert_allclose(value, np.where(x < 0, half, 1.0) / (1 + half), rtol=2e-6, atol=1e-37)
+    np.testing.assert_allclose(slope, half / (1 + half) ** 2, rtol=2e-6, atol=1e-37)
 
 
 @pytest.mark.parametrize("count", [16385, 32769, 40000, 100000])

@@ -9,8 +9,9 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require
-from jsecon.numerics import NEAR
-from jsecon.splat.differentiate import splat, view_lists
+from jsecon.numerics import NEAR, finite
+from jsecon.splat.contain import splat_contained
+from jsecon.splat.differentiate import view_lists
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.tiles import TileLists, plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering
@@ -25,6 +26,8 @@ class ViewPlan:
     """(N, 6) centre x, y (px), whitening l11, l21, l22 (1/px, times sqrt(1/2)), opacity; zero where invisible."""
     depths: Leaf
     """(N,) z in the camera, world units; zero where invisible."""
+    sound: Leaf
+    """() bool: the camera is finite; one that is not sees NaN."""
     lists: TileLists
     """which Gaussians reach which tile, front to back."""
     width: int = dataclasses.field(metadata={"static": True})
@@ -79,7 +82,8 @@ def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Arr
     # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
     splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
     depths = jnp.where(projection.visible, projection.depths, 0.0)
-    return ViewPlan(splats, depths, lists, camera.width, camera.height)
+    sound = finite(*jax.tree.leaves(camera))
+    return ViewPlan(splats, depths, sound, lists, camera.width, camera.height)
 
 
 _plan_compiled = jax.jit(_plan, static_argnums=(2,))
@@ -112,7 +116,8 @@ def render_plan(
 def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool, mesh: Mesh | None):
     features = jnp.asarray(features, plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
-    image, transmittance = splat(plan.splats, columns, plan.lists, plan.width, plan.height, mesh)
+    image, transmittance = splat_contained(plan.splats, columns, plan.lists, plan.width, plan.height, mesh)
+    image, transmittance = (jnp.where(plan.sound, a, jnp.nan) for a in (image, transmittance))
     alpha, expected = 1 - transmittance, None
     if depth:
         covered = alpha > 0

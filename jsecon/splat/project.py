@@ -1,18 +1,20 @@
 """From 3D Gaussians to 2D splats: EWA projection with a determinant that does not cancel and tight, exact extents."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 
 from jsecon.errors import require
-from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, normalize
+from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, finite, normalize, sigmoid
+from jsecon.splat.sound import usable
 from jsecon.splat.stored import stored, surely
 from jsecon.types import Array, Camera, Gaussians, Leaf
 
-# A splat wider than this (px) is flat over any image; larger axes are shrunk to it, so that squares stay in float32.
+# An axis longer than this (px) is flat over any image; it is shrunk to it, so that squares stay in float32.
 _WIDEST_PX = 1e15
+# No splat reaches back from here (px): its axes end at _WIDEST_PX.
+_FARTHEST_PX = 1e17
 # exp(60) is beyond any scene and its products with a focal length over a depth still fit float32.
 _LARGEST_LOG_SCALE = 60.0
 
@@ -23,7 +25,7 @@ class Projection:
     """N splats of one view."""
 
     means_px: Leaf
-    """(N, 2) centres, px."""
+    """(N, 2) centres, px. This and the following mean nothing where `visible` is False."""
     whitening: Leaf
     """(N, 3) l11, l21, l22 of the lower-triangular L with inverse covariance = L L^T, 1/px: with d = pixel - centre,
     the squared Mahalanobis distance is (l11 dx + l21 dy)^2 + (l22 dy)^2, never negative and without the cancellation
@@ -35,7 +37,8 @@ class Projection:
     extents: Leaf
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
     visible: Leaf
-    """(N,) bool: in front of the near plane, able to reach alpha 1/255, box touching the image, all numbers finite."""
+    """(N,) bool: usable (see `sound.usable`), in front of the near plane, able to reach alpha 1/255, box touching the
+    image."""
 
     @property
     def conics(self) -> Array:
@@ -64,25 +67,26 @@ def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tup
         along = [sum(w2c[i, k] * rotation[k][axis] for k in range(3)) * scale for i in range(3)]
         row_1.append(focal_x * (along[0] - x_ratio * along[2]))
         row_2.append(focal_y * (along[1] - y_ratio * along[2]))
-    widest = functools.reduce(jnp.maximum, [jnp.abs(entry) for entry in (*row_1, *row_2)])
-    shrink = jax.lax.stop_gradient(jnp.where(widest > _WIDEST_PX, _WIDEST_PX / widest, 1.0))
-    return [entry * shrink for entry in row_1], [entry * shrink for entry in row_2]
+    longest = [jnp.maximum(jnp.abs(first), jnp.abs(second)) for first, second in zip(row_1, row_2)]
+    shrink = [jax.lax.stop_gradient(jnp.where(size > _WIDEST_PX, _WIDEST_PX / size, 1.0)) for size in longest]
+    return [entry * by for entry, by in zip(row_1, shrink)], [entry * by for entry, by in zip(row_2, shrink)]
 
 
 def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
     """(N,) variances of x and y, blur included, and l11, l21, l22 of the inverse covariance's root."""
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     norm_1, norm_2 = dot(row_1, row_1), dot(row_2, row_2)
-    cov_xx, cov_xy, cov_yy = norm_1 + BLUR_PX2, dot(row_1, row_2), norm_2 + BLUR_PX2
-    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels, and the
-    # division comes first so that the product of two large variances is never formed.
-    l22 = jax.lax.rsqrt(cov_yy)
-    cross = [
-        (row_1[(i + 1) % 3] * row_2[(i + 2) % 3] - row_1[(i + 2) % 3] * row_2[(i + 1) % 3]) * l22 for i in range(3)
-    ]
-    x_given_y = dot(cross, cross) + BLUR_PX2 * (norm_1 / cov_yy + norm_2 / cov_yy + BLUR_PX2 / cov_yy)
-    l11 = jax.lax.rsqrt(x_given_y)
-    return cov_xx, cov_yy, l11, -(cov_xy / cov_yy) * l11, l22
+    cov_xx, cov_yy = norm_1 + BLUR_PX2, norm_2 + BLUR_PX2
+    # In y, the unit is from here on the splat's own height (constant to the gradient: it cancels): 1 / cov_yy^2, which
+    # the derivative of a quotient contains, would vanish in float32 from heights of 1e9 px on.
+    per_height = jax.lax.stop_gradient(jax.lax.rsqrt(cov_yy))
+    row_2 = [entry * per_height for entry in row_2]
+    blur_y = BLUR_PX2 * per_height * per_height
+    own_yy = dot(row_2, row_2) + blur_y
+    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels.
+    cross = [row_1[(i + 1) % 3] * row_2[(i + 2) % 3] - row_1[(i + 2) % 3] * row_2[(i + 1) % 3] for i in range(3)]
+    l11 = jax.lax.rsqrt((dot(cross, cross) + blur_y * norm_1 + BLUR_PX2 * own_yy) / own_yy)
+    return cov_xx, cov_yy, l11, -(dot(row_1, row_2) / own_yy * per_height) * l11, jax.lax.rsqrt(own_yy) * per_height
 
 
 def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
@@ -115,11 +119,11 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023; conventions in DESIGN section
     5).
 
-    Differentiable in every array of both. Raises ValueError on shapes that disagree. Non-finite Gaussians come back
-    invisible.
+    Differentiable in every array of both. Raises ValueError on shapes that disagree. Gaussians that are not usable
+    (NaN, infinite) come back invisible, with gradient zero; before a camera that is not finite, all do.
     """
     check_shapes(gaussians, camera)
-    gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
+    gaussians, camera, drawn = _guarded(*jax.tree.map(jnp.asarray, (gaussians, camera)))
     w2c = camera.world_to_camera
     width, height = camera.width, camera.height
 
@@ -127,7 +131,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     # Matrices of 3x3 as arrays took five times as long.
     mean_x, mean_y, mean_z = (gaussians.means[:, i] for i in range(3))
     x, y, z = (mean_x * w2c[i, 0] + mean_y * w2c[i, 1] + mean_z * w2c[i, 2] + w2c[i, 3] for i in range(3))
-    in_front = z > near
+    # What lies aside beyond all measure is hidden here, before its ratio overflows.
+    farthest = _FARTHEST_PX * z
+    in_front = drawn & (z > near) & (jnp.abs(camera.fx * x) < farthest) & (jnp.abs(camera.fy * y) < farthest)
     z_safe = jnp.where(in_front, z, 1.0)
     x_ratio, y_ratio = jnp.where(in_front, x, 0.0) / z_safe, jnp.where(in_front, y, 0.0) / z_safe
     mean_px, mean_py = camera.fx * x_ratio + camera.cx, camera.fy * y_ratio + camera.cy
@@ -145,7 +151,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     row_1, row_2 = stored(always, _covariance_root, w2c, unit, gaussians.log_scales, rays)
     cov_xx, cov_yy, l11, l21, l22 = stored(always, _whitening, row_1, row_2)
 
-    opacities = jax.nn.sigmoid(gaussians.opacity_logits)
+    opacities = sigmoid(gaussians.opacity_logits)
     reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))
     # widened to cover the rounding of the box against that of the exponent
     extent_x, extent_y = (
@@ -164,4 +170,25 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
         z,
         jnp.stack([extent_x, extent_y], axis=-1),
         visible,
+    )
+
+
+def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
+    """Both with harmless numbers in place of bad ones, and (N,) bool the Gaussians that are themselves: a bad number
+    must be gone before the first product, or its gradient, zero times NaN, is NaN and reaches the pose."""
+    sound = finite(*jax.tree.leaves(camera))
+    drawn = usable(gaussians) & sound
+    keep = lambda array, other: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, other)
+    harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)
+    harmless = dataclasses.replace(harmless, world_to_camera=jnp.eye(4, dtype=camera.world_to_camera.dtype))
+    return (
+        dataclasses.replace(
+            gaussians,
+            means=keep(gaussians.means, 0.0),
+            log_scales=keep(gaussians.log_scales, 0.0),
+            quaternions=keep(gaussians.quaternions, 0.0),
+            opacity_logits=keep(gaussians.opacity_logits, 0.0),
+        ),
+        jax.tree.map(lambda a, b: jnp.where(sound, a, b), camera, harmless),
+        drawn,
     )

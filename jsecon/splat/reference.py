@@ -7,8 +7,8 @@ from jsecon.types import Camera, Gaussians
 
 
 def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> dict[str, np.ndarray]:
-    """means_px (N, 2), covariances (N, 2, 2) px^2, depths (N,), opacities (N,), in_front (N,), one Gaussian at a
-    time."""
+    """means_px (N, 2), covariances (N, 2, 2) px^2 and their inverses' a, b, c (N, 3), depths (N,), opacities (N,),
+    in_front (N,), one Gaussian at a time."""
     means, log_scales, quaternions, logits = (
         np.asarray(a, np.float64)
         for a in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
@@ -19,6 +19,7 @@ def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
     out = {
         "means_px": np.zeros((count, 2)),
         "covariances": np.zeros((count, 2, 2)),
+        "conics": np.zeros((count, 3)),
         "depths": np.zeros(count),
         "opacities": np.zeros(count),
         "in_front": np.zeros(count, bool),
@@ -38,7 +39,10 @@ def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
         ty = z * np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
         jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
         scaled = jacobian @ w2c[:3, :3] @ _rotation(quaternions[i]) @ np.diag(np.exp(log_scales[i]))
-        out["covariances"][i] = scaled @ scaled.T + BLUR_PX2 * np.eye(2)
+        covariance = out["covariances"][i] = scaled @ scaled.T + BLUR_PX2 * np.eye(2)
+        # det(M M^T + e I) as a sum of positive terms: beside a needle's length its width would cancel, in float64 too.
+        squares = (np.cross(*scaled) ** 2).sum() + BLUR_PX2 * (scaled**2).sum() + BLUR_PX2**2
+        out["conics"][i] = covariance[1, 1] / squares, -covariance[0, 1] / squares, covariance[0, 0] / squares
     return out
 
 
@@ -64,9 +68,9 @@ def weights_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
     for i in np.argsort(splats["depths"], kind="stable"):
         if not splats["in_front"][i]:
             continue
-        inverse = np.linalg.inv(splats["covariances"][i])
+        a, b, c = splats["conics"][i]
         dx, dy = x - splats["means_px"][i, 0], y - splats["means_px"][i, 1]
-        q = inverse[0, 0] * dx * dx + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy * dy
+        q = a * dx * dx + 2 * b * dx * dy + c * dy * dy
         alpha = np.minimum(MAX_ALPHA, splats["opacities"][i] * np.exp(-0.5 * q))
         alpha = np.where(alpha < MIN_ALPHA, 0.0, alpha)
         running &= transmittance * (1 - alpha) > MIN_TRANSMITTANCE

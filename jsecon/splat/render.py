@@ -31,6 +31,10 @@ def render(
     capacity is planned from the data; inside one pass the static `capacity` (see `plan_capacity`): pairs that do not
     fit are counted in `.overflow`, never dropped unsaid. With frozen geometry, `plan_view` once and `render_plan`.
 
+    Gaussians with NaN or infinite numbers are hidden, and a feature that is not finite makes NaN of the pixels that its
+    Gaussian touches; neither has a gradient, nor spoils another's (`sound.count_non_finite` counts them). A camera that
+    is not finite sees NaN.
+
     `mesh` (`jsecon.parallel.host_mesh()`) spreads the tiles over several devices of this process, in value and
     gradient: a program that sets XLA_FLAGS=--xla_force_host_platform_device_count=2 before jax starts has both cores
     of a CPU that way. Without it, one device.

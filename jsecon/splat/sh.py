@@ -32,14 +32,21 @@ def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]
 
 
 def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
-    """RGB of each Gaussian as `camera` sees it: 0.5 + sum of bands, clamped at 0 (gradient masked there), not above."""
+    """RGB of each Gaussian as `camera` sees it: 0.5 + sum of bands, clamped at 0 (gradient masked there), not above.
+
+    NaN, with gradient zero, where a coefficient is not finite. A mean that is not finite counts as seen from nowhere:
+    its Gaussian is hidden anyway, and its gradient must not reach the camera.
+    """
     bands = gaussians.sh.shape[1]
+    sound = jnp.isfinite(gaussians.sh).all((1, 2))[:, None]
+    sh = jnp.where(sound[:, :, None], gaussians.sh, 0.0)
     if bands == 1:
-        rgb = C0 * gaussians.sh[:, 0]
+        rgb = C0 * sh[:, 0]
     else:
-        basis = sh_basis(normalize(gaussians.means - camera.centres[None]), bands)
-        rgb = (basis[:, :, None] * gaussians.sh).sum(1)
-    return jnp.maximum(rgb + 0.5, 0.0)
+        away = gaussians.means - camera.centres[None]
+        away = jnp.where(jnp.isfinite(away).all(1, keepdims=True), away, 0.0)
+        rgb = (sh_basis(normalize(away), bands)[:, :, None] * sh).sum(1)
+    return jnp.where(sound, jnp.maximum(rgb + 0.5, 0.0), jnp.nan)
 
 
 def sh_from_rgb(rgb: Float[Array, "n 3"]) -> Float[Array, "n 1 3"]:

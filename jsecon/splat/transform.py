@@ -1,12 +1,14 @@
 """Gaussians carried from one world into another by a similarity: turned, scaled and shifted, colours included."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.splat.sh import sh_basis
-from jsecon.types import Array, Gaussians
+from jsecon.types import Array, Camera, Gaussians
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
@@ -37,6 +39,29 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         opacity_logits=gaussians.opacity_logits,
         sh=jnp.einsum("kl,nlc->nkc", jnp.asarray(_sh_rotation(rotation, gaussians.sh.shape[1]), dtype), gaussians.sh),
     )
+
+
+def recentred(
+    gaussians: Gaussians, cameras: Camera, *, origin: Float[np.ndarray, "3"] | None = None
+) -> tuple[Gaussians, Camera, Float[np.ndarray, "4 4"]]:
+    """The same scene and cameras (one, or a batch) in a world whose origin lies at `origin`, by default the middle of
+    the means; and the (4, 4) float64 shift that leads back.
+
+    Float32 holds a coordinate of 1e6 m to 6 cm, and a camera beside it no better: such a scene (a map projection's
+    coordinates, say) can't be rendered as it is. Positions and poses are shifted in float64 and returned in float32;
+    the cameras keep what they see. Host code. Give it float64 arrays where there are any: what float32 rounded before
+    stays rounded.
+    """
+    means = np.asarray(gaussians.means, np.float64)
+    if origin is None:
+        sound = means[np.isfinite(means).all(1)]
+        origin = np.median(sound, axis=0) if len(sound) else np.zeros(3)
+    poses = np.array(cameras.world_to_camera, np.float64)
+    poses[..., :3, 3] += poses[..., :3, :3] @ origin
+    back = np.eye(4)
+    back[:3, 3] = origin
+    moved = dataclasses.replace(gaussians, means=(means - origin).astype(np.float32))
+    return moved, dataclasses.replace(cameras, world_to_camera=poses.astype(np.float32)), back
 
 
 def quaternion_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
