@@ -90,10 +90,10 @@ def _sort_packed(*fields: tuple[Array, int]) -> list[Array]:
     """Sorts by the fields, each an array of non-negative integers and its number of bits, 64 together at most, the
     first the most significant; returns them sorted, as int32. 64-bit only inside, by context."""
     with jax.enable_x64(True):
-        key = None
-        for values, bits in fields:
-            wide = lax.convert_element_type(values, jnp.uint64)
-            key = wide if key is None else lax.shift_left(key, lax.full_like(key, bits)) | wide
+        wide = [lax.convert_element_type(values, jnp.uint64) for values, _ in fields]
+        key = wide[0]
+        for values, (_, bits) in zip(wide[1:], fields[1:], strict=True):
+            key = lax.shift_left(key, lax.full_like(key, bits)) | values
         key = lax.sort(key, is_stable=False)
         out = []
         for _, bits in reversed(fields):
