@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.stability import engine, evaluate
-from experiments.stability_cases import ARGUMENTS, GRADIENT, METHOD, VALUE, cases, ordinary
+from experiments.stability_cases import ARGUMENTS, CANCELS, GRADIENT, VALUE, cases, ordinary
 from jsecon.splat.reference import weights_reference
 from jsecon.splat.render import render, render_depth, render_rgb
 from jsecon.splat.sound import count_non_finite, usable
@@ -32,9 +32,9 @@ def test_row(case):
         assert error <= case.bounds.get(name, GRADIENT), name
     assert int(count_non_finite(case.gaussians, case.features)) == case.bad
     # A wider bound must be owed to the scene: no more than four times what one rounding of its numbers does. One row
-    # shows a limit of the method and says so.
+    # is a sum that cancels, which the rounding of its inputs does not show.
     assert bool(case.bounds) == bool(case.why)
-    for name, bound in case.bounds.items() if case.why != METHOD else ():
+    for name, bound in case.bounds.items() if case.why != CANCELS else ():
         assert bound <= 4 * max(row.value_ulp if name == "value" else row.gradient_ulps[name], VALUE), name
 
 
