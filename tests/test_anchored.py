@@ -146,7 +146,25 @@ def with_votes(field, **changes):
     return dataclasses.replace(field, votes=dataclasses.replace(field.votes, **changes))
 
 
-@pytest.mark.parametrize("by", ["votes", "code"])
+def test_lead_is_over_the_strongest_other_region(field):
+    votes = field.votes
+    weights, regions = np.asarray(votes.weights, np.float64), np.asarray(votes.regions)
+    inside = np.where(regions == 2, weights, 0).sum(1)
+    rival = np.where((regions != 2) & (regions >= 0), weights, 0).max(1)
+    total = np.asarray(votes.total, np.float64)
+    labelled = np.divide(np.asarray(votes.labelled, np.float64), total, out=np.zeros_like(total), where=total > 0)
+    lead = np.divide(inside, inside + rival, out=np.zeros_like(inside), where=inside + rival > 0)
+    got = query_region(field, 2, by="lead")
+    np.testing.assert_allclose(got.similarity, np.minimum(lead, labelled), atol=1e-6)
+    clear = np.abs(np.minimum(lead, labelled) - 0.5) > 1e-5
+    np.testing.assert_array_equal(
+        np.asarray(got.mask)[clear], ((inside > rival) & (labelled > 0.5) & (np.asarray(votes.views) > 0))[clear]
+    )
+    assert got.mask.any()
+    assert (np.asarray(got.mask) >= np.asarray(query_region(field, 2, by="votes").mask)).all()  # a majority leads
+
+
+@pytest.mark.parametrize("by", ["votes", "lead", "code"])
 @pytest.mark.parametrize("threshold", [-2.0, 0.0, 0.5])
 def test_what_was_never_seen_is_never_selected(field, by, threshold):
     unseen = np.arange(64) % 2 == 0
@@ -192,7 +210,7 @@ def test_numbers_that_are_not_finite_never_select(field):
         np.testing.assert_allclose(got.similarity[3:], sound.similarity[3:], rtol=1e-5)
 
 
-@pytest.mark.parametrize("by", ["votes", "code"])
+@pytest.mark.parametrize("by", ["votes", "lead", "code"])
 def test_broken_texts_and_regions_select_nothing(field, by):
     for text in (np.zeros(12), np.full(12, np.nan), np.r_[np.inf, np.zeros(11)]):
         got = query_anchored(field, text.astype(np.float32), retrieval_threshold=-1.0, by=by)
@@ -247,7 +265,7 @@ def test_wrong_arguments_are_told(field):
         lambda: query_anchored(field, np.ones(12, np.float32), by="x"),
         lambda: query_region(field, 1, by="x"),
     ):
-        with pytest.raises(ValueError, match="'code' or 'votes'"):
+        with pytest.raises(ValueError, match="'code', 'votes' or 'lead'"):
             call()
 
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.shares import weight_inside
+from jsecon.query.shares import weight_and_rival, weight_inside
 
 
 def exact(regions, weights, chosen):
@@ -38,3 +38,15 @@ def test_extremes():
     got = np.asarray(weight_inside(*map(jnp.asarray, (regions, weights, np.asarray([True, False])))))
     np.testing.assert_array_equal(got, np.float32([1e30, 2.0, 0.0, 0.0]))  # what is not chosen does not spread
     assert (np.asarray(weight_inside(jnp.zeros((3, 0), jnp.int32), jnp.zeros((3, 0)), jnp.ones(2, bool))) == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 32, 257, 1000])
+def test_the_rival_is_the_strongest_region_not_chosen(count):
+    rng = np.random.default_rng(count)
+    regions = rng.integers(-1, count + 2, (500, 5)).astype(np.int32)
+    weights = rng.random((500, 5)).astype(np.float32)
+    chosen = rng.random(count) < 0.3
+    outside = (regions >= 0) & (regions < count) & ~chosen[np.clip(regions, 0, count - 1)]
+    weight, rival = weight_and_rival(*map(jnp.asarray, (regions, weights, chosen)))
+    np.testing.assert_allclose(weight, exact(regions, weights, chosen), rtol=1e-6)
+    np.testing.assert_array_equal(rival, np.where(outside, weights, 0).max(1))

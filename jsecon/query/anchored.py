@@ -13,12 +13,13 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.query.one_step import Number, similarities
 from jsecon.query.pixel import region_at, region_shares_at
-from jsecon.query.shares import weight_inside
+from jsecon.query.shares import weight_and_rival
 from jsecon.types import Array, LanguageField, Selection
 
 __all__ = [
     "ALIKE_THRESHOLD",
     "CODE_THRESHOLD",
+    "LEAD_THRESHOLD",
     "RETRIEVAL_THRESHOLD",
     "SHARE_THRESHOLD",
     "query_anchored",
@@ -36,6 +37,8 @@ CODE_THRESHOLD = 0.9
 """on the cosine of codes: codes that were distilled from one region lie within a few degrees (0.9 is 26)"""
 SHARE_THRESHOLD = 0.5
 """on the share of votes: more of what is seen of the Gaussian lies inside the region than outside"""
+LEAD_THRESHOLD = 0.5
+"""on the lead: the region is the strongest, and most of what is seen of the Gaussian has a label"""
 
 
 ALIKE_THRESHOLD = 0.95
@@ -74,8 +77,11 @@ def query_anchored(
     "votes": the region's share of all the weight with which the Gaussian was seen, an estimate of the probability that
         a pixel of it belongs to the region; default threshold 0.5. `unlabelled_weight` in [0, 1] says how much weight
         on unlabelled pixels counts as evidence against (1 in full; less where masks are missing from many frames).
+    "lead": the region's part of the votes of the two that matter, itself and the strongest other one, or the labelled
+        part of all weight where that is less; default threshold 0.5. Where masks are cut, merged and lost, a region
+        may be the strongest without ever having most of the votes.
     "code": cosine of the Gaussian's code with the region's (the paper); default threshold 0.9.
-    `alike_threshold`, for "votes": regions whose embedding has at least this cosine with the anchor's are the same
+    `alike_threshold`, not for "code": regions whose embedding has at least this cosine with the anchor's are the same
         thing as the text sees it (a track that broke, a twin), and their votes are added; None for the anchor alone.
         "code" needs no such rule, as regions that are alike have codes that are.
     Gaussians never seen, without a code, or with numbers that are not finite are never selected, nor regions without
@@ -94,7 +100,7 @@ def query_anchored(
         by in _THRESHOLDS,
         "query_anchored",
         got=f"by={by!r}",
-        expected="'code' or 'votes'",
+        expected="'code', 'votes' or 'lead'",
         remedy="'votes' is the default.",
     )
     if field.regions.count == 0:
@@ -130,7 +136,7 @@ def query_region(
         by in _THRESHOLDS,
         "query_region",
         got=f"by={by!r}",
-        expected="'code' or 'votes'",
+        expected="'code', 'votes' or 'lead'",
         remedy="'votes' is the default.",
     )
     if field.regions.count == 0:
@@ -148,7 +154,7 @@ def query_region(
     )
 
 
-_THRESHOLDS = {"code": CODE_THRESHOLD, "votes": SHARE_THRESHOLD}
+_THRESHOLDS = {"code": CODE_THRESHOLD, "votes": SHARE_THRESHOLD, "lead": LEAD_THRESHOLD}
 
 
 def _parts(field: LanguageField) -> _Parts:
@@ -188,15 +194,22 @@ def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_w
     anchor = jnp.maximum(region, 0)
     count = parts.embeddings.shape[0]
     chosen = jnp.arange(count) == anchor
-    if alike_threshold is not None and by == "votes":
+    if alike_threshold is not None and by != "code":
         alike, known = similarities(parts.embeddings, parts.embeddings[anchor])
         chosen |= known & (alike >= alike_threshold)
     seen = parts.views > 0
-    if by == "votes":
-        weight = weight_inside(parts.regions, parts.weights, chosen)
+    if by != "code":
+        weight, rival = weight_and_rival(parts.regions, parts.weights, chosen)
         seen_weight = parts.labelled + unlabelled_weight * jnp.maximum(parts.total - parts.labelled, 0.0)
         known = seen & (seen_weight > 0) & jnp.isfinite(seen_weight) & jnp.isfinite(weight)
         similarity = jnp.clip(weight / jnp.where(known, seen_weight, 1.0), 0.0, 1.0)
+        if by == "lead":
+            labelled = jnp.clip(parts.labelled / jnp.where(known, seen_weight, 1.0), 0.0, 1.0)
+            # The ratio to the larger of the two cannot overflow.
+            larger = jnp.maximum(jnp.maximum(weight, rival), jnp.finfo(weight.dtype).tiny)
+            lead = (weight / larger) / jnp.maximum(weight / larger + rival / larger, 1.0)
+            known = known & jnp.isfinite(rival)
+            similarity = jnp.minimum(lead, labelled)
     else:
         similarity, known = similarities(parts.codes, parts.region_codes[anchor])
         known = known & seen
