@@ -1,0 +1,342 @@
+"""Each idea beyond the paper on and off: point-level mIoU of text queries under vision with realistic faults.
+
+    python -m experiments.beyond [FOLDER_OF_DEMOS]
+
+Scenes: demo rooms of five seeds and replica_apartment_0 (where it lies beside the checkout), each seen by simulated
+vision (jsecon.vision.simulated) at three levels of noise. One query an object, by its class; a class's selection is
+compared with the Gaussians whose true object it is. All ideas work on one pass of votes, kept view by view. The letters
+are those of the ideas' list: A evidence hygiene, C neutral Gaussians, D object posterior over the views that show it, E
+consensus of views, F masks that disagree, several descriptors, G neighbours, H threshold by the largest gap.
+"""
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import sparse
+from scipy.spatial import KDTree
+from sklearn.cluster import KMeans
+
+from experiments import results, scenes
+from jsecon.language.autoencoder import encode, region_codes
+from jsecon.language.grouping import group_by_consensus
+from jsecon.language.reconcile import agree
+from jsecon.query.anchored import ALIKE_THRESHOLD, CODE_THRESHOLD
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the experiment can vary."""
+
+    demos: str = str(results.HOME.parent / "demos")
+    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
+    replica: str = str(results.CAPTURES / "replica_apartment_0")
+    texts: str = str(results.CAPTURES.parent / "text")
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    levels: tuple[str, ...] = ("low", "medium", "high")
+    latents: tuple[int, ...] = (3, 16)
+    share: float = 0.5
+    """threshold on shares of votes and posteriors."""
+    out: str = str(results.HOME / "results" / "beyond")
+
+
+class State:
+    """Regions and their votes: (N, R) votes, (T, R) which masks count, (R, E) embeddings; and what follows."""
+
+    def __init__(self, sight: scenes.Sight, proof: scenes.Evidence, ids: np.ndarray, ok: np.ndarray, regions: int):
+        """ids (M,) region of each mask, ok (M,) whether it counts; M = T R of the masks as they came."""
+        views, masks = sight.pixels.shape[0], np.flatnonzero(ok)
+        view = np.repeat(np.arange(views), sight.pixels.shape[1])
+        self.proof, self.ids, self.ok, self.view, self.regions = proof, ids, ok, view, regions
+        to_region = sparse.csr_matrix((np.ones(len(masks), np.float32), (masks, ids[masks])), shape=(len(ids), regions))
+        self.votes = (proof.votes @ to_region).toarray()
+        self.shows = np.zeros((views, regions), bool)
+        self.shows[view[masks], ids[masks]] = True
+        flat = sight.embeddings.reshape(len(ids), -1)
+        self.embeddings = _unit(to_region.T @ (flat * sight.pixels.reshape(-1, 1)))
+        self.total = np.maximum(proof.seen.sum(1), 1e-12)
+
+    def anchors(self, texts: np.ndarray) -> np.ndarray:
+        """(K,) the region nearest to each text."""
+        known = np.any(self.embeddings != 0, 1)
+        return np.where(known[:, None], self.embeddings @ texts.T, -np.inf).argmax(0)
+
+    def joined(self, anchors: np.ndarray, alike: float = ALIKE_THRESHOLD) -> list[np.ndarray]:
+        """For each anchor the regions that are alike."""
+        gram = self.embeddings @ self.embeddings.T
+        return [np.flatnonzero(gram[a] >= alike) for a in anchors]
+
+    def shares(self, groups: list[np.ndarray]) -> list[np.ndarray]:
+        """(N,) a group: its share of all votes."""
+        return [self.votes[:, g].sum(1) / self.total for g in groups]
+
+    def leads(self, groups: list[np.ndarray]) -> list[np.ndarray]:
+        """(N,) bool a group: the strongest region is not another's, and most of the weight is labelled."""
+        labelled, others = self.votes.sum(1) >= 0.5 * self.total, np.ones(self.regions, bool)
+        found = []
+        for g in groups:
+            others[g] = False
+            rival = self.votes[:, others].max(1, initial=0.0)
+            own = self.votes[:, g].sum(1)
+            found.append(labelled & (own > 0) & (own >= rival))
+            others[g] = True
+        return found
+
+    def posteriors(self, groups: list[np.ndarray]) -> list[np.ndarray]:
+        """(N,) a group: its share of what the views that show it see of the Gaussian (D)."""
+        found = []
+        for g in groups:
+            seen = self.proof.seen[:, self.shows[:, g].any(1)].sum(1)
+            found.append(self.votes[:, g].sum(1) / np.maximum(seen, 1e-12))
+        return found
+
+    def overlap(self) -> np.ndarray:
+        """(M,) IoU of each mask with the reprojection of its region: shares composited over the view."""
+        share = (self.votes / self.total[:, None]).astype(np.float32)
+        inside = np.asarray((self.proof.votes.T @ share)[np.arange(len(self.ids)), self.ids])
+        everywhere = (self.proof.seen.T @ share)[self.view, self.ids]
+        return inside, everywhere
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
+
+
+def consistent(sight: scenes.Sight, state: State, *, part: float = 0.7, rounds: int = 2) -> State:
+    """F: masks whose IoU with their region's reprojection is below `part` of the region's median are left out."""
+    here = sight.pixels.reshape(-1) > 0
+    for _ in range(rounds):
+        inside, everywhere = state.overlap()
+        iou = inside / np.maximum(sight.pixels.reshape(-1) + everywhere - inside, 1e-9)
+        median = np.array([np.median(iou[state.ok & (state.ids == r)]) if (state.ok & (state.ids == r)).any() else 0
+                           for r in range(state.regions)])  # fmt: skip
+        state = State(sight, state.proof, state.ids, here & (iou >= part * median[state.ids]), state.regions)
+    return state
+
+
+def consensus(sight: scenes.Sight, proof: scenes.Evidence, means: np.ndarray, *, agreement: float = 0.3) -> State:
+    """E: objects are groups of Gaussians that the views put together, whatever the tracker said."""
+    best = 1 / np.maximum(proof.seen.max(1), 1e-9)
+    membership = (sparse.diags(best) @ proof.votes).tocsr().astype(np.float32)
+    visible = sparse.csr_matrix((proof.seen * best[:, None]).astype(np.float32))
+    weights = proof.seen.sum(1).astype(np.float32)
+    owner = group_by_consensus(membership, visible, weights, means.astype(np.float32), agreement=agreement)
+    live, groups = np.flatnonzero(owner >= 0), int(owner.max()) + 1
+    gather = sparse.csr_matrix((np.ones(len(live), np.float32), (owner[live], live)), shape=(groups, len(owner)))
+    ids = np.asarray((gather @ proof.votes).tocsc().argmax(0)).ravel()
+    return State(sight, proof, ids, sight.pixels.reshape(-1) > 0, groups)
+
+
+def by_code(state: State, codes: np.ndarray, wanted: np.ndarray, reduce: str, threshold: float) -> list[np.ndarray]:
+    """The Gaussians whose reduced code has a cosine of at least `threshold` with each of the codes wanted."""
+    if reduce == "mean":
+        points = _unit(state.votes @ codes)
+    else:
+        points = codes[state.votes.argmax(1)] * state.votes.any(1)[:, None]
+    labelled = state.votes.sum(1) >= 0.5 * state.total
+    return [labelled & (points @ code >= threshold) for code in wanted]
+
+
+def neighbours_vote(state: State, means: np.ndarray, groups: list[np.ndarray], *, count: int = 8) -> list[np.ndarray]:
+    """G: posteriors averaged over a Gaussian and its neighbours, by how much is seen of each and how near it is."""
+    distance, near = KDTree(means).query(means, k=count + 1)
+    effective = state.proof.seen.sum(1) ** 2 / np.maximum((state.proof.seen**2).sum(1), 1e-12)
+    weight = np.exp(-0.5 * (distance / np.maximum(np.median(distance[:, 1:]), 1e-9)) ** 2)
+    weight *= (effective / (effective + 1))[near]
+    weight /= np.maximum(weight.sum(1, keepdims=True), 1e-12)
+    return [(weight * posterior[near]).sum(1) for posterior in state.posteriors(groups)]
+
+
+def several_descriptors(sight: scenes.Sight, state: State, *, most: int = 3) -> np.ndarray:
+    """F: (K,) anchors by the best of a few centres of each region's masks (LaGa's), weighted by their compactness."""
+    scores = np.full((state.regions, len(sight.texts)), -np.inf)
+    flat = sight.embeddings.reshape(len(state.ids), -1)
+    for r in range(state.regions):
+        own = flat[state.ok & (state.ids == r)]
+        if len(own):
+            fit = KMeans(min(most, len(own)), n_init=1, random_state=0).fit(own)
+            weight = fit.cluster_centers_ @ _unit(own.mean(0))
+            scores[r] = (weight[:, None] * (_unit(fit.cluster_centers_) @ sight.texts.T)).max(0)
+    return scores.argmax(0)
+
+
+def by_gap(state: State, texts: np.ndarray) -> list[np.ndarray]:
+    """H: all regions above the largest gap among the sorted scores of the upper half."""
+    groups = []
+    known = np.flatnonzero(np.any(state.embeddings != 0, 1))
+    for score in (state.embeddings[known] @ texts.T).T:
+        order = np.argsort(-score)
+        upper = score[order[: max(len(order) // 2, 2)]]
+        groups.append(known[order[: int(np.argmax(upper[:-1] - upper[1:])) + 1]])
+    return groups
+
+
+def ambiguous(state: State, groups: list[np.ndarray]) -> list[np.ndarray]:
+    """C: (N,) a group: the entropy of "inside" over the views that show the group is above 0.9 bit."""
+    found = []
+    for g in groups:
+        views = np.flatnonzero(state.shows[:, g].any(1))
+        masks = np.flatnonzero(state.ok & np.isin(state.ids, g))
+        to_view = sparse.csr_matrix(
+            (np.ones(len(masks)), (masks, state.view[masks])), shape=(len(state.ids), len(state.shows))
+        )
+        votes, seen = (state.proof.votes @ to_view).toarray()[:, views], state.proof.seen[:, views]
+        looks = seen > 1e-6
+        part = ((votes > 0.5 * seen) & looks).sum(1) / np.maximum(looks.sum(1), 1)
+        entropy = -sum(p * np.log2(np.maximum(p, 1e-9)) for p in (part, 1 - part))
+        found.append(entropy > 0.9)
+    return found
+
+
+def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence, options: Options, told: Callable):
+    """Calls told(name, masks of the K queries, CPU seconds) for each method."""
+    began = time.process_time()
+
+    def tell(name: str, masks: list[np.ndarray]) -> None:
+        nonlocal began
+        told(name, masks, time.process_time() - began)
+        began = time.process_time()
+
+    share, texts = options.share, sight.texts
+    means = np.asarray(scene.gaussians.means)
+    opacity = np.asarray(jax.nn.sigmoid(scene.gaussians.opacity_logits))
+    here = sight.pixels.reshape(-1) > 0
+    as_tracked = np.tile(np.arange(sight.pixels.shape[1]), len(sight.pixels))
+    plain = State(sight, proof, as_tracked, here, sight.pixels.shape[1])
+    anchors = plain.anchors(texts)
+    groups = plain.joined(anchors)
+
+    for latent in options.latents:
+        key = jax.random.key(scene.seed)
+        table, coder, _ = region_codes(jnp.asarray(plain.embeddings, jnp.float32), latent=latent, key=key)
+        table, asked = np.asarray(table), np.asarray(encode(coder, jnp.asarray(texts)))
+        for reduce in ("mean", "mode"):
+            for threshold in (0.5, 0.7, 0.9) if reduce == "mean" else ():
+                tell(f"one-step, {reduce}, d={latent}, {threshold}", by_code(plain, table, asked, reduce, threshold))
+            tell(
+                f"anchored by code, {reduce}, d={latent}",
+                by_code(plain, table, table[anchors], reduce, CODE_THRESHOLD),
+            )
+    shares = plain.shares(groups)
+    tell("anchored by votes", [s >= share for s in shares])
+    tell("anchored by lead", plain.leads(groups))
+    for alike in (0.9, 0.85):
+        tell(f"by votes, alike {alike}", [s >= share for s in plain.shares(plain.joined(anchors, alike))])
+    for peak in (0.02, 0.1):
+        tell(f"A peak >= {peak}", [(s >= share) & (proof.peak >= peak) for s in shares])
+    unclear = ambiguous(plain, groups)
+    tell("C entropy", [(s >= share) & ~u for s, u in zip(shares, unclear)])
+    tell("C entropy and opacity <= 0.1", [(s >= share) & ~(u & (opacity <= 0.1)) for s, u in zip(shares, unclear)])
+    tell("D views that show it", [p >= share for p in plain.posteriors(groups)])
+    tell("D + G neighbours", [p >= share for p in neighbours_vote(plain, means, groups)])
+    kept = consistent(sight, plain)
+    tell("F masks dropped", [s >= share for s in kept.shares(kept.joined(kept.anchors(texts)))])
+    tell("F masks dropped + D", [p >= share for p in kept.posteriors(kept.joined(kept.anchors(texts)))])
+    described = plain.joined(several_descriptors(sight, plain))
+    tell("F several descriptors", [s >= share for s in plain.shares(described)])
+    tell("H largest gap", [s >= share for s in plain.shares(by_gap(plain, texts))])
+    grouped = consensus(sight, proof, means)
+    found = grouped.joined(grouped.anchors(texts))
+    tell("E consensus", [s >= share for s in grouped.shares(found)])
+    tell("E consensus, by lead", grouped.leads(found))
+    tell("E + D", [p >= share for p in grouped.posteriors(found)])
+
+    ids = as_tracked.copy()
+    ids[here] = agree(proof.votes[:, np.flatnonzero(here)], as_tracked[here])
+    agreed = State(sight, proof, ids, here, plain.regions)
+    anchors = agreed.anchors(texts)
+    found = agreed.joined(anchors)
+    tell("F masks reconciled", [s >= share for s in agreed.shares(found)])
+    tell("F reconciled + D", [p >= share for p in agreed.posteriors(found)])
+    tell("F reconciled + D, alike 0.9", [p >= share for p in agreed.posteriors(agreed.joined(anchors, 0.9))])
+    tell("F reconciled + D + G", [p >= share for p in neighbours_vote(agreed, means, found)])
+    tell("F reconciled + D + H", [p >= share for p in agreed.posteriors(by_gap(agreed, texts))])
+    described = agreed.joined(several_descriptors(sight, agreed))
+    tell("F reconciled + several descriptors + D", [p >= share for p in agreed.posteriors(described)])
+    tell("F reconciled, by lead", agreed.leads(found))
+    tell("F reconciled + D, by lead", [m & (p >= share) for m, p in zip(agreed.leads(found), agreed.posteriors(found))])
+
+
+def point_miou(masks: list[np.ndarray], truth: np.ndarray) -> float:
+    """Mean over the objects that some Gaussian belongs to of the selection's IoU with those Gaussians."""
+    return float(
+        np.mean(
+            [(m & (truth == k)).sum() / (m | (truth == k)).sum() for k, m in enumerate(masks) if (truth == k).any()]
+        )
+    )
+
+
+def main(options: Options = Options()) -> dict:
+    """Runs the experiment, writes its results and returns the metrics."""
+    space = scenes.text_space(Path(options.texts))
+    found: dict[str, dict[tuple[str, str], float]] = {}
+    seconds: dict[str, list[float]] = {}
+    passes = {}
+
+    def one_scene(scene: scenes.Scene) -> None:
+        for level in options.levels:
+            sight = scenes.look(scene, level, space)
+            proof = scenes.evidence(scene, sight.masks.labels, len(sight.masks.origin))
+            passes[f"{scene.name}, {level}"] = round(proof.seconds, 2)
+
+            def told(name, masks, spent, level=level):
+                found.setdefault(name, {})[scene.name, level] = point_miou(masks, scene.truth)
+                seconds.setdefault(name, []).append(spent)
+
+            selections(scene, sight, proof, options, told)
+
+    for seed in options.seeds:
+        one_scene(scenes.demo_scene(Path(options.demos) / f"demo{seed}", seed))
+    if Path(options.replica).is_dir():
+        one_scene(scenes.replica_scene(options.replica))
+
+    rows = []
+    for name, values in found.items():
+        by_level = [np.mean([v for (_, at), v in values.items() if at == level]) for level in options.levels]
+        demos = [v for (scene, _), v in values.items() if scene.startswith("demo")]
+        others = [v for (scene, _), v in values.items() if not scene.startswith("demo")]
+        rows.append(
+            {
+                "method": name,
+                **{level: float(mean) for level, mean in zip(options.levels, by_level)},
+                "demos": float(np.mean(demos)) if demos else float("nan"),
+                "replica": float(np.mean(others)) if others else float("nan"),
+                "mean": float(np.mean(list(values.values()))),
+                "deviation": float(np.std(list(values.values()))),
+                "seconds": float(np.mean(seconds[name])),
+            }
+        )
+    metrics = {
+        "rows": rows,
+        "seconds_of_votes": passes,
+        "by_scene": {
+            name: {f"{scene}, {level}": v for (scene, level), v in values.items()} for name, values in found.items()
+        },
+    }
+    table = results.table(tuple(rows[0]), [tuple(row.values()) for row in rows])
+    results.save(Path(options.out), options, metrics, table, draw(rows))
+    print(table)
+    return metrics
+
+
+def draw(rows: list[dict]):
+    """A bar a method: mean and deviation."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 0.24 * len(rows) + 0.8))
+    axes = figure.add_subplot()
+    place = np.arange(len(rows))[::-1]
+    axes.barh(place, [r["mean"] for r in rows], 0.8, xerr=[r["deviation"] for r in rows], ecolor="0.6")
+    axes.set_yticks(place, [r["method"] for r in rows], fontsize=8)
+    axes.set_xlim(0, 1)
+    axes.set_xlabel("point-level mIoU, mean and deviation over scenes and levels")
+    return figure
+
+
+if __name__ == "__main__":
+    main(dataclasses.replace(Options(), **({"demos": sys.argv[1]} if len(sys.argv) > 1 else {})))

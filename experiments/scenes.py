@@ -1,0 +1,176 @@
+"""Scenes with true instance labels, seen by simulated vision: what `beyond.py` and `thresholds.py` measure on.
+
+The Gaussians are those of the real pipeline: demo rooms fitted to their frames, and the points of a Replica scan. A
+Gaussian's true object is the one that most of its weight lies on when the true masks of the voting views vote.
+"""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import sparse
+
+from experiments import replica_apartment_0
+from jsecon.demo import demo
+from jsecon.fit.initialise import gaussians_from_points, points_from_depth
+from jsecon.language.field import load_field
+from jsecon.language.votes import region_votes
+from jsecon.plan import Silent
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Camera, Gaussians
+from jsecon.vision.simulated import (
+    LEVELS,
+    SimulatedEmbedder,
+    SimulatedMasks,
+    TextSpace,
+    load_text_space,
+    made_text_space,
+    simulated_masks,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Gaussians, the views that vote, and their true labels."""
+
+    name: str
+    gaussians: Gaussians
+    cameras: Camera
+    """batch of T."""
+    frames: np.ndarray
+    """(T, H, W, 3) uint8."""
+    labels: np.ndarray
+    """(T, H, W) int16 the true objects 0 .. K-1, -1 = none."""
+    count: int
+    """K."""
+    seed: int
+    """of the vision that looks at it, and of the objects' classes."""
+    truth: np.ndarray
+    """(N,) the object that most of the Gaussian's weight lies on; -1 = on none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sight:
+    """What simulated vision makes of a scene."""
+
+    masks: SimulatedMasks
+    embeddings: np.ndarray
+    """(T, R, E) of the region's mask in each view; zero where it has none."""
+    pixels: np.ndarray
+    """(T, R) of that mask."""
+    texts: np.ndarray
+    """(K, E) of the objects' classes."""
+    canonical: np.ndarray
+    """(4, E)."""
+
+
+def demo_scene(folder: Path, seed: int) -> Scene:
+    """The demo room of `seed`, as `jsecon demo --seed SEED --out FOLDER` leaves it; made where it is missing."""
+    if not (folder / "field.npz").exists():
+        demo(folder, seed=seed, reporter=Silent())
+    field = load_field(folder / "field.npz")
+    told = json.loads((folder / "capture" / "scene.json").read_text())
+    voting = np.array([name not in told["held_out"] for name in field.names])
+
+    def read(kind: str, how: int) -> list[np.ndarray]:
+        files = (folder / "capture" / kind / f"{name}.png" for name, votes in zip(field.names, voting) if votes)
+        return [cv2.imread(str(file), how) for file in files]
+
+    frames = np.stack([image[..., ::-1] for image in read("images", cv2.IMREAD_COLOR)])
+    labels = np.stack(read("masks", cv2.IMREAD_UNCHANGED)).astype(np.int16) - 1
+    cameras = field.cameras[np.flatnonzero(voting)]
+    return _scene(f"demo {seed}", field.gaussians, cameras, frames, labels, len(told["objects"]), seed)
+
+
+def held_out_labels(folder: Path, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """A demo room's held-out views (V,), as indices of `names`, and their true labels (V, H, W), -1 = none."""
+    told = json.loads((folder / "capture" / "scene.json").read_text())
+    views = np.array([t for t, name in enumerate(names) if name in told["held_out"]])
+    files = (folder / "capture" / "masks" / f"{names[t]}.png" for t in views)
+    labels = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files])
+    return views, labels.astype(np.int16) - 1
+
+
+def replica_scene(folder: str, seed: int = 0) -> Scene:
+    """replica_apartment_0 as its own experiment has it: every second view votes. An id stands for several objects."""
+    options = replica_apartment_0.Options(capture=folder)
+    capture, labels = replica_apartment_0.load_replica(folder, voting_every=options.voting_every)
+    points = points_from_depth(
+        capture, voxel=options.voxel_m, stride=options.stride, frames=np.arange(len(capture.names))
+    )
+    gaussians = gaussians_from_points(
+        points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=2 * options.voxel_m
+    )
+    voting = np.flatnonzero(~capture.held_out)
+    count = len(replica_apartment_0.PALETTE)
+    frames = np.asarray(capture.frames)[voting]
+    return _scene("replica_apartment_0", gaussians, capture.cameras[voting], frames, labels[voting], count, seed)
+
+
+def _scene(name, gaussians, cameras, frames, labels, count, seed) -> Scene:
+    gaussians, cameras = jax.tree.map(jnp.asarray, (gaussians, cameras))
+    votes = region_votes(gaussians, cameras, jnp.asarray(labels), count)
+    outside = np.asarray(votes.total - votes.labelled)
+    inside, strongest = np.asarray(votes.weights[:, 0]), np.asarray(votes.regions[:, 0])
+    return Scene(name, gaussians, cameras, frames, labels, count, seed, np.where(inside > outside, strongest, -1))
+
+
+def text_space(folder: Path) -> TextSpace:
+    """CLIP's vectors of the LVIS classes where they lie in `folder`, else a made space of the same statistics."""
+    vectors, names = folder / "clip_vitb32_lvis.npy", folder / "lvis_names.json"
+    return load_text_space(vectors, names) if vectors.exists() else made_text_space([f"word {i}" for i in range(1203)])
+
+
+def look(scene: Scene, level: str, space: TextSpace) -> Sight:
+    """Simulated vision of a named level. The objects' classes are drawn by the scene's seed, the same at each level."""
+    faults, views = LEVELS[level], np.arange(len(scene.frames))
+    chosen = np.random.default_rng(scene.seed).choice(len(space.names), scene.count, replace=False)
+    classes = [space.names[i] for i in chosen]
+    masks = simulated_masks(scene.labels, faults, seed=scene.seed)
+    embedder = SimulatedEmbedder(scene.frames, scene.labels, classes, space, faults, seed=scene.seed)
+    regions = len(masks.origin)
+    pixels = np.zeros((len(views), regions), np.int64)
+    embeddings = np.zeros((len(views), regions, embedder.dim), np.float32)
+    for t, image in enumerate(masks.labels):
+        here, pixels_here = np.unique(image[image >= 0], return_counts=True)
+        pixels[t, here] = pixels_here
+        for r in here:
+            embeddings[t, r] = embedder.embed_regions(scene.frames[t], image[None] == r)[0]
+    return Sight(masks, embeddings, pixels, embedder.embed_text(classes), embedder.canonical)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """Each view's votes apart."""
+
+    votes: sparse.csr_matrix
+    """(N, T R) weight of mask (t, r), column t R + r, on each Gaussian."""
+    seen: np.ndarray
+    """(N, T) weight of all pixels of the view."""
+    peak: np.ndarray
+    """(N,) largest weight at any pixel."""
+    seconds: float
+    """CPU seconds of the pass over the views."""
+
+
+def evidence(scene: Scene, labels: np.ndarray, regions: int) -> Evidence:
+    """The votes of region labels (T, H, W), view by view."""
+    began = time.process_time()
+    capacity = plan_capacity(scene.gaussians, scene.cameras, margin=1.0)
+    count = scene.gaussians.means.shape[0]
+    blocks, seen, peak = [], [], np.zeros(count, np.float32)
+    for t, image in enumerate(labels):
+        image = jnp.asarray(image[None], jnp.int32)
+        votes = region_votes(scene.gaussians, scene.cameras[t : t + 1], image, regions, capacity=capacity)
+        weights = np.asarray(votes.weights)
+        rows, slots = np.nonzero(weights > 0)
+        entries = weights[rows, slots], (rows, np.asarray(votes.regions)[rows, slots])
+        blocks.append(sparse.csr_matrix(entries, shape=(count, regions)))
+        seen.append(np.asarray(votes.total))
+        peak = np.maximum(peak, np.asarray(votes.peak))
+    return Evidence(sparse.hstack(blocks, format="csr"), np.stack(seen, 1), peak, time.process_time() - began)
