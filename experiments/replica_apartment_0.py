@@ -18,6 +18,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from experiments import results
 from jsecon.errors import InputError
@@ -27,7 +28,6 @@ from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.votes import region_votes
 from jsecon.numerics import cosine_matrix
-from jsecon.splat.project import rotation_matrices
 from jsecon.types import Camera, Capture
 
 _HEX = """
@@ -81,7 +81,7 @@ def ids_of_colors(image: np.ndarray, where: object) -> np.ndarray:
 
 def world_to_camera(poses: np.ndarray) -> np.ndarray:
     """(T, 4, 4) world-to-camera, OpenCV axes, of rows x y z qw qx qy qz: camera-to-world, OpenGL axes."""
-    rotation = np.asarray(rotation_matrices(jnp.asarray(poses[:, 3:], jnp.float32)), np.float64)
+    rotation = Rotation.from_quat(poses[:, 3:], scalar_first=True).as_matrix()
     rotation = rotation * np.array([1.0, -1.0, -1.0])  # the columns are the camera's axes: y and z turn round
     result = np.tile(np.eye(4), (len(poses), 1, 1))
     result[:, :3, :3] = rotation.transpose(0, 2, 1)

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments import results, scenes
 from jsecon.evaluate.metrics import iou, mean_iou
-from jsecon.language.autoencoder import encode, region_codes
+from jsecon.language.codes import Spread, encode, region_codes, spread_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field
 from jsecon.language.regions import region_embeddings
@@ -40,6 +40,10 @@ class Options:
     texts: str = str(results.CAPTURES.parent / "text")
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     latents: tuple[int, ...] = (3, 16)
+    """of LangSplat's autoencoder."""
+    spread_latent: int = 16
+    """of codes placed on the sphere so that no two have a cosine above `separation`."""
+    separation: float = 0.4
     thresholds: tuple[float, ...] = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
     level: str = "medium"
     """of the embeddings' noise; the masks are true."""
@@ -47,13 +51,13 @@ class Options:
     out: str = str(results.HOME / "results" / "thresholds")
 
 
-def ask(field: LanguageField, texts, asked, phrases, threshold: float) -> dict[str, np.ndarray]:
-    """(K, N) bool the selections of K texts (K, E), with codes `asked` (K, d), by each kind of query."""
-    size = field.codes.shape[1]
+def ask(field: LanguageField, coded: str, texts, asked, phrases, threshold: float) -> dict[str, np.ndarray]:
+    """(K, N) bool the selections of K texts (K, E), with codes `asked` (K, d), by each kind of query; `coded` names the
+    kind of code."""
     kinds = {
-        f"one-step, d={size}": lambda text, code: query_one_step(field.codes, code, threshold),
-        f"canonical, d={size}": lambda text, code: query_canonical(field.codes, code, phrases, threshold),
-        f"anchored by code, d={size}": lambda text, code: query_anchored(
+        f"one-step, {coded}": lambda text, code: query_one_step(field.codes, code, threshold),
+        f"canonical, {coded}": lambda text, code: query_canonical(field.codes, code, phrases, threshold),
+        f"anchored by code, {coded}": lambda text, code: query_anchored(
             field, text, similarity_threshold=threshold, by="code"
         ),
     }
@@ -96,8 +100,11 @@ def main(options: Options = Options()) -> dict:
         texts = embedder.embed_text(classes)
         hits += list((texts @ np.asarray(regions.embeddings).T).argmax(1) == np.arange(scene.count))
 
-        for latent in options.latents:
-            table, coder, _ = region_codes(jnp.asarray(regions.embeddings), latent=latent, key=jax.random.key(seed))
+        units = jnp.asarray(regions.embeddings)
+        coders = {f"d={d}": region_codes(units, latent=d, key=jax.random.key(seed))[:2] for d in options.latents}
+        spread = spread_codes(units, options.spread_latent, separation=options.separation)
+        coders[f"spread d={options.spread_latent}"] = spread, Spread(units, spread)
+        for coded, (table, coder) in coders.items():
             codes = distill_votes(votes, table)
             asked, phrases = encode(coder, jnp.asarray(texts)), encode(coder, jnp.asarray(embedder.canonical))
             field = LanguageField(
@@ -106,9 +113,9 @@ def main(options: Options = Options()) -> dict:
             )  # fmt: skip
             once = {}
             for threshold in options.thresholds:
-                for name, masks in ask(field, texts, asked, phrases, threshold).items():
-                    if latent != options.latents[-1] and name in ("anchored by votes", "anchored by lead"):
-                        continue  # they do not look at codes
+                for name, masks in ask(field, coded, texts, asked, phrases, threshold).items():
+                    if name.endswith(("votes", "lead")) and "spread" not in coded:
+                        continue  # they do not look at codes: once is enough
                     # Selections that did not change need not be rendered again.
                     if once.get(name, (None,))[0] != masks.tobytes():
                         once[name] = masks.tobytes(), score(scene.gaussians, cameras, masks, true, options)
@@ -150,7 +157,7 @@ def draw(means: dict[str, dict[float, float]]):
     }
     for name, curve in means.items():
         kind, _, size = name.partition(", ")
-        line = "--" if size == "d=3" else "-"
+        line = {"d=3": "--", "d=16": "-"}.get(size, ":" if size else "-")
         axes.plot(list(curve), list(curve.values()), line, marker=".", color=colours[kind], label=name)
     axes.set_xlabel("threshold")
     axes.set_ylabel("mIoU, point level, rendered")

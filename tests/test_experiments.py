@@ -7,9 +7,12 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from scipy import sparse
+from small_field import make_field
 
-from experiments import apc_bin, replica_apartment_0 as replica
+from experiments import apc_bin, beyond, outliers, replica_apartment_0 as replica, scenes, thresholds
 from jsecon.errors import InputError
+from jsecon.vision.simulated import SimulatedMasks
 
 CAMERAS = """# Environment: shelf
 # Color camera intrinsic matrix
@@ -151,3 +154,64 @@ def test_apc_small_voxels_select_an_object(shared):
     assert [r["object"] for r in rows] == list(apc_bin.OBJECTS.values())
     assert np.mean([r["iou"] for r in rows]) > 0.5
     assert all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(gaussians))
+
+
+@pytest.fixture
+def two_objects():
+    """Two objects of 30 Gaussians and 20 of the wall in six views; the tracker gave their masks each other's id in the
+    last view. (sight, evidence, truth)"""
+    truth = np.repeat([0, 1, -1], [30, 30, 20])
+    votes, pixels = np.zeros((80, 12)), np.full((6, 2), 100)
+    embeddings = np.zeros((6, 2, 3))
+    for t in range(6):
+        ids = (1, 0) if t == 5 else (0, 1)
+        for k, r in enumerate(ids):
+            votes[truth == k, 2 * t + r] = 1
+            embeddings[t, r] = np.eye(3)[k]
+    sight = scenes.Sight(
+        SimulatedMasks(np.zeros((6, 1, 1), np.int16), np.arange(2)), embeddings, pixels, np.eye(3)[:2], np.eye(3)
+    )
+    return sight, scenes.Evidence(sparse.csr_matrix(votes), np.ones((80, 6)), np.ones(80), 0.0), truth
+
+
+def test_ideas_answer_what_the_votes_say(two_objects):
+    sight, proof, truth = two_objects
+    ids, ok = np.tile([0, 1], 6), np.ones(12, bool)
+    plain = beyond.State(sight, proof, ids, ok, 2)
+    groups = plain.joined(plain.anchors(sight.texts))
+    assert [list(g) for g in groups] == [[0], [1]]
+    np.testing.assert_allclose(plain.shares(groups)[0][[0, 30, 60]], [5 / 6, 1 / 6, 0])
+    assert beyond.point_miou(plain.leads(groups), truth) == 1
+    assert not any(u.any() for u in beyond.ambiguous(plain, groups))
+    kept = beyond.consistent(sight, plain)
+    assert not kept.ok[10:].any()
+    assert kept.ok[:10].all()  # F drops the two masks that were swapped
+    np.testing.assert_allclose(kept.posteriors(groups)[0][[0, 30, 60]], [1, 0, 0])
+    agreed = beyond.State(sight, proof, beyond.agree(proof.votes, ids), ok, 2)
+    np.testing.assert_allclose(agreed.shares(groups)[0][[0, 30, 60]], [1, 0, 0])
+    assert [list(g) for g in beyond.by_gap(plain, sight.texts)] == [[0], [1]]
+
+
+def test_point_miou_is_over_the_objects_that_points_belong_to():
+    truth = np.array([0, 0, 1, -1])
+    masks = [np.array([1, 0, 0, 1], bool), truth == 1, np.ones(4, bool)]
+    assert beyond.point_miou(masks, truth) == pytest.approx((1 / 3 + 1) / 2)
+
+
+def test_higher_thresholds_select_less(scene, cameras):
+    field, _ = make_field(scene, cameras)
+    texts = field.regions.embeddings
+    asked = field.region_codes
+    low, high = (thresholds.ask(field, "d=8", texts, asked, asked[:2], t) for t in (0.4, 0.7))
+    assert len(low) == 5
+    for name, masks in low.items():
+        assert (high[name] <= masks).all()
+        assert masks.any()
+
+
+def test_outlier_options_only_take_away():
+    points = outliers.made_points(3000)
+    np.testing.assert_array_equal(points, outliers.made_points(3000))
+    mask = np.arange(3000) % 3 == 0
+    for clean in outliers.cleaners(points.astype(np.float32), outliers.Options()).values():
+        assert (clean(mask) <= mask).all()
