@@ -74,8 +74,8 @@ def _run(verbs) -> None:
         "run",
         "build the language field of a capture",
         """
-        From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found and followed
-        through the frames, or given as masks), one embedding a region, codes distilled into the Gaussians. Prints its
+        From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found in the frames and
+        brought together, or given as masks), one embedding a region, codes distilled into the Gaussians. Prints its
         plan first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
         """,
     )
@@ -97,7 +97,7 @@ def _run(verbs) -> None:
         type=Path,
         metavar="DIR",
         help="instance masks, one integer PNG a frame under the frame's "
-        "name (0 = none), or LangSplat's _s.npy; without it, they are found and followed",
+        "name (0 = none), or LangSplat's _s.npy; without it, they are found in the frames",
     )
     verb.add_argument(
         "--downscale",

@@ -47,7 +47,6 @@ def over_batches(
     )(batches, *common)
 
 
-
 def spread_over_devices(
     step: Callable,
     start: Any,

@@ -108,7 +108,7 @@ def stages_of(
             "gaussians",
             f"fitted to the frames in {options.steps} steps, SH degree {options.sh_degree}",
             lambda r, p: _fit(options, folder, keys["gaussians"], r["load"], p),
-            rooms=("fit", "splat"),
+            rooms=("fit", "splat", "parallel"),
             after=("load",),
             given=_of(options, "steps", "sh_degree", "seed"),
         )
@@ -119,7 +119,15 @@ def stages_of(
             f"{options.granularity} proposals by colour and texture, "
             + ("what the views agree on" if consensus else "followed through the Gaussians"),
             lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], p),
-            rooms=("vision", "language.masklets", "language.consensus", "language.grouping", "language.votes", "splat"),
+            rooms=(
+                "vision",
+                "language.masklets",
+                "language.consensus",
+                "language.grouping",
+                "language.votes",
+                "splat",
+                "parallel",
+            ),
             after=("load", "gaussians"),
             given=_of(options, "granularity", *(("agreement", "seed") if consensus else ("iou_threshold",)))
             | {"association": options.association},
@@ -162,7 +170,7 @@ def stages_of(
         "held_out",
         "PSNR of the rendered colours",
         lambda r, p: stages.held_out_psnr(r["load"], r["gaussians"], p),
-        rooms=("fit", "splat"),
+        rooms=("fit", "splat", "parallel"),
         after=("load", "gaussians"),
     )
     return plan

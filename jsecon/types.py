@@ -135,7 +135,7 @@ class Votes:
     views: Array
     """(N,) int32 views in which the Gaussian has any weight; 0 = never seen: unknown."""
     overflow: Array
-    """() int32 (tile, Gaussian) pairs left out for want of capacity, all views; 0 means exact."""
+    """() int32 (block, Gaussian) pairs left out for want of capacity, all views; 0 means exact."""
     num_regions: int = _static()
     """R."""
 

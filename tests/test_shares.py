@@ -3,7 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.shares import weight_and_rival, weight_inside
+from jsecon.query.shares import weight_and_rival
+
+
+def weight_inside(regions, weights, chosen):
+    return weight_and_rival(regions, weights, chosen)[0]
 
 
 def exact(regions, weights, chosen):

@@ -8,7 +8,6 @@ partial-mask filter of Segment-then-Splat, but nothing is thrown away.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +18,12 @@ from jsecon.errors import require
 from jsecon.language.votes import region_votes
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians
+from jsecon.vision.atoms import Sparse
 
 ROUNDS = 10
 """most rounds; with a fifth of the masks wrong two or three suffice"""
 _CHUNK = 16
 """masks of a view are counted in multiples of this, so that few shapes are compiled"""
-
-Sparse = Any
-"""scipy.sparse matrix"""
 
 
 def reconcile_labels(
@@ -68,7 +65,7 @@ def reconcile_labels(
             int(votes.overflow) == 0,
             "capacity",
             got=f"{capacity}, {int(votes.overflow)} pairs too few in view {t}",
-            expected="room for every (tile, Gaussian) pair",
+            expected="room for every (block, Gaussian) pair",
             remedy="Leave capacity out: it is planned then.",
         )
         rows, slots = np.nonzero(np.asarray(votes.weights) > 0)

@@ -10,17 +10,11 @@ _MOST_WORDS = 8
 """a table of more words is looked up instead of selected from: a lookup costs as much as about eight selections"""
 
 
-def weight_inside(
-    regions: Int[Array, "n k"], weights: Float[Array, "n k"], chosen: Bool[Array, " r"]
-) -> Float[Array, " n"]:
-    """(N,) sum of a Gaussian's weights (N, K) on those of its regions (N, K; -1 = none) that are chosen (R,)."""
-    return weight_and_rival(regions, weights, chosen)[0]
-
-
 def weight_and_rival(
     regions: Int[Array, "n k"], weights: Float[Array, "n k"], chosen: Bool[Array, " r"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """`weight_inside`, and (N,) the largest of a Gaussian's weights on a region that is not chosen, 0 where none is.
+    """(N,) sum of a Gaussian's weights (N, K) on those of its regions (N, K; -1 = none) that are chosen (R,); and (N,)
+    the largest of its weights on a region that is not, 0 where none is.
 
     The chosen regions are bits of a few words that stay in registers, and the votes are gone through column by column:
     1 million Gaussians of 8 votes take 4 ms, a lookup of each vote in a table 8, a sum along the short rows 27.

@@ -110,7 +110,7 @@ class SceneViews:
                 int(votes.overflow) == 0,
                 "capacity",
                 got=f"{self.capacity}, {int(votes.overflow)} pairs too few in frame {t}",
-                expected="room for every (tile, Gaussian) pair",
+                expected="room for every (block, Gaussian) pair",
                 remedy="Leave capacity out: it is planned then.",
             )
             matrix = _sparse(np.asarray(votes.regions), np.asarray(votes.weights), number)
