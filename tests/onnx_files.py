@@ -1,0 +1,47 @@
+"""Writes small ONNX graphs for tests, by the onnx package (a dev extra)."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+KINDS = {
+    "float32": TensorProto.FLOAT,
+    "float16": TensorProto.FLOAT16,
+    "int64": TensorProto.INT64,
+    "int32": TensorProto.INT32,
+}
+
+
+def node(op: str, inputs: list[str], outputs: list[str], **attributes) -> onnx.NodeProto:
+    """One operation of the default domain."""
+    return helper.make_node(op, inputs, outputs, **attributes)
+
+
+def write_graph(
+    path: Path,
+    nodes: list[onnx.NodeProto],
+    inputs: dict[str, tuple[str, list]],
+    outputs: dict[str, tuple[str, list]],
+    constants: dict[str, np.ndarray] | None = None,
+    *,
+    external: str | None = None,
+) -> Path:
+    """Writes a graph of opset 17. Inputs and outputs: name -> (dtype, shape), a text for a free axis. `external` is the
+    name of the file beside it that takes the constants."""
+    values = [
+        [helper.make_tensor_value_info(name, KINDS[kind], shape) for name, (kind, shape) in side.items()]
+        for side in (inputs, outputs)
+    ]
+    stored = [numpy_helper.from_array(np.asarray(array), name) for name, array in (constants or {}).items()]
+    model = helper.make_model(
+        helper.make_graph(nodes, path.stem, *values, stored), opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    )
+    onnx.checker.check_model(model)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if external is None:
+        onnx.save(model, path)
+    else:
+        onnx.save(model, path, save_as_external_data=True, location=external, size_threshold=0)
+    return path

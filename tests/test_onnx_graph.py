@@ -1,0 +1,130 @@
+"""ONNX graphs: signatures as the file has them, and a message that names file or tensor for whatever does not fit."""
+
+import numpy as np
+import pytest
+
+from jsecon.errors import InputError
+from jsecon.vision.onnx_graph import Graph, Tensor, content_digest, describe, graph_files
+from tests.onnx_files import node, write_graph
+
+
+@pytest.fixture
+def affine(tmp_path):
+    """y = x @ w + b and z = y + y, of x (batch, 3)."""
+    nodes = [node("MatMul", ["x", "w"], ["xw"]), node("Add", ["xw", "b"], ["y"]), node("Add", ["y", "y"], ["z"])]
+    constants = {"w": np.arange(6, dtype=np.float32).reshape(3, 2), "b": np.ones(2, np.float32)}
+    outputs = {"y": ("float32", ["batch", 2]), "z": ("float32", ["batch", 2])}
+    return write_graph(tmp_path / "affine.onnx", nodes, {"x": ("float32", ["batch", 3])}, outputs, constants)
+
+
+def test_the_signature_is_that_of_the_file(affine):
+    graph = Graph(affine, threads=1, optimise=False)
+    assert graph.inputs == {"x": Tensor("x", "float32", ("batch", 3))}
+    assert list(graph.outputs) == ["y", "z"]
+    assert describe(graph.outputs.values()) == "y float32[batch, 2], z float32[batch, 2]"
+    assert graph.inputs["x"].fixed(1) == 3
+    assert graph.inputs["x"].fixed(0) is None
+    assert graph.inputs["x"].fixed(5) is None
+
+
+def test_it_runs_by_name_and_converts_within_a_kind(affine):
+    x = np.asarray([[1.0, 2.0, 3.0]])  # float64
+    found = Graph(affine, threads=1).run({"x": x}, ["z", "y"])
+    assert list(found) == ["z", "y"]
+    np.testing.assert_allclose(found["y"], x @ np.arange(6).reshape(3, 2) + 1)
+    np.testing.assert_array_equal(found["z"], 2 * found["y"])
+    assert found["y"].dtype == np.float32
+    assert list(Graph(affine, threads=1).run({"x": x})) == ["y", "z"]
+
+
+@pytest.mark.parametrize(
+    ("feeds", "outputs", "named"),
+    [
+        ({"x": np.zeros((1, 4), np.float32)}, None, ["input 'x'", "[batch, 3]", "[1, 4]"]),
+        ({"x": np.zeros((1, 3), np.int64)}, None, ["input 'x'", "float32[batch, 3]", "int64[1, 3]"]),
+        ({"image": np.zeros((1, 3), np.float32)}, None, ["tensor 'image'", "x float32[batch, 3]"]),
+        ({}, None, ["tensor 'x'"]),
+        ({"x": np.zeros((1, 3), np.float32)}, ["embedding"], ["tensor 'embedding'", "y float32[batch, 2]"]),
+    ],
+)
+def test_a_tensor_that_does_not_fit_is_named(affine, feeds, outputs, named):
+    with pytest.raises(InputError) as caught:
+        Graph(affine, threads=1).run(feeds, outputs)
+    for words in ("affine.onnx", *named):
+        assert words in str(caught.value)
+
+
+def test_requirements_name_the_tensor_and_what_was_wanted(affine):
+    graph = Graph(affine, threads=1)
+    assert graph.require_input("x", (None, 3), "a test").dtype == "float32"
+    assert graph.require_output("y", (4, 2), "a test").name == "y"
+    with pytest.raises(InputError, match=r"input 'image'.*no such input.*x float32\[batch, 3\].*CLIP's image encoder"):
+        graph.require_input("image", (1, 3, 224, 224), "CLIP's image encoder")
+    with pytest.raises(InputError, match=r"output 'y': found y float32\[batch, 2\].*\[\?, 512\]"):
+        graph.require_output("y", (None, 512), "CLIP's image encoder")
+
+
+def _damage(kind, path):
+    if kind == "missing":
+        path.unlink()
+    elif kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "cut":
+        path.write_bytes(path.read_bytes()[:100])
+    elif kind == "page":
+        path.write_bytes(b"<!DOCTYPE html><html>not found</html>")
+    elif kind == "pointer":
+        path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n")
+    elif kind == "torch":
+        path.write_bytes(b"PK\x03\x04" + bytes(200))
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("missing", "No such file"),
+        ("empty", "an empty file"),
+        ("cut", "cannot open"),
+        ("page", "cannot open"),
+        ("pointer", "Git LFS pointer"),
+        ("torch", "cannot open"),
+    ],
+)
+def test_a_file_that_is_no_graph_is_refused_by_name(affine, kind, words):
+    _damage(kind, affine)
+    with pytest.raises(InputError, match=words) as caught:
+        Graph(affine, threads=1)
+    assert str(affine) in caught.value.where
+
+
+def test_a_graph_that_fails_at_run_time_is_named(tmp_path):
+    inputs = {"a": ("float32", ["n"]), "b": ("float32", ["m"])}
+    path = write_graph(tmp_path / "sum.onnx", [node("Add", ["a", "b"], ["c"])], inputs, {"c": ("float32", ["k"])})
+    with pytest.raises(InputError, match=r"sum.onnx: found a graph that fails on a float32\[2\], b float32\[3\]"):
+        Graph(path, threads=1).run({"a": np.zeros(2), "b": np.zeros(3)})
+
+
+def test_external_data_belongs_to_the_graph(tmp_path):
+    def write(name, value):
+        constants = {"w": np.full(64, value, np.float32)}
+        shape = {"x": ("float32", [64])}, {"y": ("float32", [64])}
+        return write_graph(
+            tmp_path / name / "g.onnx", [node("Add", ["x", "w"], ["y"])], *shape, constants, external="g.bin"
+        )
+
+    path, other = write("one", 1.0), write("two", 2.0)
+    (path.parent / "notes.txt").write_text("nothing to do with it")
+    assert [file.name for file in graph_files(path)] == ["g.onnx", "g.bin"]
+    assert content_digest(graph_files(path)) != content_digest(graph_files(other))
+    assert path.read_bytes() == other.read_bytes()
+    assert content_digest(graph_files(path)) == content_digest(graph_files(write("three", 1.0)))
+    (path.parent / "g.bin").unlink()
+    with pytest.raises(InputError, match=r"g\.onnx.*g\.bin"):
+        Graph(path, threads=1)
+
+
+def test_half_precision_is_met_with_half_precision(tmp_path):
+    half = {"x": ("float16", ["n"])}, {"y": ("float16", ["n"])}
+    path = write_graph(tmp_path / "half.onnx", [node("Add", ["x", "x"], ["y"])], *half)
+    found = Graph(path, threads=1).run({"x": np.ones(3, np.float32)})
+    assert found["y"].dtype == np.float16
