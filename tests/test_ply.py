@@ -8,6 +8,7 @@ import pytest
 from capture_files import refused
 
 from jsecon.data.ply import SH_DC, load_ply, load_points_ply, save_ply
+from jsecon.data.ply_file import read_faces, write_mesh
 from jsecon.errors import InputError
 from jsecon.types import Gaussians
 
@@ -251,3 +252,26 @@ def test_points_without_colour_or_place(tmp_path):
     write(tmp_path / "p.ply", {axis: np.full(2, np.nan) for axis in "xyz"})
     with refused("p.ply", "NaN"):
         load_points_ply(tmp_path / "p.ply")
+
+
+def test_faces_round_trip_and_damage(tmp_path):
+    rng = np.random.default_rng(0)
+    vertices = np.zeros(9, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    vertices["y"] = rng.normal(size=9)
+    for corners in (3, 4):
+        faces, owners = rng.integers(0, 9, (5, corners)), rng.integers(0, 70000, 5).astype(np.int32)
+        write_mesh(tmp_path / "mesh.ply", vertices, faces, {"object_id": owners})
+        found, properties = read_faces(tmp_path / "mesh.ply")
+        np.testing.assert_array_equal(found, faces)
+        np.testing.assert_array_equal(properties["object_id"], owners)
+        np.testing.assert_array_equal(load_points_ply(tmp_path / "mesh.ply")[0][:, 1], vertices["y"])
+    data = (tmp_path / "mesh.ply").read_bytes()
+    (tmp_path / "cut.ply").write_bytes(data[:-3])
+    with refused("fewer than 5 faces"):
+        read_faces(tmp_path / "cut.ply")
+    write_mesh(tmp_path / "wrong.ply", vertices, np.full((1, 3), 9))
+    with refused("a face with vertex 9"):
+        read_faces(tmp_path / "wrong.ply")
+    write_mesh(tmp_path / "points.ply", vertices)
+    with refused("elements vertex"):
+        read_faces(tmp_path / "points.ply")

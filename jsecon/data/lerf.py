@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Bool, Real
 
@@ -22,15 +23,16 @@ from jsecon.files import write_text
 _REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels have it)."
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LabelledFrame:
-    """What was annotated in one frame."""
+    """What was annotated in one frame; a pytree."""
 
-    name: str
+    name: str = dataclasses.field(metadata={"static": True})
     """the frame's name without ending, as in Capture.names."""
-    width: int
+    width: int = dataclasses.field(metadata={"static": True})
     """px."""
-    height: int
+    height: int = dataclasses.field(metadata={"static": True})
     """px."""
     objects: dict[str, tuple[np.ndarray, np.ndarray]]
     """category -> mask bool (H, W), boxes float32 (B, 4) x1 y1 x2 y2 in px, ends included."""

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.data.lerf import LabelledFrame
+from jsecon.data.lerf_ovs import LERF_PAIRS as LERF_PAIRS
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
 from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
@@ -22,8 +23,6 @@ from jsecon.types import Camera, Gaussians, Selection
 
 VALA_THRESHOLD = 10 / 255
 """VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
-LERF_PAIRS = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
-"""(frame, query) pairs of each LERF-OVS scene (REFERENCE 0.2): a run with others does not measure the same thing"""
 LOCALISATION_WINDOW = 0.04
 """side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px of 730"""
 

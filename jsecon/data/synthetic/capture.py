@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Int16, UInt8
+from jaxtyping import Bool, Int16, UInt8
 
 from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_options, held_out
@@ -30,12 +31,13 @@ def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int =
     centres = np.stack([radius * np.cos(turn), radius * np.sin(turn), height_m], -1)
     targets = np.array([0, 0, 0.03]) + draw.normal(0, 0.03, (views, 3))
     focal = 0.5 * width / np.tan(np.radians(30))
-    poses = np.stack([_look_at(centre, target) for centre, target in zip(centres, targets)])
+    poses = np.stack([look_at(centre, target) for centre, target in zip(centres, targets)])
     focal_px, cx, cy = (np.full(views, value, np.float32) for value in (focal, width / 2, height / 2))
     return Camera(poses, focal_px, focal_px, cx, cy, width, height)
 
 
-def _look_at(centre, target):
+def look_at(centre, target):
+    """(4, 4) float32 world-to-camera of a camera at `centre` that looks at `target`, upright."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, (0, 0, 1))
     right /= np.linalg.norm(right)
@@ -72,11 +74,24 @@ def room_capture(
     )
     room = make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=views, width=width, height=height)
-    frames, instances, depths = render_views(room, cameras, progress=progress)
-    cloud, colours = _sparse_points(np.random.default_rng([seed, 7]), frames, depths, cameras, out, points)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
-    capture = Capture(frames, cameras, cloud, colours, out, None, np.eye(4, dtype=np.float32), names)
-    return capture, instances, room.names
+    capture, instances = captured(room, cameras, names, out, points=points, progress=progress)
+    return dataclasses.replace(capture, depths=None), instances, room.names
+
+
+def captured(
+    room: Room,
+    cameras: Camera,
+    names: tuple[str, ...],
+    out: Bool[np.ndarray, " t"],
+    *,
+    points: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Capture, Int16[np.ndarray, "t h w"]]:
+    """A room seen by `cameras` as a capture with depth, frames `out` held out, and its instances (-1 = background)."""
+    frames, instances, depths = render_views(room, cameras, progress=progress)
+    cloud, colours = _sparse_points(np.random.default_rng([room.seed, 7]), frames, depths, cameras, out, points)
+    return Capture(frames, cameras, cloud, colours, out, depths, np.eye(4, dtype=np.float32), names), instances
 
 
 def _sparse_points(draw, frames, depths, cameras, out, count):
@@ -152,10 +167,10 @@ def write_room(
     )
     write_colmap(capture, folder)
     for name, instance in zip(capture.names, instances):
-        _write_ids(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
+        write_ids(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
     write_lerf_labels(
         folder / "label",
-        [_labelled(capture.names[t], instances[t], names, label_pixels) for t in np.flatnonzero(capture.held_out)],
+        [labelled(capture.names[t], instances[t], names, label_pixels) for t in np.flatnonzero(capture.held_out)],
     )
     scene = {
         "seed": seed,
@@ -183,7 +198,7 @@ def _clear(folder):
             file.unlink()
 
 
-def _labelled(frame, instance, names, label_pixels):
+def labelled(frame, instance, names, label_pixels):
     """The label of a frame: its objects' masks and boxes."""
     objects = {}
     for k, name in enumerate(names):
@@ -195,6 +210,7 @@ def _labelled(frame, instance, names, label_pixels):
     return LabelledFrame(frame, instance.shape[1], instance.shape[0], objects)
 
 
-def _write_ids(path: Path, ids: UInt8[np.ndarray, "h w"]) -> None:
+def write_ids(path: Path, ids: UInt8[np.ndarray, "h w"]) -> None:
+    """Writes a label image as a grey PNG, whole or not at all."""
     with written_whole(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())
