@@ -1,10 +1,15 @@
-"""A CLIP tokenizer's files for tests: true in format, with the small vocabulary of clip_tokens.json."""
+"""CLIP folders for tests: true in format and signature, with the small vocabulary of clip_tokens.json and graphs that
+know four colours."""
 
 import functools
 import json
 from pathlib import Path
 
-from jsecon.vision.tokenizer import byte_symbols
+import numpy as np
+from onnx_files import node, write_graph
+
+from jsecon.vision.clip_folder import CLIP_MEAN, CLIP_STD
+from jsecon.vision.tokenizer import ClipTokenizer, byte_symbols
 
 
 @functools.cache
@@ -38,3 +43,75 @@ def write_tokenizer(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"version": "1.0", "added_tokens": ends, "model": model}), encoding="utf-8")
     return path
+
+
+COLOURS = {"red": (0.9, 0.1, 0.1), "green": (0.1, 0.8, 0.2), "blue": (0.1, 0.2, 0.9), "yellow": (0.9, 0.8, 0.1)}
+SIZE = 32
+LENGTH = 77
+OTHER_MEAN, OTHER_STD = [0.5, 0.4, 0.3], [0.2, 0.25, 0.3]
+
+
+def write_visual(path: Path, names: tuple[str, str], batch: int | str, mean=CLIP_MEAN, std=CLIP_STD) -> Path:
+    """Images -> mean RGB in 0..1, 3 numbers: the normalisation is undone inside, so a wrong one shows."""
+    nodes = [
+        node("Mul", [names[0], "std"], ["scaled"]),
+        node("Add", ["scaled", "mean"], ["rgb"]),
+        node("ReduceMean", ["rgb"], [names[1]], axes=[2, 3], keepdims=0),
+    ]
+    constants = {k: np.asarray(v, np.float32).reshape(1, 3, 1, 1) for k, v in (("mean", mean), ("std", std))}
+    return write_graph(
+        path, nodes, {names[0]: ("float32", [batch, 3, SIZE, SIZE])}, {names[1]: ("float32", [batch, 3])}, constants
+    )
+
+
+def write_textual(path: Path, names: tuple[str, str], batch: int | str, kind: str, *, mask: bool = False) -> Path:
+    """Texts -> the sum of the colours that they name, by a table of one row a token; a little grey for other tokens.
+
+    With a mask, of the tokens that it leaves in.
+    """
+    vocab = vocabulary()
+    table = np.full((len(vocab), 3), 0.001, np.float32)
+    for word, colour in COLOURS.items():
+        table[load_tokens([word])[0]] = colour
+    table[[vocab["<|startoftext|>"], vocab["<|endoftext|>"], 0]] = 0
+    nodes = [node("Gather", ["table", names[0]], ["rows"])]
+    inputs = {names[0]: (kind, [batch, LENGTH])}
+    if mask:
+        inputs["attention_mask"] = (kind, [batch, LENGTH])
+        nodes += [
+            node("Cast", ["attention_mask"], ["ones"], to=1),
+            node("Unsqueeze", ["ones", "last"], ["column"]),
+            node("Mul", ["rows", "column"], ["left"]),
+        ]
+    nodes.append(node("ReduceSum", ["left" if mask else "rows", "axis"], [names[1]], keepdims=0))
+    constants = {"table": table, "axis": np.asarray([1])} | ({"last": np.asarray([2])} if mask else {})
+    return write_graph(path, nodes, inputs, {names[1]: ("float32", [batch, 3])}, constants)
+
+
+def load_tokens(texts: list[str]) -> list[int]:
+    """The last id of each word: where the small vocabulary splits it, the others are shared with other words."""
+    tokenizer = ClipTokenizer(vocabulary(), [tuple(pair) for pair in fixture()["merges"]], where="fixture")
+    return [tokenizer.encode(text)[-1] for text in texts]
+
+
+def write_clip(folder: Path, layout: str) -> Path:
+    """A CLIP folder that knows colours, in one of the three layouts, each with its own signature."""
+    if layout == "immich":
+        write_visual(folder / "visual" / "model.onnx", ("image", "embedding"), 1)
+        write_textual(folder / "textual" / "model.onnx", ("text", "embedding"), 1, "int32")
+        write_tokenizer(folder / "textual" / "tokenizer.json")
+        config = {"size": [SIZE, SIZE], "mode": "RGB", "mean": CLIP_MEAN, "std": CLIP_STD, "interpolation": "bicubic"}
+        (folder / "visual" / "preprocess_cfg.json").write_text(json.dumps(config))
+    elif layout == "transformers.js":
+        write_visual(
+            folder / "onnx" / "vision_model.onnx", ("pixel_values", "image_embeds"), "batch", OTHER_MEAN, OTHER_STD
+        )
+        write_textual(folder / "onnx" / "text_model.onnx", ("input_ids", "text_embeds"), "batch", "int64", mask=True)
+        write_tokenizer(folder / "tokenizer.json")
+        config = {"crop_size": {"height": SIZE, "width": SIZE}, "image_mean": OTHER_MEAN, "image_std": OTHER_STD}
+        (folder / "preprocessor_config.json").write_text(json.dumps(config))
+    else:
+        write_visual(folder / "clip_image.onnx", ("x", "y"), 4)
+        write_textual(folder / "clip_text.onnx", ("ids", "features"), 4, "int64")
+        write_tokenizer(folder / "tokenizer.json")
+    return folder

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from onnx_files import node, write_graph
 
 from jsecon.errors import InputError
 from jsecon.vision.onnx_graph import Graph, Tensor, content_digest, describe, graph_files
-from tests.onnx_files import node, write_graph
 
 
 @pytest.fixture

@@ -200,12 +200,12 @@ def graph_files(path: str | os.PathLike) -> tuple[Path, ...]:
     return path, *(file for file in beside if file.relative_to(path.parent).as_posix().encode() in content)
 
 
-def content_digest(files: Iterable[str | os.PathLike]) -> str:
-    """32 hex digits of the files' contents in the order given; names, places and times do not count.
+def content_digest(files: Iterable[str | os.PathLike], *, extra: str = "") -> str:
+    """32 hex digits of the files' contents in the order given, and of `extra`; names, places and times do not count.
 
     Raises InputError where one cannot be read.
     """
-    whole = hashlib.blake2b(digest_size=16)
+    whole = hashlib.blake2b(extra.encode(), digest_size=16)
     for file in files:
         try:
             with open(file, "rb") as stream:

@@ -1,0 +1,68 @@
+"""Embeddings kept on disk by content: the same mask of the same frame is embedded once by the same model.
+
+    FOLDER/<digest of model and frame>.npz      keys (M, 16) uint8 of its masks, vectors (M, E) float32
+
+So a run that was stopped embeds only what is missing, and so does one whose masks have changed in part.
+"""
+
+import dataclasses
+import hashlib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from jsecon.files import written_whole
+
+_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile)
+
+
+@dataclasses.dataclass(frozen=True)
+class EmbeddingStore:
+    """What one model has embedded."""
+
+    folder: Path
+    model: str
+    """names the model by its content."""
+
+    def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
+        """Mask key -> vector (E,) float32 of a frame. A file that cannot be read holds nothing: it only saves time."""
+        try:
+            with np.load(self._path(frame), allow_pickle=False) as file:
+                keys, vectors = file["keys"], file["vectors"]
+        except _UNREADABLE:
+            return {}
+        return {key.tobytes(): vector for key, vector in zip(keys, vectors)}
+
+    def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
+        """Keeps the vectors of a frame, in place of those kept before. Raises InputError where it cannot write."""
+        if not vectors:
+            return
+        keys = np.stack([np.frombuffer(key, np.uint8) for key in vectors])
+        with written_whole(self._path(frame)) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, keys=keys, vectors=np.stack(list(vectors.values())))
+
+    def _path(self, frame: np.ndarray) -> Path:
+        digest = hashlib.blake2b(f"{self.model} {frame.shape}".encode(), digest_size=16)
+        digest.update(np.ascontiguousarray(frame))
+        return self.folder / f"{digest.hexdigest()}.npz"
+
+
+def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
+    """16 bytes that name a mask."""
+    return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
+
+
+def known_vectors(
+    known: dict[bytes, np.ndarray], keys: list[bytes], dim: int
+) -> tuple[Float32[np.ndarray, "m e"], list[int]]:
+    """Rows (M, E) of the keys that are known, zero for the others, and the indices of those others."""
+    rows = np.zeros((len(keys), dim), np.float32)
+    missing = []
+    for index, key in enumerate(keys):
+        if key in known and known[key].shape == (dim,):
+            rows[index] = known[key]
+        else:
+            missing.append(index)
+    return rows, missing

@@ -1,0 +1,235 @@
+"""CLIP: every layout and signature gives the same space, crops are LangSplat's, and what does not fit is named."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from clip_files import COLOURS, write_clip, write_textual, write_visual
+from onnx_files import node, write_graph
+
+from jsecon.errors import InputError
+from jsecon.vision.clip import CANONICAL, ClipEmbedder
+from jsecon.vision.clip_folder import ClipFiles, find_clip, read_preprocessing
+from jsecon.vision.crops import masked_crop
+from jsecon.vision.protocols import Embedder
+
+LAYOUTS = ("immich", "transformers.js", "flat")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    return {layout: write_clip(tmp_path_factory.mktemp("clip") / layout, layout) for layout in LAYOUTS}
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Four quarters, a colour each."""
+    image = np.zeros((40, 60, 3), np.uint8)
+    for n, colour in enumerate(COLOURS.values()):
+        image[20 * (n // 2) :, 30 * (n % 2) :] = np.round(255 * np.asarray(colour))
+    return image
+
+
+@pytest.fixture(scope="module")
+def masks():
+    """Each quarter without its rim, and an empty mask."""
+    found = np.zeros((5, 40, 60), bool)
+    for n in range(4):
+        found[n, 20 * (n // 2) + 2 : 20 * (n // 2) + 18, 30 * (n % 2) + 2 : 30 * (n % 2) + 28] = True
+    return found
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_images_and_texts_meet_in_every_layout(folders, frame, masks, layout):
+    embedder = ClipEmbedder(folders[layout], threads=1, batch=3)
+    assert isinstance(embedder, Embedder)
+    assert embedder.files.layout == layout
+    assert embedder.dim == 3
+    rows, texts = embedder.embed_regions(frame, masks), embedder.embed_text([f"a {name} thing" for name in COLOURS])
+    np.testing.assert_allclose(np.linalg.norm(rows, axis=1), [1, 1, 1, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(texts, axis=1), 1, atol=1e-6)
+    true = np.asarray(list(COLOURS.values()))
+    np.testing.assert_allclose(rows[:4], true / np.linalg.norm(true, axis=1, keepdims=True), atol=0.01)
+    assert ((rows[:4] @ texts.T).argmax(1) == np.arange(4)).all()
+    assert embedder.canonical.shape == (len(CANONICAL), 3)
+    embedder.close()
+    np.testing.assert_array_equal(embedder.embed_regions(frame, masks), rows)
+
+
+def test_crops_are_those_of_langsplat(frame):
+    """Against the definition, step by step, of a mask with a ragged outline, higher than wide."""
+    rng = np.random.default_rng(0)
+    mask = np.zeros(frame.shape[:2], bool)
+    mask[5:33, 20:31] = rng.random((28, 11)) < 0.7
+    mask[5, 20] = mask[32, 30] = True
+    zeroed = frame.copy()
+    zeroed[~mask] = 0
+    inside = zeroed[5 : 5 + (32 - 5), 20 : 20 + (30 - 20)]  # width and height are differences: the last are lost
+    square = np.zeros((27, 27, 3), np.uint8)
+    square[:, (27 - 10) // 2 : (27 - 10) // 2 + 10] = inside
+    np.testing.assert_array_equal(masked_crop(frame, mask, 64), cv2.resize(square, (64, 64)))
+    dot = np.zeros_like(mask)
+    dot[3, 4] = True
+    assert (masked_crop(frame, dot, 8) == frame[3, 4]).all()
+    with pytest.raises(ValueError, match="at least one pixel"):
+        masked_crop(frame, np.zeros_like(mask), 8)
+
+
+def test_a_batch_of_any_size_gives_the_same_rows(folders, frame, masks):
+    for layout in LAYOUTS:
+        rows = [
+            ClipEmbedder(folders[layout], threads=1, batch=batch).embed_regions(frame, masks) for batch in (1, 2, 16)
+        ]
+        np.testing.assert_allclose(rows[0], rows[1], atol=1e-6)
+        np.testing.assert_allclose(rows[0], rows[2], atol=1e-6)
+
+
+def test_templates_are_averaged_as_unit_vectors(folders):
+    texts = ["red thing", "blue"]
+    bare = ClipEmbedder(folders["immich"], threads=1)
+    both = ClipEmbedder(folders["immich"], threads=1, templates=("{}", "{} on green"))
+    first, second = bare.embed_text(texts), bare.embed_text([f"{text} on green" for text in texts])
+    mean = (first + second) / np.linalg.norm(first + second, axis=1, keepdims=True)
+    np.testing.assert_allclose(both.embed_text(texts), mean, atol=1e-6)
+    np.testing.assert_array_equal(both.canonical, bare.canonical)
+    with pytest.raises(ValueError, match="phrases that hold"):
+        ClipEmbedder(folders["immich"], templates=("a photo",))
+
+
+def test_embeddings_are_kept_by_content(folders, frame, masks, tmp_path, monkeypatch):
+    embedder = ClipEmbedder(folders["flat"], threads=1, store=tmp_path)
+    crops = []
+    through = embedder._through_visual
+    monkeypatch.setattr(embedder, "_through_visual", lambda c: crops.append(len(c)) or through(c))
+    rows = embedder.embed_regions(frame, masks[:3])
+    assert sum(crops) == 3
+    np.testing.assert_array_equal(embedder.embed_regions(frame, masks[[2, 1, 4]]), [*rows[[2, 1]].tolist(), [0, 0, 0]])
+    assert sum(crops) == 3
+    embedder.embed_regions(frame, masks[2:])  # one mask more
+    assert sum(crops) == 4
+    embedder.embed_regions(255 - frame, masks[:1])  # another frame
+    assert sum(crops) == 5
+    for path in tmp_path.glob("*.npz"):
+        path.write_bytes(path.read_bytes()[:50])
+    np.testing.assert_array_equal(embedder.embed_regions(frame, masks[:3]), rows)
+    assert sum(crops) == 8
+
+
+def test_the_name_is_that_of_the_content(folders, tmp_path):
+    names = {layout: ClipEmbedder(folder).name for layout, folder in folders.items()}
+    assert len(set(names.values())) == 3
+    assert ClipEmbedder(write_clip(tmp_path / "moved", "immich")).name == names["immich"]
+    config = tmp_path / "moved" / "visual" / "preprocess_cfg.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"mean": [0.5, 0.5, 0.5]}))
+    assert ClipEmbedder(tmp_path / "moved").name != names["immich"]
+
+
+def test_an_empty_text_is_refused(folders):
+    with pytest.raises(InputError, match="expected a text"):
+        ClipEmbedder(folders["flat"]).embed_text(["red", "  "])
+
+
+# Folders that are no such model
+
+
+@pytest.mark.parametrize(
+    ("layout", "lost", "words"),
+    [
+        ("immich", "textual/model.onnx", r"visual/model\.onnx without its other half"),
+        ("immich", "textual/tokenizer.json", "no tokenizer"),
+        ("transformers.js", "onnx/vision_model.onnx", r"onnx/text_model\.onnx without its other half"),
+        ("flat", "clip_text.onnx", r"clip_image\.onnx takes x float32\[4, 3, 32, 32\]"),
+    ],
+)
+def test_what_is_missing_is_named_and_where_to_get_it(tmp_path, layout, lost, words):
+    folder = write_clip(tmp_path / "clip", layout)
+    (folder / lost).unlink()
+    with pytest.raises(InputError, match=words) as caught:
+        find_clip(folder)
+    assert "huggingface.co" in str(caught.value)
+
+
+def test_folders_without_a_model_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no \.onnx file"):
+        find_clip(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        find_clip(tmp_path / "nowhere")
+
+
+def test_a_damaged_graph_is_named(tmp_path):
+    folder = write_clip(tmp_path / "clip", "immich")
+    graph = folder / "visual" / "model.onnx"
+    graph.write_bytes(graph.read_bytes()[:200])
+    with pytest.raises(InputError, match=r"visual/model\.onnx: found what ONNX Runtime"):
+        ClipEmbedder(folder).dim  # noqa: B018
+
+
+def test_graphs_of_another_kind_are_named_with_their_tensors(tmp_path, frame, masks):
+    folder = write_clip(tmp_path / "clip", "immich")
+    visual, textual = folder / "visual" / "model.onnx", folder / "textual" / "model.onnx"
+    textual_bytes, visual_bytes = textual.read_bytes(), visual.read_bytes()
+
+    visual.write_bytes(textual_bytes)  # swapped
+    with pytest.raises(InputError, match=r"input 'text': found text int32\[1, 77\]; expected text\[\?, 3, \?, \?\]"):
+        ClipEmbedder(folder).embed_regions(frame, masks)
+    visual.write_bytes(visual_bytes)
+    textual.write_bytes(visual_bytes)
+    with pytest.raises(InputError, match=r"textual/model\.onnx, input 'image'"):
+        ClipEmbedder(folder).embed_text(["red"])
+
+    hidden = {"last_hidden_state": ("float32", [1, 77, 1]), "pooler_output": ("float32", [1, 77])}
+    nodes = [
+        node("Cast", ["text"], ["pooler_output"], to=1),
+        node("Unsqueeze", ["pooler_output", "axis"], ["last_hidden_state"]),
+    ]
+    write_graph(textual, nodes, {"text": ("int64", [1, 77])}, hidden, {"axis": np.asarray([2])})
+    with pytest.raises(InputError, match=r"output 'embedding': found last_hidden_state.*projection"):
+        ClipEmbedder(folder).embed_text(["red"])
+
+    nodes = [node("Cast", ["text"], ["embedding"], to=1)]
+    write_graph(textual, nodes, {"text": ("int64", [1, 77])}, {"embedding": ("float32", [1, 77])})
+    with pytest.raises(InputError, match="texts of 77 numbers; expected 3"):
+        ClipEmbedder(folder).embed_text(["red"])
+
+
+def test_a_size_that_the_graph_does_not_take_is_named(folders, frame, masks):
+    files = folders["immich"] / "visual" / "model.onnx", folders["immich"] / "textual" / "model.onnx"
+    model = ClipFiles(*files, folders["immich"] / "textual" / "tokenizer.json", size=48)
+    with pytest.raises(InputError, match=r"input 'image': found image float32\[1, 3, 32, 32\].*\[1, 3, 48, 48\]"):
+        ClipEmbedder(model, threads=1).embed_regions(frame, masks)
+
+
+def test_embeddings_that_are_not_finite_are_refused(tmp_path, folders, frame, masks):
+    bad = write_visual(tmp_path / "bad.onnx", ("image", "embedding"), 1, std=(np.nan, 1, 1))
+    text = write_textual(tmp_path / "text.onnx", ("text", "embedding"), 1, "int32")
+    model = ClipFiles(bad, text, folders["flat"] / "tokenizer.json")
+    with pytest.raises(InputError, match=r"bad\.onnx: found an embedding that is zero or not finite"):
+        ClipEmbedder(model, threads=1).embed_regions(frame, masks)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ({"size": 16}, 16),
+        ({"size": {"shortest_edge": 24}, "crop_size": 16, "image_mean": [0, 0, 0]}, 16),
+        ({"size": {"shortest_edge": 24}}, 24),
+        ({"preprocess_cfg": {"mean": [0, 0, 0], "std": [1, 1, 1], "size": [16, 16]}}, 16),
+        ({}, None),
+        ({"size": [16, 24]}, "not of a square"),
+        ({"mean": [0, 0]}, "mean"),
+        ({"std": [0, 1, 1]}, "std"),
+        ({"std": "abc"}, "cannot be read"),
+        ([], "cannot be read"),
+    ],
+)
+def test_preprocessing_in_all_its_spellings(tmp_path, content, expected):
+    path = tmp_path / "preprocessor_config.json"
+    path.write_text(json.dumps(content))
+    if isinstance(expected, str):
+        with pytest.raises(InputError, match=expected):
+            read_preprocessing(path)
+    else:
+        mean, std, size = read_preprocessing(path)
+        assert size == expected
+        assert len(mean) == len(std) == 3
