@@ -9,7 +9,13 @@ import pytest
 
 from jsecon.data.lerf import LabelledFrame
 from jsecon.errors import InputError
-from jsecon.evaluate.lerf import LERF_PAIRS, VALA_THRESHOLD, evaluate_point_level_rendered, resized
+from jsecon.evaluate.lerf import (
+    LERF_PAIRS,
+    VALA_THRESHOLD,
+    evaluate_at_thresholds,
+    evaluate_point_level_rendered,
+    resized,
+)
 from jsecon.query.masks import selection_mask
 from jsecon.types import Selection
 
@@ -115,6 +121,29 @@ def test_the_point_is_the_maximum_of_the_similarity(scene, views, labelled):
         x, y = row.point
         assert labelled[0].objects[query][0][y, x]
         assert row.located
+
+
+def test_both_thresholds_from_one_rendering(scene, views, labelled):
+    select = lambda query: selection(members(scene)[query])
+    both = evaluate_at_thresholds(scene, views, labelled[:1], select)
+    assert list(both) == [0.7, VALA_THRESHOLD]
+    for threshold, (rows, told) in both.items():
+        alone, summary = evaluate_point_level_rendered(scene, views, labelled[:1], select, alpha_threshold=threshold)
+        assert rows == alone
+        assert told == summary
+
+
+def test_localisation_by_the_mask_takes_any_of_its_inmost_pixels(scene, views, labelled):
+    """Both groups selected, the wrong one ten times as similar: the peak misses; the mask touches the box that the
+    largest part of it lies in."""
+    left, right = members(scene)["left"], members(scene)["right"]
+    similar = np.where(right, 1.0, np.where(left, 0.1, 0.0)).astype(np.float32)
+    rows, told = evaluate_point_level_rendered(scene, views, labelled[:1], lambda _: selection(left | right, similar))
+    by_query = {row.query: row for row in rows}
+    assert by_query["right"].located
+    assert not by_query["left"].located
+    assert by_query["left"].touched or by_query["right"].touched
+    assert told["loc_mask"] == pytest.approx(np.mean([row.touched for row in rows]))
 
 
 def test_labels_of_another_size_are_evaluated_at_their_own(scene, views, labelled):
