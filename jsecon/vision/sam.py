@@ -1,0 +1,149 @@
+"""Segmenter by SAM on ONNX Runtime: the automatic mask generator with LangSplat's levels (REFERENCE B.1, B.2, G.1).
+
+A grid of points is put to the frame and to crops of it; each point gives three masks: subpart, part and whole, the
+levels s, m and l; `default` pools all three. Masks that the model thinks poor, that are not stable, or that a crop cuts
+are dropped, then repetitions by box, then small holes and islands, then LangSplat's suppression by masks.
+"""
+
+import functools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from jsecon.errors import require
+from jsecon.vision.mask_nms import langsplat_nms
+from jsecon.vision.sam_graphs import SamFiles, SamGraphs, find_sam
+from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop, stability, tidied
+from jsecon.vision.sam_prompts import Crop, crops_of, point_grid
+
+Level = Literal["default", "s", "m", "l"]
+TOKENS: dict[str, tuple[int, ...]] = {"default": (0, 1, 2), "s": (0,), "m": (1,), "l": (2,)}
+"""level -> which of a point's three masks it takes"""
+
+
+class Candidate(NamedTuple):
+    """One predicted mask on its way through the filters."""
+
+    bits: np.ndarray
+    """the frame's pixels, packed"""
+    box: tuple[int, int, int, int]
+    iou: float
+    """as the model predicts it"""
+    stability: float
+    token: int
+    crop: Crop
+
+
+class SamSegmenter:
+    """Segmenter (jsecon.vision.protocols) by a SAM model folder, or its files.
+
+    `level` is what a call returns. The other settings are LangSplat's own (REFERENCE B.1) unless given: a grid of
+    `points_per_side`^2 points a crop; least `predicted_iou` and `stability` (at logits +-`stability_offset`);
+    `box_iou` above which boxes repeat each other; `crop_layers` of 4^k crops, overlapping by `crop_overlap`; holes and
+    islands below `least_area` px are removed; `mask_iou`, `mask_score`, `mask_inner` of `langsplat_nms`. `batch`
+    prompts go to the decoder at once where it takes more than one. A frame costs 1 + 4 + ... 4^layers encoder runs and
+    as many grids of prompts: with `crop_layers=0` a fifth of LangSplat's.
+
+    Graphs are opened when first needed and kept until `close`; `name` follows from their content. Raises InputError
+    where the folder holds no SAM model, and later where a graph is of another kind, naming the tensor.
+    """
+
+    def __init__(
+        self,
+        model: str | Path | SamFiles,
+        *,
+        level: Level = "l",
+        points_per_side: int = 32,
+        predicted_iou: float = 0.7,
+        stability: float = 0.85,
+        stability_offset: float = 1.0,
+        box_iou: float = 0.7,
+        crop_layers: int = 1,
+        crop_overlap: float = 512 / 1500,
+        least_area: int = 100,
+        mask_iou: float = 0.8,
+        mask_score: float = 0.7,
+        mask_inner: float = 0.5,
+        batch: int = 64,
+        threads: int | None = None,
+    ):
+        require(
+            level in TOKENS, "level", got=level, expected=f"one of {', '.join(TOKENS)}", remedy="l is the coarsest."
+        )
+        self.files = model if isinstance(model, SamFiles) else find_sam(model)
+        self.level, self.points_per_side = level, points_per_side
+        self.crop_layers, self.crop_overlap = crop_layers, crop_overlap
+        self.predicted_iou, self.stability, self.stability_offset = predicted_iou, stability, stability_offset
+        self.box_iou, self.least_area = box_iou, least_area
+        self._nms = {"iou_threshold": mask_iou, "score_threshold": mask_score, "inner_threshold": mask_inner}
+        self._batch, self._threads = batch, threads
+        self.name = f"sam-{self.files.digest()}"
+
+    def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
+        """frame (H, W, 3) uint8 RGB -> masks (M, H, W) bool of the level, best score first; they may overlap."""
+        return self.levels(frame, (self.level,))[self.level][0]
+
+    def levels(
+        self, frame: UInt8[np.ndarray, "h w 3"], levels: Sequence[Level] = ("default", "s", "m", "l")
+    ) -> dict[str, tuple[Bool[np.ndarray, "m h w"], Float64[np.ndarray, " m"]]]:
+        """Masks (M, H, W) and scores (M,), stability times predicted IoU, of each level, best first; the points are
+        put once for all levels."""
+        wanted = sorted({token for level in levels for token in TOKENS[level]})
+        crops = crops_of(*frame.shape[:2], self.crop_layers, self.crop_overlap)
+        by_crop = [list(self._candidates(frame, crop, wanted)) for crop in crops]
+        return {level: self._filtered(frame.shape[:2], by_crop, TOKENS[level]) for level in levels}
+
+    def close(self) -> None:
+        """Drops the graphs and their memory; they are opened again when needed."""
+        self.__dict__.pop("_graphs", None)
+
+    @functools.cached_property
+    def _graphs(self) -> SamGraphs:
+        return SamGraphs(self.files, batch=self._batch, threads=self._threads)
+
+    def _candidates(self, frame: np.ndarray, crop: Crop, tokens: Sequence[int]) -> Iterable[Candidate]:
+        """The masks of one crop that are good, stable and not cut off, in the order of the points."""
+        height, width = frame.shape[:2]
+        part = np.ascontiguousarray(frame[crop.top : crop.bottom, crop.left : crop.right])
+        encoded = self._graphs.encode(part)
+        points = point_grid(self.points_per_side) * np.float32([part.shape[1], part.shape[0]])
+        for logits, ious in self._graphs.decode(encoded, points):
+            for prompt, token in zip(*np.nonzero(ious > self.predicted_iou)):
+                if token not in tokens:
+                    continue
+                mask_logits = self._graphs.to_frame(logits[prompt, token], encoded)
+                steady = stability(mask_logits, self.stability_offset)
+                if steady < self.stability:
+                    continue
+                whole = np.zeros((height, width), bool)
+                whole[crop.top : crop.bottom, crop.left : crop.right] = mask_logits > 0
+                box = box_of(whole)
+                if whole.any() and not cut_by_crop(box, crop, width, height):
+                    yield Candidate(np.packbits(whole), box, float(ious[prompt, token]), steady, int(token), crop)
+
+    def _filtered(
+        self, size: tuple[int, int], by_crop: list[list[Candidate]], tokens: tuple[int, ...]
+    ) -> tuple[Bool[np.ndarray, "m h w"], Float64[np.ndarray, " m"]]:
+        """What is left of the candidates of some tokens, and the scores."""
+        left: list[Candidate] = []
+        for candidates in by_crop:
+            own = [c for c in candidates if c.token in tokens]
+            left += [own[i] for i in box_nms(_boxes(own), np.asarray([c.iou for c in own]), self.box_iou)]
+        # Of what several crops show, the smaller crop's is the finer; with one crop this changes nothing.
+        left = [left[i] for i in box_nms(_boxes(left), np.asarray([1.0 / c.crop.area for c in left]), self.box_iou)]
+        masks, changed = np.zeros((len(left), *size), bool), np.zeros(len(left), bool)
+        for n, candidate in enumerate(left):
+            whole = np.unpackbits(candidate.bits, count=size[0] * size[1]).reshape(size).astype(bool)
+            masks[n], changed[n] = tidied(whole, self.least_area)
+        boxes = np.asarray([box_of(mask) for mask in masks], np.float64).reshape(-1, 4)
+        kept = np.sort(box_nms(boxes, 1.0 - changed, self.box_iou))
+        masks, scores = masks[kept], np.asarray([left[i].iou * left[i].stability for i in kept], np.float64)
+        kept = langsplat_nms(masks, scores, **self._nms)
+        return masks[kept], scores[kept]
+
+
+def _boxes(candidates: list[Candidate]) -> Float64[np.ndarray, "m 4"]:
+    return np.asarray([c.box for c in candidates], np.float64).reshape(-1, 4)

@@ -1,0 +1,207 @@
+"""SAM's automatic mask generator over small graphs of each dialect: the same masks as a plain twin, whatever the batch,
+and a message that names the tensor for a graph of another kind."""
+
+import numpy as np
+import pytest
+from clip_files import write_clip
+from onnx_files import node, write_graph
+from sam_files import IOUS, write_decoder, write_encoder, write_sam
+from scipy import ndimage
+
+from jsecon.errors import InputError
+from jsecon.vision.mask_nms import langsplat_nms
+from jsecon.vision.protocols import Segmenter
+from jsecon.vision.sam import TOKENS, SamSegmenter
+from jsecon.vision.sam_graphs import SamFiles, SamGraphs, find_sam
+from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop
+from jsecon.vision.sam_prompts import crops_of, point_grid
+
+KINDS = [
+    ("segment-anything", 1),
+    ("segment-anything", "batch"),
+    ("segment-anything", 7),
+    ("transformers.js", "batch"),
+    ("sam2", "batch"),
+]
+
+
+@pytest.fixture(scope="module")
+def frame():
+    image = np.full((120, 160, 3), 200, np.uint8)
+    image[20:70, 20:80] = (200, 30, 30)
+    image[60:110, 90:150] = (30, 160, 40)
+    image[75:95, 105:130] = (30, 40, 200)
+    return image
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    base = tmp_path_factory.mktemp("sam")
+    return {(kind, batch): write_sam(base / f"{kind}-{batch}", kind, batch=batch) for kind, batch in KINDS}
+
+
+@pytest.fixture(scope="module")
+def segmenter(folders):
+    return SamSegmenter(folders["segment-anything", "batch"], points_per_side=8, threads=1)
+
+
+def by_definition(folder, frame, token_of_level, side=8):
+    """The generator of REFERENCE B.1, one point a call, without any packing: masks and scores of one level."""
+    graphs = SamGraphs(find_sam(folder), batch=1, threads=1)
+    height, width = frame.shape[:2]
+    found = []
+    for crop in crops_of(height, width, 1, 512 / 1500):
+        part, own = frame[crop.top : crop.bottom, crop.left : crop.right], []
+        encoded = graphs.encode(np.ascontiguousarray(part))
+        for point in point_grid(side) * np.float32([part.shape[1], part.shape[0]]):
+            ((logits, ious),) = graphs.decode(encoded, point[None])
+            for token in token_of_level:
+                full = graphs.to_frame(logits[0, token], encoded)
+                stable = (full > 1).sum() / max((full > -1).sum(), 1)
+                mask = np.zeros((height, width), bool)
+                mask[crop.top : crop.bottom, crop.left : crop.right] = full > 0
+                if ious[0, token] > 0.7 and stable >= 0.85 and not cut_by_crop(box_of(mask), crop, width, height):
+                    own.append((mask, ious[0, token], stable, crop))
+        boxes = np.asarray([box_of(m) for m, *_ in own], float).reshape(-1, 4)
+        found += [own[i] for i in box_nms(boxes, np.asarray([iou for _, iou, _, _ in own]), 0.7)]
+    boxes = np.asarray([box_of(m) for m, *_ in found], float)
+    found = [found[i] for i in box_nms(boxes, np.asarray([1 / crop.area for *_, crop in found]), 0.7)]
+    clean = []
+    for mask, *_ in found:
+        for hole in (True, False):
+            labels, count = ndimage.label(mask ^ hole, np.ones((3, 3)))
+            areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+            small = np.flatnonzero(areas < 100) + 1
+            if hole:
+                mask = mask | np.isin(labels, small)
+            elif len(small) == count and count:
+                mask = labels == 1 + areas.argmax()
+            else:
+                mask = mask & ~np.isin(labels, small)
+        clean.append(mask)
+    unchanged = np.asarray([float((a == b[0]).all()) for a, b in zip(clean, found)])
+    kept = sorted(box_nms(np.asarray([box_of(m) for m in clean], float), unchanged, 0.7))
+    masks = np.stack([clean[i] for i in kept])
+    scores = np.asarray([float(found[i][1]) * found[i][2] for i in kept])
+    order = langsplat_nms(masks, scores)
+    return masks[order], scores[order]
+
+
+@pytest.mark.parametrize("level", ["l", "default"])
+def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
+    masks, scores = segmenter.levels(frame, (level,))[level]
+    expected, expected_scores = by_definition(folders["segment-anything", "batch"], frame, TOKENS[level])
+    assert len(masks) >= 3
+    np.testing.assert_array_equal(masks, expected)
+    np.testing.assert_allclose(scores, expected_scores, rtol=1e-6)
+    assert (np.diff(scores) <= 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter, kind):
+    other = SamSegmenter(folders[kind], points_per_side=8, threads=1, batch=5)
+    assert isinstance(other, Segmenter)
+    masks = other(frame, 0)
+    red, green = frame[..., 0] == 200, frame[..., 1] == 160
+    for true in (red & (frame[..., 1] == 30), green):
+        inner = ndimage.binary_erosion(true, iterations=12)
+        assert any((inner & mask).sum() == inner.sum() and (mask & ~true).sum() < 0.3 * mask.sum() for mask in masks)
+    if kind[0] != "sam2":  # which sees the frame stretched to a square
+        np.testing.assert_array_equal(masks, segmenter(frame, 0))
+
+
+def test_levels_are_the_three_masks_of_a_point(frame, segmenter):
+    found = segmenter.levels(frame)
+    assert list(found) == ["default", "s", "m", "l"]
+    for level, token in (("s", 1), ("m", 2), ("l", 3)):
+        assert found[level][1].max() <= IOUS[token] + 1e-6
+        np.testing.assert_array_equal(segmenter.levels(frame, (level,))[level][0], found[level][0])
+
+
+def test_without_crops_the_frame_is_encoded_once(folders, frame, monkeypatch):
+    calls = []
+    encode = SamGraphs.encode
+    monkeypatch.setattr(SamGraphs, "encode", lambda self, part: calls.append(part.shape) or encode(self, part))
+    SamSegmenter(folders["sam2", "batch"], points_per_side=4, crop_layers=0, threads=1)(frame, 0)
+    assert calls == [(120, 160, 3)]
+
+
+def test_an_encoder_that_prepares_the_image_itself_gives_the_same(tmp_path, folders, frame, segmenter):
+    encoder = write_encoder(tmp_path / "encoder.onnx", 1024, raw=True)
+    decoder = write_decoder(tmp_path / "decoder.onnx", 1024, "segment-anything", "batch")
+    normalised = write_encoder(tmp_path / "other" / "encoder.onnx", 1024)
+    one, other = (SamGraphs(SamFiles(e, decoder), threads=1).encode(frame) for e in (encoder, normalised))
+    np.testing.assert_allclose(one.features["image_embeddings"], other.features["image_embeddings"], atol=1e-4)
+
+
+def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
+    masks = segmenter(frame, 0)
+    segmenter.close()
+    np.testing.assert_array_equal(segmenter(frame, 1), masks)
+
+
+def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
+    strict = SamSegmenter(folders["transformers.js", "batch"], points_per_side=4, predicted_iou=0.999, threads=1)
+    assert strict(frame, 0).shape == (0, 120, 160)
+
+
+# Folders and graphs of another kind
+
+
+def test_folders_without_sam_say_what_they_hold(tmp_path):
+    with pytest.raises(InputError, match=r"no \.onnx file.*expected an image encoder"):
+        find_sam(tmp_path)
+    write_clip(tmp_path / "clip", "transformers.js")
+    with pytest.raises(InputError, match=r"onnx/text_model\.onnx, onnx/vision_model\.onnx") as caught:
+        find_sam(tmp_path / "clip")
+    assert "huggingface.co" in str(caught.value)
+
+
+def test_variants_beside_the_plain_graph_are_left_alone(tmp_path):
+    folder = write_sam(tmp_path, "transformers.js")
+    (folder / "onnx" / "vision_encoder_quantized.onnx").write_bytes(b"not looked at")
+    (folder / "onnx" / "prompt_encoder_mask_decoder_fp16.onnx").write_bytes(b"not looked at")
+    files = find_sam(folder)
+    assert files.encoder.name == "vision_encoder.onnx"
+    assert files.decoder.name == "prompt_encoder_mask_decoder.onnx"
+
+
+def test_tensors_that_do_not_fit_are_named(tmp_path):
+    encoder = write_encoder(tmp_path / "encoder.onnx", 256)
+    decoder = write_decoder(tmp_path / "decoder.onnx", 256, "segment-anything", "batch")
+
+    with pytest.raises(InputError, match=r"decoder\.onnx, input 'image_embeddings'.*point_coords"):
+        SamGraphs(SamFiles(decoder, decoder))
+    with pytest.raises(InputError, match=r"encoder\.onnx, input 'point_coords': found no such input"):
+        SamGraphs(SamFiles(encoder, encoder))
+
+    smaller = write_encoder(tmp_path / "small.onnx", 128)
+    with pytest.raises(
+        InputError, match=r"small\.onnx, output 'image_embeddings': found .*8, 8\]; expected .*16, 16\]"
+    ):
+        SamGraphs(SamFiles(smaller, decoder))
+
+    single = write_decoder(tmp_path / "single.onnx", 256, "segment-anything", "batch", masks=1)
+    with pytest.raises(InputError, match=r"output 'low_res_masks'.*3 or 4 masks.*return-single-mask"):
+        SamGraphs(SamFiles(encoder, single))
+
+    other = write_decoder(tmp_path / "other.onnx", 256, "sam2", "batch", masks=3)
+    with pytest.raises(InputError, match=r"other\.onnx, input 'image_embed': found no such output of encoder\.onnx"):
+        SamGraphs(SamFiles(encoder, other))
+
+    flat = write_graph(
+        tmp_path / "flat.onnx",
+        [node("Identity", ["x"], ["y"])],
+        {"x": ("float32", [1, 5])},
+        {"y": ("float32", [1, 5])},
+    )
+    with pytest.raises(InputError, match=r"flat\.onnx, input 'x': found x float32\[1, 5\]; expected one image"):
+        SamGraphs(SamFiles(flat, decoder))
+
+
+def test_a_truncated_graph_is_named(tmp_path, frame):
+    folder = write_sam(tmp_path, "sam2")
+    decoder = folder / "sam2_tiny.decoder.onnx"
+    decoder.write_bytes(decoder.read_bytes()[:-300])
+    with pytest.raises(InputError, match=r"sam2_tiny\.decoder\.onnx: found what ONNX Runtime"):
+        SamSegmenter(folder)(frame, 0)
