@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from jsecon import cache
 from jsecon.language.masklets import clean_masklets, iou_matrix, masklets
 
 
@@ -206,3 +207,52 @@ def test_clean_masklets(seed):
         new = clean[labels == old]
         assert (new >= 0).sum() == (areas[enough].sum() if enough.sum() >= 2 else 0)
         assert len(np.unique(new[new >= 0])) <= 1
+
+
+class Stopped(Exception):
+    """In place of a process that ends."""
+
+
+@pytest.mark.parametrize("stop", [1, 2, 4])
+def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop):
+    truth = squares(6)
+    truth[3:, 30:38, 30:38] = 3  # comes into view later
+    whole = tracker(truth)
+    wanted = masklets(frames_of(truth), segmenter(truth), whole)
+    assert len(whole.calls) > 1
+    kept = []
+
+    def keep(state):
+        kept.append(state())
+        if kept[-1].done == stop:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=keep)
+    tree, arrays = cache.pack(kept[-1])
+    seen, track, told = [], tracker(truth), []
+
+    def segment(frame, index):
+        seen.append(index)
+        return segmenter(truth)(frame, index)
+
+    found = masklets(
+        frames_of(truth),
+        segment,
+        track,
+        state=cache.unpack(tree, arrays),
+        progress=lambda done, total: told.append((done, total)),
+    )
+    np.testing.assert_array_equal(found, wanted)
+    assert seen == list(range(stop, 6))  # what was done is not done again
+    assert track.calls == [call for call in whole.calls if call[0] >= stop]
+    assert told[0] == (stop + 1, 6)
+
+
+def test_the_state_of_another_sequence_is_refused():
+    truth = squares(4)
+    kept = []
+    masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=lambda state: kept.append(state()))
+    assert [state.done for state in kept] == [1, 2, 3, 4]
+    with pytest.raises(ValueError, match="a state of 5 frames"):
+        masklets(frames_of(squares(5)), segmenter(truth), tracker(truth), state=kept[0])

@@ -1,5 +1,7 @@
 """Masklets: one identity an object through all frames (Algorithm 1 of the paper), over any segmenter and tracker."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +15,18 @@ from jsecon.vision.protocols import Segmenter, Tracker
 Progress = Callable[[int, int], None]
 
 
+@dataclasses.dataclass(frozen=True)
+class MaskletState:
+    """How far a sequence has come: all that `masklets` needs to go on in the middle of it. Arrays only."""
+
+    done: int
+    """frames whose proposals were prompted and tracked."""
+    proposals: dict[str, np.ndarray]
+    """masks of every frame: `rows` (T,) masks a frame, `lengths` (sum of rows,) pixels of each, `pixels` which ones."""
+    layers: dict[str, np.ndarray]
+    """the same of what was tracked."""
+
+
 def masklets(
     frames: np.ndarray,
     segment: Segmenter,
@@ -24,6 +38,8 @@ def masklets(
     min_views: int = 2,
     min_support: float = 0.5,
     join_rate: float = 0.5,
+    state: MaskletState | None = None,
+    on_checkpoint: Callable[[Callable[[], MaskletState]], None] | None = None,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """Labels (T, H, W) int16 of the masklets of a sequence, -1 = none.
@@ -39,6 +55,9 @@ def masklets(
     IoU with that frame's proposals. A pixel belongs to the smallest masklet there (in mean area) whose support is at
     least `min_support`, else to the best supported one. So what the segmenter finds again and again is cut out of what
     surrounds it, and a fragment or a merger that it found once gives way. Last, `clean_masklets`.
+
+    `on_checkpoint` gets, after each frame, a function that makes the state (of the size of all masks: not for nothing);
+    given back as `state`, with the same frames and options, the sequence goes on behind that frame to the same result.
     """
     require(
         frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8,
@@ -50,7 +69,17 @@ def masklets(
     count, height, width = frames.shape[:3]
     proposals = _Layers(count, height, width)
     layers = _Layers(count, height, width)
-    for t in range(count):
+    if state is not None:
+        require(
+            len(state.layers["rows"]) == count and 0 <= state.done <= count,
+            "state",
+            got=f"{state.done} of {len(state.layers['rows'])} frames",
+            expected=f"a state of {count} frames",
+            remedy="Give the state of this sequence, or none.",
+        )
+        proposals.restore(state.proposals)
+        layers.restore(state.layers)
+    for t in range(0 if state is None else state.done, count):
         masks = np.asarray(segment(frames[t], t), bool)
         require(
             masks.ndim == 3 and masks.shape[1:] == (height, width),
@@ -73,6 +102,8 @@ def masklets(
             )
             for other, image in enumerate(labels):
                 layers.add_labels(other, image, len(prompts))
+        if on_checkpoint is not None:
+            on_checkpoint(functools.partial(_state, t + 1, proposals, layers))
         if progress is not None:
             progress(t + 1, count)
     if not layers.size(0):
@@ -80,6 +111,10 @@ def masklets(
     layers, area, support = joined(layers, proposals, join_rate=join_rate)
     order = np.lexsort((np.where(support >= min_support, area, -support), support < min_support))
     return clean_masklets(layers.flatten(order), min_area=min_area, min_views=min_views)
+
+
+def _state(done: int, proposals: "_Layers", layers: "_Layers") -> MaskletState:
+    return MaskletState(done, proposals.record(), layers.record())
 
 
 def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
@@ -191,6 +226,23 @@ class _Layers:
         ones = np.ones(len(pixels), np.float32)
         rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
         self._rows[t] = sparse.vstack([self._rows[t], rows], format="csr")
+
+    def record(self) -> dict[str, np.ndarray]:
+        """All masks as plain arrays (see MaskletState)."""
+        return {
+            "rows": np.array([rows.shape[0] for rows in self._rows], np.int64),
+            "lengths": np.concatenate([np.diff(rows.indptr) for rows in self._rows]).astype(np.int64),
+            "pixels": np.concatenate([rows.indices for rows in self._rows]).astype(np.int32),
+        }
+
+    def restore(self, record: dict[str, np.ndarray]) -> None:
+        """Takes back what `record` gave."""
+        lengths = np.split(record["lengths"], np.cumsum(record["rows"])[:-1])
+        pixels = np.split(record["pixels"], np.cumsum([own.sum() for own in lengths])[:-1])
+        for t, (own, where) in enumerate(zip(lengths, pixels)):
+            ends = np.concatenate([[0], np.cumsum(own)])
+            shape = (len(own), self.shape[0] * self.shape[1])
+            self._rows[t] = sparse.csr_matrix((np.ones(len(where), np.float32), where, ends), shape=shape)
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """The layers with those of one group (R,) united, in the order of the groups."""
