@@ -215,6 +215,22 @@ def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     assert (tracker(frames, 2, prompts[1:2]) == -1).all()
 
 
+def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(tmp_path):
+    one, same = write_sam2(tmp_path / "one"), write_sam2(tmp_path / "same")
+    other = write_sam2(tmp_path / "other", seed=5)
+    tracker = Sam2Tracker(one)
+    assert tracker.name == Sam2Tracker(same).name
+    assert len({tracker.name, Sam2Tracker(other).name, Sam2Tracker(one, box=True).name}) == 3
+    frames, prompts = a_clip(3), a_mask(3, 4, 15, 13)[None]
+    before = tracker(frames, 1, prompts)
+    tracker.close()
+    np.testing.assert_array_equal(tracker(frames, 1, prompts), before)
+    tracker.check()
+    (one / "mlp_small.onnx").write_bytes((one / "mask_decoder_small.onnx").read_bytes())
+    with pytest.raises(InputError, match="mlp_small"):
+        tracker.check()
+
+
 def test_box_prompts_are_the_masks_boxes(folder):
     frames, mask = a_clip(3), a_mask(10, 6, 25, 18)
     labels = Sam2Tracker(folder, box=True, hole_area=0)(frames, 1, mask[None])

@@ -5,6 +5,7 @@ tracked by itself. What is held is bounded whatever the length of the sequence: 
 each object the memories that a frame to come can reach.
 """
 
+import functools
 import hashlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from jsecon.errors import require
 from jsecon.vision import sam2_heads as heads
 from jsecon.vision.sam2_bank import Bank, Memory, forget
-from jsecon.vision.sam2_graphs import Sam2Graphs, open_sam2
+from jsecon.vision.sam2_graphs import Sam2Graphs, open_sam2, sam2_digest
 from jsecon.vision.sam2_heads import Features, Prediction, Prompt
 
 
@@ -27,7 +28,8 @@ class Sam2Tracker:
     filled. The features of the last `keep` frames are held, about 16 MiB each at 1024 px, for calls on the same frames.
     `threads` bounds the cores. A pixel that several objects claim goes to the one with the highest logit.
 
-    Raises InputError where the folder does not hold a SAM 2 model.
+    Graphs are opened when first needed and kept until `close`; `name` follows from their content and the settings.
+    Raises InputError where a file of a SAM 2 model is missing in the folder, and later where one does not fit the rest.
     """
 
     def __init__(
@@ -39,9 +41,27 @@ class Sam2Tracker:
         keep: int = 16,
         threads: int | None = None,
     ):
-        self.sam2 = open_sam2(folder, threads=threads)
+        self.name = f"sam2-{sam2_digest(folder, extra=repr((box, hole_area)))}"
         self.box, self.hole_area = box, hole_area
-        self._encoder = FrameEncoder(self.sam2, keep=keep)
+        self._folder, self._keep, self._threads = folder, keep, threads
+
+    @functools.cached_property
+    def sam2(self) -> Sam2Graphs:
+        """The networks."""
+        return open_sam2(self._folder, threads=self._threads)
+
+    @functools.cached_property
+    def _encode(self) -> "FrameEncoder":
+        return FrameEncoder(self.sam2, keep=self._keep)
+
+    def check(self) -> None:
+        """Raises InputError where the folder's files do not make one SAM 2 model."""
+        open_sam2(self._folder, threads=self._threads)
+
+    def close(self) -> None:
+        """Drops the graphs, the features kept and their memory; they are made again when needed."""
+        self.__dict__.pop("_encode", None)
+        self.__dict__.pop("sam2", None)
 
     def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
         """frames (T, H, W, 3) uint8, frame `index`, its masks `prompts` (B, H, W) bool -> labels (T, H, W) int16."""
@@ -60,7 +80,7 @@ class Sam2Tracker:
             return labels
         numbers = np.array([*given, -1], np.int16)
         for t, logits in follow(
-            self.sam2, frames, [[p] for p in asked], start=index, hole_area=self.hole_area, encode=self._encoder
+            self.sam2, frames, [[p] for p in asked], start=index, hole_area=self.hole_area, encode=self._encode
         ):
             labels[t] = numbers[strongest(logits, (height, width))]
         return labels

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.vision.onnx_graph import Graph
+from jsecon.vision.onnx_graph import Graph, content_digest, graph_files
 
 STRIDE = 16
 """px of the network's image to one cell of its top features."""
@@ -150,6 +150,12 @@ def sam2_files(folder: Path) -> dict[str, Path]:
         if found:
             files[role] = found[0]
     return files
+
+
+def sam2_digest(folder: Path, *, extra: str = "") -> str:
+    """32 hex digits of the contents of the model's files, and of `extra`. Raises InputError where one is missing."""
+    graphs = [part for path in sam2_files(folder).values() for part in graph_files(path)]
+    return content_digest([*graphs, Path(folder) / "constants.npz"], extra=extra)
 
 
 def _read_constants(path: Path) -> dict[str, np.ndarray]:
