@@ -1,4 +1,4 @@
-"""The command line: demo, run, query, eval. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
+"""The command line: demo, run, query, eval, models. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
 
 import argparse
 import dataclasses
@@ -6,6 +6,7 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jsecon
 from jsecon.errors import InputError
@@ -20,6 +21,9 @@ examples
   jsecon query my_field/field.npz "red mug" "dark green bottle" --out answers
   jsecon query my_field/field.npz --at frame_00012 310 145 --out answers
   jsecon eval my_field/field.npz --labels my_capture/label --out evaluation
+  jsecon run my_capture --out my_field --segmenter sam --embedder clip
+                                                        with SAM and CLIP from model folders
+  jsecon models check clip                              what a model folder holds and lacks
 
 A run that is stopped goes on where it stopped when the same command is given again.
 """
@@ -35,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"jsecon {jsecon.__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for add in (_demo, _run, _query, _eval):
+    for add in (_demo, _run, _query, _eval, _models):
         add(verbs)
     return top
 
@@ -97,7 +101,46 @@ def _run(verbs) -> None:
         type=Path,
         metavar="DIR",
         help="instance masks, one integer PNG a frame under the frame's "
-        "name (0 = none), or LangSplat's _s.npy; without it, they are found in the frames",
+        "name (0 = none), <id>/<frame>.png, or LangSplat's _s.npy; without it, they are found in the frames",
+    )
+    verb.add_argument(
+        "--proposals",
+        type=Path,
+        metavar="DIR",
+        help="masks of single frames, to be brought together: <frame>.json of SAM's own generator, "
+        "LangSplat's _s.npy, or PNGs",
+    )
+    verb.add_argument(
+        "--segmenter",
+        type=Path,
+        metavar="DIR",
+        help="a SAM model folder (.onnx) to find proposals with, instead of colour and texture",
+    )
+    verb.add_argument(
+        "--level",
+        choices=("default", "s", "m", "l"),
+        default=Options.level,
+        help="of SAM's proposals and of LangSplat's files: subparts, parts, wholes, or all (default %(default)s)",
+    )
+    verb.add_argument(
+        "--points-per-side",
+        type=int,
+        default=Options.points_per_side,
+        metavar="N",
+        help="SAM: asked on a grid of NxN points (default %(default)s)",
+    )
+    verb.add_argument(
+        "--crop-layers",
+        type=int,
+        default=Options.crop_layers,
+        metavar="N",
+        help="SAM: asked on crops too; 1 is LangSplat's setting and takes five times longer (default %(default)s)",
+    )
+    verb.add_argument(
+        "--embedder",
+        type=Path,
+        metavar="DIR",
+        help="a CLIP model folder (.onnx, tokenizer.json) for regions and texts, instead of colours",
     )
     verb.add_argument(
         "--downscale",
@@ -209,6 +252,7 @@ def _query(verbs) -> None:
         type=float,
         help="on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, 0.5 canonical)",
     )
+    _texts(verb)
     verb.add_argument("--keep-outliers", action="store_true", help="leave out the last step, DBSCAN")
     verb.add_argument("--views", type=int, default=3, metavar="N", help="masks to write a query (default 3)")
     verb.set_defaults(act=_act_query)
@@ -230,7 +274,39 @@ def _eval(verbs) -> None:
         "--labels", type=Path, required=True, metavar="DIR", help="folder of LERF label files (frame.json)"
     )
     verb.add_argument("--out", type=Path, help="folder for evaluation.json (default: the field's)")
+    _texts(verb)
     verb.set_defaults(act=_act_eval)
+
+
+def _texts(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--embedder",
+        type=Path,
+        metavar="DIR",
+        help="the CLIP model folder that the field was made with (default: where the run had it)",
+    )
+    verb.add_argument(
+        "--template",
+        action="append",
+        metavar="PHRASE",
+        help='CLIP: a phrase for the text, such as "a photo of a {}."; several are averaged (default: the bare text)',
+    )
+
+
+def _models(verbs) -> None:
+    verb = _verb(
+        verbs,
+        "models",
+        "look into a folder of models",
+        """
+        check DIR: what models a folder holds, each graph's inputs and outputs, what it can be used for, what is
+        missing, and where such exports are published. Exit code 2 where nothing in it can be used.
+        """,
+    )
+    actions = verb.add_subparsers(dest="action", required=True, metavar="ACTION")
+    check = actions.add_parser("check", help="tell what a model folder holds")
+    check.add_argument("folder", type=Path, metavar="DIR", help="folder with .onnx files")
+    check.set_defaults(act=_act_models_check)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -275,7 +351,7 @@ def _act_run(arguments: argparse.Namespace) -> None:
 
 
 def _act_query(arguments: argparse.Namespace) -> None:
-    from jsecon import answer, pipeline
+    from jsecon import answer
     from jsecon.console import Console
     from jsecon.language.field import load_field
     from jsecon.summary import write_answers
@@ -290,8 +366,8 @@ def _act_query(arguments: argparse.Namespace) -> None:
     pixels = [(frame, _whole("X", x), _whole("Y", y)) for frame, x, y in arguments.at]
     require_writable(arguments.out)
     field = load_field(arguments.field)
-    embedder = pipeline.embedder_named(field.embedder)
-    if arguments.texts:
+    embedder = _embedder(field, arguments) if arguments.texts else None
+    if embedder is not None:
         embedder.embed_text(arguments.texts)  # a text that cannot be understood: say so before any work
     how = {"by": arguments.by, "threshold": arguments.threshold, "outliers": not arguments.keep_outliers}
     answers = [answer.ask_text(field, embedder, text, **how) for text in arguments.texts]
@@ -300,7 +376,6 @@ def _act_query(arguments: argparse.Namespace) -> None:
 
 
 def _act_eval(arguments: argparse.Namespace) -> None:
-    from jsecon import pipeline
     from jsecon.console import Console
     from jsecon.language.field import load_field
     from jsecon.summary import write_evaluation
@@ -308,7 +383,29 @@ def _act_eval(arguments: argparse.Namespace) -> None:
     out = arguments.out or arguments.field.parent
     require_writable(out)
     field = load_field(arguments.field)
-    write_evaluation(field, pipeline.embedder_named(field.embedder), arguments.labels, out, Console())
+    write_evaluation(field, _embedder(field, arguments), arguments.labels, out, Console())
+
+
+def _embedder(field: Any, arguments: argparse.Namespace) -> Any:
+    from jsecon import eyes
+
+    for template in arguments.template or ():
+        if "{}" not in template:
+            raise InputError(
+                "--template", found=template, expected="a phrase that holds {}", remedy='"a photo of a {}."'
+            )
+    return eyes.embedder_of_field(field, arguments.embedder, templates=arguments.template or ("{}",))
+
+
+def _act_models_check(arguments: argparse.Namespace) -> None:
+    from jsecon.console import Console
+    from jsecon.models import examine, report_lines, require_usable
+
+    findings = examine(arguments.folder)
+    console = Console()
+    for line in report_lines(findings):
+        console.say(line)
+    require_usable(findings)
 
 
 def _whole(name: str, text: str) -> int:

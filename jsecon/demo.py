@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jsecon import answer, pictures, pipeline, report, summary
+from jsecon import answer, eyes, pictures, pipeline, report, summary
 from jsecon.data.lerf import LabelledFrame, load_lerf_labels
 from jsecon.data.synthetic import write_room
 from jsecon.errors import InputError
@@ -40,7 +40,7 @@ def demo(
     given = pipeline.run(true_masks, out / "true_masks", reporter=reporter, cache_folder=out / "cache")
 
     labels = load_lerf_labels(capture / "label")
-    embedder = pipeline.embedder_named(found.field.embedder)
+    embedder = eyes.embedder_of_field(found.field)
     reporter.say("measured on the held-out views")
     results = summary.evaluate(found.field, embedder, labels, reporter, ("anchored", "anchored_code", "one_step"))
     with_true = summary.evaluate(given.field, embedder, labels, reporter, ("anchored", "one_step"))

@@ -18,6 +18,18 @@ class Options:
     """.ply (INRIA layout) of the scene; None: Gaussians are fitted to the frames."""
     masks: Path | None = None
     """folder of instance masks, one integer PNG a frame or LangSplat's `_s.npy`; None: found in the frames."""
+    proposals: Path | None = None
+    """folder of masks of single frames, to be brought together: SAM's JSON, LangSplat's `_s.npy`, PNGs; None: found."""
+    segmenter: Path | None = None
+    """SAM model folder that finds proposals; None: OpenCV's, by colour and texture."""
+    level: Literal["default", "s", "m", "l"] = "l"
+    """of SAM's proposals, and of LangSplat's files: all, subparts, parts, wholes."""
+    points_per_side: int = 32
+    """SAM: the grid of points put to a frame."""
+    crop_layers: int = 0
+    """SAM: also asked on 4^k crops for each layer k; 1 is LangSplat's, five times slower."""
+    embedder: Path | None = None
+    """CLIP model folder for regions and texts; None: colours."""
     downscale: float | None = None
     """frames are made this many times smaller; None: so that the longer side is at most `long_side`."""
     long_side: int = 400
@@ -64,6 +76,9 @@ def require_inputs(options: Options) -> None:
             "Give the path of a .ply, or leave out --gaussians to fit the frames.",
         ),
         (options.masks, "a folder with one mask a frame", "Give the masks' folder, or leave out --masks to find them."),
+        (options.proposals, "a folder with the masks of each frame", "Give the folder, or leave out --proposals."),
+        (options.segmenter, "a folder with a SAM model", "See `jsecon models check DIR`."),
+        (options.embedder, "a folder with a CLIP model", "See `jsecon models check DIR`."),
     ):
         if path is not None and not path.exists():
             raise InputError(path, found="nothing there", expected=what, remedy=remedy)
@@ -75,12 +90,22 @@ def require_inputs(options: Options) -> None:
         ("latent", 1),
         ("top", 1),
         ("long_side", 16),
+        ("points_per_side", 1),
+        ("crop_layers", 0),
     ):
         value = getattr(options, name)
         if value not in (None, "auto") and not value >= least:
             raise InputError(
                 f"--{name.replace('_', '-')}", found=str(value), expected=f"at least {least}", remedy="Mend the option."
             )
+    sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
+    if len(sources) > 1:
+        raise InputError(
+            " ".join(sources),
+            found="more than one source of masks",
+            expected="one: tracked masks, masks of single frames, or a model that finds them",
+            remedy="Leave out the others.",
+        )
     if not 0 < options.agreement <= 1:
         raise InputError(
             "--agreement",

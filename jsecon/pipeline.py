@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 import jsecon
-from jsecon import cache, stages
+from jsecon import cache, eyes, stages
 from jsecon.errors import InputError
-from jsecon.options import Options, require_writable
+from jsecon.options import Options, require_inputs, require_writable
 from jsecon.plan import Reporter, Silent, Step
 from jsecon.recipe import Stage, left_out, record_of, stages_of
 from jsecon.stages import Outcome
@@ -52,22 +52,6 @@ class Run:
         return {step.name: step.why for step in self.steps if step.status == "left out"}
 
 
-def embedder_named(name: str | None = None) -> Any:
-    """The embedder whose space a field lives in; the default one without a name. Raises InputError for one that this
-    version does not have."""
-    from jsecon.vision.colours import ColourEmbedder
-
-    embedder = ColourEmbedder()
-    if name not in (None, embedder.name):
-        raise InputError(
-            "field",
-            found=f"regions embedded by {name!r}",
-            expected=f"{embedder.name!r}",
-            remedy="Run the capture again with this version.",
-        )
-    return embedder
-
-
 def peak_memory_mib() -> float:
     """Largest resident memory of this process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -97,13 +81,17 @@ def run(
             expected="a folder of its own",
             remedy=f"For example {out / 'field'}, or one elsewhere.",
         )
-    embedder = embedder_named()
+    require_inputs(options)
     require_writable(out)
+    embedder, segmenter = eyes.embedder_of(options, folder), eyes.segmenter_of(options, folder)
     cache.prepare(folder)
-    plan = stages_of(options, out, folder, embedder, load)
+    plan = stages_of(options, out, folder, embedder, segmenter, load)
     steps = [Step(s.name, "cached" if cache.path_of(folder, s.name, s.key).exists() else "run", s.how) for s in plan]
     steps += [Step(name, "left out", why) for name, why in left_out(options).items()]
     reporter.plan(f"{options.capture} -> {out}", steps)
+    for stage, eye in (("masklets", segmenter), ("regions", embedder)):
+        if any(step.name == stage and step.status == "run" for step in steps):
+            eyes.require_ready(eye)
     results: dict[str, Any] = {}
     seconds: dict[str, float] = {}
     notes: list[str] = []

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from jsecon import cache, stages
-from jsecon.options import Options, require_inputs
+from jsecon.options import Options
 from jsecon.stages import Outcome
 from jsecon.types import Capture
+from jsecon.vision.proposal_store import NamedSegmenter
+from jsecon.vision.protocols import Embedder
 
 CHECKPOINT_SECONDS = 20.0
 """between two records of a fit in progress: a stop loses at most this and one chunk of steps"""
@@ -43,10 +45,14 @@ def left_out(options: Options) -> dict[str, str]:
 
 
 def stages_of(
-    options: Options, out: Path, folder: Path, embedder: Any, load: Callable[[], Capture] | None
+    options: Options,
+    out: Path,
+    folder: Path,
+    embedder: Embedder,
+    segmenter: NamedSegmenter | None,
+    load: Callable[[], Capture] | None,
 ) -> list[Stage]:
-    """The stages in order, with their keys."""
-    require_inputs(options)
+    """The stages in order, with their keys. Models count by their content, not by the place of their files."""
     keys: dict[str, str] = {}
     plan: list[Stage] = []
 
@@ -93,6 +99,7 @@ def stages_of(
             rooms=("data",),
             after=("load",),
             files=options.masks,
+            given=_of(options, "level"),
         )
     if options.gaussians is not None:
         add(
@@ -116,9 +123,8 @@ def stages_of(
         consensus = options.association == "consensus"
         add(
             "masklets",
-            f"{options.granularity} proposals by colour and texture, "
-            + ("what the views agree on" if consensus else "followed through the Gaussians"),
-            lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], p),
+            _proposals(options) + ", " + ("what the views agree on" if consensus else "followed through the Gaussians"),
+            lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], segmenter, p),
             rooms=(
                 "vision",
                 "language.masklets",
@@ -129,8 +135,10 @@ def stages_of(
                 "parallel",
             ),
             after=("load", "gaussians"),
-            given=_of(options, "granularity", *(("agreement", "seed") if consensus else ("iou_threshold",)))
-            | {"association": options.association},
+            given=_of(options, *(("agreement", "seed") if consensus else ("iou_threshold",)))
+            | {"association": options.association}
+            | _eye(options, segmenter),
+            files=options.proposals,
         )
     add(
         "regions",
@@ -138,7 +146,7 @@ def stages_of(
         lambda r, p: stages.regions(options, r["load"], r["masklets"], embedder, p),
         rooms=("vision", "language.regions"),
         after=("load", "masklets"),
-        given=_of(options, "weighting"),
+        given=_of(options, "weighting") | {"embedder": embedder.name},
     )
     add(
         "codes",
@@ -174,6 +182,26 @@ def stages_of(
         after=("load", "gaussians"),
     )
     return plan
+
+
+def _proposals(options: Options) -> str:
+    """Where the proposals come from, for the plan."""
+    if options.proposals is not None:
+        return f"proposals read from {options.proposals.name}"
+    if options.segmenter is not None:
+        crops = f" and {options.crop_layers} layers of crops" if options.crop_layers else ""
+        grid = f"{options.points_per_side}x{options.points_per_side}"
+        return f"proposals of level {options.level} by {options.segmenter.name}, asked at {grid} points{crops}"
+    return f"{options.granularity} proposals by colour and texture"
+
+
+def _eye(options: Options, segmenter: NamedSegmenter | None) -> dict[str, Any]:
+    """What the proposals depend on beside the frames."""
+    if options.proposals is not None:
+        return _of(options, "level")
+    if segmenter is not None:
+        return {"model": segmenter.name}
+    return _of(options, "granularity")
 
 
 def _of(options: Options, *names: str) -> dict[str, Any]:

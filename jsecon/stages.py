@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsecon import eyes
 from jsecon.errors import InputError
 from jsecon.options import Options
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
+from jsecon.vision.protocols import Segmenter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +126,9 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
         )
 
 
-def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussians, progress: Progress) -> Outcome:
+def masklets_from_frames(
+    options: Options, capture: Capture, gaussians: Gaussians, segmenter: Segmenter | None, progress: Progress
+) -> Outcome:
     """labels (T, H, W) int16 of the training frames: the proposals of each, brought together over the frames by what
     the scene's own Gaussians say, by consensus or by tracking."""
     from jsecon.language.consensus import consensus_masklets
@@ -134,7 +138,7 @@ def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussian
 
     train = training_frames(capture)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
-    proposals = proposals_of(options, capture, gaussians)
+    proposals, notes = proposals_of(options, capture, gaussians, segmenter)
     if options.association == "consensus":
         scene = SceneViews(gaussians, cameras, proposals)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
@@ -149,12 +153,29 @@ def masklets_from_frames(options: Options, capture: Capture, gaussians: Gaussian
         )
         labels = tracker.consistent(frames, labels)
     labels = clean_masklets(labels)
+    eyes.close(segmenter)
     _require_regions(labels, str(options.capture))
-    return Outcome(labels)
+    return Outcome(labels, notes=notes)
 
 
-def proposals_of(options: Options, capture: Capture, gaussians: Gaussians) -> Callable[[int], np.ndarray]:
-    """masks (M, H, W) bool of the t-th training frame, by the classical segmenter at the granularity asked for.
+def proposals_of(
+    options: Options, capture: Capture, gaussians: Gaussians, segmenter: Segmenter | None
+) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
+    """masks (M, H, W) bool of the t-th training frame, from disk where they are given, else by `segmenter`, else by the
+    classical one at the granularity asked for; and notes."""
+    train = training_frames(capture)
+    frames = np.asarray(capture.frames)[train]
+    if options.proposals is not None:
+        from jsecon.data.proposals import proposals_from_disk
+
+        names = [capture.names[t] for t in train]
+        return proposals_from_disk(options.proposals, names, frames.shape[1:3], level=options.level)
+    found = segmenter or classical_segmenter(options, capture, gaussians)
+    return functools.cache(lambda t: found(frames[t], t)), ()
+
+
+def classical_segmenter(options: Options, capture: Capture, gaussians: Gaussians) -> Segmenter:
+    """The segmenter without weights.
 
     Depth comes from the capture; where there is none, the coarse one takes what the Gaussians render. (The finer ones
     do not: rendered depth costs them more outline than it tells.)
@@ -165,11 +186,11 @@ def proposals_of(options: Options, capture: Capture, gaussians: Gaussians) -> Ca
     from jsecon.vision.relief import steadied_depth
 
     train = training_frames(capture)
-    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
     setting = GRANULARITIES[options.granularity]
     if capture.depths is not None:
-        segmenter = ClassicalSegmenter(**setting, depths=np.asarray(capture.depths)[train])
-    elif options.granularity == "coarse":
+        return ClassicalSegmenter(**setting, depths=np.asarray(capture.depths)[train])
+    if options.granularity == "coarse":
         capacity = plan_capacity(gaussians, cameras)
         draw = jax.jit(lambda camera: render_depth(gaussians, camera, capacity=capacity))
 
@@ -177,10 +198,8 @@ def proposals_of(options: Options, capture: Capture, gaussians: Gaussians) -> Ca
             depth, alpha = (np.asarray(image) for image in draw(cameras[t]))
             return steadied_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
 
-        segmenter = ClassicalSegmenter(**setting, depths=rendered)
-    else:
-        segmenter = ClassicalSegmenter(**setting)
-    return functools.cache(lambda t: segmenter(frames[t], t))
+        return ClassicalSegmenter(**setting, depths=rendered)
+    return ClassicalSegmenter(**setting)
 
 
 def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -> Outcome:
@@ -190,7 +209,9 @@ def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -
     assert options.masks is not None
     height, width = capture.frames.shape[1:3]
     names = [capture.names[t] for t in training_frames(capture)]
-    found = load_labels(options.masks, names, (height, width), progress=progress)
+    found = load_labels(
+        options.masks, names, (height, width), level=options.level, order=capture.names, progress=progress
+    )
     _require_regions(found.labels, str(options.masks))
     return Outcome(found.labels, notes=(f"{len(found.ids)} regions in the masks", *found.notes))
 
@@ -210,9 +231,9 @@ def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: An
     from jsecon.language.regions import region_embeddings
 
     frames = np.asarray(capture.frames)[training_frames(capture)]
-    return Outcome(
-        region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting, progress=progress)
-    )
+    found = region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting, progress=progress)
+    eyes.close(embedder)
+    return Outcome(found)
 
 
 def codes(options: Options, found: Regions, progress: Progress) -> Outcome:

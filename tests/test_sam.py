@@ -11,7 +11,7 @@ from scipy import ndimage
 from jsecon.errors import InputError
 from jsecon.vision.mask_nms import langsplat_nms
 from jsecon.vision.protocols import Segmenter
-from jsecon.vision.sam import TOKENS, SamSegmenter
+from jsecon.vision.sam import TOKENS, SamSegmenter, SamSettings
 from jsecon.vision.sam_graphs import SamFiles, SamGraphs, find_sam
 from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop
 from jsecon.vision.sam_prompts import crops_of, point_grid
@@ -42,7 +42,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def segmenter(folders):
-    return SamSegmenter(folders["segment-anything", "batch"], points_per_side=8, threads=1)
+    return SamSegmenter(folders["segment-anything", "batch"], SamSettings(points_per_side=8), threads=1)
 
 
 def by_definition(folder, frame, token_of_level, side=8):
@@ -99,7 +99,7 @@ def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter, kind):
-    other = SamSegmenter(folders[kind], points_per_side=8, threads=1, batch=5)
+    other = SamSegmenter(folders[kind], SamSettings(points_per_side=8), threads=1, batch=5)
     assert isinstance(other, Segmenter)
     masks = other(frame, 0)
     red, green = frame[..., 0] == 200, frame[..., 1] == 160
@@ -122,7 +122,7 @@ def test_without_crops_the_frame_is_encoded_once(folders, frame, monkeypatch):
     calls = []
     encode = SamGraphs.encode
     monkeypatch.setattr(SamGraphs, "encode", lambda self, part: calls.append(part.shape) or encode(self, part))
-    SamSegmenter(folders["sam2", "batch"], points_per_side=4, crop_layers=0, threads=1)(frame, 0)
+    SamSegmenter(folders["sam2", "batch"], SamSettings(points_per_side=4, crop_layers=0), threads=1)(frame, 0)
     assert calls == [(120, 160, 3)]
 
 
@@ -141,7 +141,9 @@ def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
 
 
 def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
-    strict = SamSegmenter(folders["transformers.js", "batch"], points_per_side=4, predicted_iou=0.999, threads=1)
+    strict = SamSegmenter(
+        folders["transformers.js", "batch"], SamSettings(points_per_side=4, predicted_iou=0.999), threads=1
+    )
     assert strict(frame, 0).shape == (0, 120, 160)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Int16
 
 from jsecon.data.frames import Progress
 from jsecon.data.images import IMAGE_ENDINGS, read_ids
+from jsecon.data.object_masks import object_folders, read_objects
 from jsecon.errors import InputError
 
 LEVELS = ("default", "s", "m", "l")
@@ -39,13 +40,19 @@ def load_labels(
     background: int | None = 0,
     level: str | int = "l",
     shared: bool | None = None,
+    order: Sequence[str] | None = None,
     progress: Progress = None,
 ) -> MasksFromDisk:
     """The masks in `folder` of the frames called `names`, `size` = (H, W), as labels (T, H, W).
 
-    Either `<name>.png` (also `<name>.jpg.png`), one id a pixel: 8 or 16 bit grey, a palette PNG (its indices), or RGB
-    (each colour an id, R*65536 + G*256 + B); `background` is the id of no region (None: every id is one). Or
-    LangSplat's `<name>_s.npy` (4, H, W), -1 = none, of which `level` is taken ("default", "s", "m", "l", or its index).
+    `<name>.png` (also `<name>.jpg.png`), one id a pixel: 8 or 16 bit grey, a palette PNG (its indices), or RGB (each
+    colour an id, R*65536 + G*256 + B); `background` is the id of no region (None: every id is one). Such are Gaussian
+    Grouping's object_mask and SAM 2's PNGs. Or `<id>/<name>.png`, black and white masks in a folder for each object, as
+    SAM 2 writes them with --per_obj_png_file; where they overlap the lower id lies on top. Or LangSplat's
+    `<name>_s.npy` (4, H, W), -1 = none, of which `level` is taken ("default", "s", "m", "l", or its index).
+
+    SAM 2 wants frames called 0, 1, ... `order` says what such numbers stand for: where no PNG is called like a frame,
+    and they are numbered from 0 to len(order) - 1, number n is the mask of the frame `order[n]`.
 
     `shared`: whether an id means the same object in every frame. By default so for PNGs; not for `_s.npy`, since
     LangSplat numbers the masks of each frame afresh: each is then a region of its own. Say True for tracked ones.
@@ -57,7 +64,8 @@ def load_labels(
     """
     folder = Path(folder)
     height, width = size
-    files, kind = _find(folder, names)
+    objects = object_folders(folder) if folder.is_dir() else ()
+    files, kind = _find(folder, objects, names, order)
     per_frame = kind == _SUFFIX if shared is None else not shared
     labels = np.full((len(names), height, width), -1, np.int16)
     own_ids: list[np.ndarray] = []
@@ -66,11 +74,13 @@ def load_labels(
         own_ids.append(np.zeros(0, np.int64))
         if name in files:
             if kind == _SUFFIX:
-                image, none = _read_level(files[name], level), -1
+                image, none = read_level(files[name], level), -1
+            elif objects:
+                image, none = read_objects(objects, files[name].name), -1
             else:
                 image, coloured = read_ids(files[name])
                 none, colours = background, colours + coloured
-            fitted = _fit(files[name], image, width, height)
+            fitted = fitted_to_frame(files[name], image, width, height)
             resized += fitted is not image
             own_ids[-1], labels[index] = _compact(files[name], fitted, none)
         if progress is not None:
@@ -114,17 +124,22 @@ def _notes(names, files, resized, colours, per_frame, size) -> tuple[str, ...]:
         notes.append(f"{resized} masks were resized to {size[0]}x{size[1]} (nearest).")
     if colours:
         notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
+    if numbered := [name for name in files if files[name].stem.isdecimal() and files[name].stem != name]:
+        first = numbered[0]
+        notes.append(f"The masks are numbered, and taken in the order of the frames: {files[first].name} is {first}.")
     if per_frame:
         notes.append("Each frame's masks count as regions of their own, since their ids are not shared between frames.")
     return tuple(notes)
 
 
-def _find(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], str]:
-    """Mask files by frame name, and their common ending."""
+def _find(
+    folder: Path, objects: Sequence[Path], names: Sequence[str], order: Sequence[str] | None
+) -> tuple[dict[str, Path], str]:
+    """Mask files by frame name, and their common ending; where objects have folders of their own, one of each frame."""
     if not folder.is_dir():
         raise InputError(folder, found="no such folder", expected="a folder of masks", remedy="Check the path.")
     found: dict[str, dict[str, Path]] = {".png": {}, _SUFFIX: {}}
-    for file in sorted(folder.iterdir()):
+    for file in sorted(file for place in objects or (folder,) for file in place.iterdir()):
         for ending, files in found.items():
             if file.name.lower().endswith(ending):
                 key = file.name[: -len(ending)]
@@ -138,12 +153,16 @@ def _find(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], str]:
         ".png": {name: found[".png"][name] for name in names if name in found[".png"]},
         _SUFFIX: {name: file for name, file in arrays.items() if file is not None},
     }
+    numbered = {int(key): file for key, file in found[".png"].items() if key.isdecimal()}
+    if order is not None and not matched[".png"] and sorted(numbered) == list(range(len(order))):
+        matched[".png"] = {name: numbered[order.index(name)] for name in names}
     if not matched[".png"] and not matched[_SUFFIX]:
         inside = len(set(found[".png"].values())) + len(found[_SUFFIX])
         raise InputError(
             folder,
             found=f"{inside} masks, none of which is called like a frame",
-            expected=f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png",
+            expected=f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png"
+            + ("" if order is None else f"; or a PNG for each number from 0 to {len(order) - 1}"),
             remedy="Name each mask like its frame.",
         )
     if matched[".png"] and matched[_SUFFIX]:
@@ -157,7 +176,7 @@ def _find(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], str]:
     return matched[kind], kind
 
 
-def _read_level(path: Path, level: str | int) -> np.ndarray:
+def read_level(path: Path, level: str | int) -> np.ndarray:
     if level not in (*LEVELS, 0, 1, 2, 3):
         raise InputError(
             "level", found=repr(level), expected=f"one of {', '.join(LEVELS)}", remedy="l is the coarsest."
@@ -186,7 +205,7 @@ def _read_level(path: Path, level: str | int) -> np.ndarray:
     return image.astype(np.int64)
 
 
-def _fit(path: Path, image: np.ndarray, width: int, height: int) -> np.ndarray:
+def fitted_to_frame(path: Path, image: np.ndarray, width: int, height: int) -> np.ndarray:
     """The mask at the frames' size; itself where it has that."""
     if image.shape == (height, width):
         return image

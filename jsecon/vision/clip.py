@@ -106,6 +106,13 @@ class ClipEmbedder:
         found = self._embedded(phrases).reshape(len(texts), len(self.templates), -1)
         return _unit(found.mean(1), self.files.textual)
 
+    def check(self) -> None:
+        """Puts a black image and a word through the graphs and closes them. Raises InputError where they are damaged,
+        or no CLIP model's."""
+        self._through_visual(np.zeros((1, self.size, self.size, 3), np.uint8))
+        self._embedded(["word"])
+        self.close()
+
     def close(self) -> None:
         """Drops the graphs and their memory; they are opened again when needed."""
         for name in ("_visual", "_textual"):

@@ -44,9 +44,14 @@ class EmbeddingStore:
             np.savez(file, allow_pickle=False, keys=keys, vectors=np.stack(list(vectors.values())))
 
     def _path(self, frame: np.ndarray) -> Path:
-        digest = hashlib.blake2b(f"{self.model} {frame.shape}".encode(), digest_size=16)
-        digest.update(np.ascontiguousarray(frame))
-        return self.folder / f"{digest.hexdigest()}.npz"
+        return self.folder / f"{frame_digest(self.model, frame)}.npz"
+
+
+def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
+    """32 hex digits that name a frame as one model sees it."""
+    digest = hashlib.blake2b(f"{model} {frame.shape}".encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(frame))
+    return digest.hexdigest()
 
 
 def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:

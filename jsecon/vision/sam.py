@@ -5,6 +5,7 @@ levels s, m and l; `default` pools all three. Masks that the model thinks poor, 
 are dropped, then repetitions by box, then small holes and islands, then LangSplat's suppression by masks.
 """
 
+import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,7 +14,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from jsecon.errors import require
 from jsecon.vision.mask_nms import langsplat_nms
 from jsecon.vision.sam_graphs import SamFiles, SamGraphs, find_sam
 from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop, stability, tidied
@@ -37,54 +37,61 @@ class Candidate(NamedTuple):
     crop: Crop
 
 
+@dataclasses.dataclass(frozen=True)
+class SamSettings:
+    """Of the automatic mask generator. The defaults are LangSplat's (REFERENCE B.1, B.2)."""
+
+    level: Level = "l"
+    """what a call returns"""
+    points_per_side: int = 32
+    """of the grid of points put to each crop"""
+    predicted_iou: float = 0.7
+    """a mask must be predicted to be better than this"""
+    stability: float = 0.85
+    """least IoU of the masks at logits of +- `stability_offset`"""
+    stability_offset: float = 1.0
+    box_iou: float = 0.7
+    """boxes of a higher IoU repeat each other"""
+    crop_layers: int = 1
+    """layers of 4^k crops beside the whole frame. A frame costs 1 + 4 + ... 4^layers encoder runs and as many grids of
+    prompts: without crops a fifth of LangSplat's"""
+    crop_overlap: float = 512 / 1500
+    """of neighbouring crops, as a share of the frame's shorter side"""
+    least_area: int = 100
+    """px: smaller holes are filled, smaller islands removed"""
+    mask_iou: float = 0.8
+    """`langsplat_nms`: a mask of a higher IoU with a better one goes"""
+    mask_score: float = 0.7
+    """`langsplat_nms`: least stability times predicted IoU"""
+    mask_inner: float = 0.5
+    """`langsplat_nms`: of masks inside of others"""
+
+
 class SamSegmenter:
     """Segmenter (jsecon.vision.protocols) by a SAM model folder, or its files.
 
-    `level` is what a call returns. The other settings are LangSplat's own (REFERENCE B.1) unless given: a grid of
-    `points_per_side`^2 points a crop; least `predicted_iou` and `stability` (at logits +-`stability_offset`);
-    `box_iou` above which boxes repeat each other; `crop_layers` of 4^k crops, overlapping by `crop_overlap`; holes and
-    islands below `least_area` px are removed; `mask_iou`, `mask_score`, `mask_inner` of `langsplat_nms`. `batch`
-    prompts go to the decoder at once where it takes more than one. A frame costs 1 + 4 + ... 4^layers encoder runs and
-    as many grids of prompts: with `crop_layers=0` a fifth of LangSplat's.
-
-    Graphs are opened when first needed and kept until `close`; `name` follows from their content. Raises InputError
-    where the folder holds no SAM model, and later where a graph is of another kind, naming the tensor.
+    `batch` prompts go to the decoder at once where it takes more than one; `threads` as for `Graph`. Graphs are opened
+    when first needed and kept until `close`. `name` follows from the content of the files and the settings. Raises
+    InputError where the folder holds no SAM model, and later where a graph is of another kind, naming the tensor.
     """
 
     def __init__(
         self,
         model: str | Path | SamFiles,
+        settings: SamSettings | None = None,
         *,
-        level: Level = "l",
-        points_per_side: int = 32,
-        predicted_iou: float = 0.7,
-        stability: float = 0.85,
-        stability_offset: float = 1.0,
-        box_iou: float = 0.7,
-        crop_layers: int = 1,
-        crop_overlap: float = 512 / 1500,
-        least_area: int = 100,
-        mask_iou: float = 0.8,
-        mask_score: float = 0.7,
-        mask_inner: float = 0.5,
         batch: int = 64,
         threads: int | None = None,
     ):
-        require(
-            level in TOKENS, "level", got=level, expected=f"one of {', '.join(TOKENS)}", remedy="l is the coarsest."
-        )
         self.files = model if isinstance(model, SamFiles) else find_sam(model)
-        self.level, self.points_per_side = level, points_per_side
-        self.crop_layers, self.crop_overlap = crop_layers, crop_overlap
-        self.predicted_iou, self.stability, self.stability_offset = predicted_iou, stability, stability_offset
-        self.box_iou, self.least_area = box_iou, least_area
-        self._nms = {"iou_threshold": mask_iou, "score_threshold": mask_score, "inner_threshold": mask_inner}
+        self.settings = settings or SamSettings()
         self._batch, self._threads = batch, threads
-        self.name = f"sam-{self.files.digest()}"
+        self.name = f"sam-{self.files.digest(extra=repr(self.settings))}"
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
         """frame (H, W, 3) uint8 RGB -> masks (M, H, W) bool of the level, best score first; they may overlap."""
-        return self.levels(frame, (self.level,))[self.level][0]
+        level = self.settings.level
+        return self.levels(frame, (level,))[level][0]
 
     def levels(
         self, frame: UInt8[np.ndarray, "h w 3"], levels: Sequence[Level] = ("default", "s", "m", "l")
@@ -92,9 +99,14 @@ class SamSegmenter:
         """Masks (M, H, W) and scores (M,), stability times predicted IoU, of each level, best first; the points are
         put once for all levels."""
         wanted = sorted({token for level in levels for token in TOKENS[level]})
-        crops = crops_of(*frame.shape[:2], self.crop_layers, self.crop_overlap)
+        crops = crops_of(*frame.shape[:2], self.settings.crop_layers, self.settings.crop_overlap)
         by_crop = [list(self._candidates(frame, crop, wanted)) for crop in crops]
         return {level: self._filtered(frame.shape[:2], by_crop, TOKENS[level]) for level in levels}
+
+    def check(self) -> None:
+        """Opens and closes the graphs. Raises InputError where they are damaged, or no SAM model's."""
+        _ = self._graphs
+        self.close()
 
     def close(self) -> None:
         """Drops the graphs and their memory; they are opened again when needed."""
@@ -109,14 +121,14 @@ class SamSegmenter:
         height, width = frame.shape[:2]
         part = np.ascontiguousarray(frame[crop.top : crop.bottom, crop.left : crop.right])
         encoded = self._graphs.encode(part)
-        points = point_grid(self.points_per_side) * np.float32([part.shape[1], part.shape[0]])
+        points = point_grid(self.settings.points_per_side) * np.float32([part.shape[1], part.shape[0]])
         for logits, ious in self._graphs.decode(encoded, points):
-            for prompt, token in zip(*np.nonzero(ious > self.predicted_iou)):
+            for prompt, token in zip(*np.nonzero(ious > self.settings.predicted_iou)):
                 if token not in tokens:
                     continue
                 mask_logits = self._graphs.to_frame(logits[prompt, token], encoded)
-                steady = stability(mask_logits, self.stability_offset)
-                if steady < self.stability:
+                steady = stability(mask_logits, self.settings.stability_offset)
+                if steady < self.settings.stability:
                     continue
                 whole = np.zeros((height, width), bool)
                 whole[crop.top : crop.bottom, crop.left : crop.right] = mask_logits > 0
@@ -131,17 +143,25 @@ class SamSegmenter:
         left: list[Candidate] = []
         for candidates in by_crop:
             own = [c for c in candidates if c.token in tokens]
-            left += [own[i] for i in box_nms(_boxes(own), np.asarray([c.iou for c in own]), self.box_iou)]
+            left += [own[i] for i in box_nms(_boxes(own), np.asarray([c.iou for c in own]), self.settings.box_iou)]
         # Of what several crops show, the smaller crop's is the finer; with one crop this changes nothing.
-        left = [left[i] for i in box_nms(_boxes(left), np.asarray([1.0 / c.crop.area for c in left]), self.box_iou)]
+        left = [
+            left[i] for i in box_nms(_boxes(left), np.asarray([1.0 / c.crop.area for c in left]), self.settings.box_iou)
+        ]
         masks, changed = np.zeros((len(left), *size), bool), np.zeros(len(left), bool)
         for n, candidate in enumerate(left):
             whole = np.unpackbits(candidate.bits, count=size[0] * size[1]).reshape(size).astype(bool)
-            masks[n], changed[n] = tidied(whole, self.least_area)
+            masks[n], changed[n] = tidied(whole, self.settings.least_area)
         boxes = np.asarray([box_of(mask) for mask in masks], np.float64).reshape(-1, 4)
-        kept = np.sort(box_nms(boxes, 1.0 - changed, self.box_iou))
+        kept = np.sort(box_nms(boxes, 1.0 - changed, self.settings.box_iou))
         masks, scores = masks[kept], np.asarray([left[i].iou * left[i].stability for i in kept], np.float64)
-        kept = langsplat_nms(masks, scores, **self._nms)
+        kept = langsplat_nms(
+            masks,
+            scores,
+            iou_threshold=self.settings.mask_iou,
+            score_threshold=self.settings.mask_score,
+            inner_threshold=self.settings.mask_inner,
+        )
         return masks[kept], scores[kept]
 
 

@@ -27,7 +27,7 @@ IMAGE_SIDE = 1024
 MASK_SIDE = 256
 """px of a mask prompt, where the file does not fix it"""
 ENCODERS = ("vision_encoder.onnx", "image_encoder.onnx", "encoder.onnx")
-DECODERS = ("prompt_encoder_mask_decoder.onnx", "mask_decoder.onnx", "decoder.onnx")
+DECODERS = ("decoder_batched.onnx", "prompt_encoder_mask_decoder.onnx", "mask_decoder.onnx", "decoder.onnx")
 PUBLISHED = (
     "SAM folders are published on huggingface.co: Xenova/sam-vit-base, Xenova/slimsam-77-uniform (a batch of prompts a "
     "call); vietanhdev/samexporter and segment-anything's scripts/export_onnx_model.py write one prompt a call."
@@ -63,9 +63,9 @@ class SamFiles:
     encoder: Path
     decoder: Path
 
-    def digest(self) -> str:
-        """32 hex digits of the files' contents."""
-        return content_digest([*graph_files(self.encoder), *graph_files(self.decoder)])
+    def digest(self, *, extra: str = "") -> str:
+        """32 hex digits of the files' contents, and of `extra`."""
+        return content_digest([*graph_files(self.encoder), *graph_files(self.decoder)], extra=extra)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +93,8 @@ def find_sam(folder: str | Path) -> SamFiles:
         raise InputError(
             folder,
             found=", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file",
-            expected=f"an image encoder ({ENCODERS[0]}, or one *encoder*.onnx) and a mask decoder "
-            f"({DECODERS[0]}, or one *decoder*.onnx)",
+            expected=f"an image encoder ({' or '.join(ENCODERS)}, or one *encoder*.onnx) and a mask decoder "
+            f"({' or '.join(DECODERS)}, or one *decoder*.onnx)",
             remedy=PUBLISHED,
         )
     return SamFiles(encoder, decoder)
