@@ -1,0 +1,144 @@
+"""A run with SAM and CLIP from model folders, end to end: their content is in the keys, a stopped run keeps what they
+found, and a field finds its model again or says what is missing."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+from clip_files import COLOURS, write_clip, write_visual
+from sam_files import write_sam
+from test_pipeline import Recorder
+
+from jsecon import cli, eyes, pipeline
+from jsecon.data.capture import load_capture
+from jsecon.data.ply import save_ply
+from jsecon.errors import InputError
+from jsecon.fit.start import starting_gaussians
+from jsecon.language.field import load_field
+from jsecon.options import Options
+from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
+from jsecon.vision.sam import SamSegmenter, SamSettings
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    base = tmp_path_factory.mktemp("models")
+    return write_sam(base / "sam", "transformers.js"), write_clip(base / "clip", "transformers.js")
+
+
+@pytest.fixture(scope="module")
+def splat(room, tmp_path_factory):
+    """The room's sparse points as Gaussians: a scene that is given, so that nothing is fitted."""
+    start, _ = starting_gaussians(load_capture(room, holdout=4), sh_degree=0)
+    path = tmp_path_factory.mktemp("splat") / "scene.ply"
+    save_ply(path, start)
+    return path
+
+
+@pytest.fixture(scope="module")
+def seen(room, splat, models, tmp_path_factory):
+    """A run with both: the run, its folder, and what it told."""
+    folder, reporter = tmp_path_factory.mktemp("seen"), Recorder()
+    options = Options(
+        room, gaussians=splat, holdout=4, segmenter=models[0], embedder=models[1], points_per_side=10, level="m"
+    )
+    return pipeline.run(options, folder, reporter=reporter), folder, reporter
+
+
+def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
+    run, folder, reporter = seen
+    assert "proposals of level m by sam, asked at 10x10 points" in reporter.planned["masklets"].why
+    field = load_field(folder / "field.npz")
+    assert field.embedder.startswith("clip-")
+    assert field.regions.embeddings.shape[1] == 3
+    assert field.regions.count >= 4
+    texts = eyes.embedder_of_field(field).embed_text([f"a {name} thing" for name in COLOURS])
+    frames = np.asarray(run.capture.frames)[~run.capture.held_out]
+    for text, (name, colour) in zip(texts, COLOURS.items()):
+        best = int((np.asarray(field.regions.embeddings) @ text).argmax())
+        means = [frames[run.labels == r].mean(0) for r in range(field.regions.count)]
+        cosines = [mean @ colour / np.linalg.norm(mean) / np.linalg.norm(colour) for mean in means]
+        assert cosines[best] > np.max(cosines) - 0.03, name
+
+
+def test_the_same_models_elsewhere_are_cached_and_others_are_not(seen, models, tmp_path):
+    run, folder, _ = seen
+    shutil.copytree(folder, tmp_path / "out")
+    moved = [shutil.copytree(model, tmp_path / f"moved{n}") for n, model in enumerate(models)]
+    options = dataclasses.replace(run.options, segmenter=moved[0], embedder=moved[1])
+    reporter = Recorder()
+    pipeline.run(options, tmp_path / "out", reporter=reporter)
+    assert not any(fresh for name, fresh in reporter.fresh.items() if name != "field")
+
+    write_visual(moved[1] / "onnx" / "vision_model.onnx", ("pixel_values", "image_embeds"), "batch", std=(0.1, 1, 1))
+    reporter = Recorder()
+    pipeline.run(options, tmp_path / "out", reporter=reporter)
+    fresh = {name for name, value in reporter.fresh.items() if value}
+    assert {"regions", "codes"} <= fresh
+    assert not fresh & {"load", "gaussians", "masklets", "votes"}
+
+
+def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
+    run, _, _ = seen
+    folder = shutil.copytree(models[0], tmp_path / "sam")
+    decoder = folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
+    decoder.write_bytes(decoder.read_bytes()[:400])
+    reporter = Recorder()
+    with pytest.raises(InputError, match=r"prompt_encoder_mask_decoder\.onnx: found what ONNX Runtime"):
+        pipeline.run(dataclasses.replace(run.options, segmenter=folder), tmp_path / "out", reporter=reporter)
+    assert reporter.fresh == {}
+
+
+def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):
+    _, folder, _ = seen
+    field = folder / "field.npz"
+    assert (
+        cli.main(["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"])
+        == 0
+    )
+    answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
+    text = eyes.embedder_of_field(found, templates=("a {} thing",)).embed_text(["red"])[0]
+    assert answer["region"] == int((np.asarray(found.regions.embeddings) @ text).argmax())
+    assert answer["score"] > 0.9
+    other = write_clip(tmp_path / "other", "immich")
+    assert cli.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--embedder", str(other)]) == 2
+    assert "model that the field was made with" in capsys.readouterr().err
+    assert cli.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--template", "a thing"]) == 2
+    assert "a phrase that holds {}" in capsys.readouterr().err
+    lost = dataclasses.replace(load_field(field), provenance=json.dumps({"options": {"embedder": "/nowhere"}}))
+    with pytest.raises(InputError, match=r"--embedder DIR"):
+        eyes.embedder_of_field(lost)
+    assert eyes.embedder_of_field(lost, models[1]).name == lost.embedder
+
+
+def test_templates_are_for_clip():
+    with pytest.raises(InputError, match="--template"):
+        eyes.embedder_named(templates=("a photo of a {}.",))
+
+
+def test_two_sources_of_masks_are_refused(room, models, tmp_path):
+    with pytest.raises(InputError, match="--masks --segmenter"):
+        pipeline.run(Options(room, masks=room / "masks", segmenter=models[0]), tmp_path)
+    with pytest.raises(InputError, match="SAM model"):
+        pipeline.run(Options(room, segmenter=tmp_path / "nowhere"), tmp_path)
+
+
+def test_proposals_are_kept_by_content(models, tmp_path):
+    frame = np.zeros((60, 80, 3), np.uint8)
+    frame[10:40, 10:50] = (200, 30, 30)
+    stored = StoredSegmenter(SamSegmenter(models[0], SamSettings(points_per_side=4, crop_layers=0)), tmp_path)
+    assert isinstance(stored, NamedSegmenter)
+    masks = stored(frame, 0)
+    assert len(masks) >= 1
+    failing = StoredSegmenter(SamSegmenter(models[0], SamSettings(points_per_side=4, crop_layers=0)), tmp_path)
+    failing._segmenter = None  # whatever is asked of it now must come from disk
+    np.testing.assert_array_equal(failing(frame, 5), masks)
+    with pytest.raises(TypeError):
+        failing(255 - frame, 0)
+    path = next(tmp_path.glob("*.npz"))
+    path.write_bytes(path.read_bytes()[:60])
+    np.testing.assert_array_equal(stored(frame, 0), masks)
+    finer = SamSegmenter(models[0], SamSettings(points_per_side=5, crop_layers=0))
+    assert finer.name != stored.name
