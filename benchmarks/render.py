@@ -7,13 +7,13 @@ stand beside it. Where ../shared/limit and g++ are at hand, the hand-laid AVX-51
 in turn with the rest, on every core. Errors are against the same functions in float64, which the tests hold equal to
 the brute-force sum. `--gate` exits 1 where a ratio left its tolerance of benchmarks/baseline.json.
 
-Both cores are host devices, and vectors are 512 bits wide, unless XLA_FLAGS says otherwise.
+The process is prepared as the command line prepares it (jsecon/process.py): a host device a core, 512-bit vectors,
+freed memory kept; unless XLA_FLAGS and MALLOC_* say otherwise.
 """
 
 import argparse
 import atexit
 import json
-import os
 import shutil
 import statistics
 import subprocess
@@ -23,9 +23,9 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault(
-    "XLA_FLAGS", f"--xla_force_host_platform_device_count={os.cpu_count()} --xla_cpu_prefer_vector_width=512"
-)
+from jsecon.process import prepare_process
+
+prepare_process(keep_programs=False)
 
 import jax
 import jax.numpy as jnp
@@ -113,14 +113,14 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
     features = {d: jnp.asarray(rng.normal(size=(gaussians.count, d)), jnp.float32) for d in (3, 16, 32)}
     narrow = features[3]
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    plan = plan_view(gaussians, camera, capacity=capacity)
     calls = {}
     for devices, spread in (("1 device", None), (f"{jax.local_device_count()} devices", mesh)):
         if devices in [key.split(", ")[-1] for key in calls]:
             continue
         forward = jax.jit(lambda g, f, m=spread: jsecon.render(g, camera, f, capacity=capacity, mesh=m).features)
         loss = lambda g, f, forward=forward: (forward(g, f) ** 2).sum()
-        planned = jax.jit(lambda plan, f, m=spread: render_plan(plan, f, mesh=m).features)
+        plan = plan_view(gaussians, camera, capacity=capacity, mesh=spread)
+        planned = jax.jit(lambda plan, f: render_plan(plan, f).features)
         planned_loss = lambda f, plan, planned=planned: (planned(plan, f) ** 2).sum()
         alone = jax.jit(
             lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m)
@@ -130,9 +130,9 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
             f"forward, {devices}": lambda forward=forward: forward(gaussians, narrow),
             f"forward D=16, {devices}": lambda forward=forward: forward(gaussians, features[16]),
             f"forward D=32, {devices}": lambda forward=forward: forward(gaussians, features[32]),
-            f"compositing, {devices}": lambda alone=alone: alone(plan, narrow),
-            f"planned forward, {devices}": lambda planned=planned: planned(plan, narrow),
-            f"planned forward and backward of features, {devices}": lambda g=by_features: g(narrow, plan),
+            f"compositing, {devices}": lambda alone=alone, plan=plan: alone(plan, narrow),
+            f"planned forward, {devices}": lambda planned=planned, plan=plan: planned(plan, narrow),
+            f"planned forward and backward of features, {devices}": lambda g=by_features, plan=plan: g(narrow, plan),
             f"forward and backward of everything, {devices}": lambda g=by_all: g(gaussians, narrow),
         }
     cameras = nearby(camera, 8)
@@ -140,7 +140,7 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
     eight = jax.jit(jax.vmap(lambda camera: jsecon.render(gaussians, camera, narrow, capacity=2 * capacity).features))
     calls["8 single renders"] = lambda: [single(cameras[t]) for t in range(8)]
     calls["8 views by vmap"] = lambda: eight(cameras)
-    bound = hand_laid(plan, narrow, camera)
+    bound = hand_laid(plan_view(gaussians, camera, capacity=capacity), narrow, camera)
     if bound is not None:
         calls["hand-laid bound"] = bound
     ms, compile_s = interleaved(calls, repeats)

@@ -1,63 +1,13 @@
-"""The program `jsecon` (and `python -m jsecon`): what only a program may set, before jax starts; then the command line.
+"""The program `jsecon` (and `python -m jsecon`): the process first, before jax starts; then the command line."""
 
-The library never touches the environment. A program may: XLA reads its flags once, when jax first makes an array, so
-they are settled here, and every one of them gives way to what the user has set.
-"""
-
-import hashlib
-import os
 import sys
-from collections.abc import Mapping
-from pathlib import Path
 
-
-def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
-    """The variables to set: one host device a core, full-width vectors, compiled programs kept between runs.
-
-    Flags already in XLA_FLAGS stay as they are. 512-bit vectors are asked for only where the CPU has them. The folder
-    of compiled programs carries a digest of the CPU's features, so that a home shared by unlike machines stays safe.
-    """
-    flags = environ.get("XLA_FLAGS", "").split()
-    given = {flag.split("=")[0] for flag in flags}
-    if "--xla_force_host_platform_device_count" not in given:
-        flags.append(f"--xla_force_host_platform_device_count={cores}")
-    if "avx512f" in cpu_features and "--xla_cpu_prefer_vector_width" not in given:
-        flags.append("--xla_cpu_prefer_vector_width=512")
-    chosen = {"XLA_FLAGS": " ".join(flags)}
-    if "JAX_COMPILATION_CACHE_DIR" not in environ and (home := _cache_home(environ)) is not None:
-        features = hashlib.blake2b(" ".join(sorted(cpu_features)).encode(), digest_size=6).hexdigest()
-        chosen["JAX_COMPILATION_CACHE_DIR"] = str(home / "jsecon" / f"xla-{features}")
-    return chosen
-
-
-def _cache_home(environ: Mapping[str, str]) -> Path | None:
-    """The user's cache folder where it can be written, else None: a program must run without one."""
-    base = environ.get("XDG_CACHE_HOME") or (Path(environ["HOME"]) / ".cache" if "HOME" in environ else None)
-    if base is None:
-        return None
-    try:
-        Path(base).mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return Path(base) if os.access(base, os.W_OK) else None
-
-
-def _cpu_features() -> frozenset[str]:
-    """The CPU's feature names where Linux tells them, else none."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return frozenset()
-    return next(
-        (frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith(("flags", "Features"))),
-        frozenset(),
-    )
+from jsecon.process import prepare_process
 
 
 def main() -> int:
     """Entry point: returns the exit code."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    os.environ.update(settings(os.environ, cores, _cpu_features()))
+    prepare_process()
     from jsecon.cli import main as run
 
     return run(sys.argv[1:])

@@ -1,7 +1,7 @@
-"""Both cores: the views, or one view's batches of tiles, spread over jax's local devices.
+"""Both cores: the views, or one view's strips, spread over jax's local devices.
 
-A CPU is one device to jax unless the program says otherwise before jax starts
-(XLA_FLAGS=--xla_force_host_platform_device_count=2); the command line does. The library only uses what it finds.
+A CPU is one device to jax unless the program says otherwise before jax starts (`process.prepare_process`); the command
+line does. The library only uses what it finds.
 
 One view over both devices, under jit: `render(..., mesh=host_mesh())`. Many views: `spread_over_devices`, one view a
 device, which shares nothing and so scales better.
@@ -11,11 +11,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
-AXIS = "batches"
-"""the mesh's one axis: batches of tiles"""
+AXIS = "devices"
+"""the mesh's one axis"""
 
 
 def host_mesh() -> Mesh | None:
@@ -24,27 +25,34 @@ def host_mesh() -> Mesh | None:
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None
 
 
-def over_batches(
-    local: Callable, batches: jax.Array, common: tuple, mesh: Mesh | None, *, total: bool = False
-) -> jax.Array:
-    """`local(share of batches, *common)` on every device of `mesh`, the shares' results joined along their leading
-    axis, or added up where `total`. On one device, without a mesh, `local(batches, *common)`."""
-    if mesh is None:
-        return local(batches, *common)
+def over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total: bool = False) -> Any:
+    """`local(index of the device, dealt, common)` on every device of `mesh`, each with its equal part of the arrays
+    `dealt` along their leading axes, and the whole of `common`. The results are joined along their leading axes, or
+    added up where `total`."""
 
-    def run(batches, *common):
-        out = local(batches, *common)
+    def run(dealt, common):
+        out = local(jax.lax.axis_index(AXIS), dealt, common)
         return jax.lax.psum(out, AXIS) if total else out
 
     # The carries of a walk start as constants, which the check of varying axes would have to be told of one by one.
-    sharded = PartitionSpec(AXIS)
     return jax.shard_map(
         run,
         mesh=mesh,
-        in_specs=(sharded, *(PartitionSpec() for _ in common)),
-        out_specs=PartitionSpec() if total else sharded,
+        in_specs=(PartitionSpec(AXIS), PartitionSpec()),
+        out_specs=PartitionSpec() if total else PartitionSpec(AXIS),
         check_vma=False,
-    )(batches, *common)
+    )(dealt, common)
+
+
+def over_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
+    """`local(rows, common)`, row by row independent in every array of `rows` and of the result, each device taking an
+    equal part of them; the last part is filled up with zeros, which `local` must bear."""
+    if mesh is None:
+        return local(rows, common)
+    count = jax.tree.leaves(rows)[0].shape[0]
+    fill = lambda a: jnp.pad(a, [(0, -count % mesh.size)] + [(0, 0)] * (a.ndim - 1))
+    out = over_devices(lambda _, rows, common: local(rows, common), jax.tree.map(fill, rows), common, mesh)
+    return jax.tree.map(lambda a: a[:count], out)
 
 
 def spread_over_devices(

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import jsecon
-from jsecon.__main__ import settings
 
 PACKAGE = Path(jsecon.__file__).parent
 
@@ -80,34 +79,11 @@ def test_modules_are_short_enough_to_be_read_whole():
 
 def test_no_module_touches_global_configuration():
     for path in PACKAGE.rglob("*.py"):
-        if path.name in ("__main__.py",):
+        if path.name == "process.py":
             continue
         text = path.read_text()
         assert "jax.config.update" not in text, path
         assert "os.environ[" not in text, path
-
-
-def test_settings_ask_for_every_core_and_wide_vectors_only_where_there_are_any():
-    wide = settings({}, 3, frozenset({"avx2", "avx512f"}))["XLA_FLAGS"].split()
-    assert wide == ["--xla_force_host_platform_device_count=3", "--xla_cpu_prefer_vector_width=512"]
-    assert settings({}, 1, frozenset({"avx2"}))["XLA_FLAGS"] == "--xla_force_host_platform_device_count=1"
-
-
-def test_settings_give_way_to_the_user(tmp_path):
-    environ = {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=1 --xla_cpu_prefer_vector_width=256",
-        "JAX_COMPILATION_CACHE_DIR": "/elsewhere",
-        "HOME": str(tmp_path),
-    }
-    assert settings(environ, 8, frozenset({"avx512f"})) == {"XLA_FLAGS": environ["XLA_FLAGS"]}
-    kept = settings({"HOME": str(tmp_path)}, 1, frozenset())["JAX_COMPILATION_CACHE_DIR"]
-    assert kept.startswith(str(tmp_path / ".cache" / "jsecon"))
-    assert "JAX_COMPILATION_CACHE_DIR" not in settings({}, 1, frozenset())
-
-
-def test_a_home_that_cannot_be_written_leaves_out_the_compiled_programs(tmp_path):
-    (tmp_path / "file").write_text("")
-    assert "JAX_COMPILATION_CACHE_DIR" not in settings({"XDG_CACHE_HOME": str(tmp_path / "file" / "x")}, 1, frozenset())
 
 
 def test_help_runs_as_a_program():

@@ -137,7 +137,7 @@ def _add_view(
     """Adds one view's votes to the dense accumulators."""
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
     splats, lists = plan.splats, plan.lists
-    batches = make_batches(lists, camera.width, camera.height)
+    batches = make_batches(lists, camera.width)
     tiles = to_tiles(labels + 1, lists.tile) - 1
     distinct = _distinct(tiles)
     dtype = splats.dtype
@@ -167,7 +167,7 @@ def _add_view(
                 peak = peak.at[chunk.ids].max(weight.max(-1))
                 return transmittance, (votes, total, peak)
 
-            inner = walk(table, lists, batches, ids_of_tiles, body, (votes, total, peak))
+            inner, _ = walk(table, lists, batches, ids_of_tiles, body, (votes, total, peak))
             return done + _SLOTS, *inner
 
         carry = lax.while_loop(lambda c: (c[0] == 0) | (c[0] < needed), one_pass, (jnp.int32(0), *carry))
@@ -180,7 +180,7 @@ def _add_view(
         "total": state["total"] + total,
         "peak": peak,
         "views": state["views"] + (total > 0).astype(jnp.int32),
-        "overflow": state["overflow"] + lists.overflow,
+        "overflow": state["overflow"] + plan.overflow,
     }
 
 

@@ -1,12 +1,12 @@
-"""The tiles in batches of like list length, and images cut to tiles and put together again."""
+"""The tiles of a strip in batches of like list length, and strips cut to tiles and put together again."""
 
 import dataclasses
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from jsecon.splat.strips import WHOLE, Strip
 from jsecon.splat.tiles import TileLists, grid
 from jsecon.types import Array
 
@@ -27,42 +27,39 @@ class Batches:
     across: int
     number: int
     tile: int
+    strip: Strip
 
     def corners(self, tiles: Array, dtype) -> tuple[Array, Array]:
-        """x and y of the tiles' upper left corners, px."""
-        return (tiles % self.across * self.tile).astype(dtype), (tiles // self.across * self.tile).astype(dtype)
+        """x and y of the tiles' upper left corners in the image, px."""
+        x, y = tiles % self.across, self.strip.tile_row(tiles // self.across)
+        return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
 
-def make_batches(lists: TileLists, width: int, height: int, *, shares: int = 1) -> Batches:
-    """The batches of an image. With `shares` > 1 their number is a multiple of it, and they are dealt out to and fro
-    so that each run of batches / shares batches has like work; slots are in that order."""
-    across, down = grid(width, height, lists.tile)
-    number = across * down
-    # Longest first.
+def make_batches(lists: TileLists, width: int, strip: Strip = WHOLE) -> Batches:
+    """The batches of one strip's lists, the longest first."""
+    number = lists.lengths.shape[0]
     order = jnp.argsort(-lists.lengths).astype(jnp.int32)
-    rounds = -(-number // (BATCH * shares))
-    order = jnp.concatenate([order, jnp.full(rounds * shares * BATCH - number, number, jnp.int32)])
-    dealt = np.arange(rounds * shares).reshape(rounds, shares)
-    dealt[1::2] = dealt[1::2, ::-1]
+    order = jnp.concatenate([order, jnp.full(-number % BATCH, number, jnp.int32)])
     empty = jnp.zeros(1, jnp.int32)
     return Batches(
-        order.reshape(rounds * shares, BATCH)[dealt.T.reshape(-1)],
+        order.reshape(-1, BATCH),
         jnp.concatenate([lists.starts, empty]),
         jnp.concatenate([lists.lengths, empty]),
-        across,
+        -(-width // lists.tile),
         number,
         lists.tile,
+        strip,
     )
 
 
-def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int, height: int) -> Float[Array, "h w d"]:
-    """(batches, BATCH, D, pixels) -> (H, W, D)."""
+def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> Float[Array, "h w d"]:
+    """(batches, BATCH, D, pixels) -> (rows, W, D), all rows of the strip's tiles."""
     down, tile, channels = batches.number // batches.across, batches.tile, batched.shape[2]
     slots = batches.tiles.reshape(-1)
     place = jnp.zeros(batches.number + 1, jnp.int32).at[slots].set(lax.iota(jnp.int32, slots.shape[0]))[:-1]
     tiles = batched.reshape(slots.shape[0], channels, tile, tile)[place]
     image = tiles.reshape(down, batches.across, channels, tile, tile).transpose(0, 3, 1, 4, 2)
-    return image.reshape(down * tile, batches.across * tile, channels)[:height, :width]
+    return image.reshape(down * tile, batches.across * tile, channels)[:, :width]
 
 
 def to_tiles(image: Array, tile: int) -> Array:

@@ -1,18 +1,17 @@
 """Front-to-back alpha compositing of tile lists, and its transpose: the gradient with respect to the features.
 
-A batch's tiles are walked together (walk.py), batch after batch; over several devices, each walks its share of the
-batches.
+A batch's tiles are walked together (walk.py), batch after batch; over several devices, each walks its strip.
 """
 
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import Mesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jsecon.numerics import MIN_TRANSMITTANCE
-from jsecon.parallel import over_batches
 from jsecon.splat.batches import make_batches, to_image, to_tiles
 from jsecon.splat.stored import stored
+from jsecon.splat.strips import join, over_strips, split
 from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import CHUNK, make_table, walk, weights
 from jsecon.types import Array
@@ -30,14 +29,14 @@ def composite(
     width: int,
     height: int,
     mesh: Mesh | None = None,
-) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
-    """Features (H, W, D) = sum of alpha T f, and final transmittance (H, W)."""
-    batches = make_batches(lists, width, height, shares=1 if mesh is None else mesh.size)
-    # A last channel of ones sums the weights: the final transmittance is what they leave of 1.
-    table = make_table(splats, features, jnp.ones_like(features[:, :1]))
+) -> tuple[Float[Array, "h w d"], Float[Array, "h w"], Int[Array, " tiles"]]:
+    """Features (H, W, D) = sum of alpha T f, final transmittance (H, W), and how far down each tile's list anything is
+    seen: lists cut there composite to the same, and have the same gradient."""
     channels = features.shape[1] + 1
 
-    def local(share, table, lists):
+    def local(strip, lists, table):
+        batches = make_batches(lists, width, strip)
+
         def body(transmittance, total, chunk):
             if channels <= WIDE:
                 return _summed_anew(transmittance, total, chunk)
@@ -50,10 +49,15 @@ def composite(
             total = jnp.zeros((tiles.shape[0], channels, batches.tile**2), table.dtype)
             return walk(table, lists, batches, tiles, body, total)
 
-        return lax.map(one_batch, share)
+        totals, seen = lax.map(one_batch, batches.tiles)
+        image = to_image(totals, batches, width)[None]
+        by_tile = jnp.zeros(batches.number + 1, jnp.int32).at[batches.tiles].set(seen)[:-1]
+        return image[..., :-1], 1 - image[..., -1], by_tile
 
-    image = to_image(over_batches(local, batches.tiles, (table, lists), mesh), batches, width, height)
-    return image[..., :-1], 1 - image[..., -1]
+    # A last channel of ones sums the weights: the final transmittance is what they leave of 1.
+    table = make_table(splats, features, jnp.ones_like(features[:, :1]))
+    image, transmittance, seen = over_strips(local, lists, table, mesh)
+    return join(image, lists.tile, height), join(transmittance, lists.tile, height), seen
 
 
 def _summed_anew(transmittance: Array, total: Array, chunk) -> tuple[Array, Array]:
@@ -72,20 +76,22 @@ def composite_features_vjp(
     splats: Float[Array, "n 6"], lists: TileLists, cotangent: Float[Array, "h w d"], mesh: Mesh | None = None
 ) -> Float[Array, "n d"]:
     """Gradient with respect to the features alone: W^T cotangent. No gradient of the geometry is computed."""
-    height, width, channels = cotangent.shape
-    batches = make_batches(lists, width, height, shares=1 if mesh is None else mesh.size)
-    cotangents = to_tiles(cotangent, lists.tile)
+    width, channels = cotangent.shape[1:]
 
-    def local(share, table, lists, cotangents):
+    def local(strip, dealt, table):
+        lists, (image,) = dealt
+        batches, cotangents = make_batches(lists, width, strip), to_tiles(image, lists.tile)
+
         def one_batch(gradient, tiles):
-            values = cotangents[tiles]
+            values = jnp.moveaxis(cotangents[tiles], -1, 1)  # pixels innermost on both sides: the faster product
 
             def body(transmittance, gradient, chunk):
                 weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
-                return transmittance, gradient.at[chunk.ids].add(jnp.einsum("bcp,bpd->bcd", weight, values))
+                return transmittance, gradient.at[chunk.ids].add(jnp.einsum("bcp,bdp->bcd", weight, values))
 
-            return walk(table, lists, batches, tiles, body, gradient), None
+            return walk(table, lists, batches, tiles, body, gradient)[0], None
 
-        return lax.scan(one_batch, jnp.zeros((splats.shape[0], channels), splats.dtype), share)[0]
+        return lax.scan(one_batch, jnp.zeros((splats.shape[0], channels), splats.dtype), batches.tiles)[0]
 
-    return over_batches(local, batches.tiles, (make_table(splats), lists, cotangents), mesh, total=True)
+    strips = split(cotangent, lists.tile, 1 if mesh is None else mesh.size)
+    return over_strips(local, (lists, strips), make_table(splats), mesh, total=True)

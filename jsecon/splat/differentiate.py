@@ -7,6 +7,7 @@ vmap: a loop with an early exit runs in lockstep when it is batched, as long as 
 sets of one view become more channels of one walk over its tiles, and several views are walked one after another.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -19,13 +20,23 @@ from jax.sharding import Mesh
 from jsecon.splat.composite import composite, composite_features_vjp
 from jsecon.splat.gradient import composite_vjp
 from jsecon.splat.project import Projection
+from jsecon.splat.strips import over_strips
 from jsecon.splat.tiles import TILE, TileLists, tile_lists
 from jsecon.types import Array
 
 
-def view_lists(projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE) -> TileLists:
-    """`tile_lists`, one view after another under vmap; no gradient passes."""
-    lists = sequential_vmap(lambda p: tile_lists(p, width, height, capacity=capacity, tile=tile))
+def view_lists(
+    projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, mesh: Mesh | None = None
+) -> TileLists:
+    """`tile_lists` of all strips, `capacity` shared among them, one view after another under vmap; no gradient
+    passes."""
+    each = capacity if mesh is None else -(-capacity // mesh.size)
+
+    def local(strip, dealt, projection):
+        del dealt
+        return tile_lists(projection, width, height, capacity=each, tile=tile, strip=strip)
+
+    lists = sequential_vmap(lambda p: over_strips(local, (), p, mesh))
     return lists(jax.tree.map(lax.stop_gradient, projection))
 
 
@@ -34,14 +45,15 @@ def splat(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
 ) -> tuple[Array, Array]:
     """Image (H, W, D) and final transmittance (H, W) of `splats` (N, 6) with `features` (N, D); see composite.py."""
-    return _forward(splats, features, lists, width, height, mesh)
+    return _forward(splats, features, lists, width, height, mesh)[:2]
 
 
 def _splat_forward(splats, features, lists, width, height, mesh):
     wants_geometry = splats.perturbed
     splats, features = splats.value, features.value
     lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
-    image, transmittance = _forward(splats, features, lists, width, height, mesh)
+    image, transmittance, seen = _forward(splats, features, lists, width, height, mesh)
+    lists = dataclasses.replace(lists, lengths=seen)
     saved = (features, image, transmittance) if wants_geometry else None
     return (image, transmittance), (splats, lists, saved)
 
@@ -61,35 +73,35 @@ def _splat_backward(width, height, mesh, residual, cotangents):
 splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
 
 
-def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array]:
+def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
     def one(splats, features, lists):
         return composite(splats, features, lists, width, height, mesh)
 
-    return _merging_channels(
-        one, lambda out, sets: (_unmerge(out[0], sets), jnp.broadcast_to(out[1], (sets, *out[1].shape)))
-    )(splats, features, lists)
+    def split(out, sets):
+        return (_unmerge(out[0], sets), *out[1:]), (True, False, False)
+
+    return _merging_channels(one, split)(splats, features, lists)
 
 
 def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: Mesh | None) -> Array:
     def one(splats, cotangent, lists):
         return composite_features_vjp(splats, lists, cotangent, mesh)
 
-    return _merging_channels(one, _unmerge)(splats, cotangent, lists)
+    return _merging_channels(one, lambda out, sets: (_unmerge(out, sets), True))(splats, cotangent, lists)
 
 
 def _merging_channels(one: Callable, split: Callable) -> Callable:
-    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call,
-    which `split(result, S)` takes apart; anything else runs one after another."""
+    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call;
+    `split(result, S)` takes it apart and says what of it is batched. Anything else runs one after another."""
     function = custom_vmap(one)
 
     @function.def_vmap
     def rule(size, batched, splats, channels, lists):
         if any(jax.tree.leaves((batched[0], batched[2]))):
             out = _in_sequence(function, size, tuple(batched), splats, channels, lists)
-        else:
-            merged = jnp.moveaxis(channels, 0, -2)
-            out = split(function(splats, merged.reshape(*merged.shape[:-2], -1), lists), size)
-        return out, jax.tree.map(lambda _: True, out)
+            return out, jax.tree.map(lambda _: True, out)
+        merged = jnp.moveaxis(channels, 0, -2)
+        return split(function(splats, merged.reshape(*merged.shape[:-2], -1), lists), size)
 
     return function
 

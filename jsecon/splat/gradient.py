@@ -11,9 +11,9 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.numerics import MAX_ALPHA
-from jsecon.parallel import over_batches
 from jsecon.splat.batches import make_batches, to_tiles
 from jsecon.splat.stored import stored
+from jsecon.splat.strips import over_strips, split
 from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import ATTRIBUTES, make_table, pixel_centres, running, walk, weights
 from jsecon.types import Array
@@ -37,21 +37,21 @@ def composite_vjp(
 
     The transmittance is 1 - sum of w, so its cotangent joins the others as minus a channel of constant feature 1.
     """
-    height, width, channels = cotangent.shape
-    batches = make_batches(lists, width, height, shares=1 if mesh is None else mesh.size)
+    width, channels = cotangent.shape[1:]
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
-    packed = to_tiles(
-        jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1), lists.tile
-    )
+    packed = jnp.concatenate([cotangent, cotangent_transmittance[..., None], total[..., None]], -1)
 
     x, y = (centres - lists.tile / 2 for centres in pixel_centres(lists.tile, splats.dtype))
     # All sums over a tile's pixels are moments of one quantity, h = alpha dL/dalpha, about the tile's centre.
-    monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
-    def local(share, table, lists, packed):
+    def local(strip, dealt, table):
+        lists, (packed,) = dealt
+        batches, in_tiles = make_batches(lists, width, strip), to_tiles(packed, lists.tile)
+
         def one_batch(gradient, tiles):
-            values = packed[tiles]
-            local, along_transmittance, final = values[..., :channels], values[..., channels], values[..., channels + 1]
+            values = jnp.moveaxis(in_tiles[tiles], -1, 1)  # pixels innermost on both sides: the faster product
+            local, along_transmittance, final = values[:, :channels], values[:, channels], values[:, channels + 1]
             corners = batches.corners(tiles, table.dtype)
 
             def body(transmittance, state, chunk):
@@ -66,27 +66,28 @@ def composite_vjp(
                     before,
                     final,
                 )
-                moments = jnp.einsum("bcp,pm->bcm", slope, monomials)
+                moments = jnp.einsum("bcp,mp->bcm", slope, monomials)
                 by_attribute = _attribute_gradient(moments, chunk.attributes, corners, lists.tile / 2)
-                by_feature = jnp.einsum("bcp,bpd->bcd", weight, local)
+                by_feature = jnp.einsum("bcp,bdp->bcd", weight, local)
                 rows = jnp.concatenate([by_attribute, by_feature], axis=-1)
                 return transmittance, (before, gradient.at[chunk.ids].add(rows))
 
             state = (jnp.zeros_like(final), gradient)
-            return walk(table, lists, batches, tiles, body, state)[1], None
+            return walk(table, lists, batches, tiles, body, state)[0][1], None
 
         start = jnp.zeros((splats.shape[0], ATTRIBUTES + channels), splats.dtype)
-        return lax.scan(one_batch, start, share)[0]
+        return lax.scan(one_batch, start, batches.tiles)[0]
 
-    gradient = over_batches(local, batches.tiles, (make_table(splats, features), lists, packed), mesh, total=True)
+    strips = split(packed, lists.tile, 1 if mesh is None else mesh.size)
+    gradient = over_strips(local, (lists, strips), make_table(splats, features), mesh, total=True)
     return gradient[:, :ATTRIBUTES], gradient[:, ATTRIBUTES:]
 
 
 def _along(features: Array, cotangent: Array) -> Array:
-    """(BATCH, CHUNK, D), (BATCH, pixels, D) -> (BATCH, CHUNK, pixels), the sum over the channels."""
+    """(BATCH, CHUNK, D), (BATCH, D, pixels) -> (BATCH, CHUNK, pixels), the sum over the channels."""
     if features.shape[-1] > _UNROLLED:
-        return jnp.einsum("bcd,bpd->bcp", features, cotangent)
-    terms = [features[..., d, None] * cotangent[:, None, :, d] for d in range(features.shape[-1])]
+        return jnp.einsum("bcd,bdp->bcp", features, cotangent)
+    terms = [features[..., d, None] * cotangent[:, None, d] for d in range(features.shape[-1])]
     return sum(terms[1:], terms[0])
 
 

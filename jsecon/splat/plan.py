@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import NEAR, finite
+from jsecon.parallel import over_rows
 from jsecon.splat.contain import splat_contained
 from jsecon.splat.differentiate import view_lists
 from jsecon.splat.project import check_shapes, project
@@ -34,11 +35,13 @@ class ViewPlan:
     """px."""
     height: int = dataclasses.field(metadata={"static": True})
     """px."""
+    mesh: Mesh | None = dataclasses.field(default=None, metadata={"static": True})
+    """the devices that hold its strips, or None."""
 
     @property
     def overflow(self) -> Array:
         """() int32 pairs that did not fit the capacity; 0 means that renders of the plan are exact."""
-        return self.lists.overflow
+        return self.lists.overflow.sum(-1)
 
 
 def is_traced(tree) -> bool:
@@ -46,7 +49,7 @@ def is_traced(tree) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def default_capacity(gaussians: Gaussians, camera: Camera) -> int:
+def default_capacity(gaussians: Gaussians, camera: Camera, mesh: Mesh | None = None) -> int:
     """(block, Gaussian) pairs to allow for: planned from the data; under a trace, where there is none, it must be
     given."""
     require(
@@ -56,37 +59,46 @@ def default_capacity(gaussians: Gaussians, camera: Camera) -> int:
         expected="a static int inside jit, grad or vmap",
         remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras), and check Rendering.overflow == 0.",
     )
-    return plan_capacity(gaussians, camera, margin=1.0)
+    return plan_capacity(gaussians, camera, margin=1.0, devices=1 if mesh is None else mesh.size)
 
 
 def plan_view(
-    gaussians: Gaussians, camera: Camera, *, capacity: int | None = None, near: float | Array = NEAR
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    capacity: int | None = None,
+    near: float | Array = NEAR,
+    mesh: Mesh | None = None,
 ) -> ViewPlan:
     """Projects and lists one view once, for any number of `render_plan(plan, features)`.
 
     Differentiable like `render`; where only features are to be differentiated, make the plan outside of what is, and
-    no gradient of the geometry is computed. `capacity` as for `render`. Raises ValueError on shapes that disagree.
+    no gradient of the geometry is computed. `capacity` and `mesh` as for `render`; over a mesh, each device plans its
+    strip of the image (strips.py) and keeps it. Raises ValueError on shapes that disagree.
     """
     check_shapes(gaussians, camera)
     if capacity is None:
-        capacity = default_capacity(gaussians, camera)
+        capacity = default_capacity(gaussians, camera, mesh)
     run = _plan if is_traced((gaussians, camera, near)) else _plan_compiled
-    return run(gaussians, camera, capacity, near)
+    return run(gaussians, camera, capacity, near, mesh)
 
 
-def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array) -> ViewPlan:
+def _plan(
+    gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array, mesh: Mesh | None = None
+) -> ViewPlan:
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    projection = project(gaussians, camera, near=near)
-    lists = view_lists(projection, camera.width, camera.height, capacity=capacity)
+    no_colour = dataclasses.replace(gaussians, sh=jnp.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
+    projection = over_rows(lambda rows, view: project(rows, view[0], near=view[1]), no_colour, (camera, near), mesh)
+    lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
     columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
     # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
     splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
     depths = jnp.where(projection.visible, projection.depths, 0.0)
     sound = finite(*jax.tree.leaves(camera))
-    return ViewPlan(splats, depths, sound, lists, camera.width, camera.height)
+    return ViewPlan(splats, depths, sound, lists, camera.width, camera.height, mesh)
 
 
-_plan_compiled = jax.jit(_plan, static_argnums=(2,))
+_plan_compiled = jax.jit(_plan, static_argnums=(2, 4))
 
 
 def render_plan(
@@ -95,12 +107,11 @@ def render_plan(
     *,
     background: Array | None = None,
     depth: bool = False,
-    mesh: Mesh | None = None,
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
 
-    Differentiable, under jit, grad and vmap; `background`, `depth` and `mesh` as for `render`. Raises ValueError on
-    shapes that disagree.
+    Differentiable, under jit, grad and vmap, on the devices of the plan; `background` and `depth` as for `render`.
+    Raises ValueError on shapes that disagree.
     """
     require(
         features.ndim == 2 and features.shape[0] == plan.splats.shape[0],
@@ -110,13 +121,13 @@ def render_plan(
         remedy="Give one row of features a Gaussian.",
     )
     run = _render_plan if is_traced((plan, features, background)) else _render_plan_compiled
-    return run(plan, features, background, depth, mesh)
+    return run(plan, features, background, depth)
 
 
-def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool, mesh: Mesh | None):
+def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool):
     features = jnp.asarray(features, plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
-    image, transmittance = splat_contained(plan.splats, columns, plan.lists, plan.width, plan.height, mesh)
+    image, transmittance = splat_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
     image, transmittance = (jnp.where(plan.sound, a, jnp.nan) for a in (image, transmittance))
     alpha, expected = 1 - transmittance, None
     if depth:
@@ -128,4 +139,4 @@ def _render_plan(plan: ViewPlan, features: Array, background: Array | None, dept
     return Rendering(image, alpha, plan.overflow, expected)
 
 
-_render_plan_compiled = jax.jit(_render_plan, static_argnums=(3, 4))
+_render_plan_compiled = jax.jit(_render_plan, static_argnums=(3,))

@@ -35,9 +35,9 @@ def render(
     Gaussian touches; neither has a gradient, nor spoils another's (`sound.count_non_finite` counts them). A camera that
     is not finite sees NaN.
 
-    `mesh` (`jsecon.parallel.host_mesh()`) spreads the tiles over several devices of this process, in value and
-    gradient: a program that sets XLA_FLAGS=--xla_force_host_platform_device_count=2 before jax starts has both cores
-    of a CPU that way. Without it, one device.
+    `mesh` (`jsecon.parallel.host_mesh()`) spreads the work over several devices of this process, in value and
+    gradient: a program that calls `jsecon.process.prepare_process()` before jax starts has all cores of a CPU that way.
+    Without it, one device.
 
     `background` (D,) is added with weight 1 - alpha. With `depth` the same pass also gives `.depth`, the expected
     z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
@@ -51,7 +51,7 @@ def render(
         remedy="Give one row of features a Gaussian.",
     )
     if capacity is None:
-        capacity = default_capacity(gaussians, camera)
+        capacity = default_capacity(gaussians, camera, mesh)
     run = _render if is_traced((gaussians, camera, features, background, near)) else _render_compiled
     return run(gaussians, camera, features, background, capacity, near, depth, mesh)
 
@@ -65,8 +65,8 @@ def _render(gaussians, camera, features, background, capacity, near, depth, mesh
         )
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0), alpha if depth else None)
-    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-    return render_plan(plan, features, background=background, depth=depth, mesh=mesh)
+    plan = plan_view(gaussians, camera, capacity=capacity, near=near, mesh=mesh)
+    return render_plan(plan, features, background=background, depth=depth)
 
 
 _render_compiled = jax.jit(_render, static_argnums=(4, 6, 7))
@@ -84,7 +84,7 @@ def render_rgb(
     """Renders colour from spherical harmonics: features (H, W, 3), not clamped above 1. See `render`."""
     check_shapes(gaussians, camera)
     if capacity is None:
-        capacity = default_capacity(gaussians, camera)
+        capacity = default_capacity(gaussians, camera, mesh)
     run = _render_rgb if is_traced((gaussians, camera, background, near)) else _render_rgb_compiled
     return run(gaussians, camera, background, capacity, near, mesh)
 

@@ -2,9 +2,8 @@
 
 Pairs are first made of Gaussians and blocks of BLOCK x BLOCK tiles, several times fewer than pairs of tiles, and put
 in order by one packed single-key sort of (block, depth). Each sorted pair then gets one bit for every tile of its block
-that the Gaussian's ellipse reaches, and the tiles' lists are read off the bits by counting: a stable distribution needs
-no second sort. On garden (111,785 Gaussians, 648x420) this takes a third of the time that sorting all pairs took, and
-the ellipses leave a fifth fewer pairs than boxes.
+that the Gaussian's ellipse reaches, and the tiles' lists are read off the bits (bits.py): a stable distribution needs
+no second sort, and the ellipses leave a fifth fewer pairs than boxes (garden).
 """
 
 import dataclasses
@@ -17,16 +16,15 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
+from jsecon.splat.bits import WORD, read_off, set_before, transpose_words
 from jsecon.splat.project import Projection, project
 from jsecon.splat.stored import stored
+from jsecon.splat.strips import BLOCK, WHOLE, Strip, tile_rows
 from jsecon.types import Array, Camera, Gaussians, Leaf
 
 TILE = 8
 """tile edge, px; speed only"""
-BLOCK = 4
-"""block edge, tiles; the BLOCK * BLOCK bits of a pair fit half a word"""
 _TILES = BLOCK * BLOCK
-_WORD = 32
 # Slack of the ellipse test, px: far above the rounding of a float32 exponent at the rim, far below a pixel.
 _SLACK_PX = 0.02
 
@@ -34,7 +32,10 @@ _SLACK_PX = 0.02
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TileLists:
-    """For each tile, row by row, the Gaussians that reach a pixel of it, by depth (equal depths in index order)."""
+    """For each tile, row by row, the Gaussians that reach a pixel of it, by depth (equal depths in index order).
+
+    Over several devices each holds the lists of its strip, one strip after another along every axis.
+    """
 
     gaussians: Leaf
     """(16 capacity,) int32 Gaussian ids; each tile's list is one run of it."""
@@ -43,7 +44,7 @@ class TileLists:
     lengths: Leaf
     """(tiles,) int32 how long it is."""
     overflow: Leaf
-    """() int32 (block, Gaussian) pairs that did not fit: those of the Gaussians with the highest indices."""
+    """(strips,) int32 (block, Gaussian) pairs that did not fit: those of the Gaussians with the highest indices."""
     tile: int = dataclasses.field(metadata={"static": True})
     """tile edge, px."""
 
@@ -53,9 +54,9 @@ def grid(width: int, height: int, tile: int) -> tuple[int, int]:
     return -(-width // tile), -(-height // tile)
 
 
-def _rectangles(projection: Projection, width: int, height: int, edge: int):
-    """Inclusive-exclusive ranges (x0, x1, y0, y1) of the squares of `edge` px that each splat's box touches; empty
-    where invisible."""
+def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
+    """Inclusive-exclusive ranges (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat's box touches;
+    empty where invisible."""
     across, down = grid(width, height, edge)
     ranges = []
     for axis, limit in ((0, across), (1, down)):
@@ -65,12 +66,15 @@ def _rectangles(projection: Projection, width: int, height: int, edge: int):
         # Clipped as floats first: a box may reach beyond what int32 holds.
         ranges.append(jnp.floor(jnp.clip(low, 0, limit)).astype(jnp.int32))
         ranges.append(jnp.ceil(jnp.clip(high, 0, limit)).astype(jnp.int32))
-    return ranges
+    x0, x1, y0, y1 = ranges
+    return x0, x1, strip.first_row(y0), strip.first_row(y1)
 
 
-def pair_counts(projection: Projection, width: int, height: int, *, tile: int = TILE) -> Int[Array, " n"]:
-    """(N,) int32 number of blocks of BLOCK x BLOCK tiles that each splat's box touches."""
-    x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * tile)
+def pair_counts(
+    projection: Projection, width: int, height: int, *, tile: int = TILE, strip: Strip = WHOLE
+) -> Int[Array, " n"]:
+    """(N,) int32 number of the strip's blocks of BLOCK x BLOCK tiles that each splat's box touches."""
+    x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * tile, strip)
     return (x1 - x0) * (y1 - y0)
 
 
@@ -123,20 +127,24 @@ def _sorted_pairs_by_rank(blocks: Array, owner: Array, depths: Array) -> tuple[A
     return blocks, order[rank]
 
 
-def tile_lists(projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE) -> TileLists:
-    """Lists of up to `capacity` (block, Gaussian) pairs in all; what does not fit is counted in `overflow`."""
+def tile_lists(
+    projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, strip: Strip = WHOLE
+) -> TileLists:
+    """One strip's lists of up to `capacity` (block, Gaussian) pairs in all; what does not fit is counted in
+    `overflow`."""
     require(
-        0 < capacity <= (2**31 - 1) // _TILES - _WORD,
+        0 < capacity <= (2**31 - 1) // _TILES - WORD,
         "capacity",
         got=capacity,
         expected="a positive number of (block, Gaussian) pairs whose tiles int32 can count",
         remedy="Pass jsecon.plan_capacity(gaussians, cameras), and render so large an image in parts.",
     )
-    capacity = -(-capacity // _WORD) * _WORD
+    capacity = -(-capacity // WORD) * WORD
     edge = BLOCK * tile
-    across, down = grid(width, height, edge)
+    rows = tile_rows(height, tile, strip.count)
+    across, down = -(-width // edge), -(-rows // BLOCK)
     number = across * down
-    x0, x1, y0, y1 = _rectangles(projection, width, height, edge)
+    x0, x1, y0, y1 = _rectangles(projection, width, height, edge, strip)
     # Pairs are laid out Gaussian after Gaussian; `owner` says whose pair the k-th is. int32 cumulative sums would wrap
     # past 2^31 pairs, so the sum saturates: beyond the capacity its exact value is needed only for the overflow.
     areas = (x1 - x0) * (y1 - y0)
@@ -144,55 +152,50 @@ def tile_lists(projection: Projection, width: int, height: int, *, capacity: int
     starts = ends - areas
     marks = jnp.zeros(capacity + 1, jnp.int32).at[jnp.minimum(starts, capacity)].add(1, mode="promise_in_bounds")
     owner = jnp.minimum(jnp.cumsum(marks[:capacity]) - 1, areas.shape[0] - 1)
-    rows = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)[owner]
-    within = lax.iota(jnp.int32, capacity) - rows[:, 0]
-    blocks = (rows[:, 2] + within // rows[:, 3]) * across + rows[:, 1] + within % rows[:, 3]
+    box = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)[owner]
+    within = lax.iota(jnp.int32, capacity) - box[:, 0]
+    blocks = (box[:, 2] + within // box[:, 3]) * across + box[:, 1] + within % box[:, 3]
     blocks = jnp.where(lax.iota(jnp.int32, capacity) < ends[-1], blocks, number)
     nowhere = jnp.asarray(1.0, projection.depths.dtype)
     depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), nowhere))
     blocks, owner = _sorted_pairs(blocks, owner, depths, number)
 
     always = ends[-1] >= 0
-    reach = functools.partial(_reached_tiles, across=across, number=number, tile=tile)
+    reach = functools.partial(_reached_tiles, across=across, number=number, tile=tile, strip=strip)
     ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
     reached = stored(always, reach, lax.stop_gradient(jnp.concatenate(ellipses, axis=1)), owner, blocks)
-    # For each word of 32 pairs and each tile of the block: which of the 32 reach it, and how many pairs before the
-    # word do, counted tile position after tile position, so that the lists follow one another without gaps.
-    words = reached.reshape(-1, _WORD)
-    position = lax.iota(jnp.uint32, _TILES)
-    bits = ((words[:, :, None] >> position) & 1) << lax.iota(jnp.uint32, _WORD)[:, None]
-    members = lax.reduce(bits, jnp.uint32(0), lax.bitwise_or, (1,))
-    counts = lax.population_count(members).astype(jnp.int32)
-    before = jnp.cumsum(counts.T.reshape(-1)).reshape(_TILES, -1).T - counts
-    below = (jnp.uint32(1) << lax.iota(jnp.uint32, _WORD)) - 1
-    place = lax.population_count(members[:, :, None] & below).astype(jnp.int32) + before[:, :, None]
-    reaches = ((words[:, None, :] >> position[:, None]) & 1) > 0
-    place = jnp.where(reaches, place, _TILES * capacity)
-    ids = jnp.broadcast_to(owner.reshape(-1, 1, _WORD), place.shape)
-    gaussians = jnp.zeros(_TILES * capacity + 1, jnp.int32).at[place].set(ids, mode="promise_in_bounds")
+    members = transpose_words(reached, _TILES)
+    before = set_before(members)
+    gaussians = read_off(members, before, owner)
 
     # A tile's list runs from its block's first pair to the next block's.
     first = jnp.searchsorted(blocks, lax.iota(jnp.int32, number + 1)).astype(jnp.int32)
-    word = jnp.minimum(first // _WORD, members.shape[0] - 1)
-    earlier = (first - word * _WORD).astype(jnp.uint32)[:, None]
-    mask = jnp.where(earlier >= _WORD, jnp.uint32(0xFFFFFFFF), (jnp.uint32(1) << (earlier & (_WORD - 1))) - 1)
+    word = jnp.minimum(first // WORD, members.shape[0] - 1)
+    earlier = (first - word * WORD).astype(jnp.uint32)[:, None]
+    mask = jnp.where(earlier >= WORD, jnp.uint32(0xFFFFFFFF), (jnp.uint32(1) << (earlier & (WORD - 1))) - 1)
     bounds = before[word] + lax.population_count(members[word] & mask).astype(jnp.int32)
-    tiles_across, tiles_down = grid(width, height, tile)
+    tiles_across = -(-width // tile)
+
+    # Only the last strips have rows below the image.
+    inside = (strip.tile_row(np.arange(rows)) * tile < height)[:, None]
 
     def row_by_row(of_blocks: Array) -> Array:
         square = of_blocks.reshape(down, across, BLOCK, BLOCK).transpose(0, 2, 1, 3)
-        return square.reshape(down * BLOCK, across * BLOCK)[:tiles_down, :tiles_across].reshape(-1)
+        square = square.reshape(down * BLOCK, across * BLOCK)[:rows, :tiles_across]
+        return jnp.where(inside, square, 0).reshape(-1)
 
     return TileLists(
-        gaussians[:-1],
+        gaussians,
         row_by_row(bounds[:-1]),
         row_by_row(bounds[1:] - bounds[:-1]),
-        jnp.maximum(ends[-1] - capacity, 0),
+        jnp.maximum(ends[-1:] - capacity, 0),
         tile,
     )
 
 
-def _reached_tiles(ellipses: Array, owner: Array, blocks: Array, *, across: int, number: int, tile: int) -> Array:
+def _reached_tiles(
+    ellipses: Array, owner: Array, blocks: Array, *, across: int, number: int, tile: int, strip: Strip
+) -> Array:
     """(pairs,) uint32: bit (row * BLOCK + column) is set where the ellipse alpha >= 1/255 reaches the rectangle between
     that tile's pixel centres; 0 for the block `number`. `ellipses` (N, 6) are centre, whitening and opacity.
 
@@ -206,7 +209,7 @@ def _reached_tiles(ellipses: Array, owner: Array, blocks: Array, *, across: int,
     highest = radius / l22
     widest = -l21 * highest / jnp.sqrt(l22 * l22 + l21 * l21)  # dy where the rim is farthest right
     left = (blocks % across * (BLOCK * tile)).astype(x.dtype) - x
-    top = (blocks // across * (BLOCK * tile)).astype(y.dtype) - y
+    top = (strip.block_row(blocks // across) * (BLOCK * tile)).astype(y.dtype) - y
     slack = _SLACK_PX + 1e-5 * jnp.abs(slope * highest)
     bits = jnp.zeros(blocks.shape, jnp.uint32)
     for row in range(BLOCK):
@@ -234,21 +237,25 @@ def _saturating_cumsum(areas: Array) -> Array:
     return jnp.where(wrapped, largest, exact)
 
 
-@jax.jit
-def _pairs_in_view(gaussians: Gaussians, camera: Camera) -> Array:
-    counts = pair_counts(project(gaussians, camera), camera.width, camera.height)
-    return counts.astype(jnp.float32).sum()
+@functools.partial(jax.jit, static_argnums=2)
+def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int) -> Array:
+    """The pairs of all strips, were each as long as the longest."""
+    splats = project(gaussians, camera)
+    counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, strips)) for k in range(strips)]
+    return strips * jnp.stack([count.astype(jnp.float32).sum() for count in counts]).max()
 
 
-def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25) -> int:
-    """The number of (block, Gaussian) pairs to allow for, so that no view of `cameras` (one, or a batch) overflows.
+def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25, devices: int | None = None) -> int:
+    """The number of (block, Gaussian) pairs to allow for, so that no view of `cameras` (one, or a batch) overflows,
+    also where `devices` of them share it (by default all of this process's).
 
     Host code: needs concrete arrays. Rounded up to an eighth of a power of two, so that captures of like size share
     one compilation. `margin` leaves room for Gaussians that still move.
     """
+    strips = jax.local_device_count() if devices is None else devices
     views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
     pairs = max(
-        (float(_pairs_in_view(gaussians, views[t])) for t in range(views.world_to_camera.shape[0])), default=0.0
+        (float(_pairs_in_view(gaussians, views[t], strips)) for t in range(views.world_to_camera.shape[0])), default=0.0
     )
     return round_capacity(int(np.ceil(pairs * margin * (1 + 1e-6))))  # the sum is a float32
 

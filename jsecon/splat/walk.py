@@ -126,11 +126,14 @@ def weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
     return jnp.where(before - weight > MIN_TRANSMITTANCE, weight, 0.0), after
 
 
-def walk(table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any) -> Any:
+def walk(
+    table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any
+) -> tuple[Any, Array]:
     """Applies `transmittance, state = body(transmittance, state, chunk)` chunk by chunk down the lists of one batch of
-    `tiles` (BATCH,), until the longest has ended or every pixel has stopped; returns the last state.
+    `tiles` (BATCH,), until the longest has ended or every pixel has stopped.
 
-    transmittance (BATCH, pixels) starts at 1. `table` is `make_table`'s.
+    Returns the last state, and (BATCH,) int32 how far down its list each tile had a pixel that had not stopped: nothing
+    behind is seen. transmittance (BATCH, pixels) starts at 1. `table` is `make_table`'s.
     """
     start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
     corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))
@@ -138,11 +141,11 @@ def walk(table: Array, lists: TileLists, batches: Batches, tiles: Array, body: C
     scale = np.sqrt(1 / np.log(2)).astype(table.dtype)  # from natural to binary exponents
 
     def unfinished(carry):
-        first, transmittance, _ = carry
+        first, transmittance, _, _ = carry
         return (first < longest) & (transmittance.max() > MIN_TRANSMITTANCE)
 
     def step(carry):
-        first, transmittance, state = carry
+        first, transmittance, seen, state = carry
         index = first + lax.iota(jnp.int32, CHUNK)
         ids = lists.gaussians[jnp.minimum(start + index, lists.gaussians.shape[0] - 1)]
         rows = table[ids]
@@ -153,8 +156,10 @@ def walk(table: Array, lists: TileLists, batches: Batches, tiles: Array, body: C
         always = first < longest
         alpha = stored(always, functools.partial(_alphas, tile=batches.tile), coefficients)
         chunk = Chunk(ids, rows[..., ATTRIBUTES + 1 :], rows[..., :ATTRIBUTES], alpha, always)
+        seen = jnp.where(transmittance.max(1) > MIN_TRANSMITTANCE, first + CHUNK, seen)
         transmittance, state = body(transmittance, state, chunk)
-        return first + CHUNK, transmittance, state
+        return first + CHUNK, transmittance, seen, state
 
     pixels = jnp.ones((tiles.shape[0], batches.tile**2), table.dtype)
-    return lax.while_loop(unfinished, step, (jnp.int32(0), pixels, state))[2]
+    _, _, seen, state = lax.while_loop(unfinished, step, (jnp.int32(0), pixels, jnp.zeros_like(tiles), state))
+    return state, jnp.minimum(seen, length[:, 0])

@@ -1,0 +1,78 @@
+"""What only a program may set, once, before jax starts: the library itself never touches the process it lives in.
+
+`jsecon` on the command line calls `prepare_process` first. A program of your own that wants both cores and the speed of
+benchmarks/results.md does the same:
+
+    from jsecon.process import prepare_process
+    prepare_process()
+    import jsecon
+"""
+
+import ctypes
+import hashlib
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+# mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
+# kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
+_MALLOPT = {-3: 1 << 30, -1: (1 << 31) - 1, -2: 1 << 26}
+
+
+def prepare_process(*, keep_programs: bool = True) -> None:
+    """Sets XLA's flags (see `settings`) and keeps freed memory for the next request (glibc only). Call it before jax
+    makes its first array. What the user has set in the environment stays; without `keep_programs`, compiled programs
+    are not kept on disk."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    chosen = settings(os.environ, cores, _cpu_features())
+    if not keep_programs:
+        chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
+    os.environ.update(chosen)
+    if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        for parameter, value in _MALLOPT.items() if mallopt else ():
+            mallopt(parameter, value)
+
+
+def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
+    """The variables to set: one host device a core, full-width vectors, compiled programs kept between runs.
+
+    Flags already in XLA_FLAGS stay as they are. 512-bit vectors are asked for only where the CPU has them. The folder
+    of compiled programs carries a digest of the CPU's features, so that a home shared by unlike machines stays safe.
+    """
+    flags = environ.get("XLA_FLAGS", "").split()
+    given = {flag.split("=")[0] for flag in flags}
+    if "--xla_force_host_platform_device_count" not in given:
+        flags.append(f"--xla_force_host_platform_device_count={cores}")
+    if "avx512f" in cpu_features and "--xla_cpu_prefer_vector_width" not in given:
+        flags.append("--xla_cpu_prefer_vector_width=512")
+    chosen = {"XLA_FLAGS": " ".join(flags)}
+    if "JAX_COMPILATION_CACHE_DIR" not in environ and (home := _cache_home(environ)) is not None:
+        features = hashlib.blake2b(" ".join(sorted(cpu_features)).encode(), digest_size=6).hexdigest()
+        chosen["JAX_COMPILATION_CACHE_DIR"] = str(home / "jsecon" / f"xla-{features}")
+    return chosen
+
+
+def _cache_home(environ: Mapping[str, str]) -> Path | None:
+    """The user's cache folder where it can be written, else None: a program must run without one."""
+    base = environ.get("XDG_CACHE_HOME") or (Path(environ["HOME"]) / ".cache" if "HOME" in environ else None)
+    if base is None:
+        return None
+    try:
+        Path(base).mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return Path(base) if os.access(base, os.W_OK) else None
+
+
+def _cpu_features() -> frozenset[str]:
+    """The CPU's feature names where Linux tells them, else none."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return frozenset()
+    return next(
+        (frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith(("flags", "Features"))),
+        frozenset(),
+    )

@@ -1,0 +1,49 @@
+"""What a program sets before jax starts."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jsecon.process import settings
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_settings_ask_for_every_core_and_wide_vectors_only_where_there_are_any():
+    wide = settings({}, 3, frozenset({"avx2", "avx512f"}))["XLA_FLAGS"].split()
+    assert wide == ["--xla_force_host_platform_device_count=3", "--xla_cpu_prefer_vector_width=512"]
+    assert settings({}, 1, frozenset({"avx2"}))["XLA_FLAGS"] == "--xla_force_host_platform_device_count=1"
+
+
+def test_settings_give_way_to_the_user(tmp_path):
+    environ = {
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=1 --xla_cpu_prefer_vector_width=256",
+        "JAX_COMPILATION_CACHE_DIR": "/elsewhere",
+        "HOME": str(tmp_path),
+    }
+    assert settings(environ, 8, frozenset({"avx512f"})) == {"XLA_FLAGS": environ["XLA_FLAGS"]}
+    kept = settings({"HOME": str(tmp_path)}, 1, frozenset())["JAX_COMPILATION_CACHE_DIR"]
+    assert kept.startswith(str(tmp_path / ".cache" / "jsecon"))
+    assert "JAX_COMPILATION_CACHE_DIR" not in settings({}, 1, frozenset())
+
+
+def test_a_home_that_cannot_be_written_leaves_out_the_compiled_programs(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "JAX_COMPILATION_CACHE_DIR" not in settings({"XDG_CACHE_HOME": str(tmp_path / "file" / "x")}, 1, frozenset())
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
+    program = (
+        "from jsecon.process import prepare_process\n"
+        f"prepare_process(keep_programs={kept})\n"
+        "import os, jax\n"
+        "print(jax.local_device_count(), 'JAX_COMPILATION_CACHE_DIR' in os.environ)"
+    )
+    environ = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
+    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
+    assert done.stdout.split() == [str(len(os.sched_getaffinity(0))), str(kept)]
