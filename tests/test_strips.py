@@ -26,7 +26,7 @@ def test_every_row_of_blocks_is_in_one_strip(count, first, more):
     rows = []
     for k in range(count):
         strip = Strip(k, count)
-        own = np.arange(strip.first_row(np.array(first)), strip.first_row(np.array(first + more)))
+        own = np.arange(*strip.first_row(np.array([first, first + more])))
         rows += strip.block_row(own).tolist()
         tiles = np.arange(own.size * BLOCK) + (own[0] * BLOCK if own.size else 0)
         assert strip.tile_row(tiles).tolist() == [b * BLOCK + i for b in strip.block_row(own) for i in range(BLOCK)]
@@ -44,7 +44,7 @@ def test_strips_hold_the_lists_of_the_whole(scene, camera, count):
         strip, lists = Strip(k, count), lists_of(splats, k)
         assert int(pair_counts(splats, 48, 40, strip=strip).sum()) <= int(pair_counts(splats, 48, 40).sum())
         for own in range(lists.starts.shape[0]):
-            row, column = int(strip.tile_row(np.array(own // across))), own % across
+            row, column = int(strip.tile_row(np.array([own // across]))[0]), own % across
             begin, length = int(lists.starts[own]), int(lists.lengths[own])
             if row >= down:
                 assert length == 0
