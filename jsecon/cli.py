@@ -137,6 +137,12 @@ def _run(verbs) -> None:
         help="SAM: asked on crops too; 1 is LangSplat's setting and takes five times longer (default %(default)s)",
     )
     verb.add_argument(
+        "--tracker",
+        type=Path,
+        metavar="DIR",
+        help="a SAM 2 model folder (.onnx) that follows the proposals (the paper's Algorithm 1), instead of consensus",
+    )
+    verb.add_argument(
         "--embedder",
         type=Path,
         metavar="DIR",

@@ -1,41 +1,73 @@
-"""Which eyes a run has: OpenCV and colours without any weights, or SAM and CLIP from model folders.
+"""Which eyes a run has: OpenCV and colours without any weights, or SAM, SAM 2 and CLIP from model folders.
 
 Networks are opened when first needed and closed when their stage is done: their memory would stay otherwise.
 """
 
+import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from jsecon.errors import InputError
 from jsecon.options import Options
 from jsecon.types import LanguageField
 from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
-from jsecon.vision.protocols import Embedder
+from jsecon.vision.protocols import Embedder, Tracker
 
 
-def segmenter_of(options: Options, store: Path) -> NamedSegmenter | None:
-    """SAM where the options name its folder, its masks kept under `store`; None: what needs no weights.
+@runtime_checkable
+class NamedTracker(Tracker, Protocol):
+    """A tracker that holds a network."""
 
-    Raises InputError where the folder holds no SAM model.
+    name: str
+    """of its content and settings"""
+
+    def check(self) -> None:
+        """Raises InputError where it cannot work."""
+        ...
+
+    def close(self) -> None:
+        """Drops what it holds in memory, until it is needed again."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Eyes:
+    """What looks at a run's frames."""
+
+    embedder: Embedder
+    segmenter: NamedSegmenter | None
+    """None: what needs no weights."""
+    tracker: NamedTracker | None
+    """None: through the Gaussians."""
+
+    def require_ready(self, stages: Collection[str]) -> None:
+        """Raises InputError where a network cannot do what `stages` want of it: before the long work starts."""
+        for stage, eye in (("masklets", self.segmenter), ("masklets", self.tracker), ("regions", self.embedder)):
+            check = getattr(eye, "check", None)
+            if stage in stages and check is not None:
+                check()
+
+
+def eyes_of(options: Options, store: Path) -> Eyes:
+    """SAM, SAM 2 and CLIP where the options name their folders; what they find is kept under `store`.
+
+    Raises InputError where a folder holds no such model.
     """
-    if options.segmenter is None:
-        return None
-    from jsecon.vision.sam import SamSegmenter, SamSettings
+    segmenter = tracker = None
+    if options.segmenter is not None:
+        from jsecon.vision.sam import SamSegmenter, SamSettings
 
-    settings = SamSettings(
-        level=options.level, points_per_side=options.points_per_side, crop_layers=options.crop_layers
-    )
-    return StoredSegmenter(SamSegmenter(options.segmenter, settings), store / "proposals")
+        settings = SamSettings(
+            level=options.level, points_per_side=options.points_per_side, crop_layers=options.crop_layers
+        )
+        segmenter = StoredSegmenter(SamSegmenter(options.segmenter, settings), store / "proposals")
+    if options.tracker is not None:
+        from jsecon.vision.sam2 import Sam2Tracker
 
-
-def embedder_of(options: Options, store: Path) -> Embedder:
-    """CLIP where the options name its folder, its regions' embeddings kept under `store`; else colours.
-
-    Raises InputError where the folder holds no CLIP model.
-    """
-    return embedder_named(folder=options.embedder, store=store / "embeddings")
+        tracker = Sam2Tracker(options.tracker)
+    return Eyes(embedder_named(folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
 
 
 def embedder_named(
@@ -85,15 +117,9 @@ def embedder_of_field(
     return embedder_named(field.embedder, folder=folder, templates=templates)
 
 
-def require_ready(eye: Any) -> None:
-    """Raises InputError where a network's files cannot do what they are for; said before the long work starts."""
-    check = getattr(eye, "check", None)
-    if check is not None:
-        check()
-
-
-def close(eye: Any) -> None:
-    """Drops a network's graphs, where there are any."""
-    drop = getattr(eye, "close", None)
-    if drop is not None:
-        drop()
+def close(*seeing: Any) -> None:
+    """Drops the graphs of those that hold any."""
+    for eye in seeing:
+        drop = getattr(eye, "close", None)
+        if drop is not None:
+            drop()

@@ -8,6 +8,9 @@ from jsecon.errors import InputError
 from jsecon.vision import sam_graphs
 from jsecon.vision.clip import ClipEmbedder
 from jsecon.vision.onnx_graph import Graph, describe
+from jsecon.vision.sam2_graphs import open_sam2
+
+SAM2_PUBLISHED = "The same split of SAM 2 into graphs is that of axinc-ai/segment-anything-2 on github.com."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +18,7 @@ class Use:
     """One thing that a folder could be used for."""
 
     model: str
-    """CLIP, SAM."""
+    """CLIP, SAM, SAM 2."""
     usable: bool
     told: str
     """how to use it, or what was found instead of what."""
@@ -101,4 +104,13 @@ def _sam(folder: Path) -> str:
     )
 
 
-_KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam}
+def _sam2(folder: Path) -> str:
+    try:
+        graphs = open_sam2(folder)
+    except InputError as error:
+        remedy = f"{error.remedy} {SAM2_PUBLISHED}"
+        raise InputError(error.where, found=error.found, expected=error.expected, remedy=remedy) from error
+    return f"SAM {graphs.version}: objects followed through the frames: jsecon run --tracker {folder}"
+
+
+_KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam, "SAM 2": _sam2}

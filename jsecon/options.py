@@ -28,6 +28,8 @@ class Options:
     """SAM: the grid of points put to a frame."""
     crop_layers: int = 0
     """SAM: also asked on 4^k crops for each layer k; 1 is LangSplat's, five times slower."""
+    tracker: Path | None = None
+    """SAM 2 model folder that follows the proposals (Algorithm 1); None: through the Gaussians."""
     embedder: Path | None = None
     """CLIP model folder for regions and texts; None: colours."""
     downscale: float | None = None
@@ -61,6 +63,11 @@ class Options:
     seed: int = 0
     """of whatever is drawn at random."""
 
+    @property
+    def associated_by(self) -> Literal["consensus", "tracking"]:
+        """`association`; where a tracker is given, tracking."""
+        return self.association if self.tracker is None else "tracking"
+
 
 def require_inputs(options: Options) -> None:
     """Raises InputError where a file or folder that the options name is not there, or a number is out of its range."""
@@ -78,6 +85,7 @@ def require_inputs(options: Options) -> None:
         (options.masks, "a folder with one mask a frame", "Give the masks' folder, or leave out --masks to find them."),
         (options.proposals, "a folder with the masks of each frame", "Give the folder, or leave out --proposals."),
         (options.segmenter, "a folder with a SAM model", "See `jsecon models check DIR`."),
+        (options.tracker, "a folder with a SAM 2 model", "See `jsecon models check DIR`."),
         (options.embedder, "a folder with a CLIP model", "See `jsecon models check DIR`."),
     ):
         if path is not None and not path.exists():

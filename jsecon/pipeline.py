@@ -83,15 +83,13 @@ def run(
         )
     require_inputs(options)
     require_writable(out)
-    embedder, segmenter = eyes.embedder_of(options, folder), eyes.segmenter_of(options, folder)
+    seeing = eyes.eyes_of(options, folder)
     cache.prepare(folder)
-    plan = stages_of(options, out, folder, embedder, segmenter, load)
+    plan = stages_of(options, out, folder, seeing, load)
     steps = [Step(s.name, "cached" if cache.path_of(folder, s.name, s.key).exists() else "run", s.how) for s in plan]
     steps += [Step(name, "left out", why) for name, why in left_out(options).items()]
     reporter.plan(f"{options.capture} -> {out}", steps)
-    for stage, eye in (("masklets", segmenter), ("regions", embedder)):
-        if any(step.name == stage and step.status == "run" for step in steps):
-            eyes.require_ready(eye)
+    seeing.require_ready([step.name for step in steps if step.status == "run"])
     results: dict[str, Any] = {}
     seconds: dict[str, float] = {}
     notes: list[str] = []
@@ -111,7 +109,7 @@ def run(
             notes.append(note)
             reporter.note(note)
     started = time.monotonic()
-    field = _field(results, embedder, _provenance(options, plan))
+    field = _field(results, seeing.embedder, _provenance(options, plan))
     from jsecon.language.field import save_field
 
     save_field(out / FIELD_FILE, field)

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from jsecon import cache, stages
+from jsecon.eyes import Eyes
 from jsecon.options import Options
 from jsecon.stages import Outcome
 from jsecon.types import Capture
-from jsecon.vision.proposal_store import NamedSegmenter
-from jsecon.vision.protocols import Embedder
 
 CHECKPOINT_SECONDS = 20.0
 """between two records of a fit in progress: a stop loses at most this and one chunk of steps"""
@@ -48,8 +47,7 @@ def stages_of(
     options: Options,
     out: Path,
     folder: Path,
-    embedder: Embedder,
-    segmenter: NamedSegmenter | None,
+    seeing: Eyes,
     load: Callable[[], Capture] | None,
 ) -> list[Stage]:
     """The stages in order, with their keys. Models count by their content, not by the place of their files."""
@@ -120,11 +118,11 @@ def stages_of(
             given=_of(options, "steps", "sh_degree", "seed"),
         )
     if options.masks is None:
-        consensus = options.association == "consensus"
+        consensus, tracker = options.associated_by == "consensus", seeing.tracker
         add(
             "masklets",
-            _proposals(options) + ", " + ("what the views agree on" if consensus else "followed through the Gaussians"),
-            lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], segmenter, p),
+            f"{_proposals(options)}, {_association(options)}",
+            lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], seeing, p),
             rooms=(
                 "vision",
                 "language.masklets",
@@ -136,17 +134,17 @@ def stages_of(
             ),
             after=("load", "gaussians"),
             given=_of(options, *(("agreement", "seed") if consensus else ("iou_threshold",)))
-            | {"association": options.association}
-            | _eye(options, segmenter),
+            | {"association": options.associated_by, "tracker": None if tracker is None else tracker.name}
+            | _eye(options, seeing.segmenter),
             files=options.proposals,
         )
     add(
         "regions",
-        f"embedded by {embedder.name!r}, views weighted by {options.weighting}",
-        lambda r, p: stages.regions(options, r["load"], r["masklets"], embedder, p),
+        f"embedded by {seeing.embedder.name!r}, views weighted by {options.weighting}",
+        lambda r, p: stages.regions(options, r["load"], r["masklets"], seeing.embedder, p),
         rooms=("vision", "language.regions"),
         after=("load", "masklets"),
-        given=_of(options, "weighting") | {"embedder": embedder.name},
+        given=_of(options, "weighting") | {"embedder": seeing.embedder.name},
     )
     add(
         "codes",
@@ -195,7 +193,16 @@ def _proposals(options: Options) -> str:
     return f"{options.granularity} proposals by colour and texture"
 
 
-def _eye(options: Options, segmenter: NamedSegmenter | None) -> dict[str, Any]:
+def _association(options: Options) -> str:
+    """How they are brought together, for the plan."""
+    if options.associated_by == "consensus":
+        return "what the views agree on"
+    return "followed " + (
+        "through the Gaussians" if options.tracker is None else f"by the SAM 2 of {options.tracker.name}"
+    )
+
+
+def _eye(options: Options, segmenter: Any) -> dict[str, Any]:
     """What the proposals depend on beside the frames."""
     if options.proposals is not None:
         return _of(options, "level")

@@ -127,10 +127,10 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 
 
 def masklets_from_frames(
-    options: Options, capture: Capture, gaussians: Gaussians, segmenter: Segmenter | None, progress: Progress
+    options: Options, capture: Capture, gaussians: Gaussians, seeing: eyes.Eyes, progress: Progress
 ) -> Outcome:
     """labels (T, H, W) int16 of the training frames: the proposals of each, brought together over the frames by what
-    the scene's own Gaussians say, by consensus or by tracking."""
+    the scene's own Gaussians say, by consensus or by tracking, or by a tracker of its own."""
     from jsecon.language.consensus import consensus_masklets
     from jsecon.language.masklets import clean_masklets, masklets
     from jsecon.vision.geometric import GeometricTracker
@@ -138,12 +138,12 @@ def masklets_from_frames(
 
     train = training_frames(capture)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
-    proposals, notes = proposals_of(options, capture, gaussians, segmenter)
-    if options.association == "consensus":
+    proposals, notes = proposals_of(options, capture, gaussians, seeing.segmenter)
+    if options.associated_by == "consensus":
         scene = SceneViews(gaussians, cameras, proposals)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
     else:
-        tracker = GeometricTracker(gaussians, cameras, proposals)
+        tracker = seeing.tracker or GeometricTracker(gaussians, cameras, proposals)
         labels = masklets(
             frames,
             lambda frame, index: proposals(index),
@@ -151,9 +151,10 @@ def masklets_from_frames(
             iou_threshold=options.iou_threshold,
             progress=progress,
         )
-        labels = tracker.consistent(frames, labels)
+        if isinstance(tracker, GeometricTracker):
+            labels = tracker.consistent(frames, labels)
     labels = clean_masklets(labels)
-    eyes.close(segmenter)
+    eyes.close(seeing.segmenter, seeing.tracker)
     _require_regions(labels, str(options.capture))
     return Outcome(labels, notes=notes)
 

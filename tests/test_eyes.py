@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from clip_files import COLOURS, write_clip, write_visual
+from sam2_files import write_sam2
 from sam_files import write_sam
 from test_pipeline import Recorder
 
@@ -89,6 +90,19 @@ def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
     with pytest.raises(InputError, match=r"prompt_encoder_mask_decoder\.onnx: found what ONNX Runtime"):
         pipeline.run(dataclasses.replace(run.options, segmenter=folder), tmp_path / "out", reporter=reporter)
     assert reporter.fresh == {}
+
+
+def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
+    """Random weights track nothing in earnest; the run, its plan and its key are what is tested."""
+    run, folder, _ = seen
+    shutil.copytree(folder / "cache", tmp_path / "out" / "cache")
+    reporter = Recorder()
+    options = dataclasses.replace(run.options, tracker=write_sam2(tmp_path / "sam2"))
+    followed = pipeline.run(options, tmp_path / "out", reporter=reporter)
+    assert reporter.planned["masklets"].why.endswith("followed by the SAM 2 of sam2")
+    assert reporter.fresh["masklets"]
+    assert not reporter.fresh["gaussians"]
+    assert not np.array_equal(followed.labels, run.labels)
 
 
 def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):

@@ -1,0 +1,73 @@
+"""`jsecon models check`: what a folder holds, what of it can be used, and what is missing."""
+
+import pytest
+from clip_files import write_clip
+from sam2_files import write_sam2
+from sam_files import write_sam
+
+from jsecon import cli
+from jsecon.errors import InputError
+from jsecon.models import examine, report_lines, require_usable
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    base = tmp_path_factory.mktemp("models")
+    return {
+        "CLIP": write_clip(base / "clip", "immich"),
+        "SAM": write_sam(base / "sam", "transformers.js"),
+        "SAM 2": write_sam2(base / "sam2"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
+        ("SAM", ["decoder of transformers.js, 64 prompts a call", "images of 256 px", "--segmenter"]),
+        ("SAM 2", ["2.1", "--tracker"]),
+    ],
+)
+def test_what_a_folder_is_good_for(folders, model, words):
+    findings = examine(folders[model])
+    told = {use.model: use for use in findings.uses}
+    assert {name for name, use in told.items() if use.usable} == {model}
+    for word in words:
+        assert word in told[model].told
+    for name, use in told.items():
+        if name != model:
+            assert "expected" in use.told
+            assert "huggingface.co" in use.told or "github.com" in use.told
+    require_usable(findings)
+
+
+def test_every_graph_is_told_with_its_tensors(folders, capsys):
+    assert cli.main(["models", "check", str(folders["CLIP"])]) == 0
+    told = capsys.readouterr().out
+    for line in (
+        "  textual/model.onnx",
+        "    in   text int32[1, 77]",
+        "    out  embedding float32[1, 3]",
+        "    in   image float32[1, 3, 32, 32]",
+        "CLIP: usable",
+        "SAM: not usable",
+    ):
+        assert line in told.splitlines()
+    findings = examine(folders["SAM"])
+    assert len(findings.graphs) == 2
+    assert any("input_points float32[1, batch, points, 2]" in line for line in report_lines(findings))
+
+
+def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):
+    folder = write_clip(tmp_path / "clip", "immich")
+    graph = folder / "visual" / "model.onnx"
+    graph.write_bytes(graph.read_bytes()[:100])
+    assert cli.main(["models", "check", str(folder)]) == 2
+    told = capsys.readouterr()
+    assert "cannot be opened: found what ONNX Runtime" in told.out
+    assert "nothing that can be used" in told.err
+    (tmp_path / "empty").mkdir()
+    assert cli.main(["models", "check", str(tmp_path / "empty")]) == 2
+    assert "0 graphs" in capsys.readouterr().out
+    with pytest.raises(InputError, match="no such folder"):
+        examine(tmp_path / "nowhere")
