@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int16, UInt8
+from jaxtyping import Bool, Int16, UInt
 
 from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_options, held_out
@@ -210,7 +210,7 @@ def labelled(frame, instance, names, label_pixels):
     return LabelledFrame(frame, instance.shape[1], instance.shape[0], objects)
 
 
-def write_ids(path: Path, ids: UInt8[np.ndarray, "h w"]) -> None:
+def write_ids(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:
     """Writes a label image as a grey PNG, whole or not at all."""
     with written_whole(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())

@@ -1,0 +1,151 @@
+"""The training-free rivals: a Gaussian's feature is a weighted mean of the embeddings of the masks that it lies in.
+
+They differ in the weights alone (REFERENCE I; IDEAS 1, 3, 4A). Occam's LGS (Cheng et al. 2024): alpha T at the pixel
+of the centre. Weighted back-projection (LUDVIG without its diffusion, Marrie et al. 2025; gradient-weighted
+back-projection is the same sum): alpha T at all pixels. VALA (2025): as Occam's, gated in each view.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import sparse
+from scipy.spatial import KDTree
+
+from jsecon.baselines.centres import centre_weights
+from jsecon.baselines.evidence import Evidence, local_masks
+from jsecon.language.votes import region_votes
+from jsecon.query.canonical import relevancies
+from jsecon.splat.plan import plan_view
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Array, Selection
+
+MASS, LEAST_WEIGHT, QUANTILE, SURE = 0.75, 0.13, 0.85, 0.15
+"""VALA's gate of a view: the Gaussians that make up this part of its weight, each at least so heavy, and either above
+this quantile of the view's or heavier than the last"""
+PRUNED_BELOW = 0.01
+"""VALA drops Gaussians whose weight in all views is below this part of the median"""
+NEIGHBOURS = 10
+READOUT = 0.6
+"""VALA's threshold on the smoothed, normalised relevancy"""
+
+Progress = Callable[[int, int], None] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Lifted:
+    """Features of the Gaussians and the weights that made them."""
+
+    features: np.ndarray
+    """(N, E) float32 unit; zero for a Gaussian that no mask ever held."""
+    weights: sparse.csr_matrix
+    """(N, M) of each mask on each Gaussian."""
+
+
+def train_occam(evidence: Evidence, *, progress: Progress = None) -> Lifted:
+    """Occam's LGS: features of never activated Gaussians are zero, which is their pruning."""
+    return _lifted(_centres(evidence, lambda weight: weight > 0, progress), evidence)
+
+
+def train_vala(evidence: Evidence, *, progress: Progress = None) -> Lifted:
+    """VALA: gated in each view; its cosine median of the streamed views has the normalised weighted mean as its closed
+    form (IDEAS 3.7), and is taken as that. Then Gaussians of little weight are dropped."""
+    weights = _centres(evidence, gate, progress)
+    total = np.asarray(weights.sum(1)).ravel()
+    seen = total[total > 0]
+    kept = total >= max(1e-5, PRUNED_BELOW * float(np.median(seen)) if len(seen) else 0.0)
+    return _lifted(sparse.diags(kept.astype(np.float32)) @ weights, evidence)
+
+
+def train_backprojection(evidence: Evidence, *, progress: Progress = None) -> Lifted:
+    """The full sum, one pass of votes over the views; exact: no mask of a view is left out."""
+    local, names = local_masks(evidence)
+    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    blocks = []
+    for t in range(len(local)):
+        votes = region_votes(
+            gaussians,
+            cameras[t : t + 1],
+            jnp.asarray(local[t : t + 1]),
+            names.shape[1],
+            top=names.shape[1],
+            capacity=capacity,
+        )
+        weights, slots = np.asarray(votes.weights), np.asarray(votes.regions)
+        rows, places = np.nonzero(weights > 0)
+        blocks.append((weights[rows, places], rows, names[t][slots[rows, places]]))
+        if progress is not None:
+            progress(t + 1, len(local))
+    return _lifted(_sparse(blocks, evidence), evidence)
+
+
+def gate(weight: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """VALA's gate of one view: which of the weights at the centres' pixels count."""
+    order = np.argsort(-weight, kind="stable")
+    before = np.cumsum(weight[order]) - weight[order]
+    kept = np.zeros(len(weight), bool)
+    kept[order[before < MASS * weight.sum()]] = True
+    visible = weight[weight > 0]
+    high = np.quantile(visible, QUANTILE) if len(visible) else 0.0
+    return kept & (weight >= LEAST_WEIGHT) & ((weight >= high) | (weight > SURE))
+
+
+def _centres(evidence: Evidence, chosen: Callable[[np.ndarray], np.ndarray], progress: Progress) -> sparse.csr_matrix:
+    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    blocks, masks = [], np.asarray(evidence.masks)
+    for t, image in enumerate(masks):
+        weight, pixel = (np.asarray(a) for a in centre_weights(plan_view(gaussians, cameras[t], capacity=capacity)))
+        mask = np.where(pixel >= 0, image.reshape(-1)[pixel], -1)
+        rows = np.flatnonzero(chosen(weight) & (mask >= 0) & (weight > 0))
+        blocks.append((weight[rows], rows, mask[rows]))
+        if progress is not None:
+            progress(t + 1, len(masks))
+    return _sparse(blocks, evidence)
+
+
+def _sparse(blocks: list, evidence: Evidence) -> sparse.csr_matrix:
+    values, rows, columns = (np.concatenate(parts) for parts in zip(*blocks))
+    shape = evidence.gaussians.count, len(evidence.embeddings)
+    return sparse.csr_matrix((values.astype(np.float32), (rows, columns)), shape=shape)
+
+
+def _lifted(weights: sparse.csr_matrix, evidence: Evidence) -> Lifted:
+    summed = np.asarray(weights @ np.asarray(evidence.embeddings, np.float32), np.float32)
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return Lifted(np.where(length > 0, summed / np.where(length > 0, length, 1.0), 0.0), weights)
+
+
+def query_relevancy(
+    features: Float[Array, "n e"],
+    means: Float[Array, "n 3"],
+    text: Float[Array, " e"],
+    canonical: Float[Array, "c e"],
+    *,
+    threshold: float = READOUT,
+) -> Selection:
+    """VALA's readout at the points: relevancy averaged with the mean over the ten nearest Gaussians, brought to 0 .. 1
+    over the scene, 2 r - 1 clipped at 0, above `threshold`.
+
+    Gaussians with a zero feature take no part, neither as answers nor as neighbours. Host code for the neighbours.
+    """
+    relevancy, known = (
+        np.asarray(a) for a in relevancies(jnp.asarray(features), jnp.asarray(text), jnp.asarray(canonical))
+    )
+    similarity = np.zeros(len(relevancy), np.float32)
+    there = np.flatnonzero(known)
+    if len(there):
+        points, own = np.asarray(means, np.float64)[there], relevancy[there]
+        near = KDTree(points).query(points, k=min(NEIGHBOURS + 1, len(there)))[1].reshape(len(there), -1)[:, 1:]
+        smooth = 0.5 * (own + own[near].mean(1)) if near.shape[1] else own
+        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
+        similarity[there] = np.clip(2 * spread - 1, 0, 1)
+    mask = similarity > threshold
+    score = jnp.asarray(relevancy.max(initial=0.0))
+    return Selection(jnp.asarray(mask), jnp.asarray(similarity), jnp.asarray(-1, jnp.int32), score)

@@ -1,0 +1,296 @@
+"""OpenGaussian: 6-d instance features, a codebook of two levels, and the masks' embeddings tied to its leaves.
+
+After Wu et al. 2024 (REFERENCE D.1 to D.4): (1) features whose renderings are alike within a mask and apart between
+masks; (2) coarse clusters of features and positions, then fine ones of features within each, both trained straight
+through; (3) each leaf takes the embeddings of the masks that its silhouette fits. A query is `evaluate.opengaussian`'s
+`select_leaf`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Float, Int
+
+from jsecon.baselines.codebook import assign_to_centres, cluster_means, split_roots
+from jsecon.baselines.descent import descend
+from jsecon.baselines.evidence import Evidence, local_masks, only, view_plans
+from jsecon.numerics import normalize, safe_norm
+from jsecon.splat.plan import ViewPlan, render_plan
+from jsecon.types import Array
+
+SIZE = 6
+INTRA_WEIGHT = 0.1
+SILHOUETTE = 0.7
+REFRESH_COARSE, REFRESH_FINE = 200, 50
+"""steps between two assignments of the Gaussians to centres"""
+MATCH_SILHOUETTE, MATCH_SCORE = 0.8, 0.2
+MOST_VARIANCE, LARGE = 0.006, 0.8
+"""a mask whose features vary more is no pseudo label, unless it is this large a part of the view's largest"""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class OpenGaussian:
+    """A trained model."""
+
+    features: Array
+    """(N, 6) instance features, unit."""
+    leaf_of: Array
+    """(N,) int32 leaf of each Gaussian: root * k2 + fine cluster."""
+    leaf_codes: Array
+    """(k1 k2, 6) the codebook's leaves."""
+    leaf_features: Array
+    """(k1 k2, E) language features; zero where fewer than `min_views` views matched."""
+    matches: Array
+    """(k1 k2,) int32 views in which the leaf matched a mask."""
+    siblings: int = dataclasses.field(metadata={"static": True})
+    """k2."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """Steps and sizes; the defaults are those for LERF."""
+
+    instance_steps: int = 10_000
+    coarse_steps: int = 10_000
+    fine_steps: int = 20_000
+    roots: int = 64
+    """k1."""
+    leaves: int = 10
+    """k2, of each root."""
+    position_weight: float = 0.5
+    min_views: int = 5
+    """views that a leaf must match a mask in, or it has no language feature."""
+    rate: float = 1e-3
+    """Adam's; larger for a shorter schedule."""
+    coarse_rate: float = 1e-4
+
+
+def train_opengaussian(
+    evidence: Evidence,
+    *,
+    key: Array,
+    schedule: Schedule = Schedule(),
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[OpenGaussian, Array]:
+    """Trains the three stages; returns the model and the loss of the first before each step."""
+    init_key, first_key, centre_key, coarse_key, fine_key = jax.random.split(key, 5)
+    local, names = local_masks(evidence)
+    data = view_plans(evidence), jnp.asarray(local)
+    views, slots = names.shape
+    start = jax.random.uniform(init_key, (evidence.gaussians.count, SIZE))
+    loss = functools.partial(_instance_loss, slots=slots, halfway=schedule.instance_steps // 2)
+    features, history = descend(
+        loss,
+        start,
+        data,
+        views=views,
+        steps=schedule.instance_steps,
+        optimizer=_adam(schedule.rate),
+        key=first_key,
+        progress=progress,
+    )
+    labels = _pseudo_labels(features, data, slots)
+    means = jnp.asarray(evidence.gaussians.means)
+    scaled = (means - means.min(0)) / jnp.maximum(jnp.ptp(means), 1e-9)
+    features, root_of = _coarse(features, scaled, data, labels, schedule, centre_key, coarse_key)
+    features, leaf_of, codes = _fine(features, root_of, data, labels, schedule, fine_key)
+    leaf_features, matches = _associate(leaf_of, codes, data, labels, names, np.asarray(evidence.embeddings))
+    leaf_features = jnp.where((matches >= schedule.min_views)[:, None], leaf_features, 0.0)
+    return OpenGaussian(normalize(features), leaf_of, codes, leaf_features, matches, schedule.leaves), history
+
+
+@functools.cache
+def _adam(rate: float) -> optax.GradientTransformation:
+    return optax.adam(rate, eps=1e-15)
+
+
+def _draw(plan: ViewPlan, features: Array) -> tuple[Array, Array]:
+    """(H W, 6) rendered (f + 1) / 2 of unit features, and (H W,) alpha."""
+    rendered = render_plan(plan, (normalize(features) + 1) / 2)
+    return rendered.features.reshape(-1, SIZE), rendered.alpha.reshape(-1)
+
+
+def _mask_means(image: Array, ids: Array, slots: int) -> tuple[Array, Array]:
+    """(K, 6) mean of the pixels (P, 6) of each mask, and (K,) their number; ids (P,), -1 = none."""
+    place = jnp.where(ids >= 0, ids, slots)
+    pixels = jax.ops.segment_sum(jnp.ones(place.shape), place, slots + 1)[:slots]
+    return jax.ops.segment_sum(image, place, slots + 1)[:slots] / jnp.maximum(pixels, 1)[:, None], pixels
+
+
+def _instance_loss(
+    features: Array, data: Any, view: Array, step: Array, key: Array, *, slots: int, halfway: int
+) -> Array:
+    del key
+    plans, local = data
+    image, alpha = _draw(jax.tree.map(lambda a: a[view], plans), features)
+    ids = jnp.where(alpha > SILHOUETTE, local[view].reshape(-1), -1)
+    means, pixels = _mask_means(image, ids, slots)
+    there = pixels > 0
+    number = jnp.maximum(there.sum(), 1)
+    spread = safe_norm(image - means[jnp.maximum(ids, 0)])
+    per_mask, _ = _mask_means(spread[:, None] * jnp.ones(SIZE), ids, slots)
+    intra = jnp.sum(jnp.where(there, per_mask[:, 0], 0.0)) / number
+    pairs = there[:, None] & there[None] & ~jnp.eye(slots, dtype=bool)
+    closeness = 1 / (jnp.sum((means[:, None] - means[None]) ** 2, axis=-1) + 1)
+    # Near pairs count most: weights rise by rank from 0.1 to 1; later only the nearest tenth keeps its own.
+    ranked = jnp.argsort(jnp.argsort(jnp.where(pairs, jax.lax.stop_gradient(closeness), -1.0), axis=1), axis=1)
+    rank = ranked - (slots - pairs.sum(1, keepdims=True))
+    weight = 0.1 + 0.9 * rank / jnp.maximum(pairs.sum(1, keepdims=True) - 1, 1)
+    weight = jnp.where((step >= halfway) & (weight < 0.9), 0.1, weight)
+    inter = jnp.sum(jnp.where(pairs, weight * closeness, 0.0)) / jnp.maximum(number * (number - 1), 1)
+    return INTRA_WEIGHT * intra + inter
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _pseudo_labels(features: Array, data: Any, slots: int) -> tuple[Array, Array]:
+    """(T, K, 6) the masks' mean features, and (T, K) whether each is a label: there, and even or large."""
+    plans, local = data
+
+    def one(view):
+        plan, ids = view
+        image, alpha = _draw(plan, features)
+        ids = jnp.where(alpha > SILHOUETTE, ids.reshape(-1), -1)
+        means, pixels = _mask_means(image, ids, slots)
+        variance, _ = _mask_means((image - means[jnp.maximum(ids, 0)]) ** 2, ids, slots)
+        even = variance.mean(1) <= MOST_VARIANCE
+        return means, (pixels > 0) & (even | (pixels > LARGE * pixels.max()))
+
+    return jax.lax.map(one, (plans, local))
+
+
+def _through(features: Array, of: Array, count: int) -> Array:
+    """Each Gaussian's cluster mean forward, its own feature backward."""
+    units = normalize(features)
+    means = cluster_means(units, of, jnp.zeros((count, SIZE)))
+    return units + jax.lax.stop_gradient(means[of] - units)
+
+
+def _quantised_loss(
+    features: Array, data: Any, view: Array, step: Array, key: Array, *, clusters: int, squared: bool
+) -> Array:
+    """Rendered cluster means against the pseudo labels: L1 over the labelled silhouette, or L2 of one root alone."""
+    del step
+    plans, local, (means, valid), of, root_of = data
+    plan = jax.tree.map(lambda a: a[view], plans)
+    if squared:  # a root drawn by its Gaussians: each takes its turn as often as it is large
+        root = root_of[jax.random.randint(key, (), 0, len(root_of))]
+        plan = only(plan, root_of == root)
+    image, alpha = _draw(plan, _through(features, of, clusters))
+    ids = local[view].reshape(-1)
+    target = means[view][jnp.maximum(ids, 0)]
+    counts = (ids >= 0) & valid[view][jnp.maximum(ids, 0)] & (alpha > SILHOUETTE)
+    error = jnp.square(image - target) if squared else jnp.abs(image - target)
+    return jnp.sum(jnp.where(counts[:, None], error, 0.0)) / (SIZE * jnp.maximum(counts.sum(), 1))
+
+
+def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key) -> tuple[Array, Array]:
+    """Features trained through their roots' means, and the root of each Gaussian."""
+    roots = min(schedule.roots, len(features))
+    points = lambda f: jnp.concatenate([normalize(f), schedule.position_weight * scaled], axis=1)
+    centres = points(features)[jax.random.choice(centre_key, len(features), (roots,), replace=False)]
+    loss = functools.partial(_quantised_loss, clusters=roots, squared=False)
+    of, centres = assign_to_centres(points(features), centres)
+    for start in range(0, schedule.coarse_steps, REFRESH_COARSE):
+        steps = min(REFRESH_COARSE, schedule.coarse_steps - start)
+        features, _ = descend(
+            loss,
+            features,
+            (*data, labels, of, of),
+            views=len(data[1]),
+            steps=steps,
+            optimizer=_adam(schedule.coarse_rate),
+            key=jax.random.fold_in(key, start),
+        )
+        of, centres = assign_to_centres(points(features), centres)
+    return features, of
+
+
+def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Array, Array, Array]:
+    """Features, leaves and the leaves' codes; a root has one leaf more than the most masks that it meets in a view."""
+    roots, leaves = min(schedule.roots, len(features)), schedule.leaves
+    number = _leaves_wanted(root_of, data, labels, roots, leaves)
+    split = lambda f: split_roots(normalize(f), root_of, number, leaves)
+    of = split(features)
+    loss = functools.partial(_quantised_loss, clusters=roots * leaves, squared=True)
+    for start in range(0, schedule.fine_steps, REFRESH_FINE):
+        steps = min(REFRESH_FINE, schedule.fine_steps - start)
+        features, _ = descend(
+            loss,
+            features,
+            (*data, labels, of, root_of),
+            views=len(data[1]),
+            steps=steps,
+            optimizer=_adam(schedule.rate),
+            key=jax.random.fold_in(key, start),
+        )
+        of = split(features)
+    return features, of, cluster_means(normalize(features), of, jnp.zeros((roots * leaves, SIZE)))
+
+
+def _leaves_wanted(root_of, data, labels, roots: int, leaves: int) -> Int[np.ndarray, " k"]:
+    """1 + the largest number of a view's labels that match the root: half of the label's pixels are the root's."""
+    plans, local = data
+    slots = labels[1].shape[1]
+
+    @jax.jit
+    def matched(view):
+        plan, ids, valid = view
+
+        def one(root):
+            alpha = render_plan(only(plan, root_of == root), jnp.ones((len(root_of), 1))).alpha.reshape(-1)
+            cover, pixels = _mask_means((alpha > MATCH_SILHOUETTE)[:, None] * 1.0, ids.reshape(-1), slots)
+            return jnp.sum((cover[:, 0] > 0.5) & valid & (pixels > 0))
+
+        return jax.lax.map(one, jnp.arange(roots))
+
+    most = np.stack(
+        [np.asarray(matched(jax.tree.map(lambda a, t=t: a[t], (plans, local, labels[1])))) for t in range(len(local))]
+    )
+    return np.minimum(1 + most.max(0), leaves)
+
+
+def _associate(
+    leaf_of: Array, codes: Array, data: Any, labels: Any, names: Int[np.ndarray, "t k"], embeddings: Float[Array, "m e"]
+) -> tuple[Array, Array]:
+    """(L, E) sum of the embeddings of the matched masks, divided by their number, and (L,) that number.
+
+    A leaf's silhouette alone, alpha > 0.8, meets each mask of a view with IoU (1 - L1 distance of their features); the
+    best counts where it is above 0.2 (REFERENCE D.4).
+    """
+    plans, local = data
+    slots, used = names.shape[1], jnp.asarray(np.unique(np.asarray(leaf_of)))
+
+    @jax.jit
+    def best(view):
+        plan, ids, means, valid = view
+        ids = ids.reshape(-1)
+
+        def one(leaf):
+            alpha = render_plan(only(plan, leaf_of == leaf), jnp.ones((len(leaf_of), 1))).alpha.reshape(-1)
+            shape = (alpha > MATCH_SILHOUETTE) * 1.0
+            share, pixels = _mask_means(shape[:, None], ids, slots)
+            both = share[:, 0] * pixels
+            overlap = both / jnp.maximum(pixels + shape.sum() - both, 1)
+            distance = jnp.mean(jnp.abs(means - (codes[leaf] + 1) / 2), axis=1)
+            score = jnp.where(valid & (pixels > 0), overlap * (1 - distance), 0.0)
+            return jnp.where(score.max() > MATCH_SCORE, jnp.argmax(score), -1)
+
+        return jax.lax.map(one, used)
+
+    summed = np.zeros((len(codes), embeddings.shape[1]), np.float64)
+    matches = np.zeros(len(codes), np.int32)
+    for t in range(len(local)):
+        found = np.asarray(best(jax.tree.map(lambda a, t=t: a[t], (plans, local, *labels))))
+        hit, leaf = found >= 0, np.asarray(used)
+        summed[leaf[hit]] += embeddings[names[t][found[hit]]]
+        matches[leaf[hit]] += 1
+    return jnp.asarray(summed / (matches[:, None] + 1e-4), jnp.float32), jnp.asarray(matches)
