@@ -3,316 +3,12 @@
 import argparse
 import dataclasses
 import sys
-import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import jsecon
 from jsecon.errors import InputError
+from jsecon.grammar import parser
 from jsecon.options import Options, require_writable
-
-_EPILOG = """
-examples
-  jsecon demo                                           a made-up room, from frames to answers and a report
-  jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.npz
-  jsecon run my_capture --out my_field --gaussians point_cloud.ply
-                                                        the same on a scene that is already splatted
-  jsecon query my_field/field.npz "red mug" "dark green bottle" --out answers
-  jsecon query my_field/field.npz --at frame_00012 310 145 --out answers
-  jsecon eval my_field/field.npz --labels my_capture/label --out evaluation
-  jsecon run my_capture --out my_field --segmenter sam --embedder clip
-                                                        with SAM and CLIP from model folders
-  jsecon models check clip                              what a model folder holds and lacks
-
-A run that is stopped goes on where it stopped when the same command is given again.
-"""
-
-
-def parser() -> argparse.ArgumentParser:
-    """The whole grammar of the command line."""
-    top = argparse.ArgumentParser(
-        prog="jsecon",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=_EPILOG,
-        description="Find things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.",
-    )
-    top.add_argument("--version", action="version", version=f"jsecon {jsecon.__version__}")
-    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for add in (_demo, _run, _query, _eval, _models):
-        add(verbs)
-    return top
-
-
-def _verb(verbs, name: str, short: str, long: str) -> argparse.ArgumentParser:
-    return verbs.add_parser(
-        name,
-        help=short,
-        description=textwrap.dedent(long).strip(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-
-
-def _demo(verbs) -> None:
-    verb = _verb(
-        verbs,
-        "demo",
-        "make a room, build its field, query it and write a report",
-        """
-        Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on
-        it what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is
-        used. Ends with report.html, metrics.json, field.npz and a .ply for each query. About five minutes on two cores.
-        """,
-    )
-    verb.add_argument("--seed", type=int, default=0, help="which room (default 0)")
-    verb.add_argument(
-        "--out", type=Path, default=Path("jsecon-demo"), help="folder for all of it (default ./jsecon-demo)"
-    )
-    verb.add_argument("--steps", type=int, default=None, help="of the photometric fit (default 700)")
-    verb.set_defaults(act=_act_demo)
-
-
-def _run(verbs) -> None:
-    verb = _verb(
-        verbs,
-        "run",
-        "build the language field of a capture",
-        """
-        From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found in the frames and
-        brought together, or given as masks), one embedding a region, codes distilled into the Gaussians. Prints its
-        plan first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
-        """,
-    )
-    verb.add_argument(
-        "capture",
-        type=Path,
-        metavar="CAPTURE",
-        help="folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)",
-    )
-    verb.add_argument("--out", type=Path, required=True, help="folder for the field, the report and the cache")
-    verb.add_argument(
-        "--gaussians",
-        type=Path,
-        metavar="PLY",
-        help="a scene of 3D Gaussians in the capture's world; without it, Gaussians are fitted to the frames",
-    )
-    verb.add_argument(
-        "--masks",
-        type=Path,
-        metavar="DIR",
-        help="instance masks, one integer PNG a frame under the frame's "
-        "name (0 = none), <id>/<frame>.png, or LangSplat's _s.npy; without it, they are found in the frames",
-    )
-    verb.add_argument(
-        "--proposals",
-        type=Path,
-        metavar="DIR",
-        help="masks of single frames, to be brought together: <frame>.json of SAM's own generator, "
-        "LangSplat's _s.npy, or PNGs",
-    )
-    verb.add_argument(
-        "--segmenter",
-        type=Path,
-        metavar="DIR",
-        help="a SAM model folder (.onnx) to find proposals with, instead of colour and texture",
-    )
-    verb.add_argument(
-        "--level",
-        choices=("default", "s", "m", "l"),
-        default=Options.level,
-        help="of SAM's proposals and of LangSplat's files: subparts, parts, wholes, or all (default %(default)s)",
-    )
-    verb.add_argument(
-        "--points-per-side",
-        type=int,
-        default=Options.points_per_side,
-        metavar="N",
-        help="SAM: asked on a grid of NxN points (default %(default)s)",
-    )
-    verb.add_argument(
-        "--crop-layers",
-        type=int,
-        default=Options.crop_layers,
-        metavar="N",
-        help="SAM: asked on crops too; 1 is LangSplat's setting and takes five times longer (default %(default)s)",
-    )
-    verb.add_argument(
-        "--tracker",
-        type=Path,
-        metavar="DIR",
-        help="a SAM 2 model folder (.onnx) that follows the proposals (the paper's Algorithm 1), instead of consensus",
-    )
-    verb.add_argument(
-        "--embedder",
-        type=Path,
-        metavar="DIR",
-        help="a CLIP model folder (.onnx, tokenizer.json) for regions and texts, instead of colours",
-    )
-    verb.add_argument(
-        "--downscale",
-        type=float,
-        metavar="K",
-        help=f"make frames K times smaller (default: so that the longer side is at most {Options.long_side} px)",
-    )
-    verb.add_argument("--frames", type=int, metavar="N", help="use at most N frames, evenly spaced (default: all)")
-    verb.add_argument(
-        "--holdout",
-        type=int,
-        default=Options.holdout,
-        metavar="K",
-        help="keep every K-th frame for measuring only; 0 = none (default %(default)s)",
-    )
-    verb.add_argument("--steps", type=int, default=Options.steps, help="of the photometric fit (default %(default)s)")
-    verb.add_argument(
-        "--sh-degree",
-        type=int,
-        default=Options.sh_degree,
-        choices=range(4),
-        help="of the fitted colours (default %(default)s)",
-    )
-    verb.add_argument(
-        "--latent",
-        type=_code_size,
-        default=Options.latent,
-        metavar="D",
-        help="most numbers a code may have; 3 as in the paper; auto for as few as keep the regions apart (default "
-        "%(default)s)",
-    )
-    verb.add_argument(
-        "--reduce",
-        choices=("mode", "median", "mean"),
-        default=Options.reduce,
-        help="from a Gaussian's votes to its code (default %(default)s)",
-    )
-    verb.add_argument(
-        "--granularity",
-        choices=("fine", "medium", "coarse"),
-        default=Options.granularity,
-        help="of the proposals, without masks: fine parts things; coarse joins the colours of one thing, and tells "
-        "things apart by the depth that the Gaussians render (default %(default)s)",
-    )
-    verb.add_argument(
-        "--association",
-        choices=("consensus", "tracking"),
-        default=Options.association,
-        help="of the frames' proposals: what most views agree on, or Algorithm 1 of the paper with a tracker through "
-        "the Gaussians (default %(default)s)",
-    )
-    verb.add_argument(
-        "--agreement",
-        type=float,
-        default=Options.agreement,
-        metavar="SHARE",
-        help="consensus: share of the views that must put two things into one proposal; less joins more (default "
-        "%(default)s)",
-    )
-    verb.add_argument(
-        "--iou-threshold",
-        type=float,
-        default=Options.iou_threshold,
-        metavar="KAPPA",
-        help="tracking: a proposal that overlaps a masklet by more is not new (default %(default)s)",
-    )
-    verb.add_argument(
-        "--seed", type=int, default=Options.seed, help="of whatever is drawn at random (default %(default)s)"
-    )
-    verb.set_defaults(act=_act_run)
-
-
-def _code_size(text: str) -> int | str:
-    return text if text == "auto" else int(text)
-
-
-def _query(verbs) -> None:
-    verb = _verb(
-        verbs,
-        "query",
-        "the Gaussians that a text names, or that lie under a pixel",
-        """
-        For each text, or for a pixel, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's
-        own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the
-        frames that show it best, and answers.html with the pictures.
-        """,
-    )
-    verb.add_argument("field", type=Path, metavar="FIELD", help="field.npz of a run")
-    verb.add_argument("texts", nargs="*", metavar="TEXT", help='what to find: "red mug" "dark green bottle" ...')
-    verb.add_argument(
-        "--at",
-        nargs=3,
-        action="append",
-        default=[],
-        metavar=("FRAME", "X", "Y"),
-        help="what lies under pixel "
-        "(column X, row Y) of a frame, by its name or number, in the frames as the run used them; needs no text",
-    )
-    verb.add_argument("--out", type=Path, required=True, help="folder for the answers")
-    verb.add_argument(
-        "--by",
-        choices=("votes", "code", "one_step", "canonical"),
-        default="votes",
-        help="votes, code: text -> most similar region -> the Gaussians whose votes, or whose code, are its own; "
-        "one_step, canonical: each Gaussian's code against the text (default votes)",
-    )
-    verb.add_argument(
-        "--threshold",
-        type=float,
-        help="on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, 0.5 canonical)",
-    )
-    _texts(verb)
-    verb.add_argument("--keep-outliers", action="store_true", help="leave out the last step, DBSCAN")
-    verb.add_argument("--views", type=int, default=3, metavar="N", help="masks to write a query (default 3)")
-    verb.set_defaults(act=_act_query)
-
-
-def _eval(verbs) -> None:
-    verb = _verb(
-        verbs,
-        "eval",
-        "measure a field against labels",
-        """
-        Point-level rendered protocol on LERF-style labels (one .json a frame): the selected Gaussians alone are
-        rendered, alpha > 0.7, against each labelled mask; a missing prediction counts as 0. Prints mIoU, mAcc@0.25
-        and localisation accuracy of each kind of query, and writes OUT/evaluation.json with every pair.
-        """,
-    )
-    verb.add_argument("field", type=Path, metavar="FIELD", help="field.npz of a run")
-    verb.add_argument(
-        "--labels", type=Path, required=True, metavar="DIR", help="folder of LERF label files (frame.json)"
-    )
-    verb.add_argument("--out", type=Path, help="folder for evaluation.json (default: the field's)")
-    _texts(verb)
-    verb.set_defaults(act=_act_eval)
-
-
-def _texts(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--embedder",
-        type=Path,
-        metavar="DIR",
-        help="the CLIP model folder that the field was made with (default: where the run had it)",
-    )
-    verb.add_argument(
-        "--template",
-        action="append",
-        metavar="PHRASE",
-        help='CLIP: a phrase for the text, such as "a photo of a {}."; several are averaged (default: the bare text)',
-    )
-
-
-def _models(verbs) -> None:
-    verb = _verb(
-        verbs,
-        "models",
-        "look into a folder of models",
-        """
-        check DIR: what models a folder holds, each graph's inputs and outputs, what it can be used for, what is
-        missing, and where such exports are published. Exit code 2 where nothing in it can be used.
-        """,
-    )
-    actions = verb.add_subparsers(dest="action", required=True, metavar="ACTION")
-    check = actions.add_parser("check", help="tell what a model folder holds")
-    check.add_argument("folder", type=Path, metavar="DIR", help="folder with .onnx files")
-    check.set_defaults(act=_act_models_check)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -322,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # argparse has said why
         return int(stop.code or 0)
     try:
-        arguments.act(arguments)
+        _ACTS[arguments.verb](arguments)
     except InputError as error:
         print(f"jsecon: {error}", file=sys.stderr)
         return 2
@@ -403,7 +99,7 @@ def _embedder(field: Any, arguments: argparse.Namespace) -> Any:
     return eyes.embedder_of_field(field, arguments.embedder, templates=arguments.template or ("{}",))
 
 
-def _act_models_check(arguments: argparse.Namespace) -> None:
+def _act_models(arguments: argparse.Namespace) -> None:
     from jsecon.console import Console
     from jsecon.models import examine, report_lines, require_usable
 
@@ -423,3 +119,6 @@ def _whole(name: str, text: str) -> int:
             remedy="For example: --at frame_00012 310 145",
         )
     return int(text)
+
+
+_ACTS = {"demo": _act_demo, "run": _act_run, "query": _act_query, "eval": _act_eval, "models": _act_models}

@@ -171,8 +171,10 @@ def proposals_of(
 
         names = [capture.names[t] for t in train]
         return proposals_from_disk(options.proposals, names, frames.shape[1:3], level=options.level)
-    found = segmenter or classical_segmenter(options, capture, gaussians)
-    return functools.cache(lambda t: found(frames[t], t)), ()
+    if segmenter is not None:  # which keeps what it finds on disk
+        return lambda t: segmenter(frames[t], t), ()
+    classical = classical_segmenter(options, capture, gaussians)
+    return functools.cache(lambda t: classical(frames[t], t)), ()
 
 
 def classical_segmenter(options: Options, capture: Capture, gaussians: Gaussians) -> Segmenter:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon import cli, pipeline
+from jsecon import cli, grammar, pipeline
 from jsecon.console import Console
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.plan import Reporter, Silent
@@ -126,7 +126,7 @@ def test_help_of_every_verb_has_words_for_every_option(capsys):
     for verb in ("demo", "run", "query", "eval"):
         assert _run(verb, "--help") == 0
         assert len(capsys.readouterr().out) > 300
-    for action in cli.parser()._subparsers._group_actions[0].choices.values():
+    for action in grammar.parser()._subparsers._group_actions[0].choices.values():
         assert all(option.help for option in action._actions), action.prog
 
 

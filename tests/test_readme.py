@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from jsecon import cli
+from jsecon import grammar
 
 HOME = Path(__file__).resolve().parent.parent
 README = (HOME / "README.md").read_text()
@@ -41,12 +41,12 @@ def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, mon
 
 def test_every_command_line_is_one_that_the_program_takes():
     lines = [line for block in _blocks("bash") for line in block.splitlines() if line.startswith("jsecon")]
-    lines += [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", cli._EPILOG, re.MULTILINE)]
+    lines += [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", grammar.EPILOG, re.MULTILINE)]
     assert len(lines) >= 10
     for line in lines:
         with contextlib.redirect_stderr(io.StringIO()) as told:
             try:
-                cli.parser().parse_args(shlex.split(line)[1:])
+                grammar.parser().parse_args(shlex.split(line)[1:])
             except SystemExit:
                 pytest.fail(f"{line}: {told.getvalue()}")
 
