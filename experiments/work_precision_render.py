@@ -107,7 +107,7 @@ def compiled(setting: Setting, gaussians: Gaussians, camera: Camera, features: n
     with in_place(setting):
         # Pairs are planned for the widest boxes and the lowest cut of all, so that nothing overflows.
         capacity = 3 * plan_capacity(gaussians, camera) + 4096
-        given = jnp.asarray(features, jnp.dtype(setting.features)).astype(jnp.float32)
+        given = jnp.asarray(features, jnp.dtype(setting.features))
         draw = lambda g, f: render(g, camera, f, capacity=capacity)
         ready = jax.jit(draw).lower(gaussians, given).compile()
         out = ready(gaussians, given)

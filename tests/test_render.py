@@ -168,6 +168,35 @@ def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
     np.testing.assert_allclose(slope, expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("channels", [3, 16])
+def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera, channels):
+    rounded = jnp.asarray(random_features(scene.count, channels)).astype(jnp.bfloat16)
+    draw = jax.jit(lambda f: render(scene, camera, f, capacity=CAPACITY).features)
+    image = draw(rounded)
+    assert image.dtype == jnp.float32
+    np.testing.assert_array_equal(image, draw(rounded.astype(jnp.float32)))
+    slope = lambda f: jax.jit(jax.grad(lambda f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()))(f)
+    assert slope(rounded).dtype == jnp.bfloat16
+    np.testing.assert_allclose(
+        slope(rounded).astype(jnp.float32), slope(rounded.astype(jnp.float32)), rtol=2**-7, atol=1e-3
+    )
+
+
+def test_a_capture_of_one_size_compiles_once(scene, cameras):
+    capacity = plan_capacity(scene, cameras)
+    features = jnp.asarray(random_features(scene.count, 5))
+    views = [cameras[t] for t in range(4)]
+    compiled = []
+    listen = lambda name, seconds, **_: compiled.append(name) if name.endswith("backend_compile_duration") else None
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        images = [render(scene, view, features, capacity=capacity).features for view in views]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert len(compiled) == 1
+    assert float(jnp.abs(images[0] - images[1]).max()) > 0
+
+
 def test_vmapped_gradients_equal_a_loop(scene, cameras):
     features = jnp.asarray(random_features(scene.count, 3))
     loss = lambda camera, f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()

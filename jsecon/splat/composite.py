@@ -3,6 +3,8 @@
 A batch's tiles are walked together (walk.py), batch after batch; over several devices, each walks its strip.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import Mesh
@@ -30,14 +32,18 @@ def composite(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"], Int[Array, " tiles"]]:
-    """Features (H, W, D) = sum of alpha T f, final transmittance (H, W), and how far down each tile's list anything is
+    """Features (H, W, D) = sum of alpha T f in the splats' dtype (bfloat16 `features` are read as such), final transmittance (H, W), and how far down each tile's list anything is
     seen: lists cut there composite to the same, and have the same gradient."""
     channels = features.shape[1] + 1
+    apart = features.dtype != splats.dtype
 
-    def local(strip, lists, table):
-        batches = make_batches(lists, width, strip)
+    def local(strip, lists, common):
+        (table, features), batches = common, make_batches(lists, width, strip)
 
         def body(transmittance, total, chunk):
+            if apart:
+                given = features[chunk.ids].astype(table.dtype)
+                chunk = dataclasses.replace(chunk, columns=jnp.concatenate([given, chunk.columns], axis=-1))
             if channels <= WIDE:
                 return _summed_anew(transmittance, total, chunk)
             weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
@@ -55,8 +61,9 @@ def composite(
         return image[..., :-1], 1 - image[..., -1], by_tile
 
     # A last channel of ones sums the weights: the final transmittance is what they leave of 1.
-    table = make_table(splats, features, jnp.ones_like(features[:, :1]))
-    image, transmittance, seen = over_strips(local, lists, table, mesh)
+    ones = jnp.ones_like(splats[:, :1])
+    table = make_table(splats, ones) if apart else make_table(splats, features, ones)
+    image, transmittance, seen = over_strips(local, lists, (table, features if apart else None), mesh)
     return join(image, lists.tile, height), join(transmittance, lists.tile, height), seen
 
 

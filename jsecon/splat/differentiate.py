@@ -54,20 +54,22 @@ def _splat_forward(splats, features, lists, width, height, mesh):
     lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
     image, transmittance, seen = _forward(splats, features, lists, width, height, mesh)
     lists = dataclasses.replace(lists, lengths=seen)
-    saved = (features, image, transmittance) if wants_geometry else None
-    return (image, transmittance), (splats, lists, saved)
+    saved = (image, transmittance) if wants_geometry else None
+    return (image, transmittance), (splats, features, lists, saved)
 
 
 def _splat_backward(width, height, mesh, residual, cotangents):
-    splats, lists, saved = residual
+    splats, features, lists, saved = residual
     bars = [
         jnp.zeros(bar.shape, bar.dtype) if isinstance(bar, jax.custom_derivatives.SymbolicZero) else bar
         for bar in cotangents
     ]
     if saved is None:
-        return jnp.zeros_like(splats), _features_backward(splats, bars[0], lists, mesh), None
+        gradient = _features_backward(splats, bars[0], lists, mesh)
+        return jnp.zeros_like(splats), gradient.astype(features.dtype), None
     vjp = sequential_vmap(functools.partial(composite_vjp, mesh=mesh))
-    return *vjp(splats, saved[0], lists, saved[1], saved[2], *bars), None
+    by_splat, gradient = vjp(splats, features.astype(splats.dtype), lists, *saved, *bars)
+    return by_splat, gradient.astype(features.dtype), None
 
 
 splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)

@@ -110,7 +110,8 @@ def render_plan(
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
 
-    Differentiable, under jit, grad and vmap, on the devices of the plan; `background` and `depth` as for `render`.
+    Differentiable, under jit, grad and vmap, on the devices of the plan; features, `background` and `depth` as for
+    `render`.
     Raises ValueError on shapes that disagree.
     """
     require(
@@ -125,7 +126,9 @@ def render_plan(
 
 
 def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool):
-    features = jnp.asarray(features, plan.splats.dtype)
+    features = jnp.asarray(features)
+    if depth or features.dtype != jnp.bfloat16:
+        features = features.astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
     image, transmittance = splat_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
     image, transmittance = (jnp.where(plan.sound, a, jnp.nan) for a in (image, transmittance))
