@@ -14,7 +14,7 @@ from jsecon.stages import Outcome
 from jsecon.types import Capture
 
 CHECKPOINT_SECONDS = 20.0
-"""between two records of a fit in progress: a stop loses at most this and one chunk of steps"""
+"""between two records of a stage in progress: a stop loses at most this and one chunk of steps, or one tracked frame"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +122,7 @@ def stages_of(
         add(
             "masklets",
             f"{_proposals(options)}, {_association(options)}",
-            lambda r, p: stages.masklets_from_frames(options, r["load"], r["gaussians"], seeing, p),
+            lambda r, p: _masklets(options, folder, keys["masklets"], r, seeing, p),
             rooms=(
                 "vision",
                 "language.masklets",
@@ -222,16 +222,32 @@ def record_of(folder: Path, stage: str, key: str) -> Path:
 
 def _fit(options: Options, folder: Path, key: str, capture: Capture, progress: Any) -> Outcome:
     """The photometric fit, gone on with from its last record where there is one."""
-    record, state, last = record_of(folder, "gaussians", key), None, time.monotonic()
+    state, keep = _records(record_of(folder, "gaussians", key))
+    return stages.fitted_gaussians(options, capture, progress, state, lambda current: keep(lambda: current))
+
+
+def _masklets(
+    options: Options, folder: Path, key: str, results: dict[str, Any], seeing: Eyes, progress: Any
+) -> Outcome:
+    """The masklets; a tracker that was stopped goes on behind the last frame recorded."""
+    state, keep = _records(record_of(folder, "masklets", key))
+    return stages.masklets_from_frames(
+        options, results["load"], results["gaussians"], seeing, progress, state=state, on_checkpoint=keep
+    )
+
+
+def _records(record: Path) -> tuple[Any, Callable[[Callable[[], Any]], None]]:
+    """What a stopped stage last recorded, or None; and what records it anew, given a function that makes the state."""
+    state, last = None, time.monotonic()
     if record.exists():
-        # A record that cannot be read loses time and nothing else: the fit starts again, to the same result.
+        # A record that cannot be read loses time and nothing else: the stage starts again, to the same result.
         with contextlib.suppress(cache.CorruptCacheError):
             state = cache.load(record)
 
-    def keep(current: Any) -> None:
+    def keep(current: Callable[[], Any]) -> None:
         nonlocal last
         if time.monotonic() - last >= CHECKPOINT_SECONDS:
-            cache.save(record, current)
+            cache.save(record, current())
             last = time.monotonic()
 
-    return stages.fitted_gaussians(options, capture, progress, state, keep)
+    return state, keep

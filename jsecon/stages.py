@@ -127,10 +127,18 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 
 
 def masklets_from_frames(
-    options: Options, capture: Capture, gaussians: Gaussians, seeing: eyes.Eyes, progress: Progress
+    options: Options,
+    capture: Capture,
+    gaussians: Gaussians,
+    seeing: eyes.Eyes,
+    progress: Progress,
+    *,
+    state: Any | None = None,
+    on_checkpoint: Callable[[Callable[[], Any]], None] | None = None,
 ) -> Outcome:
     """labels (T, H, W) int16 of the training frames: the proposals of each, brought together over the frames by what
-    the scene's own Gaussians say, by consensus or by tracking, or by a tracker of its own."""
+    the scene's own Gaussians say, by consensus or by tracking, or by a tracker of its own. `state` and `on_checkpoint`
+    are those of `jsecon.language.masklets.masklets`."""
     from jsecon.language.consensus import consensus_masklets
     from jsecon.language.masklets import clean_masklets, masklets
     from jsecon.vision.geometric import GeometricTracker
@@ -149,6 +157,8 @@ def masklets_from_frames(
             lambda frame, index: proposals(index),
             tracker,
             iou_threshold=options.iou_threshold,
+            state=state,
+            on_checkpoint=on_checkpoint,
             progress=progress,
         )
         if isinstance(tracker, GeometricTracker):

@@ -12,7 +12,7 @@ from sam2_files import write_sam2
 from sam_files import write_sam
 from test_pipeline import Recorder
 
-from jsecon import cli, eyes, pipeline
+from jsecon import cli, eyes, pipeline, recipe
 from jsecon.data.capture import load_capture
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
@@ -21,6 +21,7 @@ from jsecon.language.field import load_field
 from jsecon.options import Options
 from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
 from jsecon.vision.sam import SamSegmenter, SamSettings
+from jsecon.vision.sam2 import Sam2Tracker
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +104,36 @@ def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     assert reporter.fresh["masklets"]
     assert not reporter.fresh["gaussians"]
     assert not np.array_equal(followed.labels, run.labels)
+
+
+def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, splat, tmp_path, monkeypatch):
+    options = Options(room, gaussians=splat, holdout=4, tracker=write_sam2(tmp_path / "sam2"), granularity="coarse")
+    monkeypatch.setattr(recipe, "CHECKPOINT_SECONDS", 0.0)
+    own, called, stop = Sam2Tracker.__call__, [], []
+
+    def counted(self, frames, index, prompts):
+        called.append(index)
+        if index in stop:
+            raise KeyboardInterrupt
+        return own(self, frames, index, prompts)
+
+    def tracked(folder):
+        called.clear()
+        plan = recipe.stages_of(options, folder, folder, eyes.eyes_of(options, folder), None)
+        results = {}
+        for stage in plan[: [stage.name for stage in plan].index("masklets") + 1]:
+            results[stage.name] = stage.compute(results, lambda done, total: None).value
+        return results["masklets"]
+
+    monkeypatch.setattr(Sam2Tracker, "__call__", counted)
+    whole, everywhere = tracked(tmp_path / "whole"), called.copy()
+    assert len(everywhere) > 2  # frames that showed something new
+    stop.append(everywhere[1])
+    with pytest.raises(KeyboardInterrupt):
+        tracked(tmp_path / "out")
+    stop.clear()
+    np.testing.assert_array_equal(tracked(tmp_path / "out"), whole)
+    assert called == everywhere[1:]
 
 
 def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):
