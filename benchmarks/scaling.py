@@ -9,7 +9,6 @@ Times are medians, in ms; ns a pair = time over (tile, Gaussian) pairs, 8x8 px a
 
 import argparse
 import json
-import os
 import resource
 import statistics
 import subprocess
@@ -24,12 +23,16 @@ SIZES = {
 
 
 def one(count: int, width: int, height: int, channels: int, repeats: int) -> dict:
-    """Renders one size in this process."""
+    """Renders one size in this process, prepared as the command line prepares it, over all its devices."""
+    from jsecon.process import prepare_process
+
+    prepare_process(keep_programs=False)
     import jax
     import jax.numpy as jnp
     import numpy as np
 
     import jsecon
+    from jsecon.parallel import host_mesh
     from jsecon.splat.plan import plan_view
 
     rng = np.random.default_rng(0)
@@ -48,7 +51,8 @@ def one(count: int, width: int, height: int, channels: int, repeats: int) -> dic
     features = jnp.asarray(rng.normal(size=(count, channels)), jnp.float32)
     capacity = jsecon.plan_capacity(gaussians, camera, margin=1.0)
     start = time.perf_counter()
-    render = jax.jit(lambda g, f: jsecon.render(g, camera, f, capacity=capacity)).lower(gaussians, features).compile()
+    draw = lambda g, f: jsecon.render(g, camera, f, capacity=capacity, mesh=host_mesh())
+    render = jax.jit(draw).lower(gaussians, features).compile()
     compile_s = time.perf_counter() - start
     taken = []
     for _ in range(repeats + 1):
@@ -70,7 +74,6 @@ def main() -> None:
     if arguments.one:
         print(json.dumps(one(*arguments.one, arguments.repeats)))
         return
-    environ = {"XLA_FLAGS": "--xla_cpu_prefer_vector_width=512"} | os.environ
     print("| along | N | pixels | D | ms | pairs | ns a pair | compile s | peak MiB |")
     print("|---" * 9 + "|")
     for along, sizes in SIZES.items():
@@ -78,7 +81,7 @@ def main() -> None:
             if size[0] > arguments.largest:
                 continue
             command = [sys.executable, __file__, "--repeats", str(arguments.repeats), "--one", *map(str, size)]
-            done = subprocess.run(command, check=True, capture_output=True, text=True, env=environ)
+            done = subprocess.run(command, check=True, capture_output=True, text=True)
             row = json.loads(done.stdout.splitlines()[-1])
             count, width, height, channels = size
             print(

@@ -17,7 +17,7 @@ from pathlib import Path
 
 # mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
 # kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
-_MALLOPT = {-3: 1 << 30, -1: (1 << 31) - 1, -2: 1 << 26}
+_MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
