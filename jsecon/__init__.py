@@ -59,6 +59,7 @@ _CONTENTS = {
     "jsecon.evaluate.metrics": ("accuracy_at", "iou", "localization_accuracy", "mean_iou"),
     "jsecon.language.autoencoder": ("Autoencoder", "train_autoencoder"),
     "jsecon.language.distill": ("distill_l1", "distill_votes"),
+    "jsecon.language.solve_l1": ("solve_l1",),
     "jsecon.language.field": ("load_field", "save_field"),
     "jsecon.language.masklets": ("masklets",),
     "jsecon.language.regions": ("region_embeddings",),

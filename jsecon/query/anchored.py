@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.query.one_step import Number, similarities
+from jsecon.query.one_step import Codes, Number, as_codes, similarities
 from jsecon.query.pixel import region_at, region_shares_at
 from jsecon.query.shares import weight_and_rival
+from jsecon.query.units import UnitCodes
 from jsecon.types import Array, LanguageField, Selection
 
 __all__ = [
@@ -52,7 +53,7 @@ class _Parts(NamedTuple):
 
     embeddings: Array
     region_codes: Array
-    codes: Array
+    codes: Codes
     regions: Array
     weights: Array
     labelled: Array
@@ -69,6 +70,7 @@ def query_anchored(
     by: str = "votes",
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     unlabelled_weight: Number = 1.0,
+    codes: UnitCodes | None = None,
 ) -> Selection:
     """The Gaussians of the region that a text's embedding (E,) is most similar to.
 
@@ -80,7 +82,8 @@ def query_anchored(
     "lead": the region's part of the votes of the two that matter, itself and the strongest other one, or the labelled
         part of all weight where that is less; default threshold 0.5. Where masks are cut, merged and lost, a region
         may be the strongest without ever having most of the votes.
-    "code": cosine of the Gaussian's code with the region's (the paper); default threshold 0.9.
+    "code": cosine of the Gaussian's code with the region's (the paper); default threshold 0.9. `codes`, the result of
+        `unit_codes(field.codes)`, spares many queries of one field the lengths of its codes.
     `alike_threshold`, not for "code": regions whose embedding has at least this cosine with the anchor's are the same
         thing as the text sees it (a track that broke, a twin), and their votes are added; None for the anchor alone.
         "code" needs no such rule, as regions that are alike have codes that are.
@@ -107,7 +110,7 @@ def query_anchored(
         return _nothing(field)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
     return _query(
-        _parts(field),
+        _parts(field, codes),
         jnp.asarray(text_embedding),
         retrieval_threshold,
         threshold,
@@ -157,15 +160,15 @@ def query_region(
 _THRESHOLDS = {"code": CODE_THRESHOLD, "votes": SHARE_THRESHOLD, "lead": LEAD_THRESHOLD}
 
 
-def _parts(field: LanguageField) -> _Parts:
+def _parts(field: LanguageField, codes: UnitCodes | None = None) -> _Parts:
     votes = field.votes
     return _Parts(
         *(
-            jnp.asarray(a)
+            as_codes(a)
             for a in (
                 field.regions.embeddings,
                 field.region_codes,
-                field.codes,
+                field.codes if codes is None else codes,
                 votes.regions,
                 votes.weights,
                 votes.labelled,

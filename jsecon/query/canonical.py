@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require
-from jsecon.query.one_step import Number, best, similarities
+from jsecon.query.one_step import Codes, Number, as_codes, best, similarities
 from jsecon.types import Array, Selection
 
 TEMPERATURE = 10.0
@@ -13,7 +13,7 @@ TEMPERATURE = 10.0
 
 
 def query_canonical(
-    features: Float[Array, "n d"],
+    features: Codes,
     text: Float[Array, " d_text"],
     canonical: Float[Array, "c d_canonical"],
     threshold: Number,
@@ -34,17 +34,17 @@ def query_canonical(
         expected=f"({size},) and (C >= 1, {size})",
         remedy="Embed or encode text and canonical phrases as the features are.",
     )
-    return _canonical(jnp.asarray(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
+    return _canonical(as_codes(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
 
 
 @jax.jit
-def _canonical(features: Array, text: Array, canonical: Array, threshold: Number) -> Selection:
+def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number) -> Selection:
     relevancy, known = relevancies(features, text, canonical)
     return Selection(known & (relevancy >= threshold), relevancy, jnp.asarray(-1, jnp.int32), best(relevancy, known))
 
 
 def relevancies(
-    features: Float[Array, "n d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]
+    features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]
 ) -> tuple[Array, Array]:
     """LERF's relevancy (N,), and where it means something (N,); 0 elsewhere."""
     positive, known = similarities(features, text)
