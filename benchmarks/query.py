@@ -2,12 +2,13 @@
 
     python benchmarks/query.py [--gaussians 1000000] [--repeats 7] [--gate] [--update]
 
-A made field: random votes over 40 regions, unit codes of 3 and of 512 numbers, one query compiled, and 100 queries under
-vmap, in turn in one run. Errors are against NumPy float64. `--gate` exits 1 where a figure left its tolerance of
+A made field: random votes over 40 regions, unit codes of 3 and of 512 numbers, one query compiled, and 100 queries
+under vmap, in turn in one run. Errors are against NumPy float64. `--gate` exits 1 where a figure left its tolerance of
 benchmarks/baseline_query.json.
 """
 
 import argparse
+import functools
 import json
 import sys
 from pathlib import Path
@@ -64,10 +65,10 @@ def measure(count: int, repeats: int) -> list[Metric]:
         }
         if size == 512:
             ask["one-step"] = jax.jit(lambda field, units, text: query_one_step(units, text, 0.8))
-        calls = {name: lambda f=f: f(field, units, texts[0]) for name, f in ask.items()}
+        calls = {name: functools.partial(f, field, units, texts[0]) for name, f in ask.items()}
         if size == 3:
             many = {name: jax.jit(jax.vmap(f, in_axes=(None, None, 0))) for name, f in ask.items()}
-            calls |= {f"{TEXTS} {name}": lambda f=f: f(field, units, texts) for name, f in many.items()}
+            calls |= {f"{TEXTS} {name}": functools.partial(f, field, units, texts) for name, f in many.items()}
         ms, _ = interleaved(calls, repeats)
         for name in ask:
             rows.append(Metric(f"query {name}, d={size}, {count} Gaussians", ms[name], "ms", "lower", 1.0))

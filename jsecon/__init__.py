@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jsecon.language.field import load_field as load_field, save_field as save_field
     from jsecon.language.masklets import masklets as masklets
     from jsecon.language.regions import region_embeddings as region_embeddings
+    from jsecon.language.solve_l1 import solve_l1 as solve_l1
     from jsecon.language.votes import region_votes as region_votes
     from jsecon.parallel import host_mesh as host_mesh
     from jsecon.query.anchored import (
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     from jsecon.query.masks import selection_mask as selection_mask
     from jsecon.query.one_step import query_one_step as query_one_step
     from jsecon.query.outliers import remove_outliers as remove_outliers
+    from jsecon.query.probability import membership_probability as membership_probability
+    from jsecon.query.several import query_several as query_several
+    from jsecon.query.units import unit_codes as unit_codes
     from jsecon.splat.plan import plan_view as plan_view, render_plan as render_plan
     from jsecon.splat.project import project as project
     from jsecon.splat.render import render as render, render_depth as render_depth, render_rgb as render_rgb
@@ -59,10 +63,10 @@ _CONTENTS = {
     "jsecon.evaluate.metrics": ("accuracy_at", "iou", "localization_accuracy", "mean_iou"),
     "jsecon.language.autoencoder": ("Autoencoder", "train_autoencoder"),
     "jsecon.language.distill": ("distill_l1", "distill_votes"),
-    "jsecon.language.solve_l1": ("solve_l1",),
     "jsecon.language.field": ("load_field", "save_field"),
     "jsecon.language.masklets": ("masklets",),
     "jsecon.language.regions": ("region_embeddings",),
+    "jsecon.language.solve_l1": ("solve_l1",),
     "jsecon.language.votes": ("region_votes",),
     "jsecon.parallel": ("host_mesh",),
     "jsecon.query.anchored": ("query_anchored", "query_region", "region_at"),
@@ -70,6 +74,9 @@ _CONTENTS = {
     "jsecon.query.masks": ("selection_mask",),
     "jsecon.query.one_step": ("query_one_step",),
     "jsecon.query.outliers": ("remove_outliers",),
+    "jsecon.query.probability": ("membership_probability",),
+    "jsecon.query.several": ("query_several",),
+    "jsecon.query.units": ("unit_codes",),
     "jsecon.splat.plan": ("plan_view", "render_plan"),
     "jsecon.splat.project": ("project",),
     "jsecon.splat.render": ("render", "render_depth", "render_rgb"),

@@ -21,6 +21,8 @@ from jsecon.query.clusters import one_component
 from jsecon.query.masks import selection_mask
 from jsecon.query.one_step import query_one_step
 from jsecon.query.outliers import MIN_SAMPLES, default_eps, remove_outliers
+from jsecon.query.probability import membership_probability
+from jsecon.query.several import parts_of_question, query_several
 from jsecon.splat.tiles import plan_capacity
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField, Selection
@@ -61,9 +63,29 @@ def ask_text(
     by: str = "votes",
     threshold: float | None = None,
     outliers: bool = True,
+    several: bool = False,
 ) -> Answer:
-    """The Gaussians that a text names. Raises InputError where the embedder has no words for it."""
+    """The Gaussians that a text names; with `several`, of all regions that answer it (`query_several` has the rule).
+
+    A text may be composite: `"red mug" or "bowl" but not "handle"`. Raises InputError where the embedder has no words
+    for a part, and for several regions or a composite text by anything but votes.
+    """
     require(by in METHODS, "by", got=by, expected=f"one of {METHODS}", remedy="votes is the default.")
+    wanted, unwanted = parts_of_question(text)
+    if several or unwanted or len(wanted) > 1:
+        if by != "votes":
+            raise InputError(
+                text,
+                found=f"several regions by {by}",
+                expected="by votes",
+                remedy="Leave out --by, or ask for one thing.",
+            )
+        given = {} if threshold is None else {"similarity_threshold": threshold}
+        embedded = jnp.asarray(embedder.embed_text(wanted + unwanted))
+        selection = query_several(
+            field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given
+        )
+        return _answer(field, text, by, selection, outliers, {}, keep="all")
     embedding = jnp.asarray(embedder.embed_text([text])[0])
     if by in ("votes", "code"):
         selection = query_anchored(field, embedding, by=by, similarity_threshold=threshold)
@@ -133,7 +155,13 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
 
 
 def _answer(
-    field: LanguageField, question: str, by: str, selection: Selection, outliers: bool, left: dict[str, str]
+    field: LanguageField,
+    question: str,
+    by: str,
+    selection: Selection,
+    outliers: bool,
+    left: dict[str, str],
+    keep: str = "largest",
 ) -> Answer:
     mask, means = np.asarray(selection.mask), np.asarray(field.gaussians.means)
     points = means[mask].astype(np.float64)
@@ -144,7 +172,7 @@ def _answer(
     elif np.isfinite(points).all() and one_component(points, default_eps(points)):
         left = left | {"DBSCAN": "the selection is one component"}
     else:
-        mask = remove_outliers(means, mask)
+        mask = remove_outliers(means, mask, keep=keep)
     return Answer(question, by, selection, mask, left)
 
 
@@ -181,6 +209,10 @@ def figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
             "bounding_box": {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()},
         }
     region = int(answer.selection.region)
+    sure = None
+    if answer.by == "votes" and len(means):
+        probability = np.asarray(membership_probability(answer.selection.similarity, field.votes))[answer.mask]
+        sure = {"mean": round(float(probability.mean()), 4), "tenth": round(float(np.quantile(probability, 0.1)), 4)}
     return {
         "query": answer.question,
         "by": answer.by,
@@ -188,6 +220,7 @@ def figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "of": field.gaussians.count,
         "score": round(float(answer.selection.score), 6),
         "region": region if region >= 0 else None,
+        "probability": sure,
         "outliers_dropped": answer.dropped,
         "place": place,
         "left_out": answer.left_out,

@@ -56,6 +56,7 @@ def _act_query(arguments: argparse.Namespace) -> None:
     from jsecon import answer
     from jsecon.console import Console
     from jsecon.language.field import load_field
+    from jsecon.query.several import parts_of_question
     from jsecon.summary import write_answers
 
     if not arguments.texts and not arguments.at:
@@ -70,9 +71,10 @@ def _act_query(arguments: argparse.Namespace) -> None:
     field = load_field(arguments.field)
     embedder = _embedder(field, arguments) if arguments.texts else None
     if embedder is not None:
-        embedder.embed_text(arguments.texts)  # a text that cannot be understood: say so before any work
+        # a text that cannot be understood: say so before any work
+        embedder.embed_text([part for text in arguments.texts for side in parts_of_question(text) for part in side])
     how = {"by": arguments.by, "threshold": arguments.threshold, "outliers": not arguments.keep_outliers}
-    answers = [answer.ask_text(field, embedder, text, **how) for text in arguments.texts]
+    answers = [answer.ask_text(field, embedder, text, several=arguments.several, **how) for text in arguments.texts]
     answers += [answer.ask_pixel(field, frame, x, y, **how) for frame, x, y in pixels]
     write_answers(field, answers, arguments.out, Console(), views=arguments.views)
 

@@ -246,7 +246,12 @@ def _query(verbs) -> None:
         """,
     )
     verb.add_argument("field", type=Path, metavar="FIELD", help="field.npz of a run")
-    verb.add_argument("texts", nargs="*", metavar="TEXT", help='what to find: "red mug" "dark green bottle" ...')
+    verb.add_argument(
+        "texts",
+        nargs="*",
+        metavar="TEXT",
+        help='what to find: "red mug" "dark green bottle" "mug or bowl but not handle" ...',
+    )
     verb.add_argument(
         "--at",
         nargs=3,
@@ -270,6 +275,13 @@ def _query(verbs) -> None:
         help="on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, 0.5 canonical)",
     )
     _texts(verb)
+    verb.add_argument(
+        "--all",
+        action="store_true",
+        dest="several",
+        help="every region that answers a text, such as all the chairs, not only the best: those whose similarity has "
+        "come 0.8 of the way from the middle region's to the best one's (by votes)",
+    )
     verb.add_argument("--keep-outliers", action="store_true", help="leave out the last step, DBSCAN")
     verb.add_argument("--views", type=int, default=3, metavar="N", help="masks to write a query (default 3)")
 

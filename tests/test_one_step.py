@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jsecon.query.canonical import query_canonical
 from jsecon.query.one_step import query_one_step, similarities
+from jsecon.query.units import unit_codes
 
 
 def exact_cosines(codes, code):
@@ -75,3 +77,21 @@ def test_nan_threshold_and_no_gaussians_select_nothing():
 def test_sizes_that_disagree_are_told():
     with pytest.raises(ValueError, match=r"text code of size 4.*expected 3"):
         query_one_step(jnp.eye(3), jnp.ones(4), 0.5)
+
+
+@pytest.mark.parametrize(("count", "size"), [(16_385, 3), (40_000, 3), (16_385, 40), (32_769, 40), (40_000, 40)])
+def test_unit_codes_answer_as_codes_do_under_jit_and_vmap(count, size):
+    rng = np.random.default_rng(size)
+    codes, texts = (rng.normal(size=(n, size)).astype(np.float32) for n in (count, 2))
+    codes[:3] = [[0] * size, [np.nan] * size, [1e30] * size]
+    units = unit_codes(codes)
+    many = jax.jit(jax.vmap(lambda text: query_one_step(units, text, 0.1)))(texts)
+    for index, text in enumerate(texts):
+        alone, plain = query_one_step(units, text, 0.1), query_one_step(codes, text, 0.1)
+        expected = exact_cosines(codes[2:], text)
+        for got in (alone, plain, jax.tree.map(lambda a, index=index: a[index], many)):
+            np.testing.assert_allclose(got.similarity[2:], expected, atol=1e-6)
+            assert not np.asarray(got.mask)[:2].any()
+    assert float(query_one_step(units, texts[0], -1.0).mask[:2].sum()) == 0
+    relevancy = query_canonical(units, texts[0], texts, 0.5).similarity
+    np.testing.assert_allclose(relevancy, query_canonical(codes, texts[0], texts, 0.5).similarity, atol=1e-6)

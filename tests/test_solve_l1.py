@@ -24,7 +24,8 @@ def world(scene, cameras):
     away = scene.means + np.array([0, 80, 0], np.float32)
     both = jax.tree.map(lambda a: np.concatenate([a, a]), scene)
     both = dataclasses.replace(both, means=np.concatenate([scene.means, away]))
-    two = Camera(*(np.asarray(a)[:2] for a in (cameras.world_to_camera,)), *(np.full(2, v, np.float32) for v in (22.0, 21.0, 12.5, 9.5)), 24, 20)  # fmt: skip
+    pinhole = (np.full(2, v, np.float32) for v in (22.0, 21.0, 12.5, 9.5))
+    two = Camera(np.asarray(cameras.world_to_camera)[:2], *pinhole, 24, 20)
     return both, two
 
 
@@ -64,7 +65,13 @@ def case(name, world):
     return gaussians, cameras, labels
 
 
-CASES = ("plain", "duplicated", "eight orders of magnitude, one pixel", "one view only", "views that contradict each other")  # fmt: skip
+CASES = (
+    "plain",
+    "duplicated",
+    "eight orders of magnitude, one pixel",
+    "one view only",
+    "views that contradict each other",
+)
 
 
 def exact(gaussians, cameras, labels, start, loyalty, steps=4000):

@@ -24,9 +24,9 @@ def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: 
     """The Gaussians whose code has a cosine of at least `threshold` with the text's code.
 
     codes (N, d), text_code (d,), any length. A zero code (unknown) or one that is not finite has similarity 0 and is
-    never selected; nothing is for a text code that is zero or not finite. `unit_codes(codes)` in place of the codes, made
-    once, spares many queries the lengths. Selection.score is the best similarity, 0
-    where nothing is known. Raises ValueError on shapes that disagree.
+    never selected; nothing is for a text code that is zero or not finite. `unit_codes(codes)` in place of the codes,
+    made once, spares many queries the lengths. Selection.score is the best similarity, 0 where nothing is known. Raises
+    ValueError on shapes that disagree.
     """
     require(
         codes.shape[1] == text_code.shape[0],
@@ -39,13 +39,13 @@ def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: 
 
 
 @jax.jit
-def _one_step(codes: Array, text_code: Array, threshold: Number) -> Selection:
+def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> Selection:
     similarity, known = similarities(codes, text_code)
     return Selection(known & (similarity >= threshold), similarity, jnp.asarray(-1, jnp.int32), best(similarity, known))
 
 
-def as_codes(codes: Codes) -> Codes:
-    """The codes as jax's arrays."""
+def as_codes(codes: Array | UnitCodes) -> Array | UnitCodes:
+    """jax's arrays of what a caller gave."""
     return codes if isinstance(codes, UnitCodes) else jnp.asarray(codes)
 
 

@@ -1,0 +1,138 @@
+"""Questions whose answer is several regions: all the chairs; the mug, but not its handle."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float
+
+from jsecon.errors import InputError, require
+from jsecon.query.anchored import ALIKE_THRESHOLD, RETRIEVAL_THRESHOLD, SHARE_THRESHOLD
+from jsecon.query.one_step import Number, similarities
+from jsecon.query.shares import weight_and_rival
+from jsecon.types import Array, LanguageField, Selection
+
+NEARNESS = 0.8
+"""a region answers a text with the best one where its similarity has come at least so far from that of the middle
+region to that of the best"""
+
+
+def regions_of_text(
+    embeddings: Float[Array, "r e"],
+    text: Float[Array, " e"],
+    *,
+    several: bool = True,
+    nearness: Number = NEARNESS,
+    retrieval_threshold: Number = RETRIEVAL_THRESHOLD,
+    alike_threshold: Number = ALIKE_THRESHOLD,
+) -> tuple[Bool[Array, " r"], Float[Array, " r"]]:
+    """Which of R regions answer a text (E,), and all regions' cosines with it (R,), 0 where a region has no embedding.
+
+    The rule: the region with the largest cosine, b, if b is at least `retrieval_threshold`; with it all regions alike
+    (cosine with it at least `alike_threshold`: one thing seen twice). With `several` also every region whose cosine is
+    at least m + nearness (b - m), m the median over the regions: texts and images lie in cones of their own, so that
+    only the place between the typical region and the best means something, not the cosine itself.
+    """
+    cosines, known = similarities(embeddings, text)
+    scored = jnp.where(known, cosines, -jnp.inf)
+    anchor = jnp.argmax(scored)
+    best = scored[anchor]
+    alike, known_alike = similarities(embeddings, embeddings[anchor])
+    chosen = (jnp.arange(embeddings.shape[0]) == anchor) | (known_alike & (alike >= alike_threshold))
+    if several:
+        middle = jnp.nanmedian(jnp.where(known, cosines, jnp.nan))
+        chosen |= known & (cosines >= middle + nearness * (best - middle)) & (best > middle)
+    return chosen & known & (best >= retrieval_threshold), cosines
+
+
+def query_several(
+    field: LanguageField,
+    wanted: Float[Array, "q e"],
+    unwanted: Float[Array, "u e"] | None = None,
+    *,
+    several: bool = True,
+    nearness: Number = NEARNESS,
+    retrieval_threshold: Number = RETRIEVAL_THRESHOLD,
+    similarity_threshold: Number = SHARE_THRESHOLD,
+) -> Selection:
+    """The Gaussians of all regions that answer any of the wanted texts (Q, E) and none of the unwanted (U, E).
+
+    A region answers a text by the rule of `regions_of_text`. One that answers a wanted and an unwanted text belongs to
+    the one that it is more similar to, so that "mug but not handle" keeps the mug where the handle was never told
+    apart. Membership is by votes: the share of all the weight with which a Gaussian was seen that lies on the chosen
+    regions, at least `similarity_threshold`. Selection.region is the best of the chosen, -1 where there is none;
+    Selection.score its cosine. Pure: jit it or vmap it over texts. Raises ValueError on texts of another size.
+    """
+    size = field.regions.embeddings.shape[1]
+    unwanted = jnp.zeros((0, size)) if unwanted is None else jnp.asarray(unwanted)
+    require(
+        wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1,
+        "query_several",
+        got=f"wanted {wanted.shape}, unwanted {unwanted.shape}",
+        expected=f"(Q >= 1, {size}) and (U, {size})",
+        remedy="Embed the texts with the field's embedder.",
+    )
+    votes = field.votes
+    return _several(
+        *(jnp.asarray(a) for a in (field.regions.embeddings, votes.regions, votes.weights, votes.total, votes.views)),
+        jnp.asarray(wanted),
+        unwanted,
+        several,
+        nearness,
+        retrieval_threshold,
+        similarity_threshold,
+    )
+
+
+def _several_body(
+    embeddings, regions, weights, total, views, wanted, unwanted, several, nearness, retrieval, threshold
+) -> Selection:
+    count = embeddings.shape[0]
+    if count == 0:
+        nothing = jnp.zeros(regions.shape[0], weights.dtype)
+        return Selection(nothing > 0, nothing, jnp.int32(-1), jnp.zeros((), weights.dtype))
+
+    def answering(texts):
+        chosen, closeness = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, embeddings.dtype)
+        for text in texts:
+            own, cosines = regions_of_text(
+                embeddings, text, several=several, nearness=nearness, retrieval_threshold=retrieval
+            )
+            chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, cosines, -jnp.inf))
+        return chosen, closeness
+
+    chosen, closeness = answering(wanted)
+    refused, against = answering(unwanted)
+    chosen &= ~(refused & (against >= closeness))
+    weight, _ = weight_and_rival(regions, weights, chosen)
+    known = (views > 0) & (total > 0) & jnp.isfinite(total) & jnp.isfinite(weight) & jnp.any(chosen)
+    share = jnp.where(known, jnp.clip(weight / jnp.where(known, total, 1.0), 0.0, 1.0), 0.0)
+    best = jnp.argmax(jnp.where(chosen, closeness, -jnp.inf))
+    found = jnp.any(chosen)
+    return Selection(
+        known & (share >= threshold),
+        share,
+        jnp.where(found, best, -1).astype(jnp.int32),
+        jnp.where(found, closeness[best], 0.0),
+    )
+
+
+_several = jax.jit(_several_body, static_argnames="several")
+
+
+def parts_of_question(question: str) -> tuple[list[str], list[str]]:
+    """(wanted, unwanted) texts of a question such as `"red mug" or "bowl" but not "handle"`; quotes may be left out.
+
+    Raises InputError where a part is empty.
+    """
+    first, *rest = re.split(r"\s+but not\s+", question.strip(), flags=re.IGNORECASE)
+    sides = [re.split(r"\s+or\s+", side, flags=re.IGNORECASE) for side in (first, *rest)]
+    sides = [[part.strip().strip("\"'").strip() for part in side] for side in sides]
+    if not all(part for side in sides for part in side) or re.fullmatch(r"but not\b.*", question.strip().lower()):
+        raise InputError(
+            question,
+            found="a part without words",
+            expected='texts joined by "or" and "but not"',
+            remedy='For example: "red mug" or "bowl" but not "handle"',
+        )
+    return sides[0], [part for side in sides[1:] for part in side]

@@ -1,0 +1,165 @@
+"""Several regions, composite questions and the probability of belonging: against NumPy and simulated votes."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from scipy.stats import beta
+from small_field import REGIONS, make_field, unit_rows
+
+from jsecon.answer import ask_text, figures
+from jsecon.errors import InputError
+from jsecon.query.anchored import query_anchored
+from jsecon.query.probability import CORRELATION, membership_probability
+from jsecon.query.several import parts_of_question, query_several, regions_of_text
+from jsecon.types import Regions, Votes
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    """Regions 0 and 1 are two of a kind (cosine 0.9), 2 a little like them (0.3), 3 and 4 something else."""
+    field, _ = make_field(scene, cameras)
+    axes = np.eye(12, dtype=np.float32)
+    rows = [axes[0], 0.9 * axes[0] + 0.435 * axes[1], 0.3 * axes[0] + 0.954 * axes[2], axes[3], axes[4]]
+    rows = np.stack([row / np.linalg.norm(row) for row in rows])
+    return dataclasses.replace(field, regions=Regions(rows, field.regions.pixels))
+
+
+def shares(field, regions):
+    votes = field.votes
+    weight = np.where(np.isin(np.asarray(votes.regions), regions), np.asarray(votes.weights, np.float64), 0).sum(1)
+    total = np.asarray(votes.total, np.float64)
+    return np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
+
+
+def test_all_of_a_kind_are_found_and_no_others(field):
+    text = field.regions.embeddings[:1]
+    chosen, cosines = regions_of_text(field.regions.embeddings, text[0])
+    assert np.asarray(chosen).tolist() == [True, True, False, False, False]  # from 0.3 + 0.8 (1 - 0.3) = 0.86 on
+    np.testing.assert_allclose(cosines[:3], [1, 0.9, 0.3], atol=2e-3)
+
+
+def test_the_rule_is_the_stated_one(field):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        rows, text = unit_rows(rng, 9, 12), unit_rows(rng, 1, 12)[0]
+        cosines = rows.astype(np.float64) @ text
+        best, middle = cosines.max(), np.median(cosines)
+        alike = rows @ rows[cosines.argmax()] >= 0.95
+        for nearness in (0.3, 0.8):
+            expected = ((cosines >= middle + nearness * (best - middle)) | alike) & (best >= 0.2)
+            got, _ = regions_of_text(rows, text, nearness=nearness)
+            np.testing.assert_array_equal(got, expected)
+
+
+def test_selection_is_the_share_of_the_chosen_regions(field):
+    text = field.regions.embeddings[:1]
+    got = query_several(field, text)
+    np.testing.assert_allclose(got.similarity, shares(field, [0, 1]), atol=1e-6)
+    np.testing.assert_array_equal(got.mask, shares(field, [0, 1]) >= 0.5)
+    assert int(got.region) == 0
+    assert float(got.score) == pytest.approx(1, abs=1e-6)
+    one = query_several(field, text, several=False)
+    np.testing.assert_array_equal(one.mask, query_anchored(field, text[0]).mask)
+
+
+def test_unwanted_regions_are_left_out_unless_the_wanted_text_fits_them_better(field):
+    wanted, other = field.regions.embeddings[:1], field.regions.embeddings[1:2]
+    got = query_several(field, wanted, other)  # region 1 is nearer to the unwanted text, region 0 to the wanted one
+    np.testing.assert_allclose(got.similarity, shares(field, [0]), atol=1e-6)
+    same = query_several(field, wanted, wanted)
+    assert int(same.region) == -1
+    assert not same.mask.any()
+    both = query_several(field, field.regions.embeddings[3:5], several=False)
+    np.testing.assert_allclose(both.similarity, shares(field, [3, 4]), atol=1e-6)
+
+
+def test_jit_and_vmap_over_texts_equal_the_loop(field):
+    texts = unit_rows(np.random.default_rng(4), 5, 12)
+    together = jax.jit(jax.vmap(lambda text: query_several(field, text[None], texts[:1])))(texts)
+    for index, text in enumerate(texts):
+        alone = query_several(field, text[None], texts[:1])
+        np.testing.assert_array_equal(together.mask[index], alone.mask)
+        assert int(together.region[index]) == int(alone.region)
+
+
+def test_no_region_no_answer(field):
+    nothing = query_several(field, np.zeros((1, 12), np.float32))
+    assert int(nothing.region) == -1
+    assert not nothing.mask.any()
+    with pytest.raises(ValueError, match="query_several"):
+        query_several(field, np.zeros((1, 5), np.float32))
+
+
+def test_questions_come_apart():
+    assert parts_of_question("red mug") == (["red mug"], [])
+    assert parts_of_question('"mug" but not "handle"') == (["mug"], ["handle"])
+    assert parts_of_question("mug or 'bowl' But Not handle or lid") == (["mug", "bowl"], ["handle", "lid"])
+    assert parts_of_question("doorknob") == (["doorknob"], [])
+    for bad in ("", "but not handle", "mug but not ''"):
+        with pytest.raises(InputError, match="part"):
+            parts_of_question(bad)
+
+
+class Words:
+    """An embedder of two words."""
+
+    name, dim = "words", 12
+
+    def __init__(self, rows):
+        self.rows = {"chair": rows[0], "stool": rows[1]}
+
+    def embed_text(self, texts):
+        return np.stack([self.rows[text] for text in texts])
+
+
+def test_a_question_put_to_a_field(field):
+    words = Words(field.regions.embeddings)
+    every = ask_text(field, words, "chair", several=True, outliers=False)
+    np.testing.assert_array_equal(every.mask, shares(field, [0, 1]) >= 0.5)
+    but = ask_text(field, words, "chair but not stool", outliers=False)
+    np.testing.assert_array_equal(but.mask, shares(field, [0]) >= 0.5)
+    told = figures(field, but)
+    assert 0.5 < told["probability"]["tenth"] <= told["probability"]["mean"] <= 1
+    with pytest.raises(InputError, match="by votes"):
+        ask_text(field, words, "chair but not stool", by="code")
+
+
+def votes_of(views, total):
+    count = len(views)
+    return Votes(
+        np.zeros((count, 1), np.int32),
+        np.ones((count, 1), np.float32),
+        total,
+        total,
+        total,
+        views,
+        np.int32(0),
+        REGIONS,
+    )
+
+
+def test_probability_equals_the_beta_distribution():
+    rng = np.random.default_rng(0)
+    share, views = rng.random(200).astype(np.float32), rng.integers(1, 60, 200).astype(np.int32)
+    total = (views * rng.uniform(0.01, 40, 200)).astype(np.float32)
+    looks = np.minimum(views, total.astype(np.float64))
+    looks = looks / (1 + np.maximum(looks - 1, 0) * CORRELATION)
+    expected = beta.sf(0.5, 1 + share * looks, 1 + (1 - share) * looks)
+    np.testing.assert_allclose(membership_probability(share, votes_of(views, total)), expected, atol=2e-5)
+    unknown = votes_of(np.array([0, 3], np.int32), np.float32([0, np.nan]))
+    np.testing.assert_array_equal(membership_probability(np.float32([1, 1]), unknown), 0)
+
+
+def test_probability_means_what_it_says():
+    """Gaussians whose true part is drawn evenly, seen in 1 to 12 independent views: p of those at p do."""
+    rng = np.random.default_rng(1)
+    true, views = rng.random(40_000), rng.integers(1, 13, 40_000).astype(np.int32)
+    share = (rng.binomial(views, true) / views).astype(np.float32)
+    got = np.asarray(membership_probability(share, votes_of(views, views * np.float32(9)), correlation=0.0))
+    bins = np.minimum((got * 10).astype(int), 9)
+    for b in range(10):
+        own = bins == b
+        if own.sum() > 300:
+            assert abs(got[own].mean() - (true[own] > 0.5).mean()) < 0.04
