@@ -23,7 +23,7 @@ def centre_weights(plan: ViewPlan) -> tuple[Float[Array, " n"], Int[Array, " n"]
     The same weights that a render composites with, picked out of the same walk over the tiles.
     """
     splats, lists = plan.splats, plan.lists
-    batches, tile = make_batches(lists, plan.width, plan.height), lists.tile
+    batches, tile = make_batches(lists, plan.width), lists.tile
     table = make_table(splats)
     column, row = (jnp.floor(splats[:, k]).astype(jnp.int32) for k in range(2))
     inside = (splats[:, 5] > 0) & (column >= 0) & (column < plan.width) & (row >= 0) & (row < plan.height)
@@ -42,7 +42,7 @@ def centre_weights(plan: ViewPlan) -> tuple[Float[Array, " n"], Int[Array, " n"]
             own = jnp.take_along_axis(weight, pixel[..., None], axis=-1)[..., 0]
             return transmittance, found.at[chunk.ids].add(jnp.where(here, own, 0.0))
 
-        return walk(table, lists, batches, tiles, body, found), None
+        return walk(table, lists, batches, tiles, body, found)[0], None
 
     found, _ = lax.scan(one_batch, jnp.zeros_like(splats[:, 0]), batches.tiles)
     return jnp.where(inside, found, 0.0), jnp.where(inside, row * plan.width + column, -1)
