@@ -27,7 +27,7 @@ IMAGE_SIDE = 1024
 MASK_SIDE = 256
 """px of a mask prompt, where the file does not fix it"""
 ENCODERS = ("vision_encoder.onnx", "image_encoder.onnx", "encoder.onnx")
-DECODERS = ("decoder_batched.onnx", "prompt_encoder_mask_decoder.onnx", "mask_decoder.onnx", "decoder.onnx")
+DECODERS = ("prompt_encoder_mask_decoder.onnx", "mask_decoder.onnx", "decoder.onnx")
 PUBLISHED = (
     "SAM folders are published on huggingface.co: Xenova/sam-vit-base, Xenova/slimsam-77-uniform (a batch of prompts a "
     "call); vietanhdev/samexporter and segment-anything's scripts/export_onnx_model.py write one prompt a call."
