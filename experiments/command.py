@@ -1,0 +1,36 @@
+"""The command line that the tables share: --quick, --root, --out."""
+
+import argparse
+import dataclasses
+from typing import Any
+
+from experiments.methods import Steps
+
+QUICK_STEPS = Steps(
+    langsplat=60,
+    epochs=40,
+    grouping=50,
+    grouping_rates=(0.05, 0.02),
+    instance=50,
+    coarse=5,
+    fine=5,
+    roots=8,
+    leaves=3,
+    opengaussian_rate=0.05,
+    paper=60,
+)
+"""for a look at every row in two minutes: too short for the trained methods to be judged by"""
+
+
+def options_of(plan: Any, quick: Any) -> Any:
+    """The plan that the command line asks for."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="one tiny scene, a few steps: at most two minutes")
+    parser.add_argument("--root", default="", help="the real dataset; without it twins are made")
+    parser.add_argument("--out", default="", help="where the results go")
+    given = parser.parse_args()
+    chosen = quick if given.quick else plan
+    if given.root:
+        data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
+        chosen = dataclasses.replace(chosen, data=data)
+    return dataclasses.replace(chosen, out=given.out) if given.out else chosen

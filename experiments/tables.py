@@ -1,0 +1,179 @@
+"""Tables of methods over scenes and seeds: every cell computed once and kept, so that a stopped run goes on."""
+
+import dataclasses
+import hashlib
+import json
+import resource
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from experiments import results, twins
+from experiments.methods import Answers, Steps
+from experiments.setting import Setting, prepare
+from jsecon.data.benchmark import Benchmark
+from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
+from jsecon.evaluate.points import evaluate_points
+from jsecon.files import write_text
+
+Method = Callable[[Setting, Steps], Answers]
+KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "pairs", "missing", "accuracy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A table to be filled."""
+
+    data: twins.Data
+    methods: tuple[str, ...]
+    steps: Steps = dataclasses.field(default_factory=Steps)
+    fit_steps: int = 700
+    level: str = "medium"
+    """of the twins' simulated vision; unused for real data."""
+    sweep: tuple[str, ...] = ("perfect", "low", "medium", "high")
+    """levels at which the first scene and seed are run once more."""
+    out: str = ""
+
+
+def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:
+    """All cells: {"scene", "seed", "level", "method", figures, "seconds", "peak_memory_mib", "twin"}.
+
+    A cell that an earlier run with the same options left in OUT/cells is read. `seconds` are of training and all
+    queries, without loading and fitting; the memory is the process's highest so far, so later rows hide behind earlier
+    ones.
+    """
+    wanted = [(scene, seed, plan.level) for scene in plan.data.scenes for seed in plan.data.seeds]
+    if not plan.data.root:
+        first = plan.data.scenes[0], plan.data.seeds[0]
+        wanted += [(*first, level) for level in plan.sweep if level != plan.level]
+    cells = []
+    for scene, seed, level in wanted:
+        files = {name: _file(plan, scene, seed, level, name) for name in plan.methods}
+        missing = [name for name, file in files.items() if not file.exists()]
+        if missing:
+            setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps)
+            for name in missing:
+                began = time.perf_counter()
+                cell = measure(setting, methods[name](setting, plan.steps))
+                cell |= {"scene": scene, "seed": seed, "level": level, "method": name, "twin": setting.bench.twin}
+                cell["seconds"] = round(time.perf_counter() - began, 2)
+                cell["peak_memory_mib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+                write_text(files[name], json.dumps(cell))
+                tell(f"{scene} seed {seed} {level}: {name}: mIoU {cell['miou']:.3f}, {cell['seconds']:.1f} s")
+        cells += [json.loads(file.read_text()) for file in files.values()]
+    return cells
+
+
+def _file(plan: Plan, scene: str, seed: int, level: str, method: str) -> Path:
+    given = [
+        plan.data.dataset,
+        plan.data.root,
+        plan.data.size,
+        plan.data.every,
+        plan.data.downscale,
+        plan.fit_steps,
+        dataclasses.asdict(plan.steps),
+    ]
+    key = hashlib.sha1(json.dumps([*given, scene, seed, level, method], default=str).encode()).hexdigest()[:12]
+    return Path(plan.out) / "cells" / f"{scene}-{seed}-{level}-{key}.json"
+
+
+def measure(setting: Setting, answers: Answers) -> dict:
+    """The figures of one method on one setting, under the dataset's protocol; denominators checked."""
+    bench: Benchmark = setting.bench
+    if not bench.frames:
+        opacity = 1 / (1 + np.exp(-np.asarray(setting.evidence.gaussians.opacity_logits)))
+        _, told = evaluate_points(
+            answers.classes(),
+            bench.point_classes,
+            bench.queries,
+            expected_classes=bench.pairs,
+            opacities=opacity,
+        )
+        return {name: told[name] for name in KEPT if name in told}
+    both = evaluate_at_thresholds(
+        setting.evidence.gaussians,
+        setting.cameras,
+        bench.frames,
+        lambda query: answers.select(bench.queries.index(query)),
+        expected_pairs=bench.pairs,
+    )
+    strict, lenient = both[ALPHA_THRESHOLD][1], both[VALA_THRESHOLD][1]
+    return {name: strict[name] for name in KEPT if name in strict} | {
+        "miou_vala": lenient["miou"],
+        "macc_vala": lenient["macc"],
+    }
+
+
+def summarise(cells: list[dict], scenes: tuple[str, ...], level: str, figures: tuple[str, ...]) -> str:
+    """A Markdown table: a row a method, the figures of each scene as mean over the seeds +- deviation, then the mean
+    of the scenes with the deviation of the seeds' means, seconds and memory."""
+    names = list(dict.fromkeys(cell["method"] for cell in cells))
+    header = ["method", *(f"{scene} {figure}" for scene in scenes for figure in figures)]
+    header += [f"mean {figure}" for figure in figures] + ["seconds", "peak MiB so far"]
+    rows = []
+    for name in names:
+        own = [cell for cell in cells if cell["method"] == name and cell["level"] == level]
+        row = [name]
+        for scene in scenes:
+            row += [_spread([cell[f] for cell in own if cell["scene"] == scene]) for f in figures]
+        for figure in figures:
+            seeds = sorted({cell["seed"] for cell in own})
+            row.append(_spread([np.mean([c[figure] for c in own if c["seed"] == seed]) for seed in seeds]))
+        row.append(f"{np.mean([cell['seconds'] for cell in own]):.1f}")
+        row.append(f"{max(cell['peak_memory_mib'] for cell in own):.0f}")
+        rows.append(tuple(row))
+    return results.table(tuple(header), rows)
+
+
+def _spread(values: list[float]) -> str:
+    return f"{np.mean(values):.3f}" + (f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 else "")
+
+
+def means(cells: list[dict], level: str, figure: str = "miou") -> dict[str, float]:
+    """Mean over scenes and seeds of a figure, a method each."""
+    names = list(dict.fromkeys(cell["method"] for cell in cells))
+    chosen = [cell for cell in cells if cell["level"] == level]
+    return {name: float(np.mean([c[figure] for c in chosen if c["method"] == name])) for name in names}
+
+
+def leaders(cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str = "ours") -> str:
+    """Where a method whose name does not start with `ours` has the highest mIoU of a scene, a line each."""
+    lines = []
+    for scene in scenes:
+        found = means([cell for cell in cells if cell["scene"] == scene], level)
+        best = max(found, key=lambda name: found[name])
+        mine = max((value for name, value in found.items() if name.startswith(ours)), default=float("nan"))
+        if not best.startswith(ours):
+            lines.append(f"* {scene}: {best} leads with {found[best]:.3f} (ours {mine:.3f}).")
+    return "\n".join(lines) if lines else "Ours leads on every scene."
+
+
+def noise(cells: list[dict], plan: Plan) -> str:
+    """A Markdown table of mIoU over the levels of noise, on the first scene and seed."""
+    scene, seed = plan.data.scenes[0], plan.data.seeds[0]
+    here = [cell for cell in cells if (cell["scene"], cell["seed"]) == (scene, seed)]
+    levels = [level for level in plan.sweep if any(cell["level"] == level for cell in here)]
+    rows = []
+    for name in plan.methods:
+        found = {cell["level"]: cell["miou"] for cell in here if cell["method"] == name}
+        rows.append((name, *(f"{found[level]:.3f}" for level in levels)))
+    return results.table(("method", *levels), rows)
+
+
+def write(plan: Plan, cells: list[dict], figures: tuple[str, ...], *, notes: str, published: str = "") -> str:
+    """Writes results/<name>/{config.json, metrics.json, table.md, figure.png}; returns the table."""
+    twin = any(cell["twin"] for cell in cells)
+    source = f"made-up twins in {plan.data.dataset}'s layout, simulated vision ({plan.level})" if twin else "real data"
+    parts = [f"Measured on {source}. {notes}", "", summarise(cells, plan.data.scenes, plan.level, figures), ""]
+    parts += [leaders(cells, plan.data.scenes, plan.level), ""]
+    if twin and len(plan.sweep) > 1:
+        parts += [f"mIoU over the noise of vision, {plan.data.scenes[0]}:", "", noise(cells, plan), ""]
+    text = "\n".join([*parts, published]).rstrip()
+    averages = means(cells, plan.level)
+    figure = results.bars(list(averages), {"mIoU, mean of scenes": list(averages.values())}, "mIoU")
+    figure.axes[0].tick_params(axis="x", labelrotation=20)
+    results.save(Path(plan.out), plan, {"means": averages, "cells": cells}, text, figure)
+    return text

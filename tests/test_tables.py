@@ -1,0 +1,173 @@
+"""The experiments' tables on tiny twins: files of the true form in, whole results out, a stopped run goes on."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from experiments import (
+    ablation_components,
+    ablation_query,
+    lerf,
+    ovs3d,
+    published,
+    qualitative,
+    replica,
+    tables,
+    threshold_sweep,
+    twins,
+)
+from experiments.methods import COMPONENTS, METHODS, QUERIES
+from experiments.setting import overlaps, prepare
+from jsecon.data.langsplat_files import load_features
+from jsecon.data.lerf_ovs import LERF_PAIRS
+from jsecon.data.ply import save_ply
+from jsecon.fit.initialise import gaussians_from_points
+
+CHEAP = ("VALA", "ours, lead")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("tables")
+
+
+def small(plan, folder, name, **changes):
+    """The quick plan with rows that need no training, in a folder of the test's."""
+    data = dataclasses.replace(plan.data, twins=str(folder / "twins"))
+    return dataclasses.replace(plan, data=data, fit_steps=20, out=str(folder / name), **changes)
+
+
+def read(folder, name):
+    place = folder / name
+    assert {file.name for file in place.iterdir()} >= {"config.json", "metrics.json", "table.md", "figure.png"}
+    assert (place / "figure.png").stat().st_size > 1000
+    return json.loads((place / "metrics.json").read_text()), (place / "table.md").read_text()
+
+
+def test_table_1_and_its_resumption(folder, monkeypatch):
+    plan = small(lerf.QUICK, folder, "lerf", methods=CHEAP, sweep=("perfect", "medium"))
+    lerf.main(plan)
+    metrics, text = read(folder, "lerf")
+    assert {(c["method"], c["level"]) for c in metrics["cells"]} == {(m, v) for m in CHEAP for v in plan.sweep}
+    assert all(c["twin"] and c["pairs"] > 0 for c in metrics["cells"])
+    assert "made-up twins" in text
+    assert "published, measured on the real data" in text
+    assert "| VALA | 60.38 / 89.29" in text
+    perfect = {c["method"]: c["miou"] for c in metrics["cells"] if c["level"] == "perfect"}
+    assert perfect["ours, lead"] > 0.3  # 80x60 px and 20 steps of fitting: the Gaussians are rough, the masks true
+    cells = sorted((folder / "lerf" / "cells").iterdir())
+    assert len(cells) == 4
+    cells[0].unlink()
+    calls, measure = [], tables.measure
+    monkeypatch.setattr(tables, "measure", lambda *a: calls.append(1) or measure(*a))
+    lerf.main(plan)
+    assert len(calls) == 1  # the lost cell alone was computed again
+    again, _ = read(folder, "lerf")
+    strip = lambda cells: [{k: v for k, v in c.items() if k not in ("seconds", "peak_memory_mib")} for c in cells]
+    assert strip(again["cells"]) == strip(metrics["cells"])
+
+
+def test_table_2(folder):
+    """On Gaussians that lie beside the scene: nothing is fitted."""
+    plan = small(ovs3d.QUICK, folder, "ovs3d", methods=CHEAP[1:])
+    root = plan.data.place("bed", 0, plan.level)
+    capture = plan.data.load(root, "bed").capture
+    save_ply(root / "bed" / "point_cloud.ply", gaussians_from_points(capture.points, capture.point_colors, opacity=0.8))
+    ovs3d.main(plan)
+    assert not list((root / "bed").glob("fitted*"))
+    metrics, text = read(folder, "ovs3d")
+    assert all(c["pairs"] == 8 for c in metrics["cells"])  # 2 labelled frames of 4 classes
+    assert "| seconGS (the paper) | 70.58 / - |" in text
+
+
+def test_table_3(folder):
+    replica.main(small(replica.QUICK, folder, "replica", methods=CHEAP[1:]))
+    metrics, text = read(folder, "replica")
+    found = {c["method"]: c for c in metrics["cells"]}
+    assert all(0 < c["miou"] <= c["macc"] <= 1 for c in found.values())
+    assert "mean recall" in text
+
+
+def test_scannet_goes_through_the_same_code(folder):
+    size = (("views", 6), ("width", 64), ("height", 48), ("num_objects", 4), ("fine_m", 0.03), ("coarse_m", 0.2))
+    data = twins.Data("scannet", scenes=("scene0000_00",), seeds=(0,), size=size, twins=str(folder / "twins"))
+    plan = tables.Plan(data, ("ours, lead",), level="perfect", sweep=(), out=str(folder / "scannet"))
+    (cell,) = tables.fill(plan, METHODS, tell=lambda _: None)
+    assert cell["miou"] > 0.5
+    assert cell["pairs"] >= 5
+
+
+def test_ablations(folder):
+    few = ("masklets, anchored by code",)
+    ablation_components.main(small(ablation_components.QUICK, folder, "components", methods=few))
+    assert [c["method"] for c in read(folder, "components")[0]["cells"]] == list(few)
+    ablation_query.main(small(ablation_query.QUICK, folder, "query", methods=("one-step",)))
+    assert "| one-step |" in read(folder, "query")[1]
+
+
+def test_threshold_sweep(folder):
+    threshold_sweep.main(small(threshold_sweep.QUICK, folder, "sweep", thresholds=(0.5, 0.9)))
+    metrics, _ = read(folder, "sweep")
+    assert set(metrics["curves"]) == set(threshold_sweep.WAYS)
+    assert all(len(curve) == 2 and np.isfinite(curve).all() for curve in metrics["curves"].values())
+
+
+def test_qualitative(folder):
+    qualitative.main(small(qualitative.QUICK, folder, "qualitative", methods=CHEAP))
+    metrics, text = read(folder, "qualitative")
+    assert 1 <= len(metrics["iou"]) <= qualitative.TEXTS
+    assert "a twin in LERF-OVS's layout" in text
+
+
+def test_vision_on_disk_is_what_was_simulated(folder):
+    """Perfect vision: masks are the truth, one embedding an object; nothing of the held-out frames."""
+    data = dataclasses.replace(lerf.QUICK.data, twins=str(folder / "twins"))
+    setting = prepare(data, "figurines", 0, "perfect", fit_steps=20)
+    root = data.place("figurines", 0, "perfect")
+    told = json.loads((root / "twin.json").read_text())["scenes"]["figurines"]
+    held_out = {frame.name for frame in setting.bench.frames}
+    assert set(told["frames"]) == held_out
+    assert not held_out & set(setting.names)
+    assert not held_out & {file.stem.removesuffix("_f") for file in (root / "figurines/language_features").iterdir()}
+    for t, name in enumerate(setting.names):
+        truth = cv2.imread(str(root / "truth" / "figurines" / f"{name}.png"), -1).astype(int) - 1
+        objects = np.unique(truth[truth >= 0])
+        np.testing.assert_array_equal(setting.evidence.tracks[t] >= 0, truth >= 0)
+        assert len(np.unique(setting.evidence.masks[t])) - 1 == len(objects)
+    assert setting.evidence.embeddings.shape[0] == len(setting.evidence.frame)
+    length = np.linalg.norm(setting.track_embeddings, axis=1)
+    np.testing.assert_allclose(length[length > 0], 1, atol=1e-5)
+    found = load_features(root / "figurines/language_features", setting.names, (60, 80))
+    np.testing.assert_array_equal(found.labels, setting.evidence.masks)
+
+
+def test_overlaps_count_every_pixel():
+    rng = np.random.default_rng(0)
+    tracks, masks = rng.integers(-1, 3, (2, 5, 6)), rng.integers(-1, 4, (2, 5, 6))
+    found = overlaps(tracks, masks, 4)
+    for r in range(3):
+        for m in range(4):
+            assert found[r, m] == ((tracks == r) & (masks == m)).sum()
+
+
+def test_tables_say_where_ours_does_not_lead():
+    cells = [
+        {"scene": "a", "seed": 0, "level": "medium", "method": name, "miou": value, "seconds": 1.0}
+        for name, value in (("VALA", 0.6), ("ours, lead", 0.5))
+    ]
+    assert "VALA leads with 0.600 (ours 0.500)" in tables.leaders(cells, ("a",), "medium")
+    cells[1]["miou"] = 0.7
+    assert tables.leaders(cells, ("a",), "medium") == "Ours leads on every scene."
+
+
+def test_every_row_has_a_method_and_every_scene_its_denominator():
+    assert tuple(METHODS) == lerf.PLAN.methods == ovs3d.PLAN.methods == replica.PLAN.methods
+    assert ablation_components.PLAN.methods == tuple(COMPONENTS)
+    assert ablation_query.PLAN.methods == tuple(QUERIES)
+    assert set(published.LERF_SCENES) == set(LERF_PAIRS)
+    assert (len(lerf.PLAN.data.scenes), len(lerf.PLAN.data.seeds)) == (4, 3)
+    assert all(len(row) == 5 for row in published.LERF.values())
+    assert all(len(row) == 9 for row in published.REPLICA.values())
