@@ -1,0 +1,163 @@
+"""Exports CLIP, SAM and SAM 2 from their official packages as ONNX graphs, and checks ONNX Runtime against PyTorch.
+
+    pip install -e ".[export]"        (SAM 2 builds without its CUDA operator: SAM2_BUILD_CUDA=0)
+    python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k \\
+        --sam-weights sam_vit_b.pth --sam2-weights sam2.1_hiera_tiny.pt
+
+Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
+every graph's outputs, and a clip tracked by jsecon over the graphs against the official video predictor, frame by
+frame, forward and backward. `--only` takes some of clip, sam, sam2, tracking; figures of the others are kept.
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+from experiments import results
+
+TOLERANCE = 1e-3
+"""of every output, masks as logits"""
+SAME_PIXELS = 0.999
+"""of a mask"""
+PARTS = ("clip", "sam", "sam2", "tracking")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What is exported, and where to."""
+
+    out: str = "models"
+    """folder of the graphs: clip/, sam/, and one of each SAM 2 configuration."""
+    results: str = str(results.HOME / "results" / "export_models")
+    only: tuple[str, ...] = PARTS
+    clip: str = "ViT-B-16"
+    clip_weights: str | None = None
+    """an open_clip tag or a file; None: random."""
+    sam: str = "vit_b"
+    sam_weights: str | None = None
+    sam2: tuple[str, ...] = ("sam2.1_hiera_t", "sam2_hiera_t")
+    """configurations; the first is tracked over `frames`, the others over `short`."""
+    sam2_weights: str | None = None
+    """of the first configuration."""
+    frames: int = 12
+    short: int = 4
+    seed: int = 0
+    threads: int = 1
+
+
+def main(options: Options) -> dict:
+    """Exports and checks the parts asked for, writes config.json, metrics.json and table.md."""
+    import torch
+
+    torch.set_num_threads(options.threads)
+    folder = Path(options.results)
+    kept = folder / "metrics.json"
+    metrics = json.loads(kept.read_text()) if kept.exists() else {}
+    for part in options.only:
+        metrics[part] = {"clip": _clip, "sam": _sam, "sam2": _sam2, "tracking": _tracking}[part](options)
+        metrics["versions"] = _versions()
+        done = tuple(name for name in PARTS if name in metrics)
+        results.save(folder, dataclasses.replace(options, out="models", only=done), metrics, table(metrics))
+    print(table(metrics))
+    return metrics
+
+
+def _clip(options: Options) -> list[dict]:
+    from experiments import export_clip
+
+    model = export_clip.official(options.clip, options.clip_weights, seed=options.seed)
+    folder = Path(options.out) / "clip"
+    return _rows(export_clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads))
+
+
+def _sam(options: Options) -> list[dict]:
+    from experiments import export_sam
+
+    weights = None if options.sam_weights is None else Path(options.sam_weights)
+    model = export_sam.official(options.sam, weights, seed=options.seed)
+    return _rows(export_sam.export(model, Path(options.out) / "sam", seed=options.seed, threads=options.threads))
+
+
+def _sam2(options: Options) -> dict[str, list[dict]]:
+    from experiments import export_sam2
+
+    return {
+        config: _rows(
+            export_sam2.export(
+                _sam2_model(options, config), Path(options.out) / config, seed=options.seed, threads=options.threads
+            )
+        )
+        for config in options.sam2
+    }
+
+
+def _tracking(options: Options) -> dict[str, dict]:
+    from experiments import export_tracking
+
+    found = {}
+    for config in options.sam2:
+        count = options.frames if config == options.sam2[0] else options.short
+        clip = export_tracking.moving_discs(count, first=(count - 1) // 2, seed=options.seed)
+        model, folder = _sam2_model(options, config), Path(options.out) / config
+        found[config] = export_tracking.compare(model, folder, clip, threads=options.threads)
+    return found
+
+
+def _sam2_model(options: Options, config: str):
+    from experiments import export_sam2
+
+    weights = options.sam2_weights if config == options.sam2[0] else None
+    return export_sam2.official(config, None if weights is None else Path(weights), seed=options.seed)
+
+
+def _rows(agreements) -> list[dict]:
+    return [dataclasses.asdict(agreement) for agreement in agreements]
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("torch", "onnxruntime", "open_clip_torch", "segment-anything", "sam2")}
+
+
+def table(metrics: dict) -> str:
+    """Markdown: a row a graph, then a row a tracked clip."""
+    rows = []
+    groups = {"clip": metrics.get("clip", []), "sam": metrics.get("sam", [])} | metrics.get("sam2", {})
+    for model, graphs in groups.items():
+        for graph in graphs:
+            worst = max(graph["outputs"].values())
+            same = min(graph["same_signs"].values())
+            scale = max(graph["scales"].values())
+            rows.append((model, graph["graph"], f"{worst:.1e}", f"{scale:.3g}", f"{same:.5%}", _verdict(worst, same)))
+    for model, clip in metrics.get("tracking", {}).items():
+        worst, same = max(clip["largest_difference"]), clip["masks_same_pixels_least"]
+        what = f"{clip['frames']} frames, {clip['objects']} objects, forward and backward"
+        rows.append(
+            (model, what, f"{worst:.1e}", f"{clip['largest_logit_present']:.3g}", f"{same:.5%}", _verdict(worst, same))
+        )
+    header = ("model", "graph or clip", "largest difference", "largest value", "same sign (least)", "within the bounds")
+    return results.table(header, rows)
+
+
+def _verdict(worst: float, same: float) -> str:
+    return "yes" if worst <= TOLERANCE and same >= SAME_PIXELS else "no"
+
+
+def parsed(arguments: list[str] | None = None) -> Options:
+    """Options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for field in dataclasses.fields(Options):
+        name = "--" + field.name.replace("_", "-")
+        if isinstance(field.default, tuple):
+            choices = PARTS if field.name == "only" else None
+            parser.add_argument(name, nargs="+", default=field.default, choices=choices)
+        else:
+            parser.add_argument(name, type=int if isinstance(field.default, int) else str, default=field.default)
+    values = vars(parser.parse_args(arguments))
+    return Options(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+
+
+if __name__ == "__main__":
+    main(parsed())
