@@ -18,9 +18,9 @@ from unittest import mock
 import cv2
 import numpy as np
 import torch
-from experiments.export_graph import declare_missing_operators, shake
 
 from experiments import export_sam, results
+from experiments.export_graph import declare_missing_operators, shake
 from jsecon.vision.sam import SamSegmenter, SamSettings
 from jsecon.vision.sam_graphs import SamFiles, SamGraphs
 from jsecon.vision.sam_prompts import point_grid
