@@ -47,16 +47,14 @@ def measure(device, gaussians, camera, features, capacity: int, repeats: int) ->
     labels = jax.device_put(np.arange(camera.width * camera.height, dtype=np.int32) // 997 % 40, device)
     labels = labels.reshape(1, camera.height, camera.width)
     views = jax.tree.map(lambda a: jnp.asarray(a)[None], camera)
+    by_all = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    votes = jax.jit(lambda g, c, x: jsecon.region_votes(g, c, x, 40, capacity=capacity).weights)
     calls = {
         "forward, D=3": lambda: forward(gaussians, features),
         "forward, D=32": lambda: forward(gaussians, wide),
         "planned forward, D=3": lambda: planned(features),
-        "forward and backward of everything, D=3": lambda g=jax.jit(jax.grad(loss, argnums=(0, 1))): g(
-            gaussians, features
-        ),
-        "votes of one view, 40 regions": lambda v=jax.jit(
-            lambda g, c, x: jsecon.region_votes(g, c, x, 40, capacity=capacity).weights
-        ): v(gaussians, views, labels),
+        "forward and backward of everything, D=3": lambda: by_all(gaussians, features),
+        "votes of one view, 40 regions": lambda: votes(gaussians, views, labels),
     }
     out, ms = {}, {}
     for name, call in calls.items():

@@ -122,9 +122,7 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
         plan = plan_view(gaussians, camera, capacity=capacity, mesh=spread)
         planned = jax.jit(lambda plan, f: render_plan(plan, f).features)
         planned_loss = lambda f, plan, planned=planned: (planned(plan, f) ** 2).sum()
-        alone = jax.jit(
-            lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m)
-        )
+        alone = jax.jit(lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m))
         by_all, by_features = jax.jit(jax.grad(loss, argnums=(0, 1))), jax.jit(jax.grad(planned_loss))
         calls |= {
             f"forward, {devices}": lambda forward=forward: forward(gaussians, narrow),

@@ -82,9 +82,7 @@ def ask_text(
             )
         given = {} if threshold is None else {"similarity_threshold": threshold}
         embedded = jnp.asarray(embedder.embed_text(wanted + unwanted))
-        selection = query_several(
-            field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given
-        )
+        selection = query_several(field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given)
         return _answer(field, text, by, selection, outliers, {}, keep="all")
     embedding = jnp.asarray(embedder.embed_text([text])[0])
     if by in ("votes", "code"):

@@ -43,9 +43,7 @@ def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number
     return Selection(known & (relevancy >= threshold), relevancy, jnp.asarray(-1, jnp.int32), best(relevancy, known))
 
 
-def relevancies(
-    features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]
-) -> tuple[Array, Array]:
+def relevancies(features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
     """LERF's relevancy (N,), and where it means something (N,); 0 elsewhere."""
     positive, known = similarities(features, text)
     # One phrase at a time: the sums stay multiply-and-sum, and no (N, C) array of products is made.

@@ -32,8 +32,9 @@ def composite(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"], Int[Array, " tiles"]]:
-    """Features (H, W, D) = sum of alpha T f in the splats' dtype (bfloat16 `features` are read as such), final transmittance (H, W), and how far down each tile's list anything is
-    seen: lists cut there composite to the same, and have the same gradient."""
+    """Features (H, W, D) = sum of alpha T f in the splats' dtype (bfloat16 `features` are read as such), final
+    transmittance (H, W), and how far down each tile's list anything is seen: lists cut there composite to the same, and
+    have the same gradient."""
     channels = features.shape[1] + 1
     # Wide features are gathered as they are: a table of them would be written anew in every render.
     apart = channels > WIDE or features.dtype != splats.dtype

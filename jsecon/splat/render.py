@@ -39,10 +39,10 @@ def render(
     gradient: a program that calls `jsecon.process.prepare_process()` before jax starts has all cores of a CPU that way.
     Without it, one device.
 
-    Features in bfloat16 are read as such, which halves what a wide walk gathers, and summed in the Gaussians' dtype, that
-    of the image: the error is that of rounding the features (experiments/work_precision_render.py), the time the same
-    on a CPU. `background` (D,) is added with weight 1 - alpha. With `depth` the same pass also gives `.depth`, the expected
-    z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
+    Features in bfloat16 are read as such, which halves what a wide walk gathers, and summed in the Gaussians' dtype,
+    that of the image: the error is that of rounding the features (experiments/work_precision_render.py), the time the
+    same on a CPU. `background` (D,) is added with weight 1 - alpha. With `depth` the same pass also gives `.depth`, the
+    expected z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
     """
     check_shapes(gaussians, camera)
     require(
