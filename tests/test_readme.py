@@ -71,7 +71,8 @@ def test_the_ci_runs_exactly_the_second_command():
 
 def test_the_experiments_named_are_there_and_all_are_named():
     text = (HOME / "experiments" / "README.md").read_text()
-    named = set(re.findall(r"`(\w+\.py)`", text)) | {f"{n}.py" for n in re.findall(r"`python -m experiments\.(\w+)", text)}
+    named = set(re.findall(r"`(\w+\.py)`", text))
+    named |= {f"{name}.py" for name in re.findall(r"`python -m experiments\.(\w+)", text)}
     there = {
         path.name for path in (HOME / "experiments").glob("*.py") if path.name not in ("__init__.py", "results.py")
     }
