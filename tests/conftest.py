@@ -3,6 +3,7 @@
 Two host devices and the import hook must be settled before jax makes its first array and before jsecon is imported.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -37,6 +38,17 @@ if os.environ.get("CI"):
 import numpy as np  # noqa: E402
 
 from jsecon.types import Camera, Gaussians  # noqa: E402
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    """Forgets compiled programs between files before they use up the memory maps that Linux grants a process (65,530;
+    XLA needs several for each program, and crashes without)."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 25_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from scipy import sparse
 from small_field import make_field
 
-from experiments import apc_bin, beyond, outliers, replica_apartment_0 as replica, scenes, thresholds
+from experiments import apc_bin, beyond, default_vision, outliers, replica_apartment_0 as replica, scenes, thresholds
 from jsecon.errors import InputError
 from jsecon.vision.simulated import SimulatedMasks
 
@@ -215,3 +215,30 @@ def test_outlier_options_only_take_away():
     mask = np.arange(3000) % 3 == 0
     for clean in outliers.cleaners(points.astype(np.float32), outliers.Options()).values():
         assert (clean(mask) <= mask).all()
+
+
+def test_masklets_are_scored_by_outline_and_by_how_long_an_id_lasts():
+    truth = np.full((3, 10, 10), -1, np.int32)
+    truth[:, :5, :4], truth[:, 5:, :] = 0, 1
+    assert default_vision.score(truth, truth) == (1.0, 1.0)
+    renamed = truth.copy()
+    renamed[2][truth[2] == 0] = 7  # object 0: the id lasts in two of three views
+    assert default_vision.score(renamed, truth) == (1.0, pytest.approx((2 / 3 + 1) / 2))
+    half = truth.copy()
+    half[:, 5:, 5:] = -1  # object 1: half of it, in every view
+    assert default_vision.score(half, truth) == (pytest.approx(0.75), 1.0)
+    assert default_vision.score(np.full_like(truth, -1), truth) == (0.0, 0.0)
+
+
+def test_optical_flow_carries_an_id_along():
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(rng.integers(0, 255, (60, 120, 3)).astype(np.uint8), (0, 0), 1.5)
+    frames = np.stack([wide[:, t : t + 80] for t in (0, 3, 6)])
+    single = np.full((3, 60, 80), -1, np.int32)
+    for t, left in enumerate((40, 37, 34)):
+        single[t, 20:40, left : left + 20] = t
+    labels = default_vision.by_flow(frames, single)
+    assert [np.unique(labels[t][single[t] >= 0]).tolist() for t in range(3)] == [[0]] * 3
+    away = single.copy()
+    away[2] = np.where(np.roll(single[2], -30, axis=1) >= 0, 2, -1)  # somewhere else: another thing
+    assert np.unique(default_vision.by_flow(frames, away)[2]).tolist() == [-1, 3]
