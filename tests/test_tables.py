@@ -91,6 +91,7 @@ def test_table_3(folder):
     assert "mean recall" in text
 
 
+@pytest.mark.slow
 def test_scannet_goes_through_the_same_code(folder):
     size = (("views", 6), ("width", 64), ("height", 48), ("num_objects", 4), ("fine_m", 0.03), ("coarse_m", 0.2))
     data = twins.Data("scannet", scenes=("scene0000_00",), seeds=(0,), size=size, twins=str(folder / "twins"))
@@ -100,6 +101,7 @@ def test_scannet_goes_through_the_same_code(folder):
     assert cell["pairs"] >= 5
 
 
+@pytest.mark.slow
 def test_ablations(folder):
     few = ("masklets, anchored by code",)
     ablation_components.main(small(ablation_components.QUICK, folder, "components", methods=few))
@@ -108,6 +110,7 @@ def test_ablations(folder):
     assert "| one-step |" in read(folder, "query")[1]
 
 
+@pytest.mark.slow
 def test_threshold_sweep(folder):
     threshold_sweep.main(small(threshold_sweep.QUICK, folder, "sweep", thresholds=(0.5, 0.9)))
     metrics, _ = read(folder, "sweep")
@@ -115,6 +118,7 @@ def test_threshold_sweep(folder):
     assert all(len(curve) == 2 and np.isfinite(curve).all() for curve in metrics["curves"].values())
 
 
+@pytest.mark.slow
 def test_qualitative(folder):
     qualitative.main(small(qualitative.QUICK, folder, "qualitative", methods=CHEAP))
     metrics, text = read(folder, "qualitative")
