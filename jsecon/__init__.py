@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from jsecon.query.outliers import remove_outliers as remove_outliers
     from jsecon.query.probability import membership_probability as membership_probability
     from jsecon.query.several import query_several as query_several
+    from jsecon.query.showing import with_shown as with_shown
     from jsecon.query.units import unit_codes as unit_codes
     from jsecon.splat.plan import plan_view as plan_view, render_plan as render_plan
     from jsecon.splat.project import project as project
@@ -76,6 +77,7 @@ _CONTENTS = {
     "jsecon.query.outliers": ("remove_outliers",),
     "jsecon.query.probability": ("membership_probability",),
     "jsecon.query.several": ("query_several",),
+    "jsecon.query.showing": ("with_shown",),
     "jsecon.query.units": ("unit_codes",),
     "jsecon.splat.plan": ("plan_view", "render_plan"),
     "jsecon.splat.project": ("project",),

@@ -64,9 +64,9 @@ def spread_over_devices(
     *,
     static: tuple = (),
     progress: Callable[[int, int], None] | None = None,
-) -> Any:
-    """Accumulates `state = step(state, common, view, *static)` over the leading axis of `views`, view t on device t
-    mod D.
+) -> tuple[Any, list[Any]]:
+    """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`, view t on device
+    t mod D; returns the state and each view's `out`, which stays on its device.
 
     `start` is the neutral state of `merge`, which joins the devices' states pairwise in device order. Host code;
     dispatch is asynchronous, so the devices work side by side. `progress(done, total)` is called as views finish.
@@ -76,16 +76,18 @@ def spread_over_devices(
     devices = jax.local_devices()[: max(1, min(count, jax.local_device_count()))]
     shared = [jax.device_put(common, device) for device in devices]
     states = [jax.tree.map(lambda a, d=device: jax.device_put(a, d).copy(), start) for device in devices]
+    outs = []
     waves = range(0, count, len(devices))
     for first in waves:
         wave = range(first, min(first + len(devices), count))
         for index, t in enumerate(wave):
             view = jax.device_put(jax.tree.map(lambda a, t=t: a[t], views), devices[index])
-            states[index] = step(states[index], shared[index], view, *static)
+            states[index], out = step(states[index], shared[index], view, *static)
+            outs.append(out)
         if progress is not None:
             jax.block_until_ready(states)
             progress(wave.stop, count)
     total = states[0]
     for state in states[1:]:
         total = merge(total, jax.device_put(state, devices[0]))
-    return total
+    return total, outs

@@ -264,11 +264,11 @@ def codes(options: Options, found: Regions, progress: Progress) -> Outcome:
 def votes(
     options: Options, capture: Capture, gaussians: Gaussians, labels: np.ndarray, num_regions: int, progress: Progress
 ) -> Outcome:
-    """The weight that each region casts on each Gaussian over the training frames."""
+    """The weight that each region casts on each Gaussian over the training frames, with each frame's total."""
     from jsecon.language.votes import region_votes
 
     cameras = jax.tree.map(jnp.asarray, capture.cameras[training_frames(capture)])
-    cast = region_votes(gaussians, cameras, labels, num_regions, top=options.top, progress=progress)
+    cast = region_votes(gaussians, cameras, labels, num_regions, top=options.top, by_view=True, progress=progress)
     unseen = int(jnp.sum(cast.views == 0))
     left = {"unseen Gaussians": f"{unseen} of {gaussians.count} that no frame sees get no code"} if unseen else {}
     return Outcome(cast, left)
@@ -293,12 +293,14 @@ def assemble(
     provenance: str,
 ) -> LanguageField:
     """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
+    from jsecon.query.showing import with_shown
+
     pixels = np.zeros((found.count, len(capture.names)), np.int32)
     pixels[:, training_frames(capture)] = found.pixels
     return LanguageField(
         gaussians=gaussians,
         codes=point_codes,
-        votes=cast,
+        votes=with_shown(cast, found),
         regions=Regions(found.embeddings, pixels),
         region_codes=table,
         autoencoder=coder,

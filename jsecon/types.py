@@ -138,6 +138,10 @@ class Votes:
     """() int32 (block, Gaussian) pairs left out for want of capacity, all views; 0 means exact."""
     num_regions: int = _static()
     """R."""
+    by_view: Array | None = None
+    """(T, N) sum of alpha T over the pixels of each view, or None where it was not kept."""
+    shown: Array | None = None
+    """(N, K) sum of alpha T over the views that show that region, or one alike to it; None: not known."""
 
     @property
     def cut(self) -> Array:

@@ -3,11 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.shares import weight_and_rival
+from jsecon.query.shares import gather_votes
 
 
 def weight_inside(regions, weights, chosen):
-    return weight_and_rival(regions, weights, chosen)[0]
+    return gather_votes(regions, weights, chosen).weight
 
 
 def exact(regions, weights, chosen):
@@ -51,6 +51,6 @@ def test_the_rival_is_the_strongest_region_not_chosen(count):
     weights = rng.random((500, 5)).astype(np.float32)
     chosen = rng.random(count) < 0.3
     outside = (regions >= 0) & (regions < count) & ~chosen[np.clip(regions, 0, count - 1)]
-    weight, rival = weight_and_rival(*map(jnp.asarray, (regions, weights, chosen)))
+    weight, rival, _ = gather_votes(*map(jnp.asarray, (regions, weights, chosen)))
     np.testing.assert_allclose(weight, exact(regions, weights, chosen), rtol=1e-6)
     np.testing.assert_array_equal(rival, np.where(outside, weights, 0).max(1))

@@ -24,14 +24,14 @@ def labels(cameras):
 
 @pytest.fixture(scope="module")
 def expected(scene, cameras, labels):
-    """(N, R) votes, (N,) total, (N,) peak, (N,) views by brute force in float64."""
-    votes, total = np.zeros((scene.count, REGIONS)), np.zeros(scene.count)
+    """(N, R) votes, (T, N) totals, (N,) peak, (N,) views by brute force in float64."""
+    votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
     peak, views = np.zeros(scene.count), np.zeros(scene.count, int)
     for t in range(4):
         weights = weights_reference(scene, cameras[t]).reshape(-1, scene.count)
         for r in range(REGIONS):
             votes[:, r] += weights[labels[t].reshape(-1) == r].sum(0)
-        total += weights.sum(0)
+        total[t] = weights.sum(0)
         peak = np.maximum(peak, weights.max(0))
         views += weights.sum(0) > 0
     return votes, total, peak, views
@@ -39,7 +39,7 @@ def expected(scene, cameras, labels):
 
 @pytest.fixture(scope="module")
 def cast(scene, cameras, labels):
-    return region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
+    return region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
 
 
 def test_equals_the_oracles_weights(cast, expected):
@@ -48,7 +48,8 @@ def test_equals_the_oracles_weights(cast, expected):
     # float32, and alphas that fall on the other side of the 1/255 cut on single pixels
     np.testing.assert_allclose(cast.dense(), votes, rtol=2e-4, atol=0.02)
     assert np.linalg.norm(cast.dense() - votes) <= 1e-4 * np.linalg.norm(votes)
-    np.testing.assert_allclose(cast.total, total, rtol=2e-4, atol=0.02)
+    np.testing.assert_allclose(cast.by_view, total, rtol=2e-4, atol=0.02)
+    np.testing.assert_allclose(cast.total, total.sum(0), rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.peak, peak, atol=1e-4)
     np.testing.assert_array_equal(cast.views, views)
 
@@ -56,6 +57,7 @@ def test_equals_the_oracles_weights(cast, expected):
 def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels):
     few = region_votes(scene, cameras, labels, REGIONS, top=2)
     assert few.regions.shape == (scene.count, 2)
+    assert few.by_view is None
     np.testing.assert_allclose(few.weights, cast.weights[:, :2], rtol=1e-6)
     np.testing.assert_allclose(few.cut, cast.weights[:, 2:].sum(-1), rtol=1e-4, atol=1e-4)
     assert bool((cast.weights[:, :-1] >= cast.weights[:, 1:]).all())
@@ -64,9 +66,12 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
 
 def test_traced_is_eager(cast, scene, cameras, labels):
     capacity = plan_capacity(scene, cameras)
-    cast_by = jax.jit(lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, capacity=capacity))
+    cast_by = jax.jit(
+        lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, by_view=True, capacity=capacity)
+    )
     traced = cast_by(scene, labels)
     np.testing.assert_allclose(traced.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(traced.by_view, cast.by_view, rtol=1e-4, atol=1e-4)
 
 
 def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, PRNGKeyArray, UInt32
 
 from jsecon.errors import require
 from jsecon.numerics import normalize, safe_norm
-from jsecon.splat.render import is_traced, render
+from jsecon.splat.plan import ViewPlan, is_traced, plan_view, plan_views, render_plan
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Votes
 
@@ -172,11 +172,19 @@ def distill_l1(
     if capacity is None:
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     stretch = steps if progress is None else max(1, -(-steps // 100))
-    state = start
+    state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
         state = descend(
-            state, gaussians, cameras, labels, region_codes, until=stop, learning_rate=learning_rate, capacity=capacity
+            state,
+            gaussians,
+            cameras,
+            labels,
+            region_codes,
+            until=stop,
+            learning_rate=learning_rate,
+            capacity=capacity,
+            plans=plans,
         )
         if progress is not None:
             jax.block_until_ready(state.step)
@@ -262,9 +270,14 @@ def descend(
     until: int,
     capacity: int,
     learning_rate: float = 0.0025,
+    plans: ViewPlan | None = None,
 ) -> Descent:
-    """Takes `state` on to `until` steps. In stretches or at once, with one compilation and one result."""
-    return _descend(state, gaussians, cameras, labels, jnp.asarray(region_codes), until, learning_rate, capacity)
+    """Takes `state` on to `until` steps. In stretches or at once, with one compilation and one result.
+
+    `plans` are those of `splat.plan.plan_views` with the same capacity; without them each step plans its view.
+    """
+    table = jnp.asarray(region_codes)
+    return _descend(state, gaussians, cameras, labels, table, plans, until, learning_rate, capacity)
 
 
 def _optimizer(learning_rate: Any) -> optax.GradientTransformation:
@@ -272,18 +285,21 @@ def _optimizer(learning_rate: Any) -> optax.GradientTransformation:
 
 
 @functools.partial(jax.jit, static_argnames="capacity")
-def _descend(state, gaussians, cameras, labels, region_codes, until, learning_rate, capacity) -> Descent:
+def _descend(state, gaussians, cameras, labels, region_codes, plans, until, learning_rate, capacity) -> Descent:
     optimizer = _optimizer(learning_rate)
     codes = normalize(region_codes)
     known = jnp.any(codes != 0, axis=-1)
 
     def loss(features, view):
-        camera = cameras[view]
+        if plans is None:
+            plan = plan_view(gaussians, cameras[view], capacity=capacity)
+        else:
+            plan = jax.tree.map(lambda a: a[view], plans)
         ids = jnp.clip(labels[view], 0, codes.shape[0] - 1)
         mask = ((labels[view] >= 0) & known[ids])[..., None]
         # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
         units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
-        rendering = render(gaussians, camera, units, capacity=capacity)
+        rendering = render_plan(plan, units)
         return jnp.mean(jnp.where(mask, jnp.abs(rendering.features - codes[ids]), 0.0)), rendering.overflow
 
     def step(index, state):

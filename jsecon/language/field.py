@@ -170,6 +170,8 @@ def _disagreement(field: LanguageField) -> str | None:
         "canonical": (field.canonical, (field.canonical.shape[0], e)),
         "to_source": (field.to_source, (4, 4)),
     }
+    if field.votes.shown is not None:
+        expected["votes.shown"] = (field.votes.shown, (n, k))
     for name, (array, shape) in expected.items():
         if tuple(array.shape) != shape:
             return f"{name} of shape {tuple(array.shape)} where the others ask for {shape}"

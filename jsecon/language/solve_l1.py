@@ -14,7 +14,6 @@ of weights, and the duality gap bounds how far from the minimum it is.
 """
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +24,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray, UInt32
 from jsecon.errors import require
 from jsecon.numerics import normalize, safe_norm
 from jsecon.splat.composite import composite_features_vjp
-from jsecon.splat.plan import is_traced, plan_view, render_plan
+from jsecon.splat.plan import is_traced, plan_view, plan_views, render_plan
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians
 
@@ -36,8 +35,6 @@ BALANCE = 5.0
 """dual steps are this many times longer, primal ones shorter: speed only"""
 CHECK = 4
 """sweeps between two looks at the duality gap, each of which costs a sweep"""
-PLAN_BYTES = 1 << 30
-"""plans of the views are kept where they take no more than this together, and made anew at each step elsewhere"""
 
 Key = PRNGKeyArray | UInt32[Array, "2"]
 
@@ -87,7 +84,7 @@ def solve_l1(
     labels (T, H, W), -1 = none; region_codes (R, d), a zero row = a region without code, whose pixels count as
     unlabelled. At most `sweeps` passes over the views (rounded up to a multiple of `CHECK`), fewer where the relative
     duality gap falls to `tolerance` before. `key` draws the order of the views. What no labelled pixel sees keeps its
-    start. Memory: T H W d numbers of the dual beside the plans (`PLAN_BYTES`).
+    start. Memory: T H W d numbers of the dual beside the plans (`splat.plan.PLAN_BYTES`).
 
     Pure; under jit pass the static `capacity` (see `plan_capacity`): a view that does not fit makes gap and loss NaN
     and `converged` false. Raises ValueError on shapes that disagree, a loyalty that is not above zero and, outside jit,
@@ -137,9 +134,7 @@ def _solve(gaussians, cameras, labels, region_codes, start, loyalty, tolerance, 
     known = jnp.any(codes != 0, axis=-1)
     anchor = normalize(start)
     make = lambda camera: plan_view(gaussians, camera, capacity=capacity)
-    shape = jax.eval_shape(make, cameras[0])
-    kept = views * sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shape)) <= PLAN_BYTES
-    plans = lax.map(make, cameras) if kept else None
+    plans = plan_views(gaussians, cameras, capacity=capacity)
 
     def view(t):
         """Plan of a view, its targets and where they count."""

@@ -38,13 +38,15 @@ def region_votes(
     num_regions: int,
     *,
     top: int = 8,
+    by_view: bool = False,
     capacity: int | None = None,
     near: float = NEAR,
     progress: Callable[[int, int], None] | None = None,
 ) -> Votes:
     """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
 
-    Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). Outside a trace the views are
+    Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
+    is kept too (`Votes.by_view`, 4 T N bytes), as `query.showing.with_shown` wants it. Outside a trace the views are
     spread over jax's local devices and `progress(done, total)` is called after each; inside one the views are scanned
     and `capacity` must be given. Raises ValueError on shapes that disagree.
     """
@@ -77,28 +79,31 @@ def region_votes(
     count = gaussians.means.shape[0]
     block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
     blocks = math.ceil(max(num_regions, 1) / block)
-    step = functools.partial(_add_view, capacity=capacity, near=near)
+    step = functools.partial(_add_view, capacity=capacity, near=near, by_view=by_view)
     kept = (jnp.full((count, 0), -1, jnp.int32), jnp.zeros((count, 0), gaussians.means.dtype))
     for b in range(blocks):
         inside = _labels_of_block(labels, b * block, block)
         start = _empty(count, block, gaussians.means.dtype)
         if traced:
-            state = lax.scan(lambda s, view: (step(s, gaussians, *view), None), start, (cameras, inside))[0]
+            state, totals = lax.scan(lambda s, view: step(s, gaussians, *view), start, (cameras, inside))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
-            state = spread_over_devices(
+            state, totals = spread_over_devices(
                 _add_view_compiled,
                 start,
                 _merge,
                 gaussians,
                 (cameras, inside),
-                static=(capacity, near),
+                static=(capacity, near, by_view),
                 progress=report,
             )
         kept = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
         labelled = state["votes"].sum(-1) if b == 0 else labelled + state["votes"].sum(-1)
+    seen = None
+    if by_view:
+        seen = totals if traced else jnp.stack([jax.device_put(total, jax.local_devices()[0]) for total in totals])
     return Votes(
-        kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions
+        kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions, seen
     )
 
 
@@ -132,9 +137,16 @@ def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int | Array,
 
 
 def _add_view(
-    state: dict[str, Array], gaussians: Gaussians, camera: Camera, labels: Array, *, capacity: int, near: float
-) -> dict[str, Array]:
-    """Adds one view's votes to the dense accumulators."""
+    state: dict[str, Array],
+    gaussians: Gaussians,
+    camera: Camera,
+    labels: Array,
+    *,
+    capacity: int,
+    near: float,
+    by_view: bool,
+) -> tuple[dict[str, Array], Array | None]:
+    """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted."""
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, camera.width)
@@ -181,12 +193,14 @@ def _add_view(
         "peak": peak,
         "views": state["views"] + (total > 0).astype(jnp.int32),
         "overflow": state["overflow"] + plan.overflow,
-    }
+    }, total if by_view else None
 
 
 _add_view_compiled = jax.jit(
-    lambda state, gaussians, view, capacity, near: _add_view(state, gaussians, *view, capacity=capacity, near=near),
-    static_argnums=(3, 4),
+    lambda state, gaussians, view, capacity, near, by_view: _add_view(
+        state, gaussians, *view, capacity=capacity, near=near, by_view=by_view
+    ),
+    static_argnums=(3, 4, 5),
     donate_argnums=(0,),
 )
 

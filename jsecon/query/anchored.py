@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.query.one_step import Codes, Number, as_codes, similarities
 from jsecon.query.pixel import region_at, region_shares_at
-from jsecon.query.shares import weight_and_rival
+from jsecon.query.shares import gather_votes
 from jsecon.query.units import UnitCodes
 from jsecon.types import Array, LanguageField, Selection
 
@@ -37,7 +37,7 @@ depend on it."""
 CODE_THRESHOLD = 0.9
 """on the cosine of codes: codes that were distilled from one region lie within a few degrees (0.9 is 26)"""
 SHARE_THRESHOLD = 0.5
-"""on the share of votes: more of what is seen of the Gaussian lies inside the region than outside"""
+"""on the share of votes: in the views that show the region, more of what is seen of the Gaussian lies inside it"""
 LEAD_THRESHOLD = 0.5
 """on the lead: the region is the strongest, and most of what is seen of the Gaussian has a label"""
 
@@ -59,6 +59,7 @@ class _Parts(NamedTuple):
     labelled: Array
     total: Array
     views: Array
+    shown: Array | None
 
 
 def query_anchored(
@@ -69,16 +70,18 @@ def query_anchored(
     similarity_threshold: Number | None = None,
     by: str = "votes",
     alike_threshold: Number | None = ALIKE_THRESHOLD,
-    unlabelled_weight: Number = 1.0,
+    unlabelled_weight: Number | None = None,
     codes: UnitCodes | None = None,
 ) -> Selection:
     """The Gaussians of the region that a text's embedding (E,) is most similar to.
 
     Retrieval: the region with the largest cosine; where that is below `retrieval_threshold` nothing is selected, and
     Selection.region is -1. Membership, `by`:
-    "votes": the region's share of all the weight with which the Gaussian was seen, an estimate of the probability that
-        a pixel of it belongs to the region; default threshold 0.5. `unlabelled_weight` in [0, 1] says how much weight
-        on unlabelled pixels counts as evidence against (1 in full; less where masks are missing from many frames).
+    "votes": the region's share of the weight with which the Gaussian was seen in the views that show the region
+        (`Votes.shown`, from `with_shown`), an estimate of the probability that a pixel of it belongs to the region;
+        default threshold 0.5. Votes that do not know which views show what are compared with the weight of all views;
+        so are all where `unlabelled_weight` is given, which in [0, 1] says how much the weight on unlabelled pixels
+        counts as evidence against (1: in full, as where it is None).
     "lead": the region's part of the votes of the two that matter, itself and the strongest other one, or the labelled
         part of all weight where that is less; default threshold 0.5. Where masks are cut, merged and lost, a region
         may be the strongest without ever having most of the votes.
@@ -127,7 +130,7 @@ def query_region(
     similarity_threshold: Number | None = None,
     by: str = "votes",
     alike_threshold: Number | None = None,
-    unlabelled_weight: Number = 1.0,
+    unlabelled_weight: Number | None = None,
 ) -> Selection:
     """The Gaussians of region `region`, as found by `region_at`: `query_anchored` without the text; score 1.
 
@@ -175,7 +178,8 @@ def _parts(field: LanguageField, codes: UnitCodes | None = None) -> _Parts:
                 votes.total,
                 votes.views,
             )
-        )
+        ),
+        None if votes.shown is None else as_codes(votes.shown),
     )
 
 
@@ -202,8 +206,11 @@ def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_w
         chosen |= known & (alike >= alike_threshold)
     seen = parts.views > 0
     if by != "code":
-        weight, rival = weight_and_rival(parts.regions, parts.weights, chosen)
-        seen_weight = parts.labelled + unlabelled_weight * jnp.maximum(parts.total - parts.labelled, 0.0)
+        shown = parts.shown if by == "votes" and unlabelled_weight is None else None
+        weight, rival, seen_weight = gather_votes(parts.regions, parts.weights, chosen, shown)
+        if seen_weight is None:
+            part = 1.0 if unlabelled_weight is None else unlabelled_weight
+            seen_weight = parts.labelled + part * jnp.maximum(parts.total - parts.labelled, 0.0)
         known = seen & (seen_weight > 0) & jnp.isfinite(seen_weight) & jnp.isfinite(weight)
         similarity = jnp.clip(weight / jnp.where(known, seen_weight, 1.0), 0.0, 1.0)
         if by == "lead":

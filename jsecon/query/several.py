@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import InputError, require
 from jsecon.query.anchored import ALIKE_THRESHOLD, RETRIEVAL_THRESHOLD, SHARE_THRESHOLD
 from jsecon.query.one_step import Number, similarities
-from jsecon.query.shares import weight_and_rival
+from jsecon.query.shares import gather_votes
 from jsecon.types import Array, LanguageField, Selection
 
 NEARNESS = 0.8
@@ -59,9 +59,10 @@ def query_several(
 
     A region answers a text by the rule of `regions_of_text`. One that answers a wanted and an unwanted text belongs to
     the one that it is more similar to, so that "mug but not handle" keeps the mug where the handle was never told
-    apart. Membership is by votes: the share of all the weight with which a Gaussian was seen that lies on the chosen
-    regions, at least `similarity_threshold`. Selection.region is the best of the chosen, -1 where there is none;
-    Selection.score its cosine. Pure: jit it or vmap it over texts. Raises ValueError on texts of another size.
+    apart. Membership is by votes, as in `query_anchored`: of the weight with which a Gaussian was seen in the views
+    that show a chosen region, at least `similarity_threshold` lies on the chosen ones. Selection.region is the best of
+    the chosen, -1 where there is none; Selection.score its cosine. Pure: jit it or vmap it over texts. Raises
+    ValueError on texts of another size.
     """
     size = field.regions.embeddings.shape[1]
     unwanted = jnp.zeros((0, size)) if unwanted is None else jnp.asarray(unwanted)
@@ -75,6 +76,7 @@ def query_several(
     votes = field.votes
     return _several(
         *(jnp.asarray(a) for a in (field.regions.embeddings, votes.regions, votes.weights, votes.total, votes.views)),
+        None if votes.shown is None else jnp.asarray(votes.shown),
         jnp.asarray(wanted),
         unwanted,
         several,
@@ -85,7 +87,7 @@ def query_several(
 
 
 def _several_body(
-    embeddings, regions, weights, total, views, wanted, unwanted, several, nearness, retrieval, threshold
+    embeddings, regions, weights, total, views, shown, wanted, unwanted, several, nearness, retrieval, threshold
 ) -> Selection:
     count = embeddings.shape[0]
     if count == 0:
@@ -104,9 +106,10 @@ def _several_body(
     chosen, closeness = answering(wanted)
     refused, against = answering(unwanted)
     chosen &= ~(refused & (against >= closeness))
-    weight, _ = weight_and_rival(regions, weights, chosen)
-    known = (views > 0) & (total > 0) & jnp.isfinite(total) & jnp.isfinite(weight) & jnp.any(chosen)
-    share = jnp.where(known, jnp.clip(weight / jnp.where(known, total, 1.0), 0.0, 1.0), 0.0)
+    weight, _, seen = gather_votes(regions, weights, chosen, shown)
+    seen = total if seen is None else seen
+    known = (views > 0) & (seen > 0) & jnp.isfinite(seen) & jnp.isfinite(weight) & jnp.any(chosen)
+    share = jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0)
     best = jnp.argmax(jnp.where(chosen, closeness, -jnp.inf))
     found = jnp.any(chosen)
     return Selection(
