@@ -4,10 +4,10 @@
 
 Scenes: replica_apartment_0 (where it lies beside the checkout) and demo rooms, their true masks disturbed by simulated
 vision (jsecon.vision.simulated). Regions get random unit codes. Paths: votes reduced by mean, median, geometric median
-and mode; the L1 solver from the mode; and the paper's Adam on the rendered L1 (REFERENCE B.6, B.7) from zero, random
-codes and the mode, looked at several times on its way. Points are compared through the nearest region's true object.
-Seconds are wall time without compilation, what a start costs included. Each path is kept as soon as it is done, Adam's
-every few minutes: a run that was stopped goes on where it was.
+and mode; the L1 solver from the mode; and the paper's Adam on the rendered L1 (REFERENCE B.6, B.7), looked at several
+times on its way: from zero, and on one scene from random codes and the mode too. Points are compared through the
+nearest region's true object. Seconds are wall time without compilation, what a start costs included. Each path is kept
+as soon as it is done, Adam's every few minutes: a run that was stopped goes on where it was.
 """
 
 import argparse
@@ -15,32 +15,14 @@ import dataclasses
 import functools
 import hashlib
 import json
-import time
 from pathlib import Path
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments import results, scenes
-from jsecon import cache
+from experiments.code_paths import adam_path, task_of, votes_paths
 from jsecon.errors import InputError
-from jsecon.evaluate.metrics import point_accuracy, point_class_means
 from jsecon.files import write_text
-from jsecon.language.distill import descend, descent, distill_votes
-from jsecon.language.solve_l1 import solve_l1
-from jsecon.language.votes import region_votes
-from jsecon.numerics import cosine_matrix, normalize
-from jsecon.splat.render import render
-from jsecon.splat.tiles import plan_capacity
-from jsecon.types import Votes
-from jsecon.vision.simulated import LEVELS, simulated_masks
-
-CHECKPOINT_SECONDS = 120.0
-"""between two records of a descent"""
-RESTS = 60
-"""steps of Adam between two looks at the clock"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +40,8 @@ class Options:
     """of Adam."""
     looks: tuple[float, ...] = (0.02, 0.1, 0.3, 1.0)
     """at which parts of Adam's way it is measured."""
+    all_starts: tuple[str, ...] = ("demo 0",)
+    """scenes on which Adam starts from random codes and the votes' mode too; elsewhere from zero, as the paper's."""
     loyalties: tuple[float, ...] = (0.5, 0.1, 0.02)
     """of the solver."""
     sweeps: tuple[int, ...] = (4, 24)
@@ -75,164 +59,8 @@ QUICK = Options(
 )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
-class Task:
-    """One scene's problem."""
-
-    name: str
-    gaussians: Any
-    cameras: Any
-    labels: Any
-    """(T, H, W) regions of the disturbed masks."""
-    codes: Any
-    """(R, d) unit."""
-    origin: np.ndarray
-    """(R,) the true object of each region."""
-    truth: np.ndarray
-    """(N,) the true object of each Gaussian, -1 = none."""
-    capacity: int
-
-
-def task_of(scene: scenes.Scene, options: Options) -> Task:
-    """The scene under disturbed masks, at the size that the options ask for."""
-    count = len(scene.labels)
-    few = (
-        np.arange(count) if options.views is None else np.linspace(0, count - 1, min(options.views, count)).astype(int)
-    )
-    masks = simulated_masks(scene.labels[few], LEVELS[options.level], seed=scene.seed)
-    k = options.shrink
-    labels = masks.labels[:, k // 2 :: k, k // 2 :: k]
-    cameras = scene.cameras[few]
-    cameras = dataclasses.replace(
-        cameras,
-        **{name: getattr(cameras, name) / k for name in ("fx", "fy", "cx", "cy")},
-        width=labels.shape[2],
-        height=labels.shape[1],
-    )
-    codes = np.random.default_rng(scene.seed).normal(size=(len(masks.origin), options.latent)).astype(np.float32)
-    capacity = plan_capacity(scene.gaussians, cameras, margin=1.0)
-    return Task(
-        scene.name,
-        scene.gaussians,
-        cameras,
-        jnp.asarray(labels),
-        normalize(jnp.asarray(codes)),
-        masks.origin,
-        scene.truth,
-        capacity,
-    )
-
-
-def geometric_median(votes: Votes, codes: Any, *, rounds: int = 30) -> Any:
-    """(N, d) unit codes of least weighted distance to the voted regions' codes (Weiszfeld's iteration, from the mean);
-    zero where there are no votes."""
-    values, weight = codes[jnp.clip(votes.regions, 0)], jnp.where(votes.regions >= 0, votes.weights, 0.0)
-
-    def step(_, middle):
-        near = weight / jnp.maximum(jnp.linalg.norm(values - middle[:, None], axis=-1), 1e-6)
-        return (near[..., None] * values).sum(1) / jnp.maximum(near.sum(1, keepdims=True), 1e-30)
-
-    mean = (weight[..., None] * values).sum(1) / jnp.maximum(weight.sum(1, keepdims=True), 1e-30)
-    return normalize(jax.lax.fori_loop(0, rounds, step, mean))
-
-
-@functools.partial(jax.jit, static_argnames="capacity")
-def rendered_l1(gaussians, cameras, labels, table, codes, capacity):
-    """Mean over all T H W d numbers of the masked |rendered - target|."""
-
-    def one(view):
-        camera, image = view
-        error = render(gaussians, camera, codes, capacity=capacity).features - table[jnp.clip(image, 0)]
-        return jnp.mean(jnp.where((image >= 0)[..., None], jnp.abs(error), 0.0))
-
-    return jnp.mean(jax.lax.map(one, (cameras, labels)))
-
-
-def score(task: Task, codes: Any) -> dict[str, float]:
-    """Rendered L1 of unit codes, and the points' accuracy and mIoU through the nearest region's object."""
-    nearest = np.asarray(jnp.argmax(cosine_matrix(codes, task.codes), -1))
-    found = np.where(np.asarray(codes).any(-1), task.origin[nearest], -2)
-    loss = rendered_l1(task.gaussians, task.cameras, task.labels, task.codes, codes, task.capacity)
-    return {
-        "l1": float(loss),
-        "accuracy": point_accuracy(found, task.truth),
-        "miou": point_class_means(found, task.truth)[0],
-    }
-
-
-def timed(call) -> tuple[Any, float]:
-    """The result of the second call, and its seconds: the first compiles."""
-    jax.block_until_ready(call())
-    began = time.perf_counter()
-    out = jax.block_until_ready(call())
-    return out, time.perf_counter() - began
-
-
-def votes_paths(task: Task, options: Options) -> list[dict]:
-    """Reductions of the votes, and the solver from the mode."""
-    votes, spent = timed(
-        lambda: region_votes(task.gaussians, task.cameras, task.labels, len(task.origin), capacity=task.capacity)
-    )
-    rows = []
-    ways = {r: functools.partial(distill_votes, votes, task.codes, r, least_labelled=0.0) for r in ("mean", "median")}
-    ways["geometric median"] = functools.partial(jax.jit(geometric_median), votes, task.codes)
-    ways["mode"] = functools.partial(distill_votes, votes, task.codes, "mode", least_labelled=0.0)
-    for name, way in ways.items():
-        codes, own = timed(way)
-        rows.append({"path": f"votes, {name}", "seconds": spent + own, **score(task, codes)})
-    start, before = codes, spent + own
-    given = (task.gaussians, task.cameras, task.labels, task.codes, start)
-    for loyalty in options.loyalties:
-        for sweeps in options.sweeps:
-            solve = functools.partial(
-                solve_l1, *given, loyalty=loyalty, sweeps=sweeps, tolerance=1e-3, capacity=task.capacity
-            )
-            found, own = timed(solve)
-            rows.append(
-                {
-                    "path": f"solver from mode, loyalty {loyalty:g}, {int(found.sweeps)} sweeps",
-                    "seconds": before + own,
-                    **score(task, found.codes),
-                    "gap": float(found.gap),
-                    "converged": bool(found.converged),
-                }
-            )
-    return rows
-
-
-def adam_path(task: Task, options: Options, start: str, record: Path) -> list[dict]:
-    """The paper's path from one start, gone on with from `record` where there is one."""
-    before, init = 0.0, start
-    if start == "votes":
-        make = lambda: distill_votes(
-            region_votes(task.gaussians, task.cameras, task.labels, len(task.origin), capacity=task.capacity),
-            task.codes,
-            "mode",
-            least_labelled=0.0,
-        )
-        init, before = timed(make)
-    given = (task.gaussians, task.cameras, task.labels, task.codes)
-    state = descent(*given, steps=options.steps, key=jax.random.key(0), init=init)
-    seconds, rows = before, []
-    go = functools.partial(descend, capacity=task.capacity)
-    jax.block_until_ready(go(state, *given, until=1))  # compiles
-    if record.exists():
-        leaves, seconds, rows = cache.load(record)
-        state, rows = jax.tree.unflatten(jax.tree.structure(state), leaves), json.loads(rows)
-    looks = sorted({max(1, round(part * options.steps)) for part in options.looks})
-    last = time.monotonic()
-    for look in looks:
-        while int(state.step) < look:
-            began = time.perf_counter()
-            state = jax.block_until_ready(go(state, *given, until=min(int(state.step) + RESTS, look)))
-            seconds += time.perf_counter() - began
-            if time.monotonic() - last > CHECKPOINT_SECONDS:
-                cache.save(record, (jax.tree.leaves(state), seconds, json.dumps(rows)))
-                last = time.monotonic()
-        if not any(row["steps"] == look for row in rows):
-            codes = normalize(state.features)
-            rows.append({"path": f"Adam from {start}", "steps": look, "seconds": seconds, **score(task, codes)})
-    return rows
+_APART = ("out", "seeds", "demos", "replica", "all_starts")
+"""options that say which scenes and paths are taken, not how"""
 
 
 def main(options: Options = Options()) -> dict:
@@ -250,20 +78,24 @@ def main(options: Options = Options()) -> dict:
             remedy="Give a folder of demos, or put replica_apartment_0 beside the checkout.",
         )
     # Only what an option changes makes a path be taken again.
-    given = {k: v for k, v in dataclasses.asdict(options).items() if k not in ("out", "seeds", "demos", "replica")}
+    given = {k: v for k, v in dataclasses.asdict(options).items() if k not in _APART}
     digest = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:10]
     for name, make in made.items():
         task = None
-        for path in ("votes", "Adam from zero", "Adam from random", "Adam from votes"):
+        others = ("Adam from random", "Adam from votes") if name in options.all_starts else ()
+        for path in ("votes", "Adam from zero", *others):
             kept = out / "paths" / f"{name}-{path}-{digest}.json".replace(" ", "_")
             if not kept.exists():
-                task = task_of(make(), options) if task is None else task
+                if task is None:
+                    size = {"views": options.views, "shrink": options.shrink}
+                    task = task_of(make(), level=options.level, latent=options.latent, **size)
                 record = kept.with_suffix(".npz")
                 record.parent.mkdir(parents=True, exist_ok=True)
                 if path == "votes":
-                    found = votes_paths(task, options)
+                    found = votes_paths(task, loyalties=options.loyalties, sweeps=options.sweeps)
                 else:
-                    found = adam_path(task, options, path.rpartition(" ")[2], record)
+                    start = path.rpartition(" ")[2]
+                    found = adam_path(task, start, record, steps=options.steps, looks=options.looks)
                 write_text(kept, json.dumps(found, indent=1) + "\n")
                 record.unlink(missing_ok=True)
             rows += [{"scene": name, **row} for row in json.loads(kept.read_text())]

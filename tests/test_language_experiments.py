@@ -10,7 +10,7 @@ import pytest
 from scipy import sparse
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
-from experiments import ablations, autoencoder, distillation, scenes
+from experiments import ablations, autoencoder, code_paths, distillation, scenes
 from jsecon import cache
 from jsecon.splat.tiles import plan_capacity
 from jsecon.vision.simulated import SimulatedMasks, made_text_space
@@ -23,14 +23,11 @@ def task(scene, cameras):
     labels = jnp.asarray(labels_of(scene, cameras, members))
     codes = jnp.asarray(unit_rows(np.random.default_rng(1), REGIONS, 3))
     capacity = plan_capacity(scene, cameras, margin=1.0)
-    return distillation.Task("small", scene, cameras, labels, codes, np.arange(REGIONS), members, capacity)
-
-
-OPTIONS = distillation.Options(steps=8, looks=(0.5, 1.0), loyalties=(0.1,), sweeps=(8,))
+    return code_paths.Task("small", scene, cameras, labels, codes, np.arange(REGIONS), members, capacity)
 
 
 def test_the_solver_is_below_the_votes_it_starts_from(task):
-    rows = {row["path"]: row for row in distillation.votes_paths(task, OPTIONS)}
+    rows = {row["path"]: row for row in code_paths.votes_paths(task, loyalties=(0.1,), sweeps=(8,))}
     assert len(rows) == 5
     solver = next(row for name, row in rows.items() if name.startswith("solver"))
     assert solver["l1"] < min(row["l1"] for name, row in rows.items() if name.startswith("votes"))
@@ -38,9 +35,10 @@ def test_the_solver_is_below_the_votes_it_starts_from(task):
 
 
 def test_a_stopped_descent_ends_as_a_whole_one(task, tmp_path, monkeypatch):
-    monkeypatch.setattr(distillation, "RESTS", 3)
-    whole = distillation.adam_path(task, OPTIONS, "random", tmp_path / "none.npz")
-    monkeypatch.setattr(distillation, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(code_paths, "RESTS", 3)
+    way = {"steps": 8, "looks": (0.5, 1.0)}
+    whole = code_paths.adam_path(task, "random", tmp_path / "none.npz", **way)
+    monkeypatch.setattr(code_paths, "CHECKPOINT_SECONDS", 0.0)
     real, calls = cache.save, []
 
     def stopping(path, value):
@@ -51,8 +49,8 @@ def test_a_stopped_descent_ends_as_a_whole_one(task, tmp_path, monkeypatch):
 
     monkeypatch.setattr(cache, "save", stopping)
     with pytest.raises(KeyboardInterrupt):
-        distillation.adam_path(task, OPTIONS, "random", tmp_path / "kept.npz")
-    again = distillation.adam_path(task, OPTIONS, "random", tmp_path / "kept.npz")
+        code_paths.adam_path(task, "random", tmp_path / "kept.npz", **way)
+    again = code_paths.adam_path(task, "random", tmp_path / "kept.npz", **way)
     drop = lambda rows: [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
     assert drop(again) == drop(whole)
     assert [row["steps"] for row in whole] == [4, 8]
@@ -64,7 +62,7 @@ def test_geometric_median_has_the_least_distance(task):
     votes = dataclasses.make_dataclass("V", ["regions", "weights"])(
         jnp.asarray(np.stack([rng.permutation(REGIONS)[:3] for _ in range(50)])), jnp.asarray(weights)
     )
-    found = np.asarray(distillation.geometric_median(votes, task.codes, rounds=200))
+    found = np.asarray(code_paths.geometric_median(votes, task.codes, rounds=200))
     values = np.asarray(task.codes)[np.asarray(votes.regions)]
 
     def cost(points):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.splat.plan import ViewPlan, plan_view
+from jsecon.splat.plan import ViewPlan, plan_views
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians
 
@@ -80,7 +81,9 @@ def view_plans(evidence: Evidence) -> ViewPlan:
     """The plans of all views, stacked on a leading axis: the geometry is frozen, so each is made once."""
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
     capacity = plan_capacity(gaussians, cameras, margin=1.0)
-    return jax.lax.map(lambda camera: plan_view(gaussians, camera, capacity=capacity), cameras)
+    plans = plan_views(gaussians, cameras, capacity=capacity, most_bytes=sys.maxsize)
+    assert plans is not None
+    return plans
 
 
 def only(plan: ViewPlan, mask: Array) -> ViewPlan:

@@ -1,10 +1,12 @@
 """A view's plan: what repeated renders of frozen geometry share, so that they skip projection and sorting."""
 
 import dataclasses
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
@@ -16,6 +18,9 @@ from jsecon.splat.differentiate import view_lists
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.tiles import TileLists, plan_capacity
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering
+
+PLAN_BYTES = 1 << 30
+"""most that the plans of all views may take together to be kept"""
 
 
 @jax.tree_util.register_dataclass
@@ -99,6 +104,29 @@ def _plan(
 
 
 _plan_compiled = jax.jit(_plan, static_argnums=(2, 4))
+
+
+def plan_views(
+    gaussians: Gaussians,
+    cameras: Camera,
+    *,
+    capacity: int,
+    near: float | Array = NEAR,
+    most_bytes: int = PLAN_BYTES,
+) -> ViewPlan | None:
+    """The plans of all views of a batch (T), stacked on a leading axis: `jax.tree.map(lambda a: a[t], plans)` is that
+    of view t. None where they would take more than `most_bytes` together: then each is to be made when it is wanted.
+    """
+    views = cameras.world_to_camera.shape[0]
+    make = functools.partial(_plan, capacity=capacity, near=near)
+    shape = jax.eval_shape(make, gaussians, cameras[0])
+    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shape))
+    return None if views * size > most_bytes else _plan_all(gaussians, cameras, capacity, near)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _plan_all(gaussians: Gaussians, cameras: Camera, capacity: int, near: float | Array) -> ViewPlan:
+    return lax.map(lambda camera: _plan(gaussians, camera, capacity, near), cameras)
 
 
 def render_plan(

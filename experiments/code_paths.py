@@ -1,0 +1,190 @@
+"""A scene's problem for distillation, and the paths to its Gaussians' codes, each timed and scored."""
+
+import dataclasses
+import functools
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import scenes
+from jsecon import cache
+from jsecon.evaluate.metrics import point_accuracy, point_class_means
+from jsecon.language.distill import descend, descent, distill_votes
+from jsecon.language.solve_l1 import solve_l1
+from jsecon.language.votes import region_votes
+from jsecon.numerics import cosine_matrix, normalize
+from jsecon.splat.plan import plan_views
+from jsecon.splat.render import render
+from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Votes
+from jsecon.vision.simulated import LEVELS, simulated_masks
+
+CHECKPOINT_SECONDS = 120.0
+"""between two records of a descent"""
+RESTS = 60
+"""steps of Adam between two looks at the clock"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One scene's problem."""
+
+    name: str
+    gaussians: Any
+    cameras: Any
+    labels: Any
+    """(T, H, W) regions of the disturbed masks."""
+    codes: Any
+    """(R, d) unit."""
+    origin: np.ndarray
+    """(R,) the true object of each region."""
+    truth: np.ndarray
+    """(N,) the true object of each Gaussian, -1 = none."""
+    capacity: int
+
+
+def task_of(scene: scenes.Scene, *, level: str, latent: int, views: int | None = None, shrink: int = 1) -> Task:
+    """The scene under masks disturbed at a named level, with random unit codes of `latent` numbers for the regions; at
+    most so many views, evenly spaced, and frames so many times smaller."""
+    count = len(scene.labels)
+    few = np.arange(count) if views is None else np.linspace(0, count - 1, min(views, count)).astype(int)
+    masks = simulated_masks(scene.labels[few], LEVELS[level], seed=scene.seed)
+    labels = masks.labels[:, shrink // 2 :: shrink, shrink // 2 :: shrink]
+    cameras = scene.cameras[few]
+    cameras = dataclasses.replace(
+        cameras,
+        **{name: getattr(cameras, name) / shrink for name in ("fx", "fy", "cx", "cy")},
+        width=labels.shape[2],
+        height=labels.shape[1],
+    )
+    codes = np.random.default_rng(scene.seed).normal(size=(len(masks.origin), latent)).astype(np.float32)
+    capacity = plan_capacity(scene.gaussians, cameras, margin=1.0)
+    return Task(
+        scene.name,
+        scene.gaussians,
+        cameras,
+        jnp.asarray(labels),
+        normalize(jnp.asarray(codes)),
+        masks.origin,
+        scene.truth,
+        capacity,
+    )
+
+
+def geometric_median(votes: Votes, codes: Any, *, rounds: int = 30) -> Any:
+    """(N, d) unit codes of least weighted distance to the voted regions' codes (Weiszfeld's iteration, from the mean);
+    zero where there are no votes."""
+    values, weight = codes[jnp.clip(votes.regions, 0)], jnp.where(votes.regions >= 0, votes.weights, 0.0)
+
+    def step(_, middle):
+        near = weight / jnp.maximum(jnp.linalg.norm(values - middle[:, None], axis=-1), 1e-6)
+        return (near[..., None] * values).sum(1) / jnp.maximum(near.sum(1, keepdims=True), 1e-30)
+
+    mean = (weight[..., None] * values).sum(1) / jnp.maximum(weight.sum(1, keepdims=True), 1e-30)
+    return normalize(jax.lax.fori_loop(0, rounds, step, mean))
+
+
+@functools.partial(jax.jit, static_argnames="capacity")
+def rendered_l1(gaussians, cameras, labels, table, codes, capacity):
+    """Mean over all T H W d numbers of the masked |rendered - target|."""
+
+    def one(view):
+        camera, image = view
+        error = render(gaussians, camera, codes, capacity=capacity).features - table[jnp.clip(image, 0)]
+        return jnp.mean(jnp.where((image >= 0)[..., None], jnp.abs(error), 0.0))
+
+    return jnp.mean(jax.lax.map(one, (cameras, labels)))
+
+
+def score(task: Task, codes: Any) -> dict[str, float]:
+    """Rendered L1 of unit codes, and the points' accuracy and mIoU through the nearest region's object."""
+    nearest = np.asarray(jnp.argmax(cosine_matrix(codes, task.codes), -1))
+    found = np.where(np.asarray(codes).any(-1), task.origin[nearest], -2)
+    loss = rendered_l1(task.gaussians, task.cameras, task.labels, task.codes, codes, task.capacity)
+    return {
+        "l1": float(loss),
+        "accuracy": point_accuracy(found, task.truth),
+        "miou": point_class_means(found, task.truth)[0],
+    }
+
+
+def timed(call) -> tuple[Any, float]:
+    """The result of the second call, and its seconds: the first compiles."""
+    jax.block_until_ready(call())
+    began = time.perf_counter()
+    out = jax.block_until_ready(call())
+    return out, time.perf_counter() - began
+
+
+def votes_paths(task: Task, *, loyalties: tuple[float, ...], sweeps: tuple[int, ...]) -> list[dict]:
+    """Reductions of the votes, and the solver from the mode, with each loyalty and each most number of sweeps."""
+    votes, spent = timed(
+        lambda: region_votes(task.gaussians, task.cameras, task.labels, len(task.origin), capacity=task.capacity)
+    )
+    rows = []
+    ways = {r: functools.partial(distill_votes, votes, task.codes, r, least_labelled=0.0) for r in ("mean", "median")}
+    ways["geometric median"] = functools.partial(jax.jit(geometric_median), votes, task.codes)
+    ways["mode"] = functools.partial(distill_votes, votes, task.codes, "mode", least_labelled=0.0)
+    for name, way in ways.items():
+        codes, own = timed(way)
+        rows.append({"path": f"votes, {name}", "seconds": spent + own, **score(task, codes)})
+    start, before = codes, spent + own
+    given = (task.gaussians, task.cameras, task.labels, task.codes, start)
+    for loyalty in loyalties:
+        for most in sweeps:
+            solve = functools.partial(
+                solve_l1, *given, loyalty=loyalty, sweeps=most, tolerance=1e-3, capacity=task.capacity
+            )
+            found, own = timed(solve)
+            rows.append(
+                {
+                    "path": f"solver from mode, loyalty {loyalty:g}, {int(found.sweeps)} sweeps",
+                    "seconds": before + own,
+                    **score(task, found.codes),
+                    "gap": float(found.gap),
+                    "converged": bool(found.converged),
+                }
+            )
+    return rows
+
+
+def adam_path(task: Task, start: str, record: Path, *, steps: int, looks: tuple[float, ...]) -> list[dict]:
+    """The paper's path from one start, measured at each of the parts `looks` of its way; gone on with from `record`
+    where there is one."""
+    before, init = 0.0, start
+    if start == "votes":
+        make = lambda: distill_votes(
+            region_votes(task.gaussians, task.cameras, task.labels, len(task.origin), capacity=task.capacity),
+            task.codes,
+            "mode",
+            least_labelled=0.0,
+        )
+        init, before = timed(make)
+    given = (task.gaussians, task.cameras, task.labels, task.codes)
+    state = descent(*given, steps=steps, key=jax.random.key(0), init=init)
+    seconds, rows = before, []
+    plans, own = timed(lambda: plan_views(task.gaussians, task.cameras, capacity=task.capacity))
+    seconds += own
+    go = functools.partial(descend, capacity=task.capacity, plans=plans)
+    jax.block_until_ready(go(state, *given, until=1))  # compiles
+    if record.exists():
+        leaves, seconds, rows = cache.load(record)
+        state, rows = jax.tree.unflatten(jax.tree.structure(state), leaves), json.loads(rows)
+    last = time.monotonic()
+    for look in sorted({max(1, round(part * steps)) for part in looks}):
+        while int(state.step) < look:
+            began = time.perf_counter()
+            state = jax.block_until_ready(go(state, *given, until=min(int(state.step) + RESTS, look)))
+            seconds += time.perf_counter() - began
+            if time.monotonic() - last > CHECKPOINT_SECONDS:
+                cache.save(record, (jax.tree.leaves(state), seconds, json.dumps(rows)))
+                last = time.monotonic()
+        if not any(row["steps"] == look for row in rows):
+            codes = normalize(state.features)
+            rows.append({"path": f"Adam from {start}", "steps": look, "seconds": seconds, **score(task, codes)})
+    return rows
