@@ -1,4 +1,4 @@
-"""A scene's problem for distillation, and the paths to its Gaussians' codes, each timed and scored."""
+"""A scene's problem for distillation, and the paths to its Gaussians' codes, each timed and scored. Seconds are CPU time."""
 
 import dataclasses
 import functools
@@ -14,15 +14,18 @@ import numpy as np
 from experiments import scenes
 from jsecon import cache
 from jsecon.evaluate.metrics import point_accuracy, point_class_means
+from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.distill import descend, descent, distill_votes
 from jsecon.language.solve_l1 import solve_l1
 from jsecon.language.votes import region_votes
 from jsecon.numerics import cosine_matrix, normalize
+from jsecon.query.anchored import query_anchored
+from jsecon.query.showing import with_shown
 from jsecon.splat.plan import plan_views
 from jsecon.splat.render import render
 from jsecon.splat.tiles import plan_capacity
-from jsecon.types import Votes
-from jsecon.vision.simulated import LEVELS, simulated_masks
+from jsecon.types import LanguageField, Regions, Votes
+from jsecon.vision.simulated import TextSpace
 
 CHECKPOINT_SECONDS = 120.0
 """between two records of a descent"""
@@ -41,6 +44,10 @@ class Task:
     """(T, H, W) regions of the disturbed masks."""
     codes: Any
     """(R, d) unit."""
+    regions: Regions
+    """their embeddings and pixels."""
+    texts: np.ndarray
+    """(K, E) of the true objects."""
     origin: np.ndarray
     """(R,) the true object of each region."""
     truth: np.ndarray
@@ -48,31 +55,43 @@ class Task:
     capacity: int
 
 
-def task_of(scene: scenes.Scene, *, level: str, latent: int, views: int | None = None, shrink: int = 1) -> Task:
-    """The scene under masks disturbed at a named level, with random unit codes of `latent` numbers for the regions; at
-    most so many views, evenly spaced, and frames so many times smaller."""
+def task_of(
+    scene: scenes.Scene,
+    space: TextSpace,
+    *,
+    level: str,
+    latent: int,
+    views: int | None = None,
+    shrink: int = 1,
+) -> Task:
+    """The scene under simulated vision of a named level, its regions coded as in the paper: embeddings averaged over
+    the views by their pixels, LangSplat's autoencoder to `latent` numbers. At most so many views, evenly spaced, and
+    frames so many times smaller."""
     count = len(scene.labels)
     few = np.arange(count) if views is None else np.linspace(0, count - 1, min(views, count)).astype(int)
-    masks = simulated_masks(scene.labels[few], LEVELS[level], seed=scene.seed)
-    labels = masks.labels[:, shrink // 2 :: shrink, shrink // 2 :: shrink]
-    cameras = scene.cameras[few]
+    few_of = {"frames": scene.frames[few], "labels": scene.labels[few], "cameras": scene.cameras[few]}
+    sight = scenes.look(dataclasses.replace(scene, **few_of), level, space)
+    embeddings = normalize(jnp.asarray(np.einsum("tr,tre->re", sight.pixels, sight.embeddings), jnp.float32))
+    coder = train_autoencoder(embeddings, latent=latent, key=jax.random.key(scene.seed))
+    labels = sight.masks.labels[:, shrink // 2 :: shrink, shrink // 2 :: shrink]
+    cameras = few_of["cameras"]
     cameras = dataclasses.replace(
         cameras,
         **{name: getattr(cameras, name) / shrink for name in ("fx", "fy", "cx", "cy")},
         width=labels.shape[2],
         height=labels.shape[1],
     )
-    codes = np.random.default_rng(scene.seed).normal(size=(len(masks.origin), latent)).astype(np.float32)
-    capacity = plan_capacity(scene.gaussians, cameras, margin=1.0)
     return Task(
         scene.name,
         scene.gaussians,
         cameras,
         jnp.asarray(labels),
-        normalize(jnp.asarray(codes)),
-        masks.origin,
+        normalize(coder.encode(embeddings)),
+        Regions(np.asarray(embeddings), sight.pixels.T.astype(np.int32)),
+        sight.texts,
+        sight.masks.origin,
         scene.truth,
-        capacity,
+        plan_capacity(scene.gaussians, cameras, margin=1.0),
     )
 
 
@@ -101,8 +120,9 @@ def rendered_l1(gaussians, cameras, labels, table, codes, capacity):
     return jnp.mean(jax.lax.map(one, (cameras, labels)))
 
 
-def score(task: Task, codes: Any) -> dict[str, float]:
-    """Rendered L1 of unit codes, and the points' accuracy and mIoU through the nearest region's object."""
+def score(task: Task, codes: Any, votes: Votes) -> dict[str, float]:
+    """Of unit codes: rendered L1; the points' accuracy and mIoU through the nearest region's object; and the mIoU of
+    the selections that the texts anchor, by code."""
     nearest = np.asarray(jnp.argmax(cosine_matrix(codes, task.codes), -1))
     found = np.where(np.asarray(codes).any(-1), task.origin[nearest], -2)
     loss = rendered_l1(task.gaussians, task.cameras, task.labels, task.codes, codes, task.capacity)
@@ -110,29 +130,50 @@ def score(task: Task, codes: Any) -> dict[str, float]:
         "l1": float(loss),
         "accuracy": point_accuracy(found, task.truth),
         "miou": point_class_means(found, task.truth)[0],
+        "anchored": anchored(task, codes, votes, by="code"),
     }
 
 
+def anchored(task: Task, codes: Any, votes: Votes, *, by: str) -> float:
+    """Mean over the texts of objects that some Gaussian belongs to: IoU of the anchored selection with those."""
+    names, phrases = tuple(map(str, range(len(task.labels)))), np.zeros((0, task.texts.shape[1]), np.float32)
+    field = LanguageField(
+        task.gaussians, codes, votes, task.regions, task.codes, None, task.cameras, phrases, np.eye(4), names
+    )
+    ious = []
+    for k, text in enumerate(task.texts):
+        true = task.truth == k
+        if true.any():
+            mask = np.asarray(query_anchored(field, jnp.asarray(text), by=by).mask)
+            ious.append((mask & true).sum() / (mask | true).sum())
+    return float(np.mean(ious))
+
+
+def votes_of(task: Task) -> Votes:
+    """The regions' votes, which know the views that show a region."""
+    given = task.gaussians, task.cameras, task.labels, len(task.origin)
+    return with_shown(region_votes(*given, by_view=True, capacity=task.capacity), task.regions)
+
+
 def timed(call) -> tuple[Any, float]:
-    """The result of the second call, and its seconds: the first compiles."""
+    """The result of the second call, and its CPU seconds: the first compiles."""
     jax.block_until_ready(call())
-    began = time.perf_counter()
+    began = time.process_time()
     out = jax.block_until_ready(call())
-    return out, time.perf_counter() - began
+    return out, time.process_time() - began
 
 
 def votes_paths(task: Task, *, loyalties: tuple[float, ...], sweeps: tuple[int, ...]) -> list[dict]:
     """Reductions of the votes, and the solver from the mode, with each loyalty and each most number of sweeps."""
-    votes, spent = timed(
-        lambda: region_votes(task.gaussians, task.cameras, task.labels, len(task.origin), capacity=task.capacity)
-    )
+    votes, spent = timed(lambda: votes_of(task))
     rows = []
     ways = {r: functools.partial(distill_votes, votes, task.codes, r, least_labelled=0.0) for r in ("mean", "median")}
     ways["geometric median"] = functools.partial(jax.jit(geometric_median), votes, task.codes)
     ways["mode"] = functools.partial(distill_votes, votes, task.codes, "mode", least_labelled=0.0)
     for name, way in ways.items():
         codes, own = timed(way)
-        rows.append({"path": f"votes, {name}", "seconds": spent + own, **score(task, codes)})
+        rows.append({"path": f"votes, {name}", "seconds": spent + own, **score(task, codes, votes)})
+    rows[-1]["anchored_by_votes"] = anchored(task, codes, votes, by="votes")
     start, before = codes, spent + own
     given = (task.gaussians, task.cameras, task.labels, task.codes, start)
     for loyalty in loyalties:
@@ -145,7 +186,7 @@ def votes_paths(task: Task, *, loyalties: tuple[float, ...], sweeps: tuple[int, 
                 {
                     "path": f"solver from mode, loyalty {loyalty:g}, {int(found.sweeps)} sweeps",
                     "seconds": before + own,
-                    **score(task, found.codes),
+                    **score(task, found.codes, votes),
                     "gap": float(found.gap),
                     "converged": bool(found.converged),
                 }
@@ -156,15 +197,9 @@ def votes_paths(task: Task, *, loyalties: tuple[float, ...], sweeps: tuple[int, 
 def adam_path(task: Task, start: str, record: Path, *, steps: int, looks: tuple[float, ...]) -> list[dict]:
     """The paper's path from one start, measured at each of the parts `looks` of its way; gone on with from `record`
     where there is one."""
-    before, init = 0.0, start
+    before, init, votes = 0.0, start, votes_of(task)
     if start == "votes":
-        make = lambda: distill_votes(
-            region_votes(task.gaussians, task.cameras, task.labels, len(task.origin), capacity=task.capacity),
-            task.codes,
-            "mode",
-            least_labelled=0.0,
-        )
-        init, before = timed(make)
+        init, before = timed(lambda: distill_votes(votes_of(task), task.codes, "mode", least_labelled=0.0))
     given = (task.gaussians, task.cameras, task.labels, task.codes)
     state = descent(*given, steps=steps, key=jax.random.key(0), init=init)
     seconds, rows = before, []
@@ -178,13 +213,13 @@ def adam_path(task: Task, start: str, record: Path, *, steps: int, looks: tuple[
     last = time.monotonic()
     for look in sorted({max(1, round(part * steps)) for part in looks}):
         while int(state.step) < look:
-            began = time.perf_counter()
+            began = time.process_time()
             state = jax.block_until_ready(go(state, *given, until=min(int(state.step) + RESTS, look)))
-            seconds += time.perf_counter() - began
+            seconds += time.process_time() - began
             if time.monotonic() - last > CHECKPOINT_SECONDS:
                 cache.save(record, (jax.tree.leaves(state), seconds, json.dumps(rows)))
                 last = time.monotonic()
         if not any(row["steps"] == look for row in rows):
             codes = normalize(state.features)
-            rows.append({"path": f"Adam from {start}", "steps": look, "seconds": seconds, **score(task, codes)})
+            rows.append({"path": f"Adam from {start}", "steps": look, "seconds": seconds, **score(task, codes, votes)})
     return rows

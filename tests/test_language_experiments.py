@@ -13,6 +13,7 @@ from small_field import REGIONS, labels_of, true_regions, unit_rows
 from experiments import ablations, autoencoder, code_paths, distillation, scenes
 from jsecon import cache
 from jsecon.splat.tiles import plan_capacity
+from jsecon.types import Regions
 from jsecon.vision.simulated import SimulatedMasks, made_text_space
 
 
@@ -23,7 +24,11 @@ def task(scene, cameras):
     labels = jnp.asarray(labels_of(scene, cameras, members))
     codes = jnp.asarray(unit_rows(np.random.default_rng(1), REGIONS, 3))
     capacity = plan_capacity(scene, cameras, margin=1.0)
-    return code_paths.Task("small", scene, cameras, labels, codes, np.arange(REGIONS), members, capacity)
+    pixels = np.stack([(np.asarray(labels) == r).sum((1, 2)) for r in range(REGIONS)])
+    regions, texts = Regions(np.eye(REGIONS, 8, dtype=np.float32), pixels), np.eye(REGIONS, 8, dtype=np.float32)
+    return code_paths.Task(
+        "small", scene, cameras, labels, codes, regions, texts, np.arange(REGIONS), members, capacity
+    )
 
 
 def test_the_solver_is_below_the_votes_it_starts_from(task):
@@ -32,6 +37,8 @@ def test_the_solver_is_below_the_votes_it_starts_from(task):
     solver = next(row for name, row in rows.items() if name.startswith("solver"))
     assert solver["l1"] < min(row["l1"] for name, row in rows.items() if name.startswith("votes"))
     assert all(row["accuracy"] > 0.4 and row["seconds"] > 0 for row in rows.values())
+    assert rows["votes, mode"]["anchored_by_votes"] > 0.4
+    assert rows["votes, mode"]["anchored"] > 0.4
 
 
 def test_a_stopped_descent_ends_as_a_whole_one(task, tmp_path, monkeypatch):
