@@ -1,4 +1,4 @@
-"""A scene's problem for distillation, and the paths to its Gaussians' codes, each timed and scored. Seconds are CPU time."""
+"""A scene's problem for distillation, and the paths to its Gaussians' codes, each timed (CPU seconds) and scored."""
 
 import dataclasses
 import functools
