@@ -29,6 +29,7 @@ from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_region
 from jsecon.query.masks import selection_mask
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.showing import with_shown
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}
@@ -154,14 +155,15 @@ def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> L
     used = np.flatnonzero(~capture.held_out)
     cameras = jax.tree.map(jnp.asarray, capture.cameras[used])
     count = len(OBJECTS) + 1
-    votes = region_votes(gaussians, cameras, jnp.asarray(labels[used]), count)
     codes = jnp.eye(count)
     pixels = np.stack([(labels[used] == r).sum((1, 2)) for r in range(count)]).astype(np.int32)
+    regions = Regions(codes, jnp.asarray(pixels))
+    votes = with_shown(region_votes(gaussians, cameras, jnp.asarray(labels[used]), count, by_view=True), regions)
     return LanguageField(
         gaussians=gaussians,
         codes=distill_votes(votes, codes, "mode"),
         votes=votes,
-        regions=Regions(codes, jnp.asarray(pixels)),
+        regions=regions,
         region_codes=codes,
         autoencoder=None,
         cameras=cameras,

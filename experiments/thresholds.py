@@ -27,6 +27,7 @@ from jsecon.query.anchored import query_anchored
 from jsecon.query.canonical import query_canonical
 from jsecon.query.masks import selection_mask
 from jsecon.query.one_step import query_one_step
+from jsecon.query.showing import with_shown
 from jsecon.types import Camera, Gaussians, LanguageField
 from jsecon.vision.simulated import LEVELS, SimulatedEmbedder
 
@@ -96,7 +97,8 @@ def main(options: Options = Options()) -> dict:
         classes = [space.names[i] for i in chosen]
         embedder = SimulatedEmbedder(scene.frames, scene.labels, classes, space, LEVELS[options.level], seed=seed)
         regions = region_embeddings(scene.frames, scene.labels, embedder.embed_regions, num_regions=scene.count)
-        votes = region_votes(scene.gaussians, scene.cameras, jnp.asarray(scene.labels), scene.count)
+        votes = region_votes(scene.gaussians, scene.cameras, jnp.asarray(scene.labels), scene.count, by_view=True)
+        votes = with_shown(votes, regions)
         texts = embedder.embed_text(classes)
         hits += list((texts @ np.asarray(regions.embeddings).T).argmax(1) == np.arange(scene.count))
 
