@@ -39,7 +39,7 @@ class Options:
     texts: str = str(results.CAPTURES.parent / "text")
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     levels: tuple[str, ...] = ("low", "medium", "high")
-    latents: tuple[int, ...] = (3, 16)
+    latents: tuple[int, ...] = (3, 8, 16, 32)
     share: float = 0.5
     """threshold on shares of votes and posteriors."""
     out: str = str(results.HOME / "results" / "beyond")

@@ -4,7 +4,7 @@ A CPU is one device to jax unless the program says otherwise before jax starts (
 line does. The library only uses what it finds.
 
 One view over both devices, under jit: `render(..., mesh=host_mesh())`. Many views: `spread_over_devices`, one view a
-device, which shares nothing and so scales better.
+device, which shares nothing and so scales better, and over several processes too.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import AxisType, Mesh, PartitionSpec
 
 AXIS = "devices"
@@ -66,28 +67,41 @@ def spread_over_devices(
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, list[Any]]:
     """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`, view t on device
-    t mod D; returns the state and each view's `out`, which stays on its device.
+    t mod D; returns the state and each view's `out`, in the views' order.
 
     `start` is the neutral state of `merge`, which joins the devices' states pairwise in device order. Host code;
     dispatch is asynchronous, so the devices work side by side. `progress(done, total)` is called as views finish.
+
+    Over several processes (`jax.distributed.initialize`), each given the same arguments, process p of P takes views p,
+    p + P, ...; all end with the same result.
     """
-    leaves = jax.tree.leaves(views)
-    count = leaves[0].shape[0]
-    devices = jax.local_devices()[: max(1, min(count, jax.local_device_count()))]
+    rank, world = jax.process_index(), jax.process_count()
+    count = jax.tree.leaves(views)[0].shape[0]
+    own = range(rank, count, world)
+    devices = jax.local_devices()[: max(1, min(len(own), jax.local_device_count()))]
     shared = [jax.device_put(common, device) for device in devices]
     states = [jax.tree.map(lambda a, d=device: jax.device_put(a, d).copy(), start) for device in devices]
     outs = []
-    waves = range(0, count, len(devices))
-    for first in waves:
-        wave = range(first, min(first + len(devices), count))
+    for first in range(0, len(own), len(devices)):
+        wave = own[first : first + len(devices)]
         for index, t in enumerate(wave):
             view = jax.device_put(jax.tree.map(lambda a, t=t: a[t], views), devices[index])
             states[index], out = step(states[index], shared[index], view, *static)
             outs.append(out)
         if progress is not None:
             jax.block_until_ready(states)
-            progress(wave.stop, count)
+            progress(min((first + len(wave)) * world, count), count)
     total = states[0]
     for state in states[1:]:
         total = merge(total, jax.device_put(state, devices[0]))
-    return total, outs
+    outs = [jax.device_put(out, devices[0]) for out in outs]
+    if world == 1:
+        return total, outs
+    parts = process_allgather(total)
+    total = jax.tree.map(lambda a: jnp.asarray(a[0]), parts)
+    for p in range(1, world):
+        total = merge(total, jax.tree.map(lambda a, p=p: jnp.asarray(a[p]), parts))
+    blank = jax.eval_shape(lambda *given: step(*given, *static)[1], start, common, jax.tree.map(lambda a: a[0], views))
+    outs += [jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), blank)] * (-(-count // world) - len(own))
+    parts = process_allgather(jax.tree.map(lambda *rows: jnp.stack(rows), *outs))
+    return total, [jax.tree.map(lambda a, t=t: jnp.asarray(a[t % world, t // world]), parts) for t in range(count)]

@@ -46,9 +46,11 @@ def region_votes(
     """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
 
     Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
-    is kept too (`Votes.by_view`, 4 T N bytes), as `query.showing.with_shown` wants it. Outside a trace the views are
-    spread over jax's local devices and `progress(done, total)` is called after each; inside one the views are scanned
-    and `capacity` must be given. Raises ValueError on shapes that disagree.
+    is kept too (`Votes.by_view`, 4 T N bytes), as `query.showing.with_shown` wants it.
+
+    Outside a trace the views are spread over jax's local devices, and over processes that all make the same call
+    (`jax.distributed`), and `progress(done, total)` is called after each; inside one the views are scanned and
+    `capacity` must be given. Raises ValueError on shapes that disagree.
     """
     views = cameras.world_to_camera.shape[0]
     require(
@@ -101,7 +103,7 @@ def region_votes(
         labelled = state["votes"].sum(-1) if b == 0 else labelled + state["votes"].sum(-1)
     seen = None
     if by_view:
-        seen = totals if traced else jnp.stack([jax.device_put(total, jax.local_devices()[0]) for total in totals])
+        seen = totals if traced else jnp.stack(totals)
     return Votes(
         kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions, seen
     )
