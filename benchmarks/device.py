@@ -14,26 +14,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scenes import GARDEN, garden
 
 import jsecon
-
-SCENE = Path(__file__).resolve().parent.parent.parent / "shared" / "splats" / "garden"
-
-
-def load(folder: Path) -> tuple[jsecon.Gaussians, jsecon.Camera, np.ndarray]:
-    """Gaussians, camera of view 0, colours (N, 3)."""
-    d = np.load(folder / "scene.npz")
-    opacity = d["opacities"].astype(np.float64)
-    gaussians = jsecon.Gaussians(
-        d["means"].astype(np.float32),
-        np.log(d["scales"]).astype(np.float32),
-        d["quats"].astype(np.float32),
-        (np.log(opacity) - np.log1p(-opacity)).astype(np.float32),
-        np.zeros((len(opacity), 1, 3), np.float32),
-    )
-    k = d["Ks"][0].astype(np.float32)
-    numbers = (k[0, 0], k[1, 1], k[0, 2], k[1, 2], int(d["width"]), int(d["height"]))
-    return gaussians, jsecon.Camera(d["viewmats"][0].astype(np.float32), *numbers), d["colors"].astype(np.float32)
 
 
 def measure(device, gaussians, camera, features, capacity: int, repeats: int) -> dict:
@@ -75,10 +58,13 @@ def relative(a: np.ndarray, b: np.ndarray) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", type=Path, default=SCENE)
+    parser.add_argument("--scene", type=Path, default=GARDEN)
     parser.add_argument("--repeats", type=int, default=9)
     arguments = parser.parse_args()
-    gaussians, camera, features = load(arguments.scene)
+    scene = garden(arguments.scene)
+    if scene is None:
+        parser.error(f"no scene.npz in {arguments.scene}")
+    gaussians, camera, features = scene
     cpu, device = jax.devices("cpu")[0], jax.devices()[0]
     with jax.default_device(cpu):
         capacity = jsecon.plan_capacity(gaussians, camera, margin=1.0)

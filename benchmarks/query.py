@@ -1,23 +1,22 @@
 """Query speed with its error beside it.
 
-    python benchmarks/query.py [--gaussians 1000000] [--repeats 7] [--gate] [--update]
+    python benchmarks/query.py [--gaussians 1000000] [--repeats 7]
 
 A made field: random votes over 40 regions, unit codes of 3 and of 512 numbers, one query compiled, and 100 queries
-under vmap, in turn in one run. Errors are against NumPy float64. `--gate` exits 1 where a figure left its tolerance of
-benchmarks/baseline_query.json.
+under vmap, in turn in one run. Errors are against NumPy float64.
 """
 
 import argparse
 import functools
-import json
-import sys
-from pathlib import Path
 
-from render import HOME, Metric, interleaved  # first: it settles XLA_FLAGS before jax starts
+from jsecon.process import prepare_process
 
-import jax  # isort: skip
+prepare_process(keep_programs=False)
+
+import jax
 import jax.numpy as jnp
 import numpy as np
+from metrics import Metric, interleaved, show
 
 from jsecon.query.anchored import query_anchored
 from jsecon.query.one_step import query_one_step
@@ -86,28 +85,13 @@ def measure(count: int, repeats: int) -> list[Metric]:
     return rows
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--gate", action="store_true", help="exit 1 where a figure is worse than the baseline allows")
-    parser.add_argument("--update", action="store_true", help="write benchmarks/baseline_query.json")
     arguments = parser.parse_args()
-    rows = measure(arguments.gaussians, arguments.repeats)
-    print(f"jax {jax.__version__}, {jax.local_device_count()} {jax.default_backend()} device(s)")
-    print("| what | figure | unit | beside it |\n|---|---|---|---|")
-    for row in rows:
-        print(f"| {row.key} | {row.value:.3g} | {row.unit} | {row.note} |")
-    path: Path = HOME / "baseline_query.json"
-    if arguments.update:
-        path.write_text(json.dumps({row.key: row._asdict() for row in rows}, indent=1) + "\n")
-    if arguments.gate:
-        baseline = json.loads(path.read_text())
-        worse = [r.key for r in rows if r.key in baseline and r.value > baseline[r.key]["value"] * (1 + r.tolerance)]
-        print("worse than the baseline:", worse or "nothing")
-        return int(bool(worse))
-    return 0
+    show(measure(arguments.gaussians, arguments.repeats))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -15,13 +15,10 @@ import argparse
 import atexit
 import json
 import shutil
-import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
-from typing import NamedTuple
 
 from jsecon.process import prepare_process
 
@@ -30,6 +27,8 @@ prepare_process(keep_programs=False)
 import jax
 import jax.numpy as jnp
 import numpy as np
+from metrics import Metric, interleaved, show
+from scenes import GARDEN, ball, garden
 
 import jsecon
 from jsecon.parallel import host_mesh
@@ -37,72 +36,7 @@ from jsecon.splat.composite import composite
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.types import Camera, Gaussians
 
-HOME = Path(__file__).resolve().parent
-SHARED = HOME.parent.parent / "shared"
-
-
-class Metric(NamedTuple):
-    """One row of the contract."""
-
-    key: str
-    value: float
-    unit: str
-    direction: str
-    """lower or higher is better"""
-    tolerance: float
-    """share by which the value may be worse than the baseline"""
-    note: str = ""
-
-
-def made_up_scene(count: int = 20_000, width: int = 320, height: int = 240) -> tuple[Gaussians, Camera]:
-    """Gaussians in a ball before a camera, sizes and turns at random."""
-    rng = np.random.default_rng(0)
-    gaussians = Gaussians(
-        rng.normal(size=(count, 3)).astype(np.float32),
-        np.log(rng.uniform(0.005, 0.05, (count, 3))).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.normal(size=count).astype(np.float32),
-        np.zeros((count, 1, 3), np.float32),
-    )
-    pose = np.eye(4, dtype=np.float32)
-    pose[2, 3] = 4
-    return gaussians, Camera(pose, *(np.float32(v) for v in (300, 300, width / 2, height / 2)), width, height)
-
-
-def garden() -> tuple[Gaussians, Camera] | None:
-    """The reference scene beside the checkout, view 0, or None."""
-    path = SHARED / "splats" / "garden" / "scene.npz"
-    if not path.exists():
-        return None
-    d = np.load(path)
-    opacity = d["opacities"].astype(np.float64)
-    gaussians = Gaussians(
-        d["means"].astype(np.float32),
-        np.log(d["scales"]).astype(np.float32),
-        d["quats"].astype(np.float32),
-        (np.log(opacity) - np.log1p(-opacity)).astype(np.float32),
-        np.zeros((len(opacity), 1, 3), np.float32),
-    )
-    k = d["Ks"][0].astype(np.float32)
-    return gaussians, Camera(
-        d["viewmats"][0].astype(np.float32), k[0, 0], k[1, 1], k[0, 2], k[1, 2], int(d["width"]), int(d["height"])
-    )
-
-
-def interleaved(functions: dict, repeats: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Median ms of each call, taken in turn, and the seconds of each first call (compilation). A call that returns a
-    number has timed itself."""
-    compile_s, taken = {}, {name: [] for name in functions}
-    for name, call in functions.items():
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        compile_s[name] = time.perf_counter() - start
-    for _ in range(repeats):
-        for name, call in functions.items():
-            start = time.perf_counter()
-            out = jax.block_until_ready(call())
-            taken[name].append(out if isinstance(out, float) else 1e3 * (time.perf_counter() - start))
-    return {name: statistics.median(values) for name, values in taken.items()}, compile_s
+BASELINE = Path(__file__).resolve().with_name("baseline.json")
 
 
 def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> list[Metric]:
@@ -214,7 +148,7 @@ def nearby(camera: Camera, count: int) -> Camera:
 
 def hand_laid(plan, features, camera: Camera):
     """A call that returns the ms that ../shared/limit takes on the plan's lists, or None where it can't be built."""
-    source = SHARED / "limit" / "limit.cpp"
+    source = GARDEN.parent.parent / "limit" / "limit.cpp"
     if not source.exists() or shutil.which("g++") is None:
         return None
     s, lengths = np.asarray(plan.splats), np.asarray(plan.lists.lengths)
@@ -249,24 +183,16 @@ def main() -> int:
     parser.add_argument("--gate", action="store_true", help="exit 1 where a figure is worse than the baseline allows")
     parser.add_argument("--update", action="store_true", help="write benchmarks/baseline.json")
     arguments = parser.parse_args()
-    scenes = {"made-up 20k 320x240": made_up_scene(), "garden 648x420": garden()}
-    rows = [
-        row for name, scene in scenes.items() if scene is not None for row in measure(name, *scene, arguments.repeats)
-    ]
-    print(f"jax {jax.__version__}, {jax.local_device_count()} {jax.default_backend()} device(s)")
-    print("| what | figure | unit | beside it |\n|---|---|---|---|")
-    for row in rows:
-        print(f"| {row.key} | {row.value:.3g} | {row.unit} | {row.note} |")
-    path = HOME / "baseline.json"
+    rows = measure("made-up 20k 320x240", *ball(20_000, (0.005, 0.05), 320, 240, 300), arguments.repeats)
+    scene = garden()
+    if scene is not None:
+        rows += measure("garden 648x420", *scene[:2], arguments.repeats)
+    show(rows)
     if arguments.update:
-        path.write_text(json.dumps({row.key: row._asdict() for row in rows}, indent=1) + "\n")
+        BASELINE.write_text(json.dumps({row.key: row._asdict() for row in rows}, indent=1) + "\n")
     if arguments.gate:
-        baseline = json.loads(path.read_text())
-        worse = [
-            row.key
-            for row in rows
-            if row.key in baseline and row.value > baseline[row.key]["value"] * (1 + row.tolerance)
-        ]
+        known = json.loads(BASELINE.read_text())
+        worse = [r.key for r in rows if r.key in known and r.value > known[r.key]["value"] * (1 + r.tolerance)]
         print("worse than the baseline:", worse or "nothing")
         return int(bool(worse))
     return 0

@@ -30,25 +30,15 @@ def one(count: int, width: int, height: int, channels: int, repeats: int) -> dic
     import jax
     import jax.numpy as jnp
     import numpy as np
+    from scenes import ball
 
     import jsecon
     from jsecon.parallel import host_mesh
     from jsecon.splat.plan import plan_view
 
-    rng = np.random.default_rng(0)
     size = 0.6 * count ** (-1 / 3)
-    gaussians = jsecon.Gaussians(
-        jnp.asarray(rng.normal(size=(count, 3)), jnp.float32),
-        jnp.asarray(np.log(size * rng.uniform(0.1, 1.0, (count, 3))), jnp.float32),
-        jnp.asarray(rng.normal(size=(count, 4)), jnp.float32),
-        jnp.asarray(rng.normal(size=count), jnp.float32),
-        jnp.zeros((count, 1, 3), jnp.float32),
-    )
-    pose = np.eye(4, dtype=np.float32)
-    pose[2, 3] = 4
-    numbers = (jnp.float32(v) for v in (0.9 * width, 0.9 * width, width / 2, height / 2))
-    camera = jsecon.Camera(jnp.asarray(pose), *numbers, width, height)
-    features = jnp.asarray(rng.normal(size=(count, channels)), jnp.float32)
+    gaussians, camera = jax.tree.map(jnp.asarray, ball(count, (0.1 * size, size), width, height, 0.9 * width))
+    features = jnp.asarray(np.random.default_rng(1).normal(size=(count, channels)), jnp.float32)
     capacity = jsecon.plan_capacity(gaussians, camera, margin=1.0)
     start = time.perf_counter()
     draw = lambda g, f: jsecon.render(g, camera, f, capacity=capacity, mesh=host_mesh())

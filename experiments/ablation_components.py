@@ -19,11 +19,8 @@ QUICK = dataclasses.replace(
 
 
 def main(plan: tables.Plan) -> str:
-    """Fills the table, writes it, returns it."""
-    cells = tables.fill(plan, COMPONENTS, tell=print)
-    text = tables.write(plan, cells, lerf.FIGURES, notes=lerf.NOTES)
-    print(text)
-    return text
+    """The table, written."""
+    return tables.make(plan, COMPONENTS, lerf.FIGURES, notes=lerf.NOTES)
 
 
 if __name__ == "__main__":

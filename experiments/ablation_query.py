@@ -17,11 +17,8 @@ QUICK = dataclasses.replace(lerf.QUICK, methods=tuple(QUERIES), out=str(HOME / "
 
 
 def main(plan: tables.Plan) -> str:
-    """Fills the table, writes it, returns it."""
-    cells = tables.fill(plan, QUERIES, tell=print)
-    text = tables.write(plan, cells, lerf.FIGURES, notes=lerf.NOTES)
-    print(text)
-    return text
+    """The table, written."""
+    return tables.make(plan, QUERIES, lerf.FIGURES, notes=lerf.NOTES)
 
 
 if __name__ == "__main__":

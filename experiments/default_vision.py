@@ -25,7 +25,6 @@ from experiments import replica_apartment_0, results
 from jsecon.data.capture import load_capture
 from jsecon.demo import demo
 from jsecon.eyes import Eyes
-from jsecon.fit.initialise import gaussians_from_points, points_from_depth
 from jsecon.language.field import load_field
 from jsecon.options import Options as RunOptions
 from jsecon.plan import Silent
@@ -150,11 +149,7 @@ def replica(folder: str) -> tuple[Capture, Gaussians, np.ndarray]:
     """replica_apartment_0, every second view, its depth points as Gaussians."""
     given = replica_apartment_0.Options(capture=folder)
     capture, truth = replica_apartment_0.load_replica(folder, voting_every=given.voting_every)
-    points = points_from_depth(capture, voxel=given.voxel_m, stride=given.stride, frames=np.arange(len(capture.names)))
-    gaussians = gaussians_from_points(
-        points.points, points.colors, opacity=given.opacity, scale=given.scale, max_scale=2 * given.voxel_m
-    )
-    return capture, gaussians, truth
+    return capture, replica_apartment_0.points_as_gaussians(capture, given)[1], truth
 
 
 def main(options: Options = Options()) -> dict:

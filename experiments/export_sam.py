@@ -20,12 +20,17 @@ def official(kind: str, weights: Path | None, *, seed: int) -> torch.nn.Module:
     torch.manual_seed(seed)
     model = sam_model_registry[kind](checkpoint=None if weights is None else str(weights))
     if weights is None:
-        shake(model, seed)
-        with torch.no_grad():
-            for head in model.mask_decoder.output_hypernetworks_mlps:
-                head.layers[-1].weight *= STRETCH
-                head.layers[-1].bias *= STRETCH
+        make_random(model, seed)
     return model.eval().requires_grad_(False)
+
+
+def make_random(model: torch.nn.Module, seed: int) -> None:
+    """Random numbers in every parameter, mask logits stretched."""
+    shake(model, seed)
+    with torch.no_grad():
+        for head in model.mask_decoder.output_hypernetworks_mlps:
+            head.layers[-1].weight *= STRETCH
+            head.layers[-1].bias *= STRETCH
 
 
 def export(model: torch.nn.Module, folder: Path, *, seed: int, threads: int) -> list[Agreement]:

@@ -16,9 +16,8 @@ from experiments.command import QUICK_STEPS, options_of
 from experiments.methods import METHODS
 from experiments.results import HOME
 
-SIZE = (("views", 30), ("width", 256), ("height", 192))
 PLAN = tables.Plan(
-    twins.Data("lerf", scenes=published.LERF_SCENES, size=SIZE),
+    twins.Data("lerf", scenes=published.LERF_SCENES, size=(("views", 30), ("width", 256), ("height", 192))),
     tuple(METHODS),
     out=str(HOME / "results" / "lerf"),
 )
@@ -43,13 +42,9 @@ NOTES = (
 
 
 def main(plan: tables.Plan) -> str:
-    """Fills the table, writes it, returns it."""
-    cells = tables.fill(plan, METHODS, tell=print)
-    columns = (*published.LERF_SCENES, "mean")
-    beside = published.table("LERF-OVS", published.LERF, columns)
-    text = tables.write(plan, cells, FIGURES, notes=NOTES, published=beside)
-    print(text)
-    return text
+    """The table, written."""
+    beside = published.table("LERF-OVS", published.LERF, (*published.LERF_SCENES, "mean"))
+    return tables.make(plan, METHODS, FIGURES, notes=NOTES, published=beside)
 
 
 if __name__ == "__main__":

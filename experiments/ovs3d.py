@@ -36,12 +36,9 @@ QUICK = dataclasses.replace(
 
 
 def main(plan: tables.Plan) -> str:
-    """Fills the table, writes it, returns it."""
-    cells = tables.fill(plan, METHODS, tell=print)
+    """The table, written."""
     beside = published.table("3D-OVS", published.OVS3D, ("mean of 5 scenes",))
-    text = tables.write(plan, cells, FIGURES, notes=NOTES, published=beside)
-    print(text)
-    return text
+    return tables.make(plan, METHODS, FIGURES, notes=NOTES, published=beside)
 
 
 if __name__ == "__main__":

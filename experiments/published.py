@@ -3,7 +3,9 @@
 Sources: the papers as read for REFERENCE 0 and IDEAS 2. A scene's entry is (mIoU, mAcc); None = not known to us.
 """
 
-LERF_SCENES = ("figurines", "ramen", "teatime", "waldo_kitchen")
+from jsecon.data.lerf_ovs import LERF_PAIRS
+
+LERF_SCENES = tuple(LERF_PAIRS)
 Number = float | None
 
 LERF: dict[str, tuple[tuple[Number, Number], ...]] = {
@@ -29,7 +31,6 @@ OVS3D: dict[str, tuple[tuple[Number, Number], ...]] = {
 }
 """means over bed, bench, lawn, room, sofa"""
 
-REPLICA_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 REPLICA: dict[str, tuple[tuple[Number, Number], ...]] = {
     "OpenGaussian": (
         *((None, None),) * 4,
@@ -48,7 +49,8 @@ REPLICA: dict[str, tuple[tuple[Number, Number], ...]] = {
         (39.45, None),
     ),
 }
-"""scene by scene in the order of `REPLICA_SCENES`, then the mean; ten classes that the paper does not name"""
+"""scene by scene in the order of `jsecon.data.replica.REPLICA_SCENES`, then the mean; ten classes that the paper does
+not name"""
 
 
 def table(title: str, rows: dict[str, tuple[tuple[Number, Number], ...]], columns: tuple[str, ...]) -> str:

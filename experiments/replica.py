@@ -14,9 +14,10 @@ from experiments import published, tables, twins
 from experiments.command import QUICK_STEPS, options_of
 from experiments.methods import METHODS
 from experiments.results import HOME
+from jsecon.data.replica import REPLICA_SCENES
 
 PLAN = tables.Plan(
-    twins.Data("replica", scenes=published.REPLICA_SCENES, size=(("views", 30), ("width", 240), ("height", 136))),
+    twins.Data("replica", scenes=REPLICA_SCENES, size=(("views", 30), ("width", 240), ("height", 136))),
     tuple(METHODS),
     out=str(HOME / "results" / "replica"),
 )
@@ -47,14 +48,9 @@ NOTES = (
 
 
 def main(plan: tables.Plan) -> str:
-    """Fills the table, writes it, returns it."""
-    cells = tables.fill(plan, METHODS, tell=print)
-    columns = (*published.REPLICA_SCENES, "mean")
-    text = tables.write(
-        plan, cells, FIGURES, notes=NOTES, published=published.table("Replica", published.REPLICA, columns)
-    )
-    print(text)
-    return text
+    """The table, written."""
+    beside = published.table("Replica", published.REPLICA, (*REPLICA_SCENES, "mean"))
+    return tables.make(plan, METHODS, FIGURES, notes=NOTES, published=beside)
 
 
 if __name__ == "__main__":

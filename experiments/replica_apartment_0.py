@@ -23,12 +23,12 @@ from scipy.spatial.transform import Rotation
 from experiments import results
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import point_accuracy, point_class_means
-from jsecon.fit.initialise import gaussians_from_points, labels_of_points, points_from_depth
+from jsecon.fit.initialise import DepthPoints, gaussians_from_points, labels_of_points, points_from_depth
 from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.votes import region_votes
 from jsecon.numerics import cosine_matrix
-from jsecon.types import Camera, Capture
+from jsecon.types import Camera, Capture, Gaussians
 
 _HEX = """
 1f77b4 aec7e8 ff7f0e ffbb78 2ca02c 98df8a d62728 ff9896 9467bd c5b0d5
@@ -139,6 +139,16 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
     ), labels
 
 
+def points_as_gaussians(capture: Capture, options: Options) -> tuple[DepthPoints, Gaussians]:
+    """The back-projected depths of all views, one a voxel, and a Gaussian for each."""
+    everything = np.arange(len(capture.names))
+    points = points_from_depth(capture, voxel=options.voxel_m, stride=options.stride, frames=everything)
+    gaussians = gaussians_from_points(
+        points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=2 * options.voxel_m
+    )
+    return points, gaussians
+
+
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
     seconds, began = {}, time.perf_counter()
@@ -149,11 +159,7 @@ def main(options: Options = Options()) -> dict:
 
     capture, labels = load_replica(options.capture, voting_every=options.voting_every)
     lap("load")
-    everything = np.arange(len(capture.names))
-    points = points_from_depth(capture, voxel=options.voxel_m, stride=options.stride, frames=everything)
-    gaussians = gaussians_from_points(
-        points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=2 * options.voxel_m
-    )
+    points, gaussians = points_as_gaussians(capture, options)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     truth = labels_of_points(points, labels, len(PALETTE))
     silent = np.where(capture.held_out[:, None, None], labels, np.int16(-1))
@@ -194,7 +200,7 @@ def main(options: Options = Options()) -> dict:
     metrics = {
         "gaussians": gaussians.count,
         "voting_views": len(voting),
-        "views": len(everything),
+        "views": len(capture.names),
         "never_seen": int((np.asarray(votes.views) == 0).sum()),
         "overflow": int(votes.overflow),
         "points_with_label": int((truth >= 0).sum()),

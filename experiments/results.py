@@ -15,9 +15,9 @@ CAPTURES = HOME.parent.parent / "shared" / "captures"
 
 def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = None) -> None:
     """Writes the options (a dataclass), the metrics, a table in Markdown and a matplotlib figure into `folder`. Paths
-    are written from the checkout on, so that results look alike wherever they were made."""
-    config = {name: _from_checkout(value) for name, value in dataclasses.asdict(options).items()}
-    write_text(folder / "config.json", json.dumps(config, indent=2, default=str) + "\n")
+    are written by `portable`, so that results look alike wherever they were made."""
+    config = {name: portable(value) for name, value in dataclasses.asdict(options).items()}
+    write_text(folder / "config.json", json.dumps(config, indent=2) + "\n")
     write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     write_text(folder / "table.md", table + "\n")
     if figure is not None:
@@ -25,10 +25,19 @@ def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = No
             figure.savefig(temporary, dpi=110, bbox_inches="tight")
 
 
-def _from_checkout(value: Any) -> Any:
+def portable(value: Any) -> Any:
+    """A value for JSON that tells nothing of this machine. Each absolute path in it is written from the checkout on if
+    it lies there or in `shared` beside it, from ~ on if it lies in the home, and else as `.../` and its last part."""
+    if isinstance(value, dict):
+        return {key: portable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [portable(item) for item in value]
     if not isinstance(value, str | Path) or not Path(value).is_absolute():
-        return value
-    return os.path.relpath(value, HOME.parent)
+        return str(value) if isinstance(value, Path) else value
+    path = Path(os.path.normpath(value))
+    if any(path.is_relative_to(place) for place in (HOME.parent, CAPTURES.parent)):
+        return os.path.relpath(path, HOME.parent)
+    return f"~/{path.relative_to(Path.home())}" if path.is_relative_to(Path.home()) else f".../{path.name}"
 
 
 def table(header: tuple[str, ...], rows: list[tuple]) -> str:

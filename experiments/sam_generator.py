@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from experiments import export_sam, results
-from experiments.export_graph import declare_missing_operators, shake
+from experiments.export_graph import declare_missing_operators
 from jsecon.vision.sam import SamSegmenter, SamSettings
 from jsecon.vision.sam_graphs import SamFiles, SamGraphs
 from jsecon.vision.sam_prompts import point_grid
@@ -50,11 +50,7 @@ def small_sam(seed: int) -> torch.nn.Module:
     model = _build_sam(
         encoder_embed_dim=64, encoder_depth=2, encoder_num_heads=2, encoder_global_attn_indexes=[1], checkpoint=None
     )
-    shake(model, seed)
-    with torch.no_grad():
-        for head in model.mask_decoder.output_hypernetworks_mlps:
-            head.layers[-1].weight *= export_sam.STRETCH
-            head.layers[-1].bias *= export_sam.STRETCH
+    export_sam.make_random(model, seed)
     return model.eval().requires_grad_(False)
 
 

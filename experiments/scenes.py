@@ -17,7 +17,6 @@ from scipy import sparse
 
 from experiments import replica_apartment_0
 from jsecon.demo import demo
-from jsecon.fit.initialise import gaussians_from_points, points_from_depth
 from jsecon.language.field import load_field
 from jsecon.language.votes import region_votes
 from jsecon.plan import Silent
@@ -100,12 +99,7 @@ def replica_scene(folder: str, seed: int = 0) -> Scene:
     """replica_apartment_0 as its own experiment has it: every second view votes. An id stands for several objects."""
     options = replica_apartment_0.Options(capture=folder)
     capture, labels = replica_apartment_0.load_replica(folder, voting_every=options.voting_every)
-    points = points_from_depth(
-        capture, voxel=options.voxel_m, stride=options.stride, frames=np.arange(len(capture.names))
-    )
-    gaussians = gaussians_from_points(
-        points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=2 * options.voxel_m
-    )
+    _, gaussians = replica_apartment_0.points_as_gaussians(capture, options)
     voting = np.flatnonzero(~capture.held_out)
     count = len(replica_apartment_0.PALETTE)
     frames = np.asarray(capture.frames)[voting]

@@ -163,6 +163,16 @@ def noise(cells: list[dict], plan: Plan) -> str:
     return results.table(("method", *levels), rows)
 
 
+def make(
+    plan: Plan, methods: Mapping[str, Method], figures: tuple[str, ...], *, notes: str, published: str = ""
+) -> str:
+    """Fills the table, writes it, prints it, returns it."""
+    cells = fill(plan, methods, tell=print)
+    text = write(plan, cells, figures, notes=notes, published=published)
+    print(text)
+    return text
+
+
 def write(plan: Plan, cells: list[dict], figures: tuple[str, ...], *, notes: str, published: str = "") -> str:
     """Writes results/<name>/{config.json, metrics.json, table.md, figure.png}; returns the table."""
     twin = any(cell["twin"] for cell in cells)

@@ -14,13 +14,14 @@ import numpy as np
 
 from experiments import results
 from jsecon.data.benchmark import Benchmark
-from jsecon.data.langsplat_files import CANONICAL, write_features, write_text_features
+from jsecon.data.langsplat_files import write_features, write_text_features
 from jsecon.data.lerf_ovs import load_lerf_ovs
 from jsecon.data.ovs3d import load_ovs3d
 from jsecon.data.replica import load_replica
 from jsecon.data.scannet import load_scannet
 from jsecon.data.synthetic import twins
 from jsecon.files import write_text
+from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.simulated import LEVELS, Faults, SimulatedEmbedder, made_text_space, simulated_masks
 
 PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)

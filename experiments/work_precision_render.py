@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.scenes import ball, garden
 from experiments import results
 from jsecon.splat import batches, composite, differentiate, gradient, project, tiles, walk
 from jsecon.splat.reference import render_reference
@@ -31,6 +32,10 @@ from jsecon.splat.render import render
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians
 
+SCENES = {
+    "deep": ball(2000, (0.05, 0.25), 160, 120, 150),
+    "sparse: nothing to win": ball(150, (0.005, 0.02), 160, 120, 150),
+}
 MODULES = (batches, composite, differentiate, gradient, project, tiles, walk)
 
 
@@ -115,47 +120,6 @@ def compiled(setting: Setting, gaussians: Gaussians, camera: Camera, features: n
     return lambda: ready(gaussians, given).features
 
 
-def deep() -> tuple[Gaussians, Camera]:
-    return _ball(count=2000, size=(0.05, 0.25), width=160, height=120)
-
-
-def sparse() -> tuple[Gaussians, Camera]:
-    return _ball(count=150, size=(0.005, 0.02), width=160, height=120)
-
-
-def _ball(*, count: int, size: tuple[float, float], width: int, height: int) -> tuple[Gaussians, Camera]:
-    rng = np.random.default_rng(0)
-    gaussians = Gaussians(
-        rng.normal(size=(count, 3)).astype(np.float32),
-        np.log(rng.uniform(*size, (count, 3))).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.normal(size=count).astype(np.float32),
-        np.zeros((count, 1, 3), np.float32),
-    )
-    pose = np.eye(4, dtype=np.float32)
-    pose[2, 3] = 4
-    return gaussians, Camera(pose, *(np.float32(v) for v in (150, 150, width / 2, height / 2)), width, height)
-
-
-def garden(folder: Path) -> tuple[Gaussians, Camera, np.ndarray, np.ndarray] | None:
-    """The scene, its view 0, its colours and their image in float64, or None where it is not at hand."""
-    if not (folder / "reference.npz").exists():
-        return None
-    d, reference = np.load(folder / "scene.npz"), np.load(folder / "reference.npz")
-    opacity, k = d["opacities"].astype(np.float64), d["Ks"][0].astype(np.float32)
-    gaussians = Gaussians(
-        d["means"].astype(np.float32),
-        np.log(d["scales"]).astype(np.float32),
-        d["quats"].astype(np.float32),
-        (np.log(opacity) - np.log1p(-opacity)).astype(np.float32),
-        np.zeros((len(opacity), 1, 3), np.float32),
-    )
-    view = d["viewmats"][0].astype(np.float32)
-    camera = Camera(view, k[0, 0], k[1, 1], k[0, 2], k[1, 2], int(d["width"]), int(d["height"]))
-    image = next(reference[name] for name in ("image", "render", "colors") if name in reference.files)
-    return gaussians, camera, d["colors"].astype(np.float32), np.asarray(image, np.float64)
-
-
 def measure(name: str, gaussians, camera, features, expected, repeats: int) -> list[dict]:
     """A row a setting: ms (median, in turn), ratio to the recommended setting, errors."""
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
@@ -215,13 +179,14 @@ def picture(rows: list[dict]):
 def main(options: Options = Options()) -> dict:
     """Measures every setting in every scene and writes config.json, metrics.json, table.md and figure.png."""
     rng, rows = np.random.default_rng(1), []
-    for name, (gaussians, camera) in {"deep": deep(), "sparse: nothing to win": sparse()}.items():
+    for name, (gaussians, camera) in SCENES.items():
         features = rng.uniform(-1, 1, (gaussians.count, 3)).astype(np.float32)
         expected = render_reference(gaussians, camera, features)[0]
         rows += measure(name, gaussians, camera, features, expected, options.repeats)
-    scene = garden(options.garden)
-    if scene is not None:
-        rows += measure("garden, view 0", *scene, options.repeats)
+    scene, reference = garden(options.garden), options.garden / "reference.npz"
+    if scene is not None and reference.exists():
+        expected = np.load(reference)["image"].astype(np.float64)
+        rows += measure("garden, view 0", *scene, expected, options.repeats)
     header = ("scene", "knob", "setting", "ms", "x recommended", "median error", "99.9 % below", "largest")
     told = [
         (

@@ -14,7 +14,6 @@ from jsecon.baselines.evidence import evidence_of_tracks, local_masks
 from jsecon.baselines.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
 from jsecon.baselines.langsplat import train_langsplat
 from jsecon.baselines.opengaussian import Schedule, train_opengaussian
-from jsecon.data.langsplat_files import CANONICAL
 from jsecon.data.lerf import LabelledFrame
 from jsecon.data.ovs3d import box_of
 from jsecon.errors import InputError
@@ -22,6 +21,7 @@ from jsecon.evaluate.lerf import evaluate_point_level_rendered
 from jsecon.evaluate.opengaussian import most_similar_text, select_leaf, select_text
 from jsecon.splat.plan import plan_view
 from jsecon.splat.project import project
+from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.simulated import made_text_space
 
 QUERIES = ("floor", "red ball", "blue ball", "green ball")

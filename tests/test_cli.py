@@ -1,7 +1,6 @@
 """The command line: what each verb leaves behind, and one clear message and exit code 2 for each kind of bad input."""
 
 import json
-import os
 import shutil
 import struct
 
@@ -123,7 +122,7 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
 
 
 def test_help_of_every_verb_has_words_for_every_option(capsys):
-    for verb in ("demo", "run", "query", "eval"):
+    for verb in ("demo", "run", "query", "eval", "models"):
         assert _run(verb, "--help") == 0
         assert len(capsys.readouterr().out) > 300
     for action in grammar.parser()._subparsers._group_actions[0].choices.values():
@@ -363,4 +362,3 @@ def test_short_steps_stay_silent_in_logs():
         for done in range(100):
             progress(done + 1, 100)
     assert err.text == ""
-    assert os.sep

@@ -9,10 +9,10 @@ from clip_files import COLOURS, write_clip, write_textual, write_visual
 from onnx_files import node, write_graph
 
 from jsecon.errors import InputError
-from jsecon.vision.clip import CANONICAL, ClipEmbedder
+from jsecon.vision.clip import ClipEmbedder
 from jsecon.vision.clip_folder import ClipFiles, find_clip, read_preprocessing
 from jsecon.vision.crops import masked_crop
-from jsecon.vision.protocols import Embedder
+from jsecon.vision.protocols import CANONICAL, Embedder
 
 LAYOUTS = ("immich", "transformers.js", "flat")
 

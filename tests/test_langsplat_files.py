@@ -7,12 +7,12 @@ import pytest
 from capture_files import refused
 
 from jsecon.data.langsplat_files import (
-    CANONICAL,
     load_features,
     load_text_features,
     write_features,
     write_text_features,
 )
+from jsecon.vision.protocols import CANONICAL
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jsecon.data.lerf import LabelledFrame
+from jsecon.data.lerf_ovs import LERF_PAIRS
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import (
-    LERF_PAIRS,
     VALA_THRESHOLD,
     evaluate_at_thresholds,
     evaluate_point_level_rendered,

@@ -1,8 +1,6 @@
 """The weight with which each Gaussian is seen at the one pixel that holds its centre, which is all that Occam's LGS and
 VALA look at."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -15,7 +13,7 @@ from jsecon.splat.walk import make_table, walk, weights
 from jsecon.types import Array
 
 
-@functools.partial(jax.jit)
+@jax.jit
 def centre_weights(plan: ViewPlan) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """alpha T (N,) of each Gaussian at the pixel that its projected centre lies in, and that pixel (N,), row * width +
     column; -1, with weight 0, where it lies outside the image or the Gaussian is not visible.

@@ -197,21 +197,16 @@ def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key)
     roots = min(schedule.roots, len(features))
     points = lambda f: jnp.concatenate([normalize(f), schedule.position_weight * scaled], axis=1)
     centres = points(features)[jax.random.choice(centre_key, len(features), (roots,), replace=False)]
-    loss = functools.partial(_quantised_loss, clusters=roots, squared=False)
-    of, centres = assign_to_centres(points(features), centres)
-    for start in range(0, schedule.coarse_steps, REFRESH_COARSE):
-        steps = min(REFRESH_COARSE, schedule.coarse_steps - start)
-        features, _ = descend(
-            loss,
-            features,
-            (*data, labels, of, of),
-            views=len(data[1]),
-            steps=steps,
-            optimizer=_adam(schedule.coarse_rate),
-            key=jax.random.fold_in(key, start),
-        )
+
+    def assign(features):
+        nonlocal centres
         of, centres = assign_to_centres(points(features), centres)
-    return features, of
+        return of
+
+    loss = functools.partial(_quantised_loss, clusters=roots, squared=False)
+    given = lambda of: (*data, labels, of, of)
+    steps, rate = schedule.coarse_steps, schedule.coarse_rate
+    return _clustered(loss, features, assign, given, steps=steps, refresh=REFRESH_COARSE, rate=rate, key=key)
 
 
 def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Array, Array, Array]:
@@ -219,21 +214,31 @@ def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Arr
     roots, leaves = min(schedule.roots, len(features)), schedule.leaves
     number = _leaves_wanted(root_of, data, labels, roots, leaves)
     split = lambda f: split_roots(normalize(f), root_of, number, leaves)
-    of = split(features)
     loss = functools.partial(_quantised_loss, clusters=roots * leaves, squared=True)
-    for start in range(0, schedule.fine_steps, REFRESH_FINE):
-        steps = min(REFRESH_FINE, schedule.fine_steps - start)
+    given = lambda of: (*data, labels, of, root_of)
+    steps, rate = schedule.fine_steps, schedule.rate
+    features, of = _clustered(loss, features, split, given, steps=steps, refresh=REFRESH_FINE, rate=rate, key=key)
+    return features, of, cluster_means(normalize(features), of, jnp.zeros((roots * leaves, SIZE)))
+
+
+def _clustered(
+    loss: Callable, features: Array, assign: Callable, given: Callable, *, steps: int, refresh: int, rate: float, key
+) -> tuple[Array, Array]:
+    """Features trained on `given(of)`, and the cluster `of` each Gaussian, assigned anew every `refresh` steps."""
+    of = assign(features)
+    for start in range(0, steps, refresh):
+        data = given(of)
         features, _ = descend(
             loss,
             features,
-            (*data, labels, of, root_of),
+            data,
             views=len(data[1]),
-            steps=steps,
-            optimizer=_adam(schedule.rate),
+            steps=min(refresh, steps - start),
+            optimizer=_adam(rate),
             key=jax.random.fold_in(key, start),
         )
-        of = split(features)
-    return features, of, cluster_means(normalize(features), of, jnp.zeros((roots * leaves, SIZE)))
+        of = assign(features)
+    return features, of
 
 
 def _leaves_wanted(root_of, data, labels, roots: int, leaves: int) -> Int[np.ndarray, " k"]:

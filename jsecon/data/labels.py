@@ -177,6 +177,7 @@ def _find(
 
 
 def read_level(path: Path, level: str | int) -> np.ndarray:
+    """ids (H, W) of one level of a `_s.npy`, -1 = none. Raises InputError where it is no such file."""
     if level not in (*LEVELS, 0, 1, 2, 3):
         raise InputError(
             "level", found=repr(level), expected=f"one of {', '.join(LEVELS)}", remedy="l is the coarsest."

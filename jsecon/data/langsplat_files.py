@@ -17,9 +17,7 @@ from jaxtyping import Float, Int
 from jsecon.data.labels import LEVELS, load_labels
 from jsecon.errors import InputError
 from jsecon.files import write_text, written_whole
-
-CANONICAL = ("object", "things", "stuff", "texture")
-"""LERF's canonical phrases; text_features.json holds them beside the queries"""
+from jsecon.vision.protocols import CANONICAL
 
 
 class FrameMasks(NamedTuple):

@@ -88,13 +88,18 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     return form, elements, after
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """The vertex element as a structured array."""
+def _opened(path: Path) -> tuple[bytes, str, list[_Element], int]:
+    """The file, and what `_header` says of it."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise bad_ply(path, error.strerror or "an error on reading", "a .ply file", "Check the path.") from error
-    form, elements, offset = _header(path, data)
+    return data, *_header(path, data)
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """The vertex element as a structured array."""
+    data, form, elements, offset = _opened(path)
     names = [element.name for element in elements]
     if "chunk" in names or any(name == "packed_position" for element in elements for name, _ in element.fields):
         raise bad_ply(
@@ -150,11 +155,7 @@ def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     on any other, and on indices beyond the vertices.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise bad_ply(path, error.strerror or "an error on reading", "a .ply file", "Check the path.") from error
-    form, elements, offset = _header(path, data)
+    data, form, elements, offset = _opened(path)
     names = [element.name for element in elements]
     if form == "ascii" or "face" not in names or "vertex" not in names:
         raise bad_ply(path, f"{form} elements {', '.join(names) or 'none'}", "binary elements vertex and face")

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.data.lerf import LabelledFrame
-from jsecon.errors import InputError, require
+from jsecon.errors import require
+from jsecon.evaluate.lerf import labelled_pairs
 from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
 from jsecon.query.canonical import relevancies
 from jsecon.types import Array
@@ -115,14 +116,7 @@ def evaluate_langsplat_2d(
     pair whose labelled mask is empty counts as 0 too. Raises InputError for labels without pairs, or with another
     number of them than `expected_pairs`.
     """
-    pairs = [(frame, query) for frame in labels for query in frame.objects]
-    if not pairs or (expected_pairs is not None and len(pairs) != expected_pairs):
-        raise InputError(
-            "labels",
-            found=f"{len(pairs)} (frame, query) pairs",
-            expected=f"{expected_pairs or 'at least one'}",
-            remedy="Evaluate on the very label files of the protocol, all of them.",
-        )
+    pairs = labelled_pairs(labels, expected_pairs)
     rows = []
     for done, (frame, query) in enumerate(pairs, start=1):
         (true, boxes), maps = frame.objects[query], maps_of(frame, query)

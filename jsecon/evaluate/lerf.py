@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.data.lerf import LabelledFrame
-from jsecon.data.lerf_ovs import LERF_PAIRS as LERF_PAIRS
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
 from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
@@ -67,7 +66,7 @@ def evaluate_point_level_rendered(
 
     cameras: by frame name, of any size with the labels' aspect; they are brought to the labels' size.
     select: category -> Selection over the Gaussians; None (no answer to this text) counts as missing.
-    expected_pairs: the protocol's denominator where it is known (`LERF_PAIRS`), checked.
+    expected_pairs: the protocol's denominator where it is known (`jsecon.data.lerf_ovs.LERF_PAIRS`), checked.
 
     Localisation has two readings, since the paper's own two tables do not agree on one (REFERENCE 0.3). By the peak,
     summary["loc_acc"]: the point of maximum of the selected Gaussians' similarity, composited by sum alpha T s over
@@ -99,16 +98,9 @@ def evaluate_at_thresholds(
 ) -> dict[float, tuple[list[Row], dict]]:
     """`evaluate_point_level_rendered` at several silhouette thresholds, from one rendering a pair: OpenGaussian's and
     VALA's by default, to stand side by side."""
-    pairs = [(frame, category) for frame in labels for category in frame.objects]
     for frame in labels:
         _check(frame, cameras)
-    if not pairs or (expected_pairs is not None and len(pairs) != expected_pairs):
-        raise InputError(
-            "labels",
-            found=f"{len(pairs)} (frame, query) pairs",
-            expected=f"{expected_pairs or 'at least one'}",
-            remedy="Evaluate on the very label files of the protocol, all of them.",
-        )
+    pairs = labelled_pairs(labels, expected_pairs)
     answers: dict[str, Selection | None] = {}
     rows: dict[float, list[Row]] = {threshold: [] for threshold in alpha_thresholds}
     for done, (frame, category) in enumerate(pairs, start=1):
@@ -138,6 +130,19 @@ def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> di
         "loc_acc": float(np.mean([row.located for row in rows])) if rows else float("nan"),
         "loc_mask": float(np.mean([row.touched for row in rows])) if rows else float("nan"),
     }
+
+
+def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> list[tuple[LabelledFrame, str]]:
+    """All (frame, query) pairs. Raises InputError for none, or another number than `expected`."""
+    pairs = [(frame, query) for frame in labels for query in frame.objects]
+    if not pairs or (expected is not None and len(pairs) != expected):
+        raise InputError(
+            "labels",
+            found=f"{len(pairs)} (frame, query) pairs",
+            expected=f"{expected or 'at least one'}",
+            remedy="Evaluate on the very label files of the protocol, all of them.",
+        )
+    return pairs
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

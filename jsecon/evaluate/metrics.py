@@ -74,14 +74,23 @@ def point_class_means(predicted: Int[Array, " n"], true: Int[Array, " n"], *, ig
     OpenGaussian's ScanNet script, and the likely meaning of mAcc on Replica (REFERENCE D.7, 0.2), not "IoU > 0.25".
     Points of true label `ignore` are left out of both sides. NaN where no point has a label.
     """
+    scores = list(class_scores(predicted, true, ignore=ignore).values())
+    miou, macc = np.mean(scores, axis=0) if scores else (np.nan, np.nan)
+    return float(miou), float(macc)
+
+
+def class_scores(
+    predicted: Int[Array, " n"], true: Int[Array, " n"], *, ignore: int = -1
+) -> dict[int, tuple[float, float]]:
+    """(IoU, recall) of each class that occurs in the truth; points of true label `ignore` are left out."""
     predicted, true = np.asarray(predicted), np.asarray(true)
     predicted, true = predicted[true != ignore], true[true != ignore]
-    ious, recalls = [], []
+    scores = {}
     for label in np.unique(true):
         both = np.sum((predicted == label) & (true == label))
-        ious.append(both / np.sum((predicted == label) | (true == label)))
-        recalls.append(both / np.sum(true == label))
-    return (float(np.mean(ious)), float(np.mean(recalls))) if ious else (float("nan"), float("nan"))
+        either = np.sum((predicted == label) | (true == label))
+        scores[int(label)] = float(both / either), float(both / np.sum(true == label))
+    return scores
 
 
 def _values(ious: Iterable[float | None]) -> np.ndarray:

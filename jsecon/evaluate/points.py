@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError, require
+from jsecon.evaluate.metrics import class_scores
 from jsecon.types import Array
 
 LEAST_OPACITY = 0.1
@@ -60,14 +61,10 @@ def evaluate_points(
         faint = int((counted & (np.asarray(opacities) < LEAST_OPACITY)).sum())
         counted &= np.asarray(opacities) >= LEAST_OPACITY
     predicted, true = predicted[counted], true[counted]
-    rows = []
-    for k in np.unique(true):
-        is_true, is_found = true == k, predicted == k
-        both = int((is_true & is_found).sum())
-        either = int((is_true | is_found).sum())
-        rows.append(
-            ClassRow(queries[k], both / either, both / int(is_true.sum()), int(is_true.sum()), int(is_found.sum()))
-        )
+    rows = [
+        ClassRow(queries[k], own, recall, int((true == k).sum()), int((predicted == k).sum()))
+        for k, (own, recall) in class_scores(predicted, true).items()
+    ]
     if not rows or (expected_classes is not None and len(rows) != expected_classes):
         raise InputError(
             "labelled points",

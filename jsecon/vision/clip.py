@@ -16,12 +16,9 @@ from jsecon.vision.clip_folder import ClipFiles, find_clip
 from jsecon.vision.crops import masked_crop
 from jsecon.vision.embedding_store import EmbeddingStore, known_vectors, mask_key
 from jsecon.vision.onnx_graph import Graph, Tensor, describe
+from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.tokenizer import CONTEXT_LENGTH, ClipTokenizer, load_tokenizer
 
-CANONICAL = ("object", "things", "stuff", "texture")
-"""what a query must beat (LERF)"""
-PHOTO_TEMPLATES = ("a photo of a {}.", "a photo of the {}.", "a close-up photo of a {}.", "a cropped photo of a {}.")
-"""phrases for a caller who wants more than the bare text"""
 DEFAULT_SIZE = 224
 """px of an image, where neither the configuration nor the graph fixes it"""
 _VISUAL_OUTPUTS = ("embedding", "image_embeds", "image_features", "image_embedding")

@@ -8,6 +8,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+CANONICAL = ("object", "things", "stuff", "texture")
+"""LERF's canonical phrases: what a query must beat"""
+
 
 @runtime_checkable
 class Segmenter(Protocol):
@@ -39,7 +42,7 @@ class Embedder(Protocol):
     dim: int
     """E"""
     canonical: np.ndarray
-    """(C, E) float32 unit: what a query must beat (LERF: object, things, stuff, texture)"""
+    """(C, E) float32 unit: what a query must beat, such as `CANONICAL`"""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""

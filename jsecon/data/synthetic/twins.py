@@ -14,12 +14,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jsecon.data.benchmark import TWIN_FILE
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
-from jsecon.data.lerf import write_lerf_labels
+from jsecon.data.lerf import LabelledFrame, write_lerf_labels
 from jsecon.data.ovs3d import write_poses_bounds, write_segmentations
 from jsecon.data.ply_file import write_mesh
 from jsecon.data.scannet import CLASS_SETS, NYU40
@@ -53,21 +53,11 @@ def write_lerf_twin(
     cameras = room_cameras(room, views=views, width=width, height=height)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
     out = np.arange(views) % annotated_every == 0
-    capture, instances = captured(room, cameras, names, out, points=200 * views, progress=progress)
-    write_colmap(capture, root / scene, image_format="jpg")
-    frames = [labelled(names[t], instances[t], room.names, label_pixels) for t in np.flatnonzero(out)]
+    capture, instances, frames = _labelled_capture(root / scene, room, cameras, names, out, label_pixels, progress)
     write_lerf_labels(root / "label" / scene, frames, image_ending=".jpg")
-    _finish(
-        root,
-        scene,
-        capture,
-        instances,
-        seed=seed,
-        frames=[frame.name for frame in frames],
-        pairs=sum(len(frame.objects) for frame in frames),
-        queries=sorted({name for frame in frames for name in frame.objects}),
-        objects=room.names,
-    )
+    pairs = sum(len(frame.objects) for frame in frames)
+    queries = sorted({name for frame in frames for name in frame.objects})
+    _finish(root, scene, capture, instances, frames, seed=seed, pairs=pairs, queries=queries, objects=room.names)
     return root
 
 
@@ -88,26 +78,15 @@ def write_ovs3d_twin(
     cameras = _forward_cameras(room, views, width, height)
     names = tuple(f"{view:02d}" for view in range(views))
     out = np.isin(np.arange(views), np.linspace(0, views - 1, labelled_frames + 2).round()[1:-1])
-    capture, instances = captured(room, cameras, names, out, points=200 * views, progress=progress)
-    write_colmap(capture, root / scene, image_format="jpg")
+    capture, instances, frames = _labelled_capture(root / scene, room, cameras, names, out, 1, progress)
     assert capture.depths is not None
     sizes = np.tile([height, width, float(cameras.fx[0])], (views, 1))
     bounds = np.stack([capture.depths.min((1, 2)), capture.depths.max((1, 2))], axis=1)
     poses = np.asarray(cameras.world_to_camera, np.float64)
     write_poses_bounds(root / scene / "poses_bounds.npy", poses, sizes, bounds)
-    frames = [labelled(names[t], instances[t], room.names, 1) for t in np.flatnonzero(out)]
     write_segmentations(root / scene / "segmentations", frames, names, room.names)
-    _finish(
-        root,
-        scene,
-        capture,
-        instances,
-        seed=seed,
-        frames=[frame.name for frame in frames],
-        pairs=len(frames) * num_objects,
-        queries=sorted(room.names),
-        objects=room.names,
-    )
+    pairs, queries = len(frames) * num_objects, sorted(room.names)
+    _finish(root, scene, capture, instances, frames, seed=seed, pairs=pairs, queries=queries, objects=room.names)
     return root
 
 
@@ -127,7 +106,8 @@ def write_replica_twin(
 ) -> Path:
     """A room as a scene of Replica in NICE-SLAM's rendering. Classes are the objects' shapes, wall, floor, ceiling and
     table; `ready_labels` writes them a line a vertex instead of as habitat's semantic mesh."""
-    room, capture, owners, mesh = _scanned(seed, views, width, height, num_objects, fine_m, coarse_m, progress)
+    names = tuple(f"frame{view:06d}" for view in range(views))
+    room, capture, owners, mesh = _scanned(seed, names, width, height, num_objects, fine_m, coarse_m, progress)
     classes = [item.shape for item in room.objects] + list(SURROUNDINGS)
     table = {name: n for n, name in enumerate(sorted(set(classes)), start=1)}
     ids = np.array([table[name] for name in classes])
@@ -160,7 +140,7 @@ def write_replica_twin(
     queries = sorted({item.shape for item in room.objects} | {"table"})
     occurring = {classes[k] for k in np.unique(mesh.vertex_owners)} & set(queries)
     pairs = len(occurring)
-    _finish(root, scene, capture, owners, seed=seed, frames=[], pairs=pairs, queries=queries, objects=classes)
+    _finish(root, scene, capture, owners, seed=seed, pairs=pairs, queries=queries, objects=classes)
     return root
 
 
@@ -179,7 +159,8 @@ def write_scannet_twin(
     progress: Progress = None,
 ) -> Path:
     """A room as a scan of ScanNet, its objects under NYU40 ids in turn; frames `lost` have infinite poses."""
-    room, capture, owners, mesh = _scanned(seed, views, width, height, num_objects, fine_m, coarse_m, progress)
+    numbers = tuple(map(str, range(views)))
+    room, capture, owners, mesh = _scanned(seed, numbers, width, height, num_objects, fine_m, coarse_m, progress)
     surroundings = {"wall": 1, "floor": 2, "table": 7, CEILING: 22}
     of_objects = [FURNISHINGS[k % len(FURNISHINGS)] for k in range(len(room.objects))]
     ids = np.array(of_objects + [surroundings[name] for name in SURROUNDINGS])
@@ -205,29 +186,23 @@ def write_scannet_twin(
     pairs = {str(size): len(present & set(chosen)) for size, chosen in CLASS_SETS.items()}
     objects = [NYU40.get(number, CEILING) for number in ids]
     queries = list(NYU40.values())
-    names_of = tuple(str(t) for t in range(views))
-    _finish(
-        root,
-        scene,
-        capture,
-        owners,
-        seed=seed,
-        frames=[],
-        pairs=pairs,
-        queries=queries,
-        objects=objects,
-        names=names_of,
-    )
+    _finish(root, scene, capture, owners, seed=seed, pairs=pairs, queries=queries, objects=objects)
     return root
 
 
 def _scanned(
-    seed: int, views: int, width: int, height: int, num_objects: int, fine: float, coarse: float, progress: Progress
+    seed: int,
+    names: tuple[str, ...],
+    width: int,
+    height: int,
+    num_objects: int,
+    fine: float,
+    coarse: float,
+    progress: Progress,
 ) -> tuple[Room, Capture, Int[np.ndarray, "t h w"], Mesh]:
     room = make_room(seed, num_objects=num_objects)
-    cameras = room_cameras(room, views=views, width=width, height=height)
-    names = tuple(f"frame{view:06d}" for view in range(views))
-    capture, instances = captured(room, cameras, names, np.zeros(views, bool), points=100, progress=progress)
+    cameras = room_cameras(room, views=len(names), width=width, height=height)
+    capture, instances = captured(room, cameras, names, np.zeros(len(names), bool), points=100, progress=progress)
     points, owners = surfaces_of(room, capture, instances)
     return room, capture, owners, mesh_of(points, owners, capture.frames, num_objects, fine=fine, coarse=coarse)
 
@@ -245,21 +220,36 @@ def _forward_cameras(room: Room, views: int, width: int, height: int) -> Camera:
     return Camera(poses, focal, focal, cx, cy, width, height)
 
 
+def _labelled_capture(
+    folder: Path,
+    room: Room,
+    cameras: Camera,
+    names: tuple[str, ...],
+    out: Bool[np.ndarray, " t"],
+    label_pixels: int,
+    progress: Progress,
+) -> tuple[Capture, Int[np.ndarray, "t h w"], list[LabelledFrame]]:
+    """The room seen by `cameras`, written for COLMAP; its instances, and the labels of the frames `out`."""
+    capture, instances = captured(room, cameras, names, out, points=200 * len(names), progress=progress)
+    write_colmap(capture, folder, image_format="jpg")
+    frames = [labelled(names[t], instances[t], room.names, label_pixels) for t in np.flatnonzero(out)]
+    return capture, instances, frames
+
+
 def _finish(
     root: Path,
     scene: str,
     capture: Capture,
     owners: Int[np.ndarray, "t h w"],
-    *,
-    names: tuple[str, ...] | None = None,
+    frames: Sequence[LabelledFrame] = (),
     **told: Any,
 ) -> None:
     """The truth of each pixel, and, last, what was written of the scene."""
-    for name, image in zip(names or capture.names, owners):
+    for name, image in zip(capture.names, owners):
         write_ids(root / "truth" / scene / f"{name}.png", (image + 1).astype(np.uint8))
     file = root / TWIN_FILE
     scenes = json.loads(file.read_text())["scenes"] if file.exists() else {}
-    told = {key: list(value) if isinstance(value, tuple) else value for key, value in told.items()}
+    told |= {"frames": [frame.name for frame in frames]}
     write_text(file, json.dumps({"scenes": scenes | {scene: told}}, indent=1) + "\n")
 
 
