@@ -56,7 +56,7 @@ def _demo(verbs) -> None:
         """
         Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on
         it what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is
-        used. Ends with report.html, metrics.json, field.npz and a .ply for each query. About five minutes on two cores.
+        used. Ends with report.html, metrics.json, field.npz and a .ply for each query. One to two minutes on two cores.
         """,
     )
     verb.add_argument("--seed", type=int, default=0, help="which room (default 0)")

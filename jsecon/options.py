@@ -17,7 +17,7 @@ class Options:
     gaussians: Path | None = None
     """.ply (INRIA layout) of the scene; None: Gaussians are fitted to the frames."""
     masks: Path | None = None
-    """folder of instance masks, one integer PNG a frame or LangSplat's `_s.npy`; None: found in the frames."""
+    """folder of instance masks: an integer PNG a frame, a folder an object, or LangSplat's `_s.npy`; None: found."""
     proposals: Path | None = None
     """folder of masks of single frames, to be brought together: SAM's JSON, LangSplat's `_s.npy`, PNGs; None: found."""
     segmenter: Path | None = None

@@ -3,12 +3,24 @@
 Two host devices and the import hook must be settled before jax makes its first array and before jsecon is imported.
 """
 
+import atexit
+import contextlib
+import fcntl
 import gc
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+# Programs that one test compiled are there for all others of the run: those of the other workers, of subprocesses, and
+# those that compile the same again. xdist's workers inherit the folder.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jsecon-tests-")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import jax
 import pytest
@@ -38,6 +50,15 @@ if os.environ.get("CI"):
 import numpy as np  # noqa: E402
 
 from jsecon.types import Camera, Gaussians  # noqa: E402
+
+
+LONGEST = ("test_pipeline", "test_tables", "test_baselines", "test_demo", "test_readme", "test_render", "test_stability")
+
+
+def pytest_collection_modifyitems(items):
+    """The longest files first: one of them at the end would leave the other workers without work."""
+    place = {name: n for n, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -108,20 +129,37 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory) -> Path:
-    """The demo room on disk, as small as it can be and still have objects to find: 8 views of 160x120, 2 held out."""
-    from jsecon.data.synthetic import write_room
+def made_once(tmp_path_factory):
+    """A context for what all workers of a run share: one makes it, the others wait and find it there."""
 
-    return write_room(
-        tmp_path_factory.mktemp("room") / "capture", 0, views=8, width=160, height=120, holdout=4, points=1200
-    )
+    @contextlib.contextmanager
+    def alone(name):
+        base = tmp_path_factory.getbasetemp()
+        base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+        with open(base / f"{name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield base / name
+
+    return alone
 
 
 @pytest.fixture(scope="session")
-def room_run(room, tmp_path_factory):
+def room(made_once) -> Path:
+    """The demo room on disk, as small as it can be and still have objects to find: 8 views of 160x120, 2 held out."""
+    from jsecon.data.synthetic import write_room
+
+    with made_once("room") as folder:
+        if not (folder / "written").exists():
+            write_room(folder / "capture", 0, views=8, width=160, height=120, holdout=4, points=1200)
+            (folder / "written").touch()
+    return folder / "capture"
+
+
+@pytest.fixture(scope="session")
+def room_run(room, made_once):
     """A finished run on that room with its true masks given, and the folder that it was written to."""
     from jsecon import pipeline
 
-    out = tmp_path_factory.mktemp("run")
     options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150, sh_degree=0)
-    return pipeline.run(options, out), out
+    with made_once("run") as out:
+        return pipeline.run(options, out), out

@@ -1,5 +1,7 @@
 """Tile lists against a readable loop; capacities; the packed sort."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,23 +36,38 @@ def reaches(scene, camera, tile: int) -> np.ndarray:
     return out
 
 
+@functools.partial(jax.jit, static_argnums=2)
+def _listed(scene, camera, tile: int):
+    splats = project(scene, camera)
+    return splats, tile_lists(splats, camera.width, camera.height, capacity=1024, tile=tile)
+
+
+def listed(scene, camera, tile: int):
+    """Projection and lists of a view as NumPy arrays: slices of jax's would compile anew for each length."""
+    return jax.tree.map(np.asarray, _listed(scene, camera, tile))
+
+
 @pytest.mark.parametrize("tile", [4, 8])
 def test_every_tile_lists_what_reaches_it_front_to_back(scene, cameras, tile):
     for t in range(4):
-        splats = project(scene, cameras[t])
-        lists = tile_lists(splats, 48, 40, capacity=1024, tile=tile)
+        splats, lists = listed(scene, cameras[t], tile)
         assert int(lists.overflow.sum()) == 0
-        depths, expected = np.asarray(splats.depths), reaches(scene, cameras[t], tile)
+        depths, expected = splats.depths, reaches(scene, cameras[t], tile)
         assert expected.shape[0] == lists.starts.shape[0]
         spare = 0
         for k, touched in enumerate(expected):
-            got = np.asarray(lists.gaussians[lists.starts[k] : lists.starts[k] + lists.lengths[k]])
+            got = lists.gaussians[lists.starts[k] : lists.starts[k] + lists.lengths[k]]
             assert len(set(got)) == len(got)
             assert (np.diff(depths[got]) >= 0).all()
             assert set(np.flatnonzero(touched)) <= set(got)
             spare += len(got) - touched.sum()
         # Tight: what a list holds in vain is an ellipse that passes between pixel centres.
         assert spare < 0.06 * expected.sum()
+
+
+@jax.jit
+def counted(scene, camera):
+    return pair_counts(project(scene, camera), camera.width, camera.height).sum()
 
 
 def needles(count: int, seed: int) -> Gaussians:
@@ -68,10 +85,10 @@ def needles(count: int, seed: int) -> Gaussians:
 def test_no_tile_of_a_needle_is_missed(cameras):
     scene = needles(60, 0)
     for t in range(4):
-        lists = tile_lists(project(scene, cameras[t]), 48, 40, capacity=1024)
+        _, lists = listed(scene, cameras[t], 8)
         for k, touched in enumerate(reaches(scene, cameras[t], 8)):
             got = lists.gaussians[lists.starts[k] : lists.starts[k] + lists.lengths[k]]
-            assert set(np.flatnonzero(touched)) <= set(np.asarray(got))
+            assert set(np.flatnonzero(touched)) <= set(got)
 
 
 def test_both_sorts_of_pairs_agree():
@@ -94,15 +111,13 @@ def test_equal_depths_keep_index_order():
 
 
 def test_what_does_not_fit_is_counted(scene, camera):
-    splats = project(scene, camera)
-    pairs = int(pair_counts(splats, 48, 40).sum())
-    lists = tile_lists(splats, 48, 40, capacity=64)
-    assert int(lists.overflow.sum()) == pairs - 64
+    lists = jax.jit(lambda camera: tile_lists(project(scene, camera), 48, 40, capacity=64))(camera)
+    assert int(lists.overflow.sum()) == counted(scene, camera) - 64
 
 
 def test_a_plan_fits_every_view_and_leaves_room(scene, cameras):
     capacity = plan_capacity(scene, cameras, margin=1.0)
-    most = max(int(pair_counts(project(scene, cameras[t]), 48, 40).sum()) for t in range(4))
+    most = max(counted(scene, cameras[t]) for t in range(4))
     assert most <= capacity
     assert plan_capacity(scene, cameras[0]) <= plan_capacity(scene, cameras, margin=2.0)
     assert round_capacity(0) == 1024

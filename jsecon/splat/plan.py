@@ -139,8 +139,7 @@ def render_plan(
     """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
 
     Differentiable, under jit, grad and vmap, on the devices of the plan; features, `background` and `depth` as for
-    `render`.
-    Raises ValueError on shapes that disagree.
+    `render`. Raises ValueError on shapes that disagree.
     """
     require(
         features.ndim == 2 and features.shape[0] == plan.splats.shape[0],
