@@ -51,8 +51,15 @@ import numpy as np  # noqa: E402
 
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
-
-LONGEST = ("test_pipeline", "test_tables", "test_baselines", "test_demo", "test_readme", "test_render", "test_stability")
+LONGEST = (
+    "test_pipeline",
+    "test_tables",
+    "test_baselines",
+    "test_demo",
+    "test_readme",
+    "test_render",
+    "test_stability",
+)
 
 
 def pytest_collection_modifyitems(items):
@@ -156,10 +163,11 @@ def room(made_once) -> Path:
 
 
 @pytest.fixture(scope="session")
-def room_run(room, made_once):
-    """A finished run on that room with its true masks given, and the folder that it was written to."""
+def room_run(room, made_once, tmp_path_factory):
+    """A finished run on that room with its true masks given, and a folder as it was written, this worker's own."""
     from jsecon import pipeline
 
     options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150, sh_degree=0)
-    with made_once("run") as out:
-        return pipeline.run(options, out), out
+    with made_once("run") as folder:
+        run = pipeline.run(options, folder)
+        return run, Path(shutil.copytree(folder, tmp_path_factory.mktemp("run") / "out"))

@@ -28,10 +28,9 @@ def labels_of(scene, cameras, members):
     """(T, H, W) int16: the region that makes up most of each pixel, -1 where alpha is below 0.3."""
     onehot = jnp.asarray(np.eye(REGIONS, dtype=np.float32)[members])
     capacity = plan_capacity(scene, cameras)
-    draw = jax.jit(lambda camera: render(scene, camera, onehot, capacity=capacity))
     labels = []
     for view in range(cameras.world_to_camera.shape[0]):
-        shares = np.asarray(draw(cameras[view]).features)
+        shares = np.asarray(render(scene, cameras[view], onehot, capacity=capacity).features)
         labels.append(np.where(shares.sum(-1) > 0.3, shares.argmax(-1), -1))
     return np.stack(labels).astype(np.int16)
 
