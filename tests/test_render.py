@@ -84,6 +84,13 @@ def test_shapes_that_disagree_raise(scene, camera, cameras):
         render(scene, cameras, random_features(scene.count, 2))
 
 
+def squares(features, gaussians, camera):
+    return (render(gaussians, camera, features, capacity=CAPACITY).features ** 2).sum()
+
+
+slope = jax.jit(jax.grad(squares))
+
+
 def central_difference(function, argument, index, step):
     high, low = (argument.at[index].add(s) for s in (step, -step))
     return (function(high) - function(low)) / (2 * step)
@@ -144,25 +151,22 @@ def test_every_gradient_equals_central_differences(x64, scene, camera):
 
 def test_wide_features_have_the_same_gradient_as_narrow_ones(scene, camera):
     wide = random_features(scene.count, 12)
-    loss = lambda f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()
-    slope = jax.jit(jax.grad(loss))
-    gradient = slope(wide)
+    gradient = slope(wide, scene, camera)
     for start in (0, 4, 8):
         part = wide[:, start : start + 4]
-        np.testing.assert_allclose(gradient[:, start : start + 4], slope(part), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(gradient[:, start : start + 4], slope(part, scene, camera), rtol=1e-4, atol=1e-4)
 
 
 def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
     features = jnp.asarray(random_features(scene.count, 3))
-    loss = lambda g, f: (render(g, camera, f, capacity=CAPACITY).features ** 2).sum()
-    alone = jax.jit(jax.grad(loss, argnums=1))(scene, features)
-    together = jax.jit(jax.grad(loss, argnums=(0, 1)))(scene, features)[1]
+    alone = slope(features, scene, camera)
+    together = jax.jit(jax.grad(squares, argnums=(0, 1)))(features, scene, camera)[0]
     np.testing.assert_allclose(alone, together, rtol=1e-4, atol=1e-5)
     # and rendering is linear: <W f, W f> has gradient 2 W^T W f
     other = jnp.asarray(random_features(scene.count, 3, seed=9))
-    slope = (alone * other).sum()
+    along = (alone * other).sum()
     expected = 2 * (render(scene, camera, features).features * render(scene, camera, other).features).sum()
-    np.testing.assert_allclose(slope, expected, rtol=1e-4)
+    np.testing.assert_allclose(along, expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("channels", [3, 16])
@@ -172,8 +176,7 @@ def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera, channe
     image = draw(rounded)
     assert image.dtype == jnp.float32
     np.testing.assert_array_equal(image, draw(rounded.astype(jnp.float32)))
-    slope = jax.jit(jax.grad(lambda f: (draw(f) ** 2).sum()))
-    gradient, whole = slope(rounded), slope(rounded.astype(jnp.float32))
+    gradient, whole = (slope(f, scene, camera) for f in (rounded, rounded.astype(jnp.float32)))
     assert gradient.dtype == jnp.bfloat16
     np.testing.assert_allclose(gradient.astype(jnp.float32), whole, rtol=2**-7, atol=1e-3)
 
@@ -195,11 +198,9 @@ def test_a_capture_of_one_size_compiles_once(scene, cameras):
 
 def test_vmapped_gradients_equal_a_loop(scene, cameras):
     features = jnp.asarray(random_features(scene.count, 3))
-    loss = lambda camera, f: (render(scene, camera, f, capacity=CAPACITY).features ** 2).sum()
-    batched = jax.jit(jax.vmap(jax.grad(loss, argnums=1), in_axes=(0, None)))(cameras, features)
-    single = jax.jit(jax.grad(loss, argnums=1))
+    batched = jax.jit(jax.vmap(slope, in_axes=(None, None, 0)))(features, scene, cameras)
     for t in range(4):
-        np.testing.assert_allclose(batched[t], single(cameras[t], features), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(batched[t], slope(features, scene, cameras[t]), rtol=1e-4, atol=1e-5)
 
 
 def test_projection_equals_its_twin(scene, camera):
