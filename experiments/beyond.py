@@ -23,9 +23,9 @@ from scipy.spatial import KDTree
 from sklearn.cluster import KMeans
 
 from experiments import results, scenes
+from experiments.reconcile import agree
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.grouping import group_by_consensus
-from jsecon.language.reconcile import agree
 from jsecon.query.anchored import ALIKE_THRESHOLD, CODE_THRESHOLD
 
 

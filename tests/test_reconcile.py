@@ -1,68 +1,10 @@
-"""Masks that carry a wrong id are put right by the other views; ids that are right stay."""
-
-import dataclasses
+"""The rounds in which masks and Gaussians come to agree, against plain loops."""
 
 import numpy as np
-import pytest
-from balls import ring_of_balls
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
-from jsecon.language.reconcile import agree, reconcile_labels
-from jsecon.splat.tiles import plan_capacity
-
-VIEWS = 8
-
-
-@pytest.fixture(scope="module")
-def world():
-    gaussians, cameras, _, labels, _ = ring_of_balls()
-    labels = labels[::3].copy()
-    for image in labels:  # slivers of a ball behind another lie under its blur
-        for ball in (1, 2, 3):
-            if (image == ball).sum() < 40:
-                image[image == ball] = -1
-    return gaussians, cameras[np.arange(0, 24, 3)], labels
-
-
-def test_right_labels_stay(world):
-    gaussians, cameras, labels = world
-    np.testing.assert_array_equal(reconcile_labels(gaussians, cameras, labels), labels)
-    holes = np.where((labels == 0) | (np.arange(VIEWS)[:, None, None] == 3), -1, labels)
-    np.testing.assert_array_equal(reconcile_labels(gaussians, cameras, holes), holes)
-
-
-def test_a_swap_and_a_new_id_are_undone(world):
-    gaussians, cameras, labels = world
-    wrong = labels.copy()
-    wrong[7][labels[7] == 1], wrong[7][labels[7] == 2] = 2, 1
-    wrong[1][labels[1] == 3] = 7
-    told = []
-    found = reconcile_labels(gaussians, cameras, wrong, progress=lambda *step: told.append(step))
-    np.testing.assert_array_equal(found, labels)
-    assert told == [(t + 1, VIEWS) for t in range(VIEWS)]
-    np.testing.assert_array_equal(reconcile_labels(gaussians, cameras, wrong, rounds=0), wrong)
-
-
-def test_two_places_under_one_id_stay_one(world):
-    gaussians, cameras, labels = world
-    twins = np.where(labels == 2, 1, labels)
-    np.testing.assert_array_equal(reconcile_labels(gaussians, cameras, twins), twins)
-
-
-def test_nothing_labelled_and_wrong_shapes(world):
-    gaussians, cameras, labels = world
-    nothing = np.full_like(labels, -1)
-    np.testing.assert_array_equal(reconcile_labels(gaussians, cameras, nothing), nothing)
-    with pytest.raises(ValueError, match="labels"):
-        reconcile_labels(gaussians, cameras, labels[:2])
-    with pytest.raises(ValueError, match="rounds"):
-        reconcile_labels(gaussians, cameras, labels, rounds=-1)
-    with pytest.raises(ValueError, match="capacity"):
-        reconcile_labels(gaussians, cameras, labels, capacity=64)
-    unseen = dataclasses.replace(gaussians, means=gaussians.means + np.float32(100))
-    capacity = plan_capacity(gaussians, cameras, margin=1.0)  # the other tests', so that nothing is compiled anew
-    np.testing.assert_array_equal(reconcile_labels(unseen, cameras, labels, capacity=capacity), labels)
+from experiments.reconcile import agree
 
 
 def one_round(votes, ids):
@@ -90,3 +32,14 @@ def test_rounds_equal_the_plain_loops(seed, rounds):
     for _ in range(rounds):
         expected = one_round(votes, expected)
     np.testing.assert_array_equal(agree(sparse.csr_matrix(votes), ids, rounds=rounds), expected)
+
+
+def test_a_mask_under_another_id_is_outvoted_and_right_ones_stay():
+    """Two objects of ten Gaussians in five views, mask 2t + k of object k; the last view has them swapped."""
+    votes = np.zeros((20, 10))
+    for t in range(5):
+        votes[:10, 2 * t], votes[10:, 2 * t + 1] = 1, 1
+    ids = np.array([0, 1] * 4 + [1, 0])
+    np.testing.assert_array_equal(agree(sparse.csr_matrix(votes), ids), [0, 1] * 5)
+    np.testing.assert_array_equal(agree(sparse.csr_matrix(votes), np.array([0, 1] * 5)), [0, 1] * 5)
+    np.testing.assert_array_equal(agree(sparse.csr_matrix(0 * votes), ids), ids)
