@@ -3,14 +3,22 @@
     python -m experiments.default_vision [FOLDER]
 
 Scenes: the demo rooms of seeds 0 to 4 (made in FOLDER where they are missing) and, where ../shared/captures is at hand,
-replica_apartment_0, whose ids stand for several objects each. For every true object that fills at least 1 % of a view:
-the best IoU of any masklet with it there, its mean over objects and views; and the share of an object's views whose
-best masklet has the id that is the best in most of them, its mean over objects seen twice or more. All from the
-pipeline's own stages: consensus (the default) and Algorithm 1 through the Gaussians; beside them, the same proposals
-left alone in each frame, and carried from frame to frame by dense optical flow (OpenCV's DIS).
+replica_apartment_0. Its ids are true ones modulo 40, so one stands for several things, here and there in the flat: an
+object is what hangs together in space of one id (`connected_parts`); the ids as they are stand beside it. For every
+true object that fills at least 1 % of a view: the best IoU of any masklet with it there, its mean over objects and
+views; and the share of an object's views whose best masklet has the id that is the best in most of them, its mean over
+objects seen twice or more. All from the pipeline's own stages: consensus (the default) and Algorithm 1 through the
+Gaussians; beside them, the same proposals left alone in each frame, and carried from frame to frame by dense optical
+flow (OpenCV's DIS).
+
+Each cell (scene, way) is kept in OUT/cells as it is finished, under a key that holds the code it comes from: a run that
+was stopped goes on, and a changed vision is measured anew. Algorithm 1, which takes longest, comes last.
 """
 
 import dataclasses
+import functools
+import hashlib
+import json
 import sys
 import tempfile
 import time
@@ -20,11 +28,16 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from experiments import replica_apartment_0, results
+from jsecon import cache
 from jsecon.data.capture import load_capture
 from jsecon.demo import demo
 from jsecon.eyes import Eyes
+from jsecon.files import write_text
 from jsecon.language.field import load_field
 from jsecon.options import Options as RunOptions
 from jsecon.plan import Silent
@@ -36,6 +49,14 @@ LEAST = 0.01
 """share of a view that an object must fill to count there"""
 KEPT = 0.5
 """optical flow: a proposal keeps the id that fills at least this much of it, as IoU"""
+WAYS = CONSENSUS, ALONE, FLOW, TRACKING = (
+    "consensus (default)",
+    "each frame alone",
+    "optical flow",
+    "tracking (Algorithm 1)",
+)
+Scene = tuple[Capture, Gaussians, dict[str, np.ndarray]]
+"""with the true labels (T, H, W), -1 = none, of each kind"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,72 +130,134 @@ def by_flow(frames: np.ndarray, single: np.ndarray, *, kept: float = KEPT) -> np
     return labels
 
 
-def measure(capture: Capture, gaussians: Gaussians, truth: np.ndarray) -> dict[str, dict[str, float]]:
-    """The scores and seconds (segmentation included) of each way, on the frames that take part."""
-    gaussians = jax.tree.map(jnp.asarray, gaussians)
-    options = RunOptions(capture=Path())
-    train = training_frames(capture)
-    frames, truth = np.asarray(capture.frames)[train], truth[train]
-    none = Eyes(ColourEmbedder(), None, None)
-    track = dataclasses.replace(options, association="tracking")
-    silent = lambda done, total: None
-    single = lambda: alone(frames, proposals_of(options, capture, gaussians, None)[0])
-    ways = {
-        "each frame alone": single,
-        "optical flow": lambda: by_flow(frames, single()),
-        "tracking (Algorithm 1)": lambda: masklets_from_frames(track, capture, gaussians, none, silent).value,
-        "consensus (default)": lambda: masklets_from_frames(options, capture, gaussians, none, silent).value,
-    }
-    found = {}
-    for name, way in ways.items():
-        start = time.perf_counter()
-        labels = way()
-        seconds = time.perf_counter() - start
-        iou, lasting = score(labels, truth)
-        found[name] = {"best_iou": iou, "lasting": lasting, "seconds": seconds}
-    return found
+def measure(options: RunOptions, capture: Capture, gaussians: Gaussians, way: str) -> tuple[np.ndarray, float]:
+    """(labels (T, H, W) by one of WAYS on the frames that take part, seconds with the segmentation)."""
+    frames = np.asarray(capture.frames)[training_frames(capture)]
+    start = time.perf_counter()
+    if way in (ALONE, FLOW):
+        labels = alone(frames, proposals_of(options, capture, gaussians, None)[0])
+        labels = by_flow(frames, labels) if way == FLOW else labels
+    else:
+        options = dataclasses.replace(options, association="consensus" if way == CONSENSUS else "tracking")
+        none = Eyes(ColourEmbedder(), None, None)
+        labels = masklets_from_frames(options, capture, gaussians, none, lambda done, total: None).value
+    return labels, time.perf_counter() - start
 
 
-def demo_room(folder: Path, seed: int) -> tuple[Capture, Gaussians, np.ndarray]:
-    """The room of `seed` as `jsecon demo` leaves it, and its true labels (T, H, W)."""
+def connected_parts(capture: Capture, ids: np.ndarray, *, voxel: float = 0.1, least: int = 10) -> np.ndarray:
+    """Parts (T, H, W) int32 of ids (T, H, W), -1 = none: what hangs together in space, by the depths of all views.
+
+    Voxels (edge in world units) that hold pixels of an id are joined with those of the same id among their 26
+    neighbours. A part of fewer than `least` voxels, which is an outline's noise, goes to the nearest larger one of its
+    id. Pixels without depth are -1.
+    """
+    poses = np.asarray(capture.cameras.world_to_camera, np.float64)
+    cells = []
+    for t, (depth, image) in enumerate(zip(capture.depths, ids, strict=True)):
+        camera = capture.cameras[t]
+        row, column = np.nonzero((depth > 0) & (image >= 0))
+        z = depth[row, column].astype(np.float64)
+        x = (column + 0.5 - float(camera.cx)) / float(camera.fx) * z
+        y = (row + 0.5 - float(camera.cy)) / float(camera.fy) * z
+        world = (np.stack([x, y, z], 1) - poses[t, :3, 3]) @ poses[t, :3, :3]
+        cells.append(np.column_stack([np.floor(world / voxel), image[row, column]]).astype(np.int64))
+    lowest = np.min([own.min(0) for own in cells], axis=0)
+    size = np.max([own.max(0) for own in cells], axis=0) - lowest + 1
+    keys = [np.ravel_multi_index((own - lowest).T, size) for own in cells]
+    known = np.unique(np.concatenate([np.unique(own) for own in keys]))
+    place = np.stack(np.unravel_index(known, size), 1)
+    place, name = place[:, :3].astype(np.float64), place[:, 3]
+    pairs = cKDTree(place).query_pairs(1.75, output_type="ndarray")  # the diagonal of a voxel is 1.73
+    pairs = pairs[name[pairs[:, 0]] == name[pairs[:, 1]]]
+    joined = sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(known), len(known)))
+    part = connected_components(joined, directed=False)[1]
+    small = np.bincount(part)[part] < least
+    for number in np.unique(name[small]):
+        few, many = np.flatnonzero(small & (name == number)), np.flatnonzero(~small & (name == number))
+        if len(many):
+            part[few] = part[many[cKDTree(place[many]).query(place[few])[1]]]
+    result = np.full(ids.shape, -1, np.int32)
+    for t, own in enumerate(keys):
+        result[t][(capture.depths[t] > 0) & (ids[t] >= 0)] = part[np.searchsorted(known, own)]
+    return result
+
+
+def demo_room(folder: Path, seed: int) -> Scene:
+    """The room of `seed` as `jsecon demo` leaves it."""
     if not (folder / "field.npz").exists():
         demo(folder, seed=seed, reporter=Silent())
     capture = load_capture(folder / "capture", holdout=8)
     files = [folder / "capture" / "masks" / f"{name}.png" for name in capture.names]
     truth = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.int32) - 1
-    return capture, load_field(folder / "field.npz").gaussians, truth
+    return capture, load_field(folder / "field.npz").gaussians, {"objects": truth}
 
 
-def replica(folder: str) -> tuple[Capture, Gaussians, np.ndarray]:
+def replica(folder: str) -> Scene:
     """replica_apartment_0, every second view, its depth points as Gaussians."""
     given = replica_apartment_0.Options(capture=folder)
-    capture, truth = replica_apartment_0.load_replica(folder, voting_every=given.voting_every)
-    return capture, replica_apartment_0.points_as_gaussians(capture, given)[1], truth
+    capture, ids = replica_apartment_0.load_replica(folder, voting_every=given.voting_every)
+    gaussians = replica_apartment_0.points_as_gaussians(capture, given)[1]
+    return capture, gaussians, {"objects": connected_parts(capture, ids), "ids": ids}
 
 
 def main(options: Options = Options()) -> dict:
-    """Measures every scene and writes the table."""
+    """Measures every cell that is missing and writes the table."""
     rooms = Path(options.rooms or tempfile.mkdtemp())
     scenes = {f"demo {seed}": (lambda seed=seed: demo_room(rooms / f"demo{seed}", seed)) for seed in options.seeds}
     if Path(options.capture).exists():
-        scenes["replica_apartment_0"] = lambda: replica(options.capture)
-    found = {}
-    for name, make in scenes.items():
-        found[name] = measure(*make())
-        print(name, found[name], flush=True)
-    rows = [
-        (scene, way, row["best_iou"], row["lasting"], row["seconds"])
-        for scene, ways in found.items()
-        for way, row in ways.items()
-    ]
-    demos = [ways for name, ways in found.items() if name.startswith("demo")]
-    for way in demos[0] if demos else ():
-        mean = [float(np.mean([room[way][key] for room in demos])) for key in ("best_iou", "lasting", "seconds")]
-        rows.append((f"mean of {len(demos)} demos", way, *mean))
-    table = results.table(("scene", "association", "mean best IoU", "share of views under one id", "seconds"), rows)
-    results.save(Path(options.out), options, found, table)
-    print(table)
+        scenes["replica_apartment_0"] = functools.partial(replica, options.capture)
+    run = RunOptions(capture=Path())
+    found: dict[str, dict] = {scene: {} for scene in scenes}
+    for ways in (WAYS[:-1], WAYS[-1:]):
+        for scene, make in scenes.items():
+            missing = [way for way in ways if not cell_of(options, scene, way).exists()]
+            made = make() if missing else None
+            for way in missing:
+                capture, gaussians, truths = made
+                labels, seconds = measure(run, capture, jax.tree.map(jnp.asarray, gaussians), way)
+                cell = {"seconds": round(seconds, 1)}
+                for kind, truth in truths.items():
+                    cell[kind] = dict(zip(("best_iou", "lasting"), score(labels, truth[training_frames(capture)])))
+                write_text(cell_of(options, scene, way), json.dumps(cell))
+                print(scene, way, cell, flush=True)
+            found[scene] |= {way: json.loads(cell_of(options, scene, way).read_text()) for way in ways}
+    write(options, found)
     return found
+
+
+def cell_of(options: Options, scene: str, way: str) -> Path:
+    """Where a cell is kept."""
+    source = cache.source_digest(("vision", "language.consensus", "language.grouping", "language.masklets", "stages"))
+    key = hashlib.sha1(json.dumps([source, scene, way]).encode()).hexdigest()[:12]
+    return Path(options.out) / "cells" / f"{scene.replace(' ', '')}-{WAYS.index(way)}-{key}.json"
+
+
+def write(options: Options, found: dict[str, dict]) -> None:
+    """Writes the results and prints the table."""
+    rows = []
+    for scene, ways in found.items():
+        for kind in ("objects", "ids"):
+            for way, cell in ways.items():
+                if kind in cell:
+                    name = scene if kind == "objects" else f"{scene}, ids modulo 40 as objects"
+                    rows.append((name, way, cell[kind]["best_iou"], cell[kind]["lasting"], cell["seconds"]))
+    demos = [ways for scene, ways in found.items() if scene.startswith("demo")]
+    means = {}
+    for way in WAYS if demos else ():
+        means[way] = [float(np.mean([room[way]["objects"][key] for room in demos])) for key in ("best_iou", "lasting")]
+        seconds = float(np.mean([room[way]["seconds"] for room in demos]))
+        rows.append((f"mean of {len(demos)} demos", way, *means[way], seconds))
+    table = results.table(("scene", "association", "mean best IoU", "share of views under one id", "seconds"), rows)
+    groups = {f"{len(demos)} demos": means} if demos else {}
+    groups |= {
+        scene: {way: (cell["objects"]["best_iou"], cell["objects"]["lasting"]) for way, cell in ways.items()}
+        for scene, ways in found.items()
+        if not scene.startswith("demo")
+    }
+    labels = [f"{name}\n{figure}" for name in groups for figure in ("best IoU", "one id")]
+    series = {way: [value for group in groups.values() for value in group[way]] for way in WAYS}
+    results.save(Path(options.out), options, found, table, results.bars(labels, series, "share"))
+    print(table)
 
 
 if __name__ == "__main__":

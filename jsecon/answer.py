@@ -92,7 +92,8 @@ def ask_text(
         if by == "one_step":
             selection = query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
         else:
-            canonical = encode(field.autoencoder, field.canonical)
+            phrases = field.canonical if len(field.canonical) else embedder.canonical
+            canonical = encode(field.autoencoder, jnp.asarray(phrases))
             selection = query_canonical(
                 field.codes, code, canonical, CANONICAL_THRESHOLD if threshold is None else threshold
             )

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 from jsecon.errors import InputError
 from jsecon.options import Options
 from jsecon.types import LanguageField
+from jsecon.vision.given import GivenSpace, given_dim, missing_model
 from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
 from jsecon.vision.protocols import Embedder, Tracker
 
@@ -67,7 +68,15 @@ def eyes_of(options: Options, store: Path) -> Eyes:
         from jsecon.vision.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(options.tracker)
-    return Eyes(embedder_named(folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
+    given = None
+    if options.features is not None:
+        from jsecon.data.langsplat_files import feature_size
+
+        given = GivenSpace(feature_size(options.features))
+        if options.embedder is None:
+            return Eyes(given, segmenter, tracker)
+    name = None if given is None else given.name
+    return Eyes(embedder_named(name, folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
 
 
 def embedder_named(
@@ -77,11 +86,15 @@ def embedder_named(
     templates: Sequence[str] = ("{}",),
     store: Path | None = None,
 ) -> Embedder:
-    """The embedder whose space is called `name` (None: any): CLIP where its folder is given, else colours.
+    """The embedder whose space is called `name` (None: any): CLIP where its folder is given, else colours. In a given
+    space (`GivenSpace`) only CLIP knows texts, and any will do whose embeddings have as many numbers.
 
     `templates` are phrases for CLIP to put texts into. Raises InputError where the folder holds no CLIP model, or the
     embedder found is of another space.
     """
+    dim = given_dim(name)
+    if dim is not None and folder is None:
+        raise missing_model(dim)
     if folder is not None:
         from jsecon.vision.clip import ClipEmbedder
 
@@ -101,7 +114,14 @@ def embedder_named(
                 expected="one made with CLIP",
                 remedy="Leave out --template.",
             )
-    if name not in (None, found.name):
+    if dim is not None and found.dim != dim:
+        raise InputError(
+            "--embedder",
+            found=f"a model whose embeddings have {found.dim} numbers",
+            expected=f"{dim}, as those from files have",
+            remedy="Give the CLIP model that made the files.",
+        )
+    if dim is None and name not in (None, found.name):
         raise InputError("field", found=f"regions embedded by {name!r}", expected=f"{found.name!r}", remedy=remedy)
     return found
 

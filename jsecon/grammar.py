@@ -207,6 +207,13 @@ def _model_options(run: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="a CLIP model folder (.onnx, tokenizer.json) for regions and texts, instead of colours",
     )
+    group.add_argument(
+        "--features",
+        type=Path,
+        metavar="DIR",
+        help="LangSplat's language_features: regions take their embeddings from <frame>_s.npy and _f.npy; texts then "
+        "need the CLIP that made them (--embedder, here or of query)",
+    )
 
 
 def _field_options(run: argparse.ArgumentParser) -> None:

@@ -32,6 +32,8 @@ class Options:
     """SAM 2 model folder that follows the proposals (Algorithm 1); None: through the Gaussians."""
     embedder: Path | None = None
     """CLIP model folder for regions and texts; None: colours."""
+    features: Path | None = None
+    """folder of LangSplat's `_f.npy` beside `_s.npy`, from which regions get their embeddings; None: `embedder`."""
     downscale: float | None = None
     """frames are made this many times smaller; None: so that the longer side is at most `long_side`."""
     long_side: int = 400
@@ -84,6 +86,7 @@ def require_inputs(options: Options) -> None:
         ),
         (options.masks, "a folder with one mask a frame", "Give the masks' folder, or leave out --masks to find them."),
         (options.proposals, "a folder with the masks of each frame", "Give the folder, or leave out --proposals."),
+        (options.features, "a folder with each frame's _s.npy and _f.npy", "Give the folder, or leave out --features."),
         (options.segmenter, "a folder with a SAM model", "See `jsecon models check DIR`."),
         (options.tracker, "a folder with a SAM 2 model", "See `jsecon models check DIR`."),
         (options.embedder, "a folder with a CLIP model", "See `jsecon models check DIR`."),

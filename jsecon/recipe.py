@@ -40,6 +40,8 @@ def left_out(options: Options) -> dict[str, str]:
             left["view-dependent colour"] = "SH degree 0"
     if options.masks is not None:
         left["segmenter"] = left["association"] = f"masks are given ({options.masks.name})"
+    if options.features is not None:
+        left["embedder"] = f"embeddings are given ({options.features.name})"
     return left
 
 
@@ -138,13 +140,19 @@ def stages_of(
             | _eye(options, seeing.segmenter),
             files=options.proposals,
         )
+    if options.features is None:
+        how, rooms, given = f"embedded by {seeing.embedder.name!r}", ("vision",), {"embedder": seeing.embedder.name}
+    else:
+        how = f"embeddings read from {options.features.name}, level {options.level}"
+        rooms, given = ("data",), _of(options, "level")
     add(
         "regions",
-        f"embedded by {seeing.embedder.name!r}, views weighted by {options.weighting}",
+        f"{how}, views weighted by {options.weighting}",
         lambda r, p: stages.regions(options, r["load"], r["masklets"], seeing.embedder, p),
-        rooms=("vision", "language.regions"),
+        rooms=(*rooms, "language.regions"),
         after=("load", "masklets"),
-        given=_of(options, "weighting") | {"embedder": seeing.embedder.name},
+        given=_of(options, "weighting") | given,
+        files=options.features,
     )
     add(
         "codes",

@@ -5,7 +5,6 @@ by any step after the loading, the final measurement apart.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +18,10 @@ from jsecon.options import Options
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
 from jsecon.vision.protocols import Segmenter
+from jsecon.vision.runs import remembered
+
+CLOUD = 100_000
+"""points, at most, that the normals of a capture with depth are taken from"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,25 +187,29 @@ def proposals_of(
     if segmenter is not None:  # which keeps what it finds on disk
         return lambda t: segmenter(frames[t], t), ()
     classical = classical_segmenter(options, capture, gaussians)
-    return functools.cache(lambda t: classical(frames[t], t)), ()
+    return remembered(lambda t: classical(frames[t], t)), ()
 
 
 def classical_segmenter(options: Options, capture: Capture, gaussians: Gaussians) -> Segmenter:
     """The segmenter without weights.
 
-    Depth comes from the capture; where there is none, the coarse one takes what the Gaussians render. (The finer ones
-    do not: rendered depth costs them more outline than it tells.)
+    Surfaces come from the capture's depth; where there is none, the coarse one takes the depth that the Gaussians
+    render. (The finer ones do not: rendered depth costs them more outline than it tells.)
     """
+    from jsecon.fit.initialise import points_from_depth
     from jsecon.splat.render import render_depth
     from jsecon.splat.tiles import plan_capacity
     from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
     from jsecon.vision.relief import steadied_depth
+    from jsecon.vision.surfaces import surfaces_from_depth
 
     train = training_frames(capture)
     cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
     setting = GRANULARITIES[options.granularity]
     if capture.depths is not None:
-        return ClassicalSegmenter(**setting, depths=np.asarray(capture.depths)[train])
+        depths = np.asarray(capture.depths)[train]
+        points = points_from_depth(capture, max_points=CLOUD, stride=4).points
+        return ClassicalSegmenter(**setting, surfaces=surfaces_from_depth(depths, capture.cameras[train], points))
     if options.granularity == "coarse":
         capacity = plan_capacity(gaussians, cameras)
         draw = jax.jit(lambda camera: render_depth(gaussians, camera, capacity=capacity))
@@ -240,9 +247,25 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 
 
 def regions(options: Options, capture: Capture, labels: np.ndarray, embedder: Any, progress: Progress) -> Outcome:
-    """One embedding a region."""
-    from jsecon.language.regions import region_embeddings
+    """One embedding a region, by the embedder or from files."""
+    from jsecon.language.regions import given_embeddings, region_embeddings
 
+    if options.features is not None:
+        from jsecon.data.langsplat_files import load_features
+
+        names = [capture.names[t] for t in training_frames(capture)]
+        given = load_features(options.features, names, labels.shape[1:], level=options.level)
+        if not len(given.embeddings):
+            raise InputError(
+                options.features,
+                found=f"no mask of level {options.level} in any frame",
+                expected="masks with their embeddings",
+                remedy="Take another --level, or write the files again.",
+            )
+        found = given_embeddings(labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress)
+        bare = int((~found.embeddings.any(1)).sum())
+        notes = (f"{len(given.embeddings)} embeddings in the files",)
+        return Outcome(found, notes=(*notes, f"{bare} regions lie on no mask with one") if bare else notes)
     frames = np.asarray(capture.frames)[training_frames(capture)]
     found = region_embeddings(frames, labels, embedder.embed_regions, weighting=options.weighting, progress=progress)
     eyes.close(embedder)

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 from clip_files import COLOURS, write_clip, write_visual
@@ -12,13 +13,15 @@ from sam2_files import write_sam2
 from sam_files import write_sam
 from test_pipeline import Recorder
 
-from jsecon import cli, eyes, pipeline, recipe
+from jsecon import cli, eyes, pipeline, recipe, stages
 from jsecon.data.capture import load_capture
+from jsecon.data.langsplat_files import write_features
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
-from jsecon.language.field import load_field
+from jsecon.language.field import load_field, save_field
 from jsecon.options import Options
+from jsecon.vision.given import GivenSpace
 from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
 from jsecon.vision.sam import SamSegmenter, SamSettings
 from jsecon.vision.sam2 import Sam2Tracker
@@ -156,6 +159,48 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     with pytest.raises(InputError, match=r"--embedder DIR"):
         eyes.embedder_of_field(lost)
     assert eyes.embedder_of_field(lost, models[1]).name == lost.embedder
+
+
+def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, models, tmp_path):
+    capture, folder, rows = load_capture(room, holdout=4), tmp_path / "language_features", []
+    for t, name in enumerate(capture.names):
+        ids = cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED).astype(int)
+        labels = np.unique(ids, return_inverse=True)[1].reshape(ids.shape) - (0 in ids)
+        vectors = np.random.default_rng(t).normal(size=(labels.max() + 1, 3))
+        write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+        rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
+    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
+    seeing = eyes.eyes_of(options, tmp_path)
+    assert seeing.embedder.name == "given-3"
+    plan = {stage.name: stage for stage in recipe.stages_of(options, tmp_path, tmp_path, seeing, None)}
+    assert "read from language_features, level l" in plan["regions"].how
+    assert "embedder" in recipe.left_out(options)
+    results = {"load": capture}
+    results["masklets"] = plan["masklets"].compute(results, lambda done, total: None).value
+    found = plan["regions"].compute(results, lambda done, total: None)
+    np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
+    assert found.notes == (f"{len(rows)} embeddings in the files",)
+    for name in capture.names:
+        write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
+    with pytest.raises(InputError, match="no mask of level l"):
+        stages.regions(options, capture, results["masklets"], seeing.embedder, lambda done, total: None)
+    with_clip = eyes.eyes_of(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
+    assert with_clip.name.startswith("clip-")
+
+
+def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, capsys):
+    known = load_field(seen[1] / "field.npz")
+    given = dataclasses.replace(known, embedder="given-3", canonical=np.zeros((0, 3), np.float32), provenance="{}")
+    save_field(tmp_path / "field.npz", given)
+    ask = ["query", str(tmp_path / "field.npz"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
+    assert cli.main(ask) == 2
+    assert "came from files, 3 numbers each" in capsys.readouterr().err
+    with pytest.raises(InputError, match="--embedder DIR"):
+        GivenSpace(3).embed_text(["red"])
+    assert cli.main([*ask, "--embedder", str(models[1]), "--by", "canonical"]) == 0  # the phrases, too, are the model's
+    assert json.loads((tmp_path / "answers" / "red.json").read_text())["count"] > 0
+    with pytest.raises(InputError, match="5, as those from files have"):
+        eyes.embedder_named("given-5", folder=models[1])
 
 
 def test_templates_are_for_clip():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.language.regions import region_embeddings
+from jsecon.language.regions import given_embeddings, region_embeddings
 
 
 def embed(frame, masks):
@@ -43,6 +43,28 @@ def test_equals_the_definition(seed, weighting):
     assert regions.embeddings.dtype == np.float32
     np.testing.assert_allclose(regions.embeddings, slow(frames, labels, 7, weighting), atol=1e-6)
     np.testing.assert_array_equal(regions.pixels, [[(image == r).sum() for image in labels] for r in range(7)])
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["pixels", "uniform"]))
+def test_given_embeddings_equal_the_definition(seed, weighting):
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(-1, 3, (3, 6, 7)).astype(np.int16)
+    masks = np.where(rng.random((3, 6, 7)) < 0.3, -1, rng.integers(0, 9, (3, 6, 7)))
+    rows = rng.normal(size=(9, 4)).astype(np.float32)
+    wanted = np.zeros((4, 4))
+    for r in range(3):
+        for t in range(3):
+            inside = (labels[t] == r) & (masks[t] >= 0)
+            if inside.any():
+                mean = rows[masks[t][inside]].astype(np.float64).mean(0)
+                wanted[r] += mean / np.linalg.norm(mean) * ((labels[t] == r).sum() if weighting == "pixels" else 1)
+    wanted /= np.maximum(np.linalg.norm(wanted, axis=1, keepdims=True), 1e-12)
+    found = given_embeddings(labels, masks, rows, weighting=weighting, num_regions=4)
+    np.testing.assert_allclose(found.embeddings, wanted, atol=1e-6)
+    np.testing.assert_array_equal(found.pixels[3], 0)
+    with pytest.raises(ValueError, match="masks"):
+        given_embeddings(labels, masks[:2], rows)
 
 
 def test_a_large_view_outweighs_a_small_one_only_with_pixels():

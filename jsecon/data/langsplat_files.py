@@ -42,15 +42,14 @@ def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, 
     frame: list[int] = []
     for t, name in enumerate(names):
         file = folder / f"{name}_f.npy"
-        try:
-            table = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        table = _read_table(file)
+        if rows and table.shape[-1] != len(rows[0]):
             raise InputError(
                 file,
-                found=f"nothing readable ({error})",
-                expected="a (M, E) array, one row a mask",
-                remedy="Run LangSplat's preprocess.py on every frame.",
-            ) from error
+                found=f"rows of {table.shape[-1]} numbers",
+                expected=f"{len(rows[0])}, as in the frames before",
+                remedy="Write all frames' files with the same model.",
+            )
         found = load_labels(folder, [name], size, level=level)
         if table.ndim != 2 or not np.isfinite(table).all() or max(found.ids, default=-1) >= len(table):
             raise InputError(
@@ -68,6 +67,34 @@ def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, 
     width = rows[0].shape[-1] if rows else 0
     embeddings = np.stack(rows).astype(np.float32) if rows else np.zeros((0, width), np.float32)
     return FrameMasks(labels, embeddings, np.array(frame, np.int32))
+
+
+def feature_size(folder: Path) -> int:
+    """E of the embeddings in `folder`. Raises InputError where it holds no `_f.npy`, or the first is damaged."""
+    files = sorted(folder.glob("*_f.npy"))
+    if not files:
+        raise InputError(
+            folder,
+            found="no _f.npy",
+            expected="<frame>_f.npy beside <frame>_s.npy",
+            remedy="Give the language_features folder that LangSplat's preprocess.py wrote.",
+        )
+    return int(_read_table(files[0]).shape[-1])
+
+
+def _read_table(file: Path) -> np.ndarray:
+    try:
+        table = np.load(file, allow_pickle=False)
+        if table.ndim == 0:
+            raise ValueError("a single number")
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            file,
+            found=f"nothing readable ({error})",
+            expected="a (M, E) array, one row a mask",
+            remedy="Run LangSplat's preprocess.py on every frame.",
+        ) from error
+    return table
 
 
 def write_features(

@@ -11,6 +11,7 @@ from scipy import sparse
 from jsecon.errors import require
 from jsecon.vision.atoms import Sparse
 from jsecon.vision.protocols import Segmenter, Tracker
+from jsecon.vision.runs import Runs, runs_of_masks, runs_of_rows
 
 Progress = Callable[[int, int], None]
 
@@ -22,7 +23,7 @@ class MaskletState:
     done: int
     """frames whose proposals were prompted and tracked."""
     proposals: dict[str, np.ndarray]
-    """masks of every frame: `rows` (T,) masks a frame, `lengths` (sum of rows,) pixels of each, `pixels` which ones."""
+    """masks of every frame: `rows` (T,) masks a frame; `counts`, `starts`, `stops` of their runs, as in `Runs`."""
     layers: dict[str, np.ndarray]
     """the same of what was tracked."""
 
@@ -124,8 +125,9 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
     the most agreed pairs first, where that holds in more than `join_rate` of the frames (two at least) that show both:
     the view consensus of mask clustering (Yan et al., CVPR 2024), between tracks instead of single masks.
     """
+    tables = [_overlaps(layers.at(t), proposals.at(t)) for t in range(layers.count)]
     while True:
-        together, both, area, support = _agreement(layers, proposals)
+        together, both, area, support = _agreement(tables)
         rate = np.where(both >= 2, together / np.maximum(both, 1), 0.0)
         np.fill_diagonal(rate, 0.0)
         groups = np.arange(len(rate))
@@ -139,15 +141,21 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
         if np.array_equal(groups, np.arange(len(rate))):
             return layers, area, support
         layers = layers.grouped(groups)
+        _, first, members = np.unique(groups, return_index=True, return_counts=True)
+        united = np.flatnonzero(members > 1)
+        for t, table in enumerate(tables):  # the others' rows stay what they were
+            tables[t] = tuple(rows[first] for rows in table)
+            for rows, own in zip(tables[t], _overlaps(layers.at(t)[united], proposals.at(t))):
+                rows[united] = own
 
 
-def _agreement(layers: "_Layers", proposals: "_Layers") -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support."""
-    count = layers.size(0)
+def _agreement(tables: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support.
+    `tables` holds each frame's `_overlaps` of masklets and proposals."""
+    count = len(tables[0][0])
     together, both = np.zeros((count, count)), np.zeros((count, count))
     area, support, views = np.zeros(count), np.zeros(count), np.zeros(count)
-    for t in range(layers.count):
-        size, shared, overlap = _overlaps(layers.at(t), proposals.at(t))
+    for size, shared, overlap in tables:
         shown = (size > 0).astype(np.float64)
         covered = (shared > 0.5 * size[:, None]).astype(np.float32)
         together += covered @ covered.T > 0
@@ -202,60 +210,61 @@ def _new(masks: Sparse, known: Sparse, threshold: float) -> np.ndarray:
 
 
 class _Layers:
-    """Masks of many things in every frame, free to overlap: a sparse (R, H W) matrix of ones a frame."""
+    """Masks of many things in every frame, free to overlap, kept as runs of pixels."""
 
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
-        self._rows: list[Sparse] = [sparse.csr_matrix((0, height * width), dtype=np.float32) for _ in range(count)]
+        empty = np.zeros(0, np.int32)
+        self._runs = [Runs(empty, empty, empty, height * width) for _ in range(count)]
 
     def size(self, t: int) -> int:
-        return self._rows[t].shape[0]
+        return len(self._runs[t].counts)
 
     def at(self, t: int) -> Sparse:
         """(R, H W) ones at frame t."""
-        return self._rows[t]
+        return self._runs[t].rows()
 
     def add_masks(self, t: int, masks: np.ndarray) -> None:
         """Appends masks (M, H, W) bool to frame t."""
-        flat = sparse.csr_matrix(masks.reshape(len(masks), self.shape[0] * self.shape[1]), dtype=np.float32)
-        self._rows[t] = sparse.vstack([self._rows[t], flat], format="csr")
+        self._runs[t] = self._runs[t].followed_by(runs_of_masks(masks))
 
     def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
         """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
         pixels = np.flatnonzero((labels >= 0) & (labels < number))
         ones = np.ones(len(pixels), np.float32)
         rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
-        self._rows[t] = sparse.vstack([self._rows[t], rows], format="csr")
+        self._runs[t] = self._runs[t].followed_by(runs_of_rows(rows))
 
     def record(self) -> dict[str, np.ndarray]:
         """All masks as plain arrays (see MaskletState)."""
-        return {
-            "rows": np.array([rows.shape[0] for rows in self._rows], np.int64),
-            "lengths": np.concatenate([np.diff(rows.indptr) for rows in self._rows]).astype(np.int64),
-            "pixels": np.concatenate([rows.indices for rows in self._rows]).astype(np.int32),
+        return {"rows": np.array([len(runs.counts) for runs in self._runs], np.int64)} | {
+            name: np.concatenate([getattr(runs, name) for runs in self._runs]) for name in ("counts", "starts", "stops")
         }
 
     def restore(self, record: dict[str, np.ndarray]) -> None:
         """Takes back what `record` gave."""
-        lengths = np.split(record["lengths"], np.cumsum(record["rows"])[:-1])
-        pixels = np.split(record["pixels"], np.cumsum([own.sum() for own in lengths])[:-1])
-        for t, (own, where) in enumerate(zip(lengths, pixels)):
-            ends = np.concatenate([[0], np.cumsum(own)])
-            shape = (len(own), self.shape[0] * self.shape[1])
-            self._rows[t] = sparse.csr_matrix((np.ones(len(where), np.float32), where, ends), shape=shape)
+        counts = np.split(record["counts"], np.cumsum(record["rows"])[:-1])
+        places = np.cumsum([own.sum() for own in counts])[:-1]
+        starts, stops = (np.split(record[name], places) for name in ("starts", "stops"))
+        pixels = self.shape[0] * self.shape[1]
+        self._runs = [Runs(*frame, pixels) for frame in zip(starts, stops, counts)]
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """The layers with those of one group (R,) united, in the order of the groups."""
         number = np.unique(groups, return_inverse=True)[1]
         unite: Sparse = sparse.csr_matrix((np.ones(len(groups), np.float32), (number, np.arange(len(groups)))))
         result = _Layers(self.count, *self.shape)
-        result._rows = [(unite @ rows).sign() for rows in self._rows]
+        for t in range(self.count):
+            united = (unite @ self.at(t)).tocsr()
+            united.sort_indices()
+            result._runs[t] = runs_of_rows(united)
         return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:
         """(T, H, W) int16 labels: the first in `best_first` that covers a pixel owns it."""
         labels = np.full((self.count, self.shape[0] * self.shape[1]), -1, np.int16)
-        for image, rows in zip(labels, self._rows):
+        for t, image in enumerate(labels):
+            rows = self.at(t)
             for masklet in best_first[::-1]:
                 image[rows.indices[rows.indptr[masklet] : rows.indptr[masklet + 1]]] = masklet
         return labels.reshape(self.count, *self.shape)

@@ -4,10 +4,13 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from jsecon.errors import require
 from jsecon.types import Regions
+
+Embed = Callable[[int, np.ndarray], np.ndarray]
+"""(frame's index, masks (M, H, W) bool) -> (M, E) unit, zero where there is nothing to embed"""
 
 
 def region_embeddings(
@@ -37,6 +40,57 @@ def region_embeddings(
         expected=str(frames.shape[:3]),
         remedy="Give one label image a frame, of the frame's own size.",
     )
+    return pooled(
+        labels,
+        lambda t, masks: embed(frames[t], masks),
+        weighting=weighting,
+        num_regions=num_regions,
+        progress=progress,
+    )
+
+
+def given_embeddings(
+    labels: Int[np.ndarray, "t h w"],
+    masks: Int[np.ndarray, "_ _ _"],
+    embeddings: Float[np.ndarray, "m e"],
+    *,
+    weighting: Literal["pixels", "uniform"] = "pixels",
+    num_regions: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Regions:
+    """Embeddings of the regions of a labelled sequence, from those that masks of its frames have already.
+
+    labels (T, H, W) integers, -1 = none; masks (T, H, W) rows of `embeddings` (M, E), -1 = none. In each view a region
+    has the mean of the embeddings under its pixels, scaled to unit length; where it lies on no mask it does not count.
+    Else as `region_embeddings`.
+    """
+    require(
+        masks.shape == labels.shape,
+        "masks",
+        got=masks.shape,
+        expected=str(labels.shape),
+        remedy="Give one image of rows a frame, of the labels' size.",
+    )
+
+    def under(t: int, regions: np.ndarray) -> np.ndarray:
+        rows, place = np.unique(masks[t][masks[t] >= 0], return_inverse=True)
+        known = masks[t] >= 0
+        inside = [np.bincount(place[region[known]], minlength=len(rows)) for region in regions]
+        found = np.asarray(inside, np.float64).reshape(len(regions), len(rows)) @ embeddings[rows].astype(np.float64)
+        return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
+
+    return pooled(labels, under, weighting=weighting, num_regions=num_regions, progress=progress)
+
+
+def pooled(
+    labels: Int[np.ndarray, "t h w"],
+    embed: Embed,
+    *,
+    weighting: Literal["pixels", "uniform"],
+    num_regions: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Regions:
+    """`region_embeddings` with what embeds the masks of the t-th frame given as a function of t."""
     require(
         weighting in ("pixels", "uniform"),
         "weighting",
@@ -53,13 +107,13 @@ def region_embeddings(
         expected="labels below num_regions",
         remedy="Raise num_regions, or leave it out.",
     )
-    pixels = np.zeros((count, len(frames)), np.int32)
+    pixels = np.zeros((count, len(labels)), np.int32)
     total: np.ndarray | None = None
-    for t, (frame, image) in enumerate(zip(frames, labels)):
+    for t, image in enumerate(labels):
         pixels[:, t] = np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count]
         seen = np.flatnonzero(pixels[:, t])
         if len(seen):
-            found = np.asarray(embed(frame, image[None] == seen[:, None, None]), np.float64)
+            found = np.asarray(embed(t, image[None] == seen[:, None, None]), np.float64)
             require(
                 found.ndim == 2 and len(found) == len(seen),
                 "embed",
@@ -71,9 +125,9 @@ def region_embeddings(
             weight = pixels[seen, t].astype(np.float64) if weighting == "pixels" else np.ones(len(seen))
             total[seen] += weight[:, None] * found
         if progress is not None:
-            progress(t + 1, len(frames))
+            progress(t + 1, len(labels))
     if total is None:  # nothing is labelled: the embedder alone knows E
-        total = np.zeros((count, np.asarray(embed(frames[0], np.zeros((1, *frames.shape[1:3]), bool))).shape[1]))
+        total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     unit = np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0)
     return Regions(embeddings=unit.astype(np.float32), pixels=pixels)

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import require
 from jsecon.vision.relief import geometry_features
+from jsecon.vision.surfaces import Surface
 
 BORDER_SHARE = 0.4
 """of the step across the border in a dissimilarity; the rest is the difference of the means"""
@@ -61,6 +62,9 @@ class ClassicalSegmenter:
     """relative step of depth that counts as much as `merge_distance`"""
     crease_degrees: float = 50.0
     """angle between normals that counts as much as `merge_distance`"""
+    surfaces: Callable[[int], Surface | None] | None = None
+    """the surface of a frame, None = unknown, in place of `depths` and `normals`: then regions also keep apart by their
+    mean normals, and a step of depth is one off the plane, since on a wall seen from its side depth jumps all along"""
 
     def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
         """frame (H, W, 3) uint8 -> masks (M, H, W) bool, a partition of the frame but for specks, best first."""
@@ -77,6 +81,13 @@ class ClassicalSegmenter:
             remedy="Give RGB frames as 8-bit arrays.",
         )
         features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
+        minimum = self.min_area * frame.shape[0] * frame.shape[1]
+        surface = None if self.surfaces is None else self.surfaces(index)
+        if surface is not None:
+            features, seeds = self._with_surface(features, surface)
+            atoms = oversegment(seeds)
+            edges = borders(atoms, features, surface, steepness=self.merge_distance / self.depth_jump)
+            return merge(atoms, features, edges, distance=self.merge_distance, min_area=minimum)
         shape = geometry_features(
             _map_of(self.depths, index, frame.shape[:2]),
             _map_of(self.normals, index, frame.shape),
@@ -85,8 +96,25 @@ class ClassicalSegmenter:
             crease_degrees=self.crease_degrees,
         )
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
-        minimum = self.min_area * frame.shape[0] * frame.shape[1]
         return merge(atoms, features, borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum)
+
+    def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W, 6) colour and normal, in which a crease weighs as a step of `merge_distance`; and (H, W, 7) what small
+        regions are cut by: the same, the normal at half its weight, with depth."""
+        require(
+            surface.points.shape == surface.normals.shape == colour.shape,
+            "surface",
+            got=(surface.points.shape, surface.normals.shape),
+            expected=str(colour.shape),
+            remedy="Give surfaces of the frame's own size.",
+        )
+        turned = surface.normals * np.float32(
+            self.merge_distance / (2.0 * np.sin(np.radians(self.crease_degrees) / 2.0))
+        )
+        depth = np.log(np.maximum(surface.points[..., 2:], 1e-6)) * np.float32(
+            0.5 * self.merge_distance / np.log1p(self.depth_jump)
+        )
+        return np.concatenate([colour, turned], -1), np.concatenate([colour, 0.5 * turned, depth], -1)
 
 
 def _map_of(maps: Maps, index: int, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -156,15 +184,17 @@ class Borders:
 
 def borders(
     atoms: Int32[np.ndarray, "h w"],
-    features: Float32[np.ndarray, "h w 3"],
-    shape: Float32[np.ndarray, "h w c"] | None,
+    features: Float32[np.ndarray, "h w d"],
+    shape: Float32[np.ndarray, "h w c"] | Surface | None,
     *,
+    steepness: float = 1.0,
     most: float = 40.0,
 ) -> Borders:
     """Who borders on whom, and how hard.
 
     A step is measured between pixels two to either side of the border, so that the blur of an edge does not hide it. A
-    step of shape counts `most` at most: one far background does not outweigh the rest of an outline.
+    step of shape is one of its channels (H, W, C), or `steepness` times how far a surface leaves its plane; it counts
+    `most` at most: one far background does not outweigh the rest of an outline.
     """
     keys, colours, shapes = [], [], []
     for axis in (0, 1):
@@ -179,7 +209,12 @@ def borders(
 
         keys.append(np.sort(np.stack([a[cut], b[cut]], -1), axis=-1))
         colours.append(step(features))
-        shapes.append(np.zeros(len(colours[-1])) if shape is None else np.minimum(step(shape), most))
+        if shape is None:
+            shapes.append(np.zeros(len(colours[-1])))
+        elif isinstance(shape, Surface):
+            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], most))
+        else:
+            shapes.append(np.minimum(step(shape), most))
     pairs, inverse = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
     inverse = inverse.reshape(-1)
     return Borders(
@@ -192,7 +227,7 @@ def borders(
 
 def merge(
     atoms: Int32[np.ndarray, "h w"],
-    features: Float32[np.ndarray, "h w 3"],
+    features: Float32[np.ndarray, "h w d"],
     edges: Borders,
     *,
     distance: float,

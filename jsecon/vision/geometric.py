@@ -72,11 +72,14 @@ class GeometricTracker:
             view = views[t]
             here = evidence[view.seen]
             if t in owners:
-                here -= view.clearly(_one_hot(owners[t], len(classes)))
+                rows, columns, said = _said(view, owners[t], len(classes))
+                here[rows, columns] -= said
             if not (here[:, : len(prompts)] > 1e-3).any():  # nothing of the prompts can be seen
                 continue
             owners[t] = self._match(view, here, best[view.seen])
-            evidence[view.seen] = here + view.clearly(_one_hot(owners[t], len(classes)))
+            rows, columns, said = _said(view, owners[t], len(classes))
+            here[rows, columns] += said
+            evidence[view.seen] = here
             best[view.seen] = np.maximum(best[view.seen], view.clarity)
         for t, owner in owners.items():
             labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].atoms]
@@ -148,12 +151,20 @@ class GeometricTracker:
         assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)
         known = np.minimum(np.minimum(best / np.maximum(view.clarity, 1e-6), assigned) / self.glimpse, 1.0)
         known = np.square(known).astype(np.float32)[:, None]
+        # Of most classes a frame shows nothing, of most of what it shows the visited frames say nothing: left out.
+        rows, classes = np.flatnonzero(known), np.flatnonzero(evidence.any(0))
         # Gaussians on an outline lean into the neighbours: squares side with the majority.
-        owned = np.square(evidence)
-        owned *= known / np.maximum(owned.sum(1, keepdims=True), 1e-12)
-        return claim_atoms(view, view.on_atoms(owned), view.on_atoms(known))
+        owned = np.square(evidence[rows])
+        owned *= known[rows] / np.maximum(owned.sum(1, keepdims=True), 1e-12)
+        votes = view.votes[rows]
+        owner = claim_atoms(view, votes.T @ owned[:, classes], votes.T @ known[rows])
+        return np.where(owner >= 0, classes[owner], -1)
 
 
-def _one_hot(owner: np.ndarray, count: int) -> np.ndarray:
-    """(A,) class of each atom, -1 = none -> (A, count) float32."""
-    return (owner[:, None] == np.arange(count)).astype(np.float32)
+def _said(view: View, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a view that gives its atoms to classes (A,), -1 = none, of `count`, says of its Gaussians: row, class and
+    weight of each entry that is not 0 of `view.clearly` of the classes one-hot."""
+    owned = np.flatnonzero(owner >= 0)
+    one_hot = sparse.csr_matrix((np.ones(len(owned), np.float32), (owned, owner[owned])), shape=(len(owner), count))
+    cast = (view.votes @ one_hot).tocoo()
+    return cast.row, cast.col, view.clarity[cast.row] * cast.data

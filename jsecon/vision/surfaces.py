@@ -1,0 +1,92 @@
+"""What depth says about a frame's surfaces: where each pixel lies, and the normal there, smooth because many views made
+it.
+
+A single depth frame is too noisy, or too coarsely stored, for normals. All frames' points together are not: each point
+of the joint cloud gets the normal of its neighbourhood, and each pixel that of the point nearest to where it lies.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int
+from scipy.spatial import cKDTree
+
+from jsecon.types import Camera
+from jsecon.vision.relief import steadied_depth
+
+NEIGHBOURS = 24
+"""points whose plane is a point's own"""
+_ROUNDS = 4
+_SHARPNESS = 0.1
+"""of 1 - cosine: neighbours whose normals differ more do not smooth each other"""
+
+
+class Surface(NamedTuple):
+    """A frame's surfaces."""
+
+    points: np.ndarray
+    """(H, W, 3) float32 in the camera's axes, world units."""
+    normals: np.ndarray
+    """(H, W, 3) float32 unit, towards the camera."""
+
+    def off_plane(self, axis: int, near: Int[np.ndarray, " n"], far: Int[np.ndarray, " n"]) -> Float[np.ndarray, "_ _"]:
+        """How far pixels `far` along an axis lie off the plane of the pixels `near` and the other way round, the
+        smaller of the two, as a share of the nearer one's z: 0 along any plane, however steeply it is seen."""
+        a, b = np.take(self.points, near, axis), np.take(self.points, far, axis)
+        off = [np.abs(np.einsum("...k,...k", b - a, np.take(self.normals, which, axis))) for which in (near, far)]
+        return np.minimum(*off) / np.maximum(np.minimum(a[..., 2], b[..., 2]), 1e-6)
+
+
+def cloud_normals(points: Float[np.ndarray, "p 3"], *, neighbours: int = NEIGHBOURS) -> Float64[np.ndarray, "p 3"]:
+    """Unit normals (P, 3), of either sign, of a cloud of surface points (P, 3), P >= 3.
+
+    The direction in which the `neighbours` nearest points spread least; then, some rounds over, the mean of the
+    neighbours' normals, each weighted by how well it agrees, which leaves creases sharp (a bilateral filter).
+    """
+    points = np.asarray(points, np.float64)
+    near = cKDTree(points).query(points, k=min(neighbours, len(points)), workers=-1)[1]
+    normals = np.empty_like(points)
+    for part in np.array_split(np.arange(len(points)), len(points) // 65536 + 1):
+        spread = points[near[part]] - points[near[part]].mean(1, keepdims=True)
+        normals[part] = np.linalg.eigh(np.einsum("pki,pkj->pij", spread, spread))[1][:, :, 0]
+    for _ in range(_ROUNDS):
+        cosines = np.einsum("pki,pi->pk", normals[near], normals)
+        weights = np.sign(cosines) * np.exp((np.abs(cosines) - 1.0) / _SHARPNESS)
+        normals = np.einsum("pk,pki->pi", weights, normals[near])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
+
+
+def surfaces_from_depth(
+    depths: Float[np.ndarray, "t h w"], cameras: Camera, points: Float[np.ndarray, "p 3"]
+) -> Callable[[int], Surface | None]:
+    """A function of a frame's index: its surface from depths (T, H, W), 0 = unknown, of `cameras` (a batch of T).
+
+    points (P, 3), world: those of all frames together, thinned (a few centimetres apart in a room). The depth is
+    steadied (`steadied_depth`), which also fills what is unknown. None for a frame without any depth.
+    """
+    tree, normals = cKDTree(points), cloud_normals(points)
+    poses = np.asarray(cameras.world_to_camera, np.float64)
+
+    def surface_of(t: int) -> Surface | None:
+        if not (depths[t] > 0).any():
+            return None
+        rotation, camera = poses[t, :3, :3], cameras[t]
+        here = back_projected(steadied_depth(np.asarray(depths[t], np.float32)), camera)
+        # Normals change slowly: every second pixel is asked, in each direction.
+        asked = here[::2, ::2].reshape(-1, 3)
+        own = normals[tree.query((asked - poses[t, :3, 3]) @ rotation, workers=-1)[1]] @ rotation.T
+        own = own.reshape(*here[::2, ::2].shape).repeat(2, 0).repeat(2, 1)[: here.shape[0], : here.shape[1]]
+        away = np.einsum("hwk,hwk->hw", own, here) > 0
+        return Surface(here.astype(np.float32), np.where(away[..., None], -own, own).astype(np.float32))
+
+    return surface_of
+
+
+def back_projected(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
+    """z-depth (H, W) -> points (H, W, 3) in the camera's axes; pixel centres lie at halves."""
+    rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    x = (columns - float(camera.cx)) / float(camera.fx)
+    y = (rows - float(camera.cy)) / float(camera.fy)
+    return np.stack([x, y, np.ones_like(x)], -1) * depth[..., None].astype(np.float64)
