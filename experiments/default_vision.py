@@ -22,6 +22,7 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -41,7 +42,8 @@ from jsecon.files import write_text
 from jsecon.language.field import load_field
 from jsecon.options import Options as RunOptions
 from jsecon.plan import Silent
-from jsecon.stages import masklets_from_frames, proposals_of, training_frames
+from jsecon.proposals import proposals_of
+from jsecon.stages import masklets_from_frames, training_frames
 from jsecon.types import Capture, Gaussians
 from jsecon.vision.colours import ColourEmbedder
 
@@ -132,10 +134,11 @@ def by_flow(frames: np.ndarray, single: np.ndarray, *, kept: float = KEPT) -> np
 
 def measure(options: RunOptions, capture: Capture, gaussians: Gaussians, way: str) -> tuple[np.ndarray, float]:
     """(labels (T, H, W) by one of WAYS on the frames that take part, seconds with the segmentation)."""
-    frames = np.asarray(capture.frames)[training_frames(capture)]
+    train = training_frames(capture)
+    frames = np.asarray(capture.frames)[train]
     start = time.perf_counter()
     if way in (ALONE, FLOW):
-        labels = alone(frames, proposals_of(options, capture, gaussians, None)[0])
+        labels = alone(frames, proposals_of(options, capture, train, gaussians, None)[0])
         labels = by_flow(frames, labels) if way == FLOW else labels
     else:
         options = dataclasses.replace(options, association="consensus" if way == CONSENSUS else "tracking")
@@ -203,9 +206,11 @@ def replica(folder: str) -> Scene:
 def main(options: Options = Options()) -> dict:
     """Measures every cell that is missing and writes the table."""
     rooms = Path(options.rooms or tempfile.mkdtemp())
-    scenes = {f"demo {seed}": (lambda seed=seed: demo_room(rooms / f"demo{seed}", seed)) for seed in options.seeds}
+    scenes: dict[str, Callable[[], Scene]] = {}
     if Path(options.capture).exists():
         scenes["replica_apartment_0"] = functools.partial(replica, options.capture)
+    for seed in options.seeds:
+        scenes[f"demo {seed}"] = functools.partial(demo_room, rooms / f"demo{seed}", seed)
     run = RunOptions(capture=Path())
     found: dict[str, dict] = {scene: {} for scene in scenes}
     for ways in (WAYS[:-1], WAYS[-1:]):
@@ -227,7 +232,8 @@ def main(options: Options = Options()) -> dict:
 
 def cell_of(options: Options, scene: str, way: str) -> Path:
     """Where a cell is kept."""
-    source = cache.source_digest(("vision", "language.consensus", "language.grouping", "language.masklets", "stages"))
+    rooms = ("vision", "proposals", "language.consensus", "language.grouping", "language.masklets", "options")
+    source = cache.source_digest(rooms)
     key = hashlib.sha1(json.dumps([source, scene, way]).encode()).hexdigest()[:12]
     return Path(options.out) / "cells" / f"{scene.replace(' ', '')}-{WAYS.index(way)}-{key}.json"
 

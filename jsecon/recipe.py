@@ -131,6 +131,8 @@ def stages_of(
                 "language.consensus",
                 "language.grouping",
                 "language.votes",
+                "fit.initialise",
+                "proposals",
                 "splat",
                 "parallel",
             ),

@@ -17,11 +17,6 @@ from jsecon.errors import InputError
 from jsecon.options import Options
 from jsecon.plan import Progress
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions, Votes
-from jsecon.vision.protocols import Segmenter
-from jsecon.vision.runs import remembered
-
-CLOUD = 100_000
-"""points, at most, that the normals of a capture with depth are taken from"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,12 +139,13 @@ def masklets_from_frames(
     are those of `jsecon.language.masklets.masklets`."""
     from jsecon.language.consensus import consensus_masklets
     from jsecon.language.masklets import clean_masklets, masklets
+    from jsecon.proposals import proposals_of
     from jsecon.vision.geometric import GeometricTracker
     from jsecon.vision.views import SceneViews
 
     train = training_frames(capture)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
-    proposals, notes = proposals_of(options, capture, gaussians, seeing.segmenter)
+    proposals, notes = proposals_of(options, capture, train, gaussians, seeing.segmenter)
     if options.associated_by == "consensus":
         scene = SceneViews(gaussians, cameras, proposals)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
@@ -170,56 +166,6 @@ def masklets_from_frames(
     eyes.close(seeing.segmenter, seeing.tracker)
     _require_regions(labels, str(options.capture))
     return Outcome(labels, notes=notes)
-
-
-def proposals_of(
-    options: Options, capture: Capture, gaussians: Gaussians, segmenter: Segmenter | None
-) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
-    """masks (M, H, W) bool of the t-th training frame, from disk where they are given, else by `segmenter`, else by the
-    classical one at the granularity asked for; and notes."""
-    train = training_frames(capture)
-    frames = np.asarray(capture.frames)[train]
-    if options.proposals is not None:
-        from jsecon.data.proposals import proposals_from_disk
-
-        names = [capture.names[t] for t in train]
-        return proposals_from_disk(options.proposals, names, frames.shape[1:3], level=options.level)
-    if segmenter is not None:  # which keeps what it finds on disk
-        return lambda t: segmenter(frames[t], t), ()
-    classical = classical_segmenter(options, capture, gaussians)
-    return remembered(lambda t: classical(frames[t], t)), ()
-
-
-def classical_segmenter(options: Options, capture: Capture, gaussians: Gaussians) -> Segmenter:
-    """The segmenter without weights.
-
-    Surfaces come from the capture's depth; where there is none, the coarse one takes the depth that the Gaussians
-    render. (The finer ones do not: rendered depth costs them more outline than it tells.)
-    """
-    from jsecon.fit.initialise import points_from_depth
-    from jsecon.splat.render import render_depth
-    from jsecon.splat.tiles import plan_capacity
-    from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
-    from jsecon.vision.relief import steadied_depth
-    from jsecon.vision.surfaces import surfaces_from_depth
-
-    train = training_frames(capture)
-    cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
-    setting = GRANULARITIES[options.granularity]
-    if capture.depths is not None:
-        depths = np.asarray(capture.depths)[train]
-        points = points_from_depth(capture, max_points=CLOUD, stride=4).points
-        return ClassicalSegmenter(**setting, surfaces=surfaces_from_depth(depths, capture.cameras[train], points))
-    if options.granularity == "coarse":
-        capacity = plan_capacity(gaussians, cameras)
-        draw = jax.jit(lambda camera: render_depth(gaussians, camera, capacity=capacity))
-
-        def rendered(t: int) -> np.ndarray:
-            depth, alpha = (np.asarray(image) for image in draw(cameras[t]))
-            return steadied_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
-
-        return ClassicalSegmenter(**setting, depths=rendered)
-    return ClassicalSegmenter(**setting)
 
 
 def masklets_from_disk(options: Options, capture: Capture, progress: Progress) -> Outcome:

@@ -136,7 +136,7 @@ def colour_features(
     frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
 ) -> Float32[np.ndarray, "h w 3"]:
     """(H, W, 3) uint8 -> (H, W, 3) float32: weighted L, a and b of the smoothed frame, CIELAB units."""
-    smooth = brightened(frame)
+    smooth = adapted(frame)
     if smoothing > 0:
         smooth = cv2.pyrMeanShiftFiltering(smooth, 5, smoothing, maxLevel=0)
         smooth = cv2.bilateralFilter(smooth, 7, 2.0 * smoothing, 3.0)
@@ -144,18 +144,21 @@ def colour_features(
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
-def brightened(
-    frame: UInt8[np.ndarray, "h w 3"], *, target: float = 0.22, most: float = 8.0
+def adapted(
+    frame: UInt8[np.ndarray, "h w 3"], *, dark: float = 0.22, light: float = 0.3, most: float = 8.0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """(H, W, 3) uint8 with lifted shadows, where the median of linear luminance is below `target` (a mid grey).
+    """(H, W, 3) uint8 with lifted shadows or lowered lights, where the median of linear luminance is below `dark` (a
+    mid grey) or above `light`.
 
     CIELAB's steps are those of an eye adapted to the scene's white; in a dark photograph those between dark things are
-    too small. x -> g x / (1 + (g - 1) x) multiplies the dark by g and leaves black and white where they are.
+    too small, in a bright one those between white walls. x -> g x / (1 + (g - 1) x) multiplies the odds by g, at most
+    `most` or its inverse, and leaves black and white where they are.
     """
     linear = (np.arange(256, dtype=np.float32) / 255.0) ** 2.2
     luminance = linear[frame] @ np.asarray([0.2126, 0.7152, 0.0722], np.float32)
-    middle = max(float(np.median(luminance)), 1e-6)
-    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0), most)
+    middle = min(max(float(np.median(luminance)), 1e-6), 1.0 - 1e-6)
+    target = min(max(middle, dark), light)
+    gain = min(max(target * (1.0 - middle) / (middle * (1.0 - target)), 1.0 / most), most)
     table = np.round(255.0 * (gain * linear / (1.0 + (gain - 1.0) * linear)) ** (1.0 / 2.2)).astype(np.uint8)
     return table[frame]
 
