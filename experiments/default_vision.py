@@ -226,7 +226,7 @@ def main(options: Options = Options()) -> dict:
                 write_text(cell_of(options, scene, way), json.dumps(cell))
                 print(scene, way, cell, flush=True)
             found[scene] |= {way: json.loads(cell_of(options, scene, way).read_text()) for way in ways}
-    write(options, found)
+        write(options, found)
     return found
 
 
@@ -239,7 +239,8 @@ def cell_of(options: Options, scene: str, way: str) -> Path:
 
 
 def write(options: Options, found: dict[str, dict]) -> None:
-    """Writes the results and prints the table."""
+    """Writes the results of the ways that all scenes have cells of, and prints the table."""
+    measured = [way for way in WAYS if all(way in ways for ways in found.values())]
     rows = []
     for scene, ways in found.items():
         for kind in ("objects", "ids"):
@@ -249,19 +250,19 @@ def write(options: Options, found: dict[str, dict]) -> None:
                     rows.append((name, way, cell[kind]["best_iou"], cell[kind]["lasting"], cell["seconds"]))
     demos = [ways for scene, ways in found.items() if scene.startswith("demo")]
     means = {}
-    for way in WAYS if demos else ():
+    for way in measured if demos else ():
         means[way] = [float(np.mean([room[way]["objects"][key] for room in demos])) for key in ("best_iou", "lasting")]
         seconds = float(np.mean([room[way]["seconds"] for room in demos]))
         rows.append((f"mean of {len(demos)} demos", way, *means[way], seconds))
     table = results.table(("scene", "association", "mean best IoU", "share of views under one id", "seconds"), rows)
     groups = {f"{len(demos)} demos": means} if demos else {}
     groups |= {
-        scene: {way: (cell["objects"]["best_iou"], cell["objects"]["lasting"]) for way, cell in ways.items()}
+        scene: {way: [ways[way]["objects"][key] for key in ("best_iou", "lasting")] for way in measured}
         for scene, ways in found.items()
         if not scene.startswith("demo")
     }
     labels = [f"{name}\n{figure}" for name in groups for figure in ("best IoU", "one id")]
-    series = {way: [value for group in groups.values() for value in group[way]] for way in WAYS}
+    series = {way: [value for group in groups.values() for value in group[way]] for way in measured}
     results.save(Path(options.out), options, found, table, results.bars(labels, series, "share"))
     print(table)
 

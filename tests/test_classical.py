@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from jsecon.language.masklets import iou_matrix
-from jsecon.vision.classical import ClassicalSegmenter, borders, merge, oversegment
+from jsecon.vision.classical import ClassicalSegmenter, adapted, borders, merge, oversegment
 from jsecon.vision.protocols import Segmenter
 
 
@@ -90,6 +90,20 @@ def test_depth_and_normals_part_what_colour_does_not():
     assert len(unknown) == 1
     with pytest.raises(ValueError, match="map"):
         ClassicalSegmenter(depths=depth[None, :-1])(frame, 0)
+
+
+def test_dark_and_bright_frames_are_seen_by_adapted_eyes():
+    frame, _ = desk()
+    median = lambda image: np.median(((image / 255.0) ** 2.2) @ [0.2126, 0.7152, 0.0722])
+    linear = (frame / 255.0) ** 2.2
+    for gain, low, high in ((0.2, 0.21, 0.23), (5.0, 0.29, 0.31)):
+        exposed = (255 * (gain * linear / (1 + (gain - 1) * linear)) ** (1 / 2.2)).round().astype(np.uint8)
+        assert not low <= median(exposed) <= high
+        assert low <= median(adapted(exposed)) <= high
+        exposed[0, :40], exposed[0, 40:80] = 0, 255
+        np.testing.assert_array_equal(adapted(exposed)[0, :80], exposed[0, :80])  # black and white stay
+    between = np.full((4, 5, 3), 140, np.uint8)  # 0.27
+    np.testing.assert_array_equal(adapted(between), between)
 
 
 @pytest.mark.parametrize("frame", [
