@@ -12,6 +12,7 @@ from small_field import make_field
 
 from experiments import apc_bin, beyond, default_vision, outliers, replica_apartment_0 as replica, scenes, thresholds
 from jsecon.errors import InputError
+from jsecon.fit.initialise import gaussians_from_points, points_from_depth
 from jsecon.types import Camera, Capture
 from jsecon.vision.simulated import SimulatedMasks
 
@@ -271,8 +272,8 @@ def test_a_stopped_measurement_goes_on(flat_capture, tmp_path, monkeypatch, caps
 
     def scene(folder):
         seen.append(folder)
-        points = default_vision.points_from_depth(flat_capture, voxel=0.05)
-        return flat_capture, default_vision.gaussians_from_points(points.points, points.colors), {"objects": truth}
+        points = points_from_depth(flat_capture, voxel=0.05)
+        return flat_capture, gaussians_from_points(points.points, points.colors), {"objects": truth}
 
     monkeypatch.setattr(default_vision, "replica", scene)
     options = default_vision.Options(seeds=(), capture=str(tmp_path), out=str(tmp_path / "out"))
