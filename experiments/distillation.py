@@ -45,7 +45,7 @@ class Options:
     """at which parts of Adam's way it is measured."""
     all_starts: tuple[str, ...] = ("demo 0",)
     """scenes on which Adam starts from random codes and the votes' mode too; elsewhere from zero, as the paper's."""
-    loyalties: tuple[float, ...] = (0.5, 0.1, 0.02)
+    loyalties: tuple[float, ...] = (0.1,)
     """of the solver."""
     sweeps: tuple[int, ...] = (4, 24)
     """most passes over the views that the solver takes."""
@@ -64,8 +64,9 @@ QUICK = Options(
 )  # fmt: skip
 
 
-_APART = ("out", "seeds", "demos", "replica", "texts", "all_starts")
-"""options that say which scenes and paths are taken, not how"""
+_SCENE = ("level", "latent", "views", "shrink", "replica_shrink")
+_OF_PATH = {"votes": (*_SCENE, "loyalties", "sweeps"), "Adam": (*_SCENE, "steps", "looks")}
+"""options that make a path be taken again where they change"""
 
 
 def main(options: Options = Options()) -> dict:
@@ -82,13 +83,12 @@ def main(options: Options = Options()) -> dict:
             expected="a scene to measure on",
             remedy="Give a folder of demos, or put replica_apartment_0 beside the checkout.",
         )
-    # Only what an option changes makes a path be taken again.
-    given = {k: v for k, v in dataclasses.asdict(options).items() if k not in _APART}
-    digest = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:10]
     paths = [(name, path) for name in made for path in ("votes", "Adam from zero")]
     paths += [(n, path) for n in made if n in options.all_starts for path in ("Adam from random", "Adam from votes")]
     space, task = scenes.text_space(Path(options.texts)), None
     for name, path in paths:
+        given = {option: getattr(options, option) for option in _OF_PATH[path.split()[0]]}
+        digest = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:10]
         kept = out / "paths" / f"{name}-{path}-{digest}.json".replace(" ", "_")
         if not kept.exists():
             if task is None or task.name != name:
