@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.association import Association, associated, by_consensus
 from experiments.setting import Setting
 from jsecon.baselines import lifting
+from jsecon.baselines.evidence import shared_capacity
 from jsecon.baselines.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
 from jsecon.baselines.langsplat import train_langsplat
 from jsecon.baselines.opengaussian import Schedule, train_opengaussian
@@ -20,12 +22,14 @@ from jsecon.evaluate.opengaussian import most_similar_text, select_leaf, select_
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.distill import distill_l1, distill_votes
+from jsecon.language.reconcile import reconcile_labels
 from jsecon.language.votes import region_votes
-from jsecon.query.anchored import query_anchored
-from jsecon.query.canonical import query_canonical
+from jsecon.query.anchored import ALIKE_THRESHOLD, query_anchored, query_region
+from jsecon.query.canonical import query_canonical, relevancies
 from jsecon.query.one_step import query_one_step
 from jsecon.query.outliers import remove_outliers
-from jsecon.types import LanguageField, Regions, Selection
+from jsecon.query.showing import with_shown
+from jsecon.types import LanguageField, Regions, Selection, Votes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,8 +94,8 @@ def langsplat(setting: Setting, steps: Steps) -> Answers:
 def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
     """Tracked ids; a text is found in the first view or not at all."""
     rates = dict(zip(("identity_rate", "classifier_rate"), steps.grouping_rates))
-    key = jax.random.key(setting.seed)
-    model, _ = train_gaussian_grouping(setting.evidence, key=key, steps=steps.grouping, **rates)
+    key, classes = jax.random.key(setting.seed), 1 + len(setting.tracked.embeddings)
+    model, _ = train_gaussian_grouping(setting.evidence, key=key, steps=steps.grouping, classes=classes, **rates)
     ask = lambda k: query_gaussian_grouping(
         model, setting.evidence, jnp.asarray(setting.texts[k]), jnp.asarray(setting.canonical)
     )
@@ -131,32 +135,67 @@ def _lifted(train: Callable) -> Callable[[Setting, Steps], Answers]:
     return lambda setting, steps: _by_features(setting, train(setting.evidence).features, relevancy=True)
 
 
-def field_of(setting: Setting, *, latent: int | str = "auto", uniform: bool = False, steps: Steps | None = None):
-    """jsecon's field of a setting. latent=3: LangSplat's autoencoder; with `steps` the paper's own path, Adam on the
-    rendered L1 from random codes, else the votes' mode."""
+def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:
+    """The regions of a setting: by "tracks", "reconciled" tracks, "consensus", or any other name with its `labels`."""
     evidence = setting.evidence
-    embeddings = setting.uniform_embeddings if uniform else setting.track_embeddings
-    tracks = jnp.asarray(evidence.tracks)
-    votes = region_votes(evidence.gaussians, evidence.cameras, tracks, len(embeddings))
-    key = jax.random.key(setting.seed)
+    if by == "tracks":
+        return setting.tracked
+    if labels is not None:
+        return setting.shared.get(by, lambda: associated(evidence, labels))
+    if by == "reconciled":
+        capacity = shared_capacity(evidence.gaussians, evidence.cameras)
+        settle = lambda: reconcile_labels(evidence.gaussians, evidence.cameras, evidence.tracks, capacity=capacity)
+        return setting.shared.get(by, lambda: associated(evidence, settle()))
+    return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed))
+
+
+def field_of(
+    setting: Setting,
+    *,
+    by: str = "tracks",
+    labels: np.ndarray | None = None,
+    latent: int | str = "auto",
+    uniform: bool = False,
+    steps: Steps | None = None,
+) -> LanguageField:
+    """jsecon's field of a setting, its regions those of `association`. latent=3: LangSplat's autoencoder; with `steps`
+    the paper's own path, Adam on the rendered L1 from random codes, else the votes' mode."""
+    evidence, shared = setting.evidence, setting.shared
+    regions = association(setting, by, labels=labels)
+    embeddings = jnp.asarray(regions.uniform_embeddings if uniform else regions.embeddings)
+    found, key = jnp.asarray(regions.labels), jax.random.key(setting.seed)
+    capacity = shared_capacity(evidence.gaussians, evidence.cameras)
+    known = Regions(np.asarray(embeddings), regions.pixels)
+
+    def cast() -> Votes:
+        given = evidence.gaussians, evidence.cameras, found, len(embeddings)
+        return with_shown(region_votes(*given, by_view=True, capacity=capacity), known)
+
+    votes = shared.get(("votes", by, uniform), cast)
     if latent == "auto":
-        table, coder, _ = region_codes(jnp.asarray(embeddings), latent=latent, key=key)
+        table, coder, _ = shared.get(("codes", by, uniform), lambda: region_codes(embeddings, latent=latent, key=key))
     else:
-        coder = train_autoencoder(
-            jnp.asarray(embeddings), latent=latent, key=key, epochs=None if steps is None else steps.epochs
-        )
-        table = coder.encode(jnp.asarray(embeddings))
+        epochs = None if steps is None else steps.epochs
+        coder = train_autoencoder(embeddings, latent=latent, key=key, epochs=epochs)
+        table = coder.encode(embeddings)
     if steps is None:
         codes = distill_votes(votes, table)
     else:
         codes, _ = distill_l1(
-            evidence.gaussians, evidence.cameras, tracks, table, steps=steps.paper, key=key, init="random"
+            evidence.gaussians,
+            evidence.cameras,
+            found,
+            table,
+            steps=steps.paper,
+            key=key,
+            init="random",
+            capacity=capacity,
         )
     return LanguageField(
         evidence.gaussians,
         codes,
         votes,
-        Regions(embeddings, setting.track_pixels.astype(np.int32)),
+        known,
         table,
         coder,
         evidence.cameras,
@@ -166,30 +205,50 @@ def field_of(setting: Setting, *, latent: int | str = "auto", uniform: bool = Fa
     )
 
 
-def ask_field(setting: Setting, field: LanguageField, way: str, *, clean: bool = True, threshold=None) -> Answers:
-    """Queries of a field: `way` is votes, lead, code (all anchored), one_step or canonical; `clean` drops outliers."""
+def ask_field(
+    setting: Setting,
+    field: LanguageField,
+    way: str,
+    *,
+    anchor: str = "cosine",
+    clean: bool = True,
+    threshold: float | None = None,
+) -> Answers:
+    """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code
+    (all anchored), one_step or canonical; `clean` drops outliers.
+
+    anchor: a text takes the region of the largest "cosine", or of the largest "relevancy", LERF's: what makes a region
+    alike to every text, such as its noise along the texts' cone, then cancels against the canonical phrases.
+    """
     means = np.asarray(setting.evidence.gaussians.means)
+    by, weight = ("votes", 1.0) if way == "all_views" else (way, None)
+    embeddings, phrases = jnp.asarray(field.regions.embeddings), jnp.asarray(field.canonical)
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
-        if way in ("votes", "lead", "code"):
-            found = query_anchored(field, text, by=way, similarity_threshold=threshold)
-        elif way == "one_step":
+        if way == "one_step":
             found = query_one_step(
                 field.codes, encode(field.autoencoder, text), 0.9 if threshold is None else threshold
             )
-        else:
-            canonical = encode(field.autoencoder, jnp.asarray(field.canonical))
-            code = encode(field.autoencoder, text)
+        elif way == "canonical":
+            code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
             found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
+        elif anchor == "cosine":
+            found = query_anchored(field, text, by=by, similarity_threshold=threshold, unlabelled_weight=weight)
+        else:
+            relevancy, _ = relevancies(embeddings, text, phrases)
+            best = jnp.argmax(relevancy)
+            options = {"similarity_threshold": threshold, "unlabelled_weight": weight}
+            found = query_region(field, best, by=by, alike_threshold=ALIKE_THRESHOLD, **options)
+            found = dataclasses.replace(found, score=relevancy[best])
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
     return _by_selection(setting, ask)
 
 
-def _field(way: str, *, clean: bool = True, **options) -> Callable[[Setting, Steps], Answers]:
-    return lambda setting, steps: ask_field(setting, field_of(setting, **options), way, clean=clean)
+def _field(way: str, *, anchor: str = "cosine", clean: bool = True, **options) -> Callable[[Setting, Steps], Answers]:
+    return lambda setting, steps: ask_field(setting, field_of(setting, **options), way, anchor=anchor, clean=clean)
 
 
 def paper(setting: Setting, steps: Steps) -> Answers:
@@ -205,10 +264,15 @@ METHODS: dict[str, Callable[[Setting, Steps], Answers]] = {
     "weighted back-projection": _lifted(lifting.train_backprojection),
     "VALA": _lifted(lifting.train_vala),
     "the paper's path": paper,
-    "ours, votes": _field("votes"),
-    "ours, lead": _field("lead"),
+    "ours, tracks, votes": _field("votes"),
+    "ours, tracks, lead": _field("lead"),
+    "ours, consensus, votes": _field("votes", by="consensus"),
+    "ours, consensus, lead": _field("lead", by="consensus"),
+    "ours, consensus, votes, relevancy": _field("votes", by="consensus", anchor="relevancy"),
 }
 """the rows of Tables 1 to 3"""
+RECOMMENDED = "ours, consensus, votes"
+"""what jsecon does by default with masks of single frames: the row to hold against the others"""
 COMPONENTS: dict[str, Callable[[Setting, Steps], Answers]] = {
     "per-frame masks, one-step": langsplat,
     "masklets, one-step": _field("one_step", clean=False),
@@ -217,14 +281,18 @@ COMPONENTS: dict[str, Callable[[Setting, Steps], Answers]] = {
     "uniform instead of pixel weights": _field("code", uniform=True),
     "3-d autoencoder codes instead of spread ones": _field("code", latent=3),
     "trained on the rendered L1 (the paper's path)": paper,
-    "membership by votes": _field("votes"),
+    "membership by votes of all views": _field("all_views"),
+    "membership by votes of the views that show it": _field("votes"),
     "membership by lead": _field("lead"),
+    "masks associated by consensus, by votes": _field("votes", by="consensus"),
+    "consensus, by votes, anchored by relevancy": _field("votes", by="consensus", anchor="relevancy"),
 }
 """the rows of Table 4"""
 QUERIES: dict[str, Callable[[Setting, Steps], Answers]] = {
     "one-step": _field("one_step"),
     "canonical": _field("canonical"),
     "anchored by code": _field("code"),
+    "anchored by votes of all views": _field("all_views"),
     "anchored by votes": _field("votes"),
     "anchored by lead": _field("lead"),
 }

@@ -41,8 +41,8 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
     """All cells: {"scene", "seed", "level", "method", figures, "seconds", "peak_memory_mib", "twin"}.
 
     A cell that an earlier run with the same options left in OUT/cells is read. `seconds` are of training and all
-    queries, without loading and fitting; the memory is the process's highest so far, so later rows hide behind earlier
-    ones.
+    queries, without loading and fitting, what methods share charged to each; the memory is the process's highest so
+    far, so later rows hide behind earlier ones.
     """
     wanted = [(scene, seed, plan.level) for scene in plan.data.scenes for seed in plan.data.seeds]
     if not plan.data.root:
@@ -58,7 +58,7 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
                 began = time.perf_counter()
                 cell = measure(setting, methods[name](setting, plan.steps))
                 cell |= {"scene": scene, "seed": seed, "level": level, "method": name, "twin": setting.bench.twin}
-                cell["seconds"] = round(time.perf_counter() - began, 2)
+                cell["seconds"] = round(time.perf_counter() - began + setting.shared.settle(), 2)
                 cell["peak_memory_mib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
                 write_text(files[name], json.dumps(cell))
                 tell(f"{scene} seed {seed} {level}: {name}: mIoU {cell['miou']:.3f}, {cell['seconds']:.1f} s")
@@ -139,16 +139,22 @@ def means(cells: list[dict], level: str, figure: str = "miou") -> dict[str, floa
     return {name: float(np.mean([c[figure] for c in chosen if c["method"] == name])) for name in names}
 
 
-def leaders(cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str = "ours") -> str:
-    """Where a method whose name does not start with `ours` has the highest mIoU of a scene, a line each."""
-    lines = []
+def leaders(cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str, why: str = "") -> str:
+    """Where another method's mIoU of a scene is above that of the row `ours`, a line each, and `why`. Rows whose names
+    start with "ours" are not others: the best of several of one's own would be chosen by the answer."""
+    lines, compared = [], False
     for scene in scenes:
         found = means([cell for cell in cells if cell["scene"] == scene], level)
-        best = max(found, key=lambda name: found[name])
-        mine = max((value for name, value in found.items() if name.startswith(ours)), default=float("nan"))
-        if not best.startswith(ours):
-            lines.append(f"* {scene}: {best} leads with {found[best]:.3f} (ours {mine:.3f}).")
-    return "\n".join(lines) if lines else "Ours leads on every scene."
+        mine = found.get(ours, float("nan"))
+        rivals = {name: value for name, value in found.items() if not name.startswith("ours")}
+        if not rivals:
+            continue
+        compared, best = True, max(rivals, key=lambda name: rivals[name])
+        if not mine >= rivals[best]:
+            lines.append(f"* {scene}: {best} leads with {rivals[best]:.3f} ({ours}: {mine:.3f}).")
+    if not lines:
+        return f'The row "{ours}" leads on every scene.' if compared else ""
+    return "\n".join([*lines, "", why] if why else lines)
 
 
 def noise(cells: list[dict], plan: Plan) -> str:
@@ -164,21 +170,39 @@ def noise(cells: list[dict], plan: Plan) -> str:
 
 
 def make(
-    plan: Plan, methods: Mapping[str, Method], figures: tuple[str, ...], *, notes: str, published: str = ""
+    plan: Plan,
+    methods: Mapping[str, Method],
+    figures: tuple[str, ...],
+    *,
+    notes: str,
+    ours: str = "",
+    why: str = "",
+    published: str = "",
 ) -> str:
     """Fills the table, writes it, prints it, returns it."""
-    cells = fill(plan, methods, tell=print)
-    text = write(plan, cells, figures, notes=notes, published=published)
+    cells = fill(plan, methods, tell=lambda line: print(line, flush=True))
+    text = write(plan, cells, figures, notes=notes, ours=ours, why=why, published=published)
     print(text)
     return text
 
 
-def write(plan: Plan, cells: list[dict], figures: tuple[str, ...], *, notes: str, published: str = "") -> str:
-    """Writes results/<name>/{config.json, metrics.json, table.md, figure.png}; returns the table."""
+def write(
+    plan: Plan,
+    cells: list[dict],
+    figures: tuple[str, ...],
+    *,
+    notes: str,
+    ours: str = "",
+    why: str = "",
+    published: str = "",
+) -> str:
+    """Writes results/<name>/{config.json, metrics.json, table.md, figure.png}; returns the table. `ours` is the row
+    that the others are held against (none: no such comparison), `why` says why it does not lead where it does not."""
     twin = any(cell["twin"] for cell in cells)
     source = f"made-up twins in {plan.data.dataset}'s layout, simulated vision ({plan.level})" if twin else "real data"
     parts = [f"Measured on {source}. {notes}", "", summarise(cells, plan.data.scenes, plan.level, figures), ""]
-    parts += [leaders(cells, plan.data.scenes, plan.level), ""]
+    if ours:
+        parts += [leaders(cells, plan.data.scenes, plan.level, ours=ours, why=why), ""]
     if twin and len(plan.sweep) > 1:
         parts += [f"mIoU over the noise of vision, {plan.data.scenes[0]}:", "", noise(cells, plan), ""]
     text = "\n".join([*parts, published]).rstrip()

@@ -118,3 +118,7 @@ class Data:
         if self.root:
             return Path(self.root)
         return make(self.dataset, results.HOME.parent / self.twins, scene, seed, level, dict(self.size))
+
+    def kept(self, root: Path, scene: str) -> Path:
+        """Where Gaussians fitted to the scene are kept: twins of all levels of noise share them."""
+        return root / scene if self.root else root.parent / "fitted"

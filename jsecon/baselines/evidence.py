@@ -15,6 +15,8 @@ from jsecon.splat.plan import ViewPlan, plan_views
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Camera, Gaussians
 
+_SLOTS = 8
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -64,10 +66,10 @@ def evidence_of_tracks(
 
 def local_masks(evidence: Evidence) -> tuple[Int[np.ndarray, "t h w"], Int[np.ndarray, "t k"]]:
     """The masks counted from 0 in each frame (T, H, W), -1 = none; and the rows (T, K) that the counts stand for, -1
-    past a frame's last."""
+    past a frame's last. K is a multiple of 8: scenes share their compiled programs."""
     masks, frame = np.asarray(evidence.masks), np.asarray(evidence.frame)
     rows = [np.flatnonzero(frame == t) for t in range(len(masks))]
-    names = np.full((len(masks), max(1, max(map(len, rows), default=1))), -1, np.int32)
+    names = np.full((len(masks), _SLOTS * -(-max(1, max(map(len, rows), default=1)) // _SLOTS)), -1, np.int32)
     local = np.full(masks.shape, -1, np.int32)
     for t, here in enumerate(rows):
         names[t, : len(here)] = here
@@ -77,10 +79,15 @@ def local_masks(evidence: Evidence) -> tuple[Int[np.ndarray, "t h w"], Int[np.nd
     return local, names
 
 
+def shared_capacity(gaussians: Gaussians, cameras: Camera) -> int:
+    """`plan_capacity`, in powers of two: scenes of one kind share their compiled programs."""
+    return 1 << (plan_capacity(gaussians, cameras, margin=1.0) - 1).bit_length()
+
+
 def view_plans(evidence: Evidence) -> ViewPlan:
     """The plans of all views, stacked on a leading axis: the geometry is frozen, so each is made once."""
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    capacity = shared_capacity(gaussians, cameras)
     plans = plan_views(gaussians, cameras, capacity=capacity, most_bytes=sys.maxsize)
     assert plans is not None
     return plans

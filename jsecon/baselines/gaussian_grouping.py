@@ -30,7 +30,7 @@ from jsecon.types import Array, Selection
 STEPS = 30_000
 SIZE = 16
 CLASSES = 256
-"""ids are 8-bit; 0 is no mask"""
+"""ids are 8-bit; 0 is no mask. Both losses are divided by this number's, whatever the classifier's size"""
 IDENTITY_RATE, CLASSIFIER_RATE = 2.5e-3, 5e-4
 KL_EVERY, KL_SAMPLES, KL_NEIGHBOURS, KL_WEIGHT = 5, 1000, 5, 2.0
 OVERLAP = 0.7
@@ -44,16 +44,16 @@ RELEVANT = 0.5
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GaussianGrouping:
-    """Identity codes and the linear classifier of 256 ids."""
+    """Identity codes and the linear classifier of C ids, 256 by default."""
 
     identity: Array
     """(N, 16)."""
     kernel: Array
-    """(16, 256)."""
+    """(16, C)."""
     bias: Array
-    """(256,)."""
+    """(C,)."""
 
-    def probabilities(self, identity: Float[Array, "*batch 16"]) -> Float[Array, "*batch 256"]:
+    def probabilities(self, identity: Float[Array, "*batch 16"]) -> Float[Array, "*batch classes"]:
         """Softmax over the ids of codes, a Gaussian's or a rendered pixel's; id 0 = no mask, id k = track k - 1."""
         return jax.nn.softmax(identity @ self.kernel + self.bias)
 
@@ -65,26 +65,28 @@ def train_gaussian_grouping(
     steps: int = STEPS,
     identity_rate: float = IDENTITY_RATE,
     classifier_rate: float = CLASSIFIER_RATE,
+    classes: int = CLASSES,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[GaussianGrouping, Array]:
     """Cross entropy of the rendered codes' classes over all pixels, divided by log 256, and at every fifth step the 3D
     loss: the KL divergence between 1,000 Gaussians' classes and those of their five nearest (themselves included).
 
-    A schedule of hundreds of steps wants larger rates than the paper's. Returns the model and the loss before each
-    step. Raises InputError for more than 255 tracks.
+    A schedule of hundreds of steps wants larger rates than the paper's. `classes`: the classifier's outputs; those that
+    no track has only take time. Returns the model and the loss before each step. Raises InputError for more than
+    classes - 1 tracks.
     """
     most = int(np.asarray(evidence.tracks).max(initial=-1)) + 1
-    if most >= CLASSES:
+    if most >= classes:
         raise InputError(
-            "tracks", found=f"{most} ids", expected=f"at most {CLASSES - 1}", remedy="Leave small regions out."
+            "tracks", found=f"{most} ids", expected=f"at most {classes - 1}", remedy="Leave small regions out."
         )
     count = evidence.gaussians.count
     init_key, kernel_key, bias_key, key = jax.random.split(key, 4)
     bound = 1 / math.sqrt(SIZE)
     params = {
         "identity": (jax.random.uniform(init_key, (count, SIZE)) - 0.5) / C0,
-        "kernel": jax.random.uniform(kernel_key, (SIZE, CLASSES), minval=-bound, maxval=bound),
-        "bias": jax.random.uniform(bias_key, (CLASSES,), minval=-bound, maxval=bound),
+        "kernel": jax.random.uniform(kernel_key, (SIZE, classes), minval=-bound, maxval=bound),
+        "bias": jax.random.uniform(bias_key, (classes,), minval=-bound, maxval=bound),
     }
     means = np.asarray(evidence.gaussians.means, np.float64)
     nearest = KDTree(means).query(means, k=min(KL_NEIGHBOURS, count))[1].reshape(count, -1).astype(np.int32)
@@ -152,7 +154,8 @@ def query_gaussian_grouping(
     rendered = render_plan(jax.tree.map(lambda a: a[0], view_plans(first)), model.identity).features
     predicted = np.asarray(model.probabilities(rendered)).argmax(-1)
     mask = np.asarray(evidence.masks[0]) == here[best]
-    sizes, inside = (np.bincount(ids.reshape(-1), minlength=CLASSES) for ids in (predicted, predicted[mask]))
+    classes = len(model.bias)
+    sizes, inside = (np.bincount(ids.reshape(-1), minlength=classes) for ids in (predicted, predicted[mask]))
     kept = (sizes > 0) & (inside > OVERLAP * sizes)
     kept[0] = False
     probability = (model.probabilities(model.identity) * kept).sum(-1)

@@ -13,13 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jsecon.baselines.evidence import Evidence
+from jsecon.baselines.evidence import Evidence, shared_capacity
 from jsecon.language.autoencoder import Autoencoder, train_autoencoder
 from jsecon.language.distill import distill_l1
 from jsecon.types import Array
 
 STEPS = 30_000
 LATENT = 3
+_ROWS = 256
+"""masks are counted in multiples of this: scenes share their compiled programs"""
 
 
 @jax.tree_util.register_dataclass
@@ -57,15 +59,17 @@ def train_langsplat(
     """
     coder_key, code_key = jax.random.split(key)
     autoencoder = train_autoencoder(jnp.asarray(evidence.embeddings), latent=latent, key=coder_key, **training)
+    table = autoencoder.encode(jnp.asarray(evidence.embeddings))
     codes, history = distill_l1(
         evidence.gaussians,
         evidence.cameras,
         jnp.asarray(evidence.masks),
-        autoencoder.encode(jnp.asarray(evidence.embeddings)),
+        jnp.pad(table, ((0, -len(table) % _ROWS), (0, 0))),
         steps=steps,
         key=code_key,
         init=init,
         learning_rate=learning_rate,
+        capacity=shared_capacity(evidence.gaussians, evidence.cameras),
         progress=progress,
     )
     return LangSplat(codes, autoencoder, history)

@@ -18,11 +18,10 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from jsecon.baselines.centres import centre_weights
-from jsecon.baselines.evidence import Evidence, local_masks
+from jsecon.baselines.evidence import Evidence, local_masks, shared_capacity
 from jsecon.language.votes import region_votes
 from jsecon.query.canonical import relevancies
 from jsecon.splat.plan import plan_view
-from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Array, Selection
 
 MASS, LEAST_WEIGHT, QUANTILE, SURE = 0.75, 0.13, 0.85, 0.15
@@ -66,7 +65,7 @@ def train_backprojection(evidence: Evidence, *, progress: Progress = None) -> Li
     """The full sum, one pass of votes over the views; exact: no mask of a view is left out."""
     local, names = local_masks(evidence)
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    capacity = shared_capacity(gaussians, cameras)
     blocks = []
     for t in range(len(local)):
         votes = region_votes(
@@ -98,7 +97,7 @@ def gate(weight: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
 
 def _centres(evidence: Evidence, chosen: Callable[[np.ndarray], np.ndarray], progress: Progress) -> sparse.csr_matrix:
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    capacity = shared_capacity(gaussians, cameras)
     blocks, masks = [], np.asarray(evidence.masks)
     for t, image in enumerate(masks):
         weight, pixel = (np.asarray(a) for a in centre_weights(plan_view(gaussians, cameras[t], capacity=capacity)))

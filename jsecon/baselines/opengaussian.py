@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from jsecon.baselines.codebook import assign_to_centres, cluster_means, split_roots
 from jsecon.baselines.descent import descend
 from jsecon.baselines.evidence import Evidence, local_masks, only, view_plans
+from jsecon.baselines.silhouettes import silhouette_overlaps
 from jsecon.numerics import normalize, safe_norm
 from jsecon.splat.plan import ViewPlan, render_plan
 from jsecon.types import Array
@@ -34,6 +35,8 @@ REFRESH_COARSE, REFRESH_FINE = 200, 50
 MATCH_SILHOUETTE, MATCH_SCORE = 0.8, 0.2
 MOST_VARIANCE, LARGE = 0.006, 0.8
 """a mask whose features vary more is no pseudo label, unless it is this large a part of the view's largest"""
+_LEAVES = 64
+"""leaves in use are counted in multiples of this, so that few shapes are compiled"""
 
 
 @jax.tree_util.register_dataclass
@@ -87,7 +90,7 @@ def train_opengaussian(
     data = view_plans(evidence), jnp.asarray(local)
     views, slots = names.shape
     start = jax.random.uniform(init_key, (evidence.gaussians.count, SIZE))
-    loss = functools.partial(_instance_loss, slots=slots, halfway=schedule.instance_steps // 2)
+    loss = _instance_loss_of(slots, schedule.instance_steps // 2)
     features, history = descend(
         loss,
         start,
@@ -150,6 +153,12 @@ def _instance_loss(
     return INTRA_WEIGHT * intra + inter
 
 
+@functools.cache
+def _instance_loss_of(slots: int, halfway: int) -> Callable:
+    """One function object for each pair of options: `descend` compiles once for each."""
+    return functools.partial(_instance_loss, slots=slots, halfway=halfway)
+
+
 @functools.partial(jax.jit, static_argnums=2)
 def _pseudo_labels(features: Array, data: Any, slots: int) -> tuple[Array, Array]:
     """(T, K, 6) the masks' mean features, and (T, K) whether each is a label: there, and even or large."""
@@ -192,6 +201,11 @@ def _quantised_loss(
     return jnp.sum(jnp.where(counts[:, None], error, 0.0)) / (SIZE * jnp.maximum(counts.sum(), 1))
 
 
+@functools.cache
+def _quantised_loss_of(clusters: int, squared: bool) -> Callable:
+    return functools.partial(_quantised_loss, clusters=clusters, squared=squared)
+
+
 def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key) -> tuple[Array, Array]:
     """Features trained through their roots' means, and the root of each Gaussian."""
     roots = min(schedule.roots, len(features))
@@ -203,7 +217,7 @@ def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key)
         of, centres = assign_to_centres(points(features), centres)
         return of
 
-    loss = functools.partial(_quantised_loss, clusters=roots, squared=False)
+    loss = _quantised_loss_of(roots, False)
     given = lambda of: (*data, labels, of, of)
     steps, rate = schedule.coarse_steps, schedule.coarse_rate
     return _clustered(loss, features, assign, given, steps=steps, refresh=REFRESH_COARSE, rate=rate, key=key)
@@ -214,7 +228,7 @@ def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Arr
     roots, leaves = min(schedule.roots, len(features)), schedule.leaves
     number = _leaves_wanted(root_of, data, labels, roots, leaves)
     split = lambda f: split_roots(normalize(f), root_of, number, leaves)
-    loss = functools.partial(_quantised_loss, clusters=roots * leaves, squared=True)
+    loss = _quantised_loss_of(roots * leaves, True)
     given = lambda of: (*data, labels, of, root_of)
     steps, rate = schedule.fine_steps, schedule.rate
     features, of = _clustered(loss, features, split, given, steps=steps, refresh=REFRESH_FINE, rate=rate, key=key)
@@ -243,24 +257,17 @@ def _clustered(
 
 def _leaves_wanted(root_of, data, labels, roots: int, leaves: int) -> Int[np.ndarray, " k"]:
     """1 + the largest number of a view's labels that match the root: half of the label's pixels are the root's."""
-    plans, local = data
-    slots = labels[1].shape[1]
+    both, _, pixels = _overlaps(data, root_of, roots, labels[1].shape[1])
+    matched = (both > 0.5 * pixels[:, None]) & labels[1][:, None] & (pixels[:, None] > 0)
+    most = np.asarray(matched.sum(2).max(0))
+    return np.minimum(1 + most, leaves)
 
-    @jax.jit
-    def matched(view):
-        plan, ids, valid = view
 
-        def one(root):
-            alpha = render_plan(only(plan, root_of == root), jnp.ones((len(root_of), 1))).alpha.reshape(-1)
-            cover, pixels = _mask_means((alpha > MATCH_SILHOUETTE)[:, None] * 1.0, ids.reshape(-1), slots)
-            return jnp.sum((cover[:, 0] > 0.5) & valid & (pixels > 0))
-
-        return jax.lax.map(one, jnp.arange(roots))
-
-    most = np.stack(
-        [np.asarray(matched(jax.tree.map(lambda a, t=t: a[t], (plans, local, labels[1])))) for t in range(len(local))]
-    )
-    return np.minimum(1 + most.max(0), leaves)
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _overlaps(data: Any, group_of: Array, groups: int, slots: int) -> tuple[Array, Array, Array]:
+    """`silhouette_overlaps` of all views: (T, G, K), (T, G), (T, K)."""
+    one = lambda view: silhouette_overlaps(view[0], group_of, view[1], MATCH_SILHOUETTE, groups=groups, slots=slots)
+    return jax.lax.map(one, data)
 
 
 def _associate(
@@ -271,31 +278,19 @@ def _associate(
     A leaf's silhouette alone, alpha > 0.8, meets each mask of a view with IoU (1 - L1 distance of their features); the
     best counts where it is above 0.2 (REFERENCE D.4).
     """
-    plans, local = data
-    slots, used = names.shape[1], jnp.asarray(np.unique(np.asarray(leaf_of)))
-
-    @jax.jit
-    def best(view):
-        plan, ids, means, valid = view
-        ids = ids.reshape(-1)
-
-        def one(leaf):
-            alpha = render_plan(only(plan, leaf_of == leaf), jnp.ones((len(leaf_of), 1))).alpha.reshape(-1)
-            shape = (alpha > MATCH_SILHOUETTE) * 1.0
-            share, pixels = _mask_means(shape[:, None], ids, slots)
-            both = share[:, 0] * pixels
-            overlap = both / jnp.maximum(pixels + shape.sum() - both, 1)
-            distance = jnp.mean(jnp.abs(means - (codes[leaf] + 1) / 2), axis=1)
-            score = jnp.where(valid & (pixels > 0), overlap * (1 - distance), 0.0)
-            return jnp.where(score.max() > MATCH_SCORE, jnp.argmax(score), -1)
-
-        return jax.lax.map(one, used)
-
+    used, place = np.unique(np.asarray(leaf_of), return_inverse=True)
+    groups = _LEAVES * -(-len(used) // _LEAVES)
+    both, area, pixels = (np.asarray(a) for a in _overlaps(data, jnp.asarray(place, jnp.int32), groups, names.shape[1]))
+    means, valid = (np.asarray(a) for a in labels)
     summed = np.zeros((len(codes), embeddings.shape[1]), np.float64)
     matches = np.zeros(len(codes), np.int32)
-    for t in range(len(local)):
-        found = np.asarray(best(jax.tree.map(lambda a, t=t: a[t], (plans, local, *labels))))
-        hit, leaf = found >= 0, np.asarray(used)
-        summed[leaf[hit]] += embeddings[names[t][found[hit]]]
-        matches[leaf[hit]] += 1
+    own = (np.asarray(codes)[used] + 1) / 2
+    for t in range(len(both)):
+        overlap = both[t, : len(used)] / np.maximum(pixels[t] + area[t, : len(used), None] - both[t, : len(used)], 1)
+        distance = np.abs(means[t][None] - own[:, None]).mean(-1)
+        score = np.where(valid[t] & (pixels[t] > 0), overlap * (1 - distance), 0.0)
+        found = score.argmax(1)
+        hit = score.max(1) > MATCH_SCORE
+        summed[used[hit]] += embeddings[names[t][found[hit]]]
+        matches[used[hit]] += 1
     return jnp.asarray(summed / (matches[:, None] + 1e-4), jnp.float32), jnp.asarray(matches)

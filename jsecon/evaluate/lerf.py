@@ -18,10 +18,14 @@ from jsecon.data.lerf import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
 from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
+from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians, Selection
 
 VALA_THRESHOLD = 10 / 255
 """VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
+FEW = 1 << 16
+"""Gaussians up to which the room that all of them take serves every selection, in one compilation; with more of them
+each rendering makes room for its own selection alone"""
 LOCALISATION_WINDOW = 0.04
 """side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px of 730"""
 
@@ -101,13 +105,14 @@ def evaluate_at_thresholds(
     for frame in labels:
         _check(frame, cameras)
     pairs = labelled_pairs(labels, expected_pairs)
+    capacity = _capacity(gaussians, cameras, labels) if gaussians.count <= FEW else None
     answers: dict[str, Selection | None] = {}
     rows: dict[float, list[Row]] = {threshold: [] for threshold in alpha_thresholds}
     for done, (frame, category) in enumerate(pairs, start=1):
         if category not in answers:
             answers[category] = select(category)
         camera = resized(cameras[frame.name], frame.width, frame.height)
-        found = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds)
+        found = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds, capacity)
         for threshold, row in zip(alpha_thresholds, found):
             rows[threshold].append(row)
         if progress is not None:
@@ -153,6 +158,16 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
+def _capacity(gaussians: Gaussians, cameras: Mapping[str, Camera], labels: Sequence[LabelledFrame]) -> int:
+    """Room for all Gaussians in any labelled frame, in powers of two: scenes of one kind share a compilation."""
+    given = jax.tree.map(jnp.asarray, gaussians)
+    sizes = [
+        plan_capacity(given, jax.tree.map(jnp.asarray, resized(cameras[f.name], f.width, f.height)), margin=1.0)
+        for f in labels
+    ]
+    return 1 << (max(sizes) - 1).bit_length()
+
+
 def _rows(
     gaussians: Gaussians,
     camera: Camera,
@@ -160,13 +175,15 @@ def _rows(
     category: str,
     selection: Selection | None,
     thresholds: tuple[float, ...],
+    capacity: int | None,
 ) -> list[Row]:
     true, boxes = frame.objects[category]
     if selection is None or not np.asarray(selection.mask).any():
         region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
         nothing = np.zeros(true.shape, bool)
         return [Row(frame.name, category, 0.0, False, False, None, 0, region, score, nothing) for _ in thresholds]
-    rendering = render_selection(gaussians, jax.tree.map(jnp.asarray, camera), selection.mask, selection.similarity)
+    camera = jax.tree.map(jnp.asarray, camera)
+    rendering = render_selection(gaussians, camera, selection.mask, selection.similarity, capacity=capacity)
     alpha, point = np.asarray(rendering.alpha), _middle(_peak(np.asarray(rendering.features[..., 0])))
     rows = []
     for threshold in thresholds:

@@ -1,0 +1,98 @@
+"""Masks of single frames brought together over the frames: by a tracker's ids from disk, or by the views' consensus."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.baselines.evidence import Evidence, shared_capacity
+from jsecon.language.consensus import consensus_masklets
+from jsecon.language.masklets import clean_masklets
+from jsecon.vision.views import SceneViews
+
+ROWS = 32
+"""regions are counted in multiples of this, the last without pixels and embedding: scenes share compiled programs"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Association:
+    """Regions that are alike in all frames, and what is known of each."""
+
+    labels: np.ndarray
+    """(T, H, W) int32 region, -1 = none."""
+    embeddings: np.ndarray
+    """(R, E) unit, of each region the mean of its masks' embeddings weighted by their pixels (phi_bar)."""
+    uniform_embeddings: np.ndarray
+    """(R, E) the same with each view counting alike."""
+    pixels: np.ndarray
+    """(R, T) int32."""
+
+
+def associated(evidence: Evidence, labels: np.ndarray) -> Association:
+    """The regions of `labels` (T, H, W): a mask counts for a region by the pixels that both hold."""
+    inside = overlaps(labels, np.asarray(evidence.masks), len(evidence.embeddings))
+    inside = np.pad(inside, ((0, -len(inside) % ROWS), (0, 0)))
+    frame = np.asarray(evidence.frame)
+    pixels = np.zeros((len(inside), len(labels)), np.int32)
+    for t in range(len(labels)):
+        pixels[:, t] = inside[:, frame == t].sum(1)
+    share = inside / np.maximum(pixels[:, frame], 1)
+    embeddings = np.asarray(evidence.embeddings)
+    return Association(labels.astype(np.int32), unit(inside @ embeddings), unit(share @ embeddings), pixels)
+
+
+def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int) -> Association:
+    """jsecon's own association, which looks at no track: groups of Gaussians that most views put into one mask claim
+    the pixels of each frame."""
+    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    masks = np.asarray(evidence.masks)
+
+    def proposals(t: int) -> np.ndarray:
+        rows = np.flatnonzero(np.asarray(evidence.frame) == t)
+        return masks[t][None] == rows[:, None, None]
+
+    scene = SceneViews(gaussians, cameras, proposals, capacity=shared_capacity(gaussians, cameras))
+    return associated(evidence, clean_masklets(consensus_masklets(frames, scene, seed=seed)))
+
+
+def overlaps(labels: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:
+    """(R, M) pixels that lie in both the region and the mask."""
+    regions = int(labels.max(initial=-1)) + 1
+    both = (labels >= 0) & (masks >= 0)
+    joint = np.bincount(labels[both].astype(np.int64) * count + masks[both], minlength=regions * count)
+    return joint.reshape(regions, count)
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    """Rows of unit length; zero rows stay zero."""
+    length = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.where(length > 0, rows / np.where(length > 0, length, 1), 0).astype(np.float32)
+
+
+class Shared:
+    """What several methods of one setting need, computed once; its cost is charged to each that asks for it."""
+
+    def __init__(self):
+        self._kept: dict[Any, tuple[Any, float]] = {}
+        self._borrowed: dict[Any, float] = {}
+
+    def get(self, key: Any, compute: Callable[[], Any]) -> Any:
+        """The value of `key`, which `compute` gives the first time."""
+        if key not in self._kept:
+            began = time.perf_counter()
+            value = jax.block_until_ready(compute())
+            self._kept[key] = value, time.perf_counter() - began
+            self._borrowed.setdefault(key, 0.0)
+        else:
+            self._borrowed.setdefault(key, self._kept[key][1])
+        return self._kept[key][0]
+
+    def settle(self) -> float:
+        """Seconds that others spent on what was asked for since the last call."""
+        seconds = sum(self._borrowed.values())
+        self._borrowed = {}
+        return seconds

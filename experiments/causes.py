@@ -1,0 +1,112 @@
+"""Where a selection's IoU is lost: a wrong region for the text, a broken region, or the wrong Gaussians for the region?
+
+    python -m experiments.causes [--quick]
+
+One twin of LERF-OVS as Table 1 uses it. Masks are associated over the frames by the tracker's ids as they come, by
+these reconciled with what the views say of the same Gaussians, and by consensus. For each: how many texts find a region
+of the right object; how much of the object its best region holds over all frames (recall) and how much of that is the
+object's (purity); and mIoU of the text's region, and of the best region given, by each kind of membership. Above all
+stands what the Gaussians themselves allow: true masks, membership by votes. Memberships: the share of the votes of all
+views; of the views that show the region; the lead. VALA, which needs no region, is beside.
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import lerf, results, tables
+from experiments.association import overlaps
+from experiments.methods import METHODS, Answers, Steps, ask_field, association, field_of
+from experiments.setting import Setting, prepare
+from experiments.twins import Data
+from jsecon.query.anchored import query_anchored, query_region
+from jsecon.query.outliers import remove_outliers
+from jsecon.types import Selection
+
+ASSOCIATIONS = ("tracks", "reconciled", "consensus")
+MEMBERSHIPS = ("all_views", "votes", "lead")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the experiment can vary."""
+
+    data: Data = lerf.PLAN.data
+    scene: str = "figurines"
+    seed: int = 0
+    level: str = "medium"
+    fit_steps: int = lerf.PLAN.fit_steps
+    out: str = str(results.HOME / "results" / "causes")
+
+
+QUICK = Options(lerf.QUICK.data, fit_steps=80, out=str(results.HOME / "results" / "quick" / "causes"))
+
+
+def true_objects(setting: Setting, options: Options) -> tuple[np.ndarray, list[int]]:
+    """(T, H, W) the object of each pixel of the evidence's frames, -1 = none, and the object that each query means."""
+    root = options.data.place(options.scene, options.seed, options.level)
+    objects = json.loads((root / "twin.json").read_text())["scenes"][options.scene]["objects"]
+    files = (root / "truth" / options.scene / f"{name}.png" for name in setting.names)
+    labels = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.int32) - 1
+    return labels, [objects.index(query) for query in setting.bench.queries]
+
+
+def given(setting: Setting, field, regions: list[int], way: str) -> Answers:
+    """The answers where each query is told its region."""
+
+    def ask(k: int) -> Selection:
+        by, weight = ("votes", 1.0) if way == "all_views" else (way, None)
+        found = query_region(field, regions[k], by=by, unlabelled_weight=weight)
+        kept = remove_outliers(np.asarray(setting.evidence.gaussians.means), np.asarray(found.mask))
+        return dataclasses.replace(found, mask=jnp.asarray(kept))
+
+    return Answers(ask, lambda: np.zeros(0, np.int32))
+
+
+def main(options: Options = Options()) -> dict:
+    """Runs the experiment, writes its results and returns the metrics."""
+    setting = prepare(options.data, options.scene, options.seed, options.level, fit_steps=options.fit_steps)
+    truth, meant = true_objects(setting, options)
+    rows: list[dict] = []
+
+    def told(name: str, answers: Answers, **more) -> None:
+        figures = tables.measure(setting, answers)
+        rows.append({"what": name, **more, "miou": figures["miou"], "miou_vala": figures["miou_vala"]})
+
+    told("true masks, votes", given(setting, field_of(setting, by="truth", labels=truth), meant, "votes"))
+    told("VALA", METHODS["VALA"](setting, Steps()))
+    for by in ASSOCIATIONS:
+        field, regions = field_of(setting, by=by), association(setting, by)
+        joint = overlaps(regions.labels, truth, int(truth.max()) + 1)
+        joint = np.pad(joint, ((0, len(regions.embeddings) - len(joint)), (0, 0)))
+        size, whole = regions.pixels.sum(1), np.bincount(truth[truth >= 0], minlength=joint.shape[1])
+        best = [int(joint[:, k].argmax()) for k in meant]
+        found = [int(query_anchored(field, jnp.asarray(text)).region) for text in setting.texts]
+        right = [r for r, k in zip(found, meant) if r >= 0 and joint[r].argmax() == k]
+        state = {
+            "texts": f"{len(right)} of {len(meant)}",
+            "recall": float(np.mean([joint[r, k] / whole[k] for r, k in zip(best, meant)])),
+            "purity": float(np.mean([joint[r, k] / max(size[r], 1) for r, k in zip(best, meant)])),
+        }
+        for way in MEMBERSHIPS:
+            told(f"{by}, {way}", ask_field(setting, field, way), **state)
+            told(f"{by}, {way}, region given", given(setting, field, best, way), **state)
+    columns = ("what", "texts", "recall", "purity", "miou", "miou_vala")
+    table = results.table(columns, [tuple(row.get(name, "") for name in columns) for row in rows])
+    text = f"{options.scene}, seed {options.seed}, a twin in LERF-OVS's layout, {options.level} noise.\n\n{table}"
+    names = [row["what"].replace(", ", "\n") for row in rows]
+    figure = results.bars(names, {"mIoU": [row["miou"] for row in rows]}, "mIoU")
+    results.save(Path(options.out), options, {"rows": rows}, text, figure)
+    print(text)
+    return {"rows": rows}
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="one tiny scene")
+    main(QUICK if parser.parse_args().quick else Options())

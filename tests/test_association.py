@@ -1,0 +1,52 @@
+"""Regions from labels: who holds which pixels of which mask, what that makes of the embeddings; and shared work."""
+
+import time
+
+import numpy as np
+import pytest
+
+from experiments.association import ROWS, Shared, associated, overlaps, unit
+from jsecon.baselines.evidence import Evidence
+
+
+def test_overlaps_count_every_pixel():
+    rng = np.random.default_rng(0)
+    tracks, masks = rng.integers(-1, 3, (2, 5, 6)), rng.integers(-1, 4, (2, 5, 6))
+    found = overlaps(tracks, masks, 4)
+    for r in range(3):
+        for m in range(4):
+            assert found[r, m] == ((tracks == r) & (masks == m)).sum()
+
+
+def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views():
+    masks = np.full((2, 2, 5), -1, np.int32)
+    masks[0, 0], masks[0, 1, :2], masks[1, 0, :2] = 0, 1, 2
+    labels = np.full(masks.shape, -1, np.int32)
+    labels[0, 0], labels[1, 0] = 0, 0  # five pixels of mask 0; two of mask 2 and three of none
+    labels[0, 1] = 1
+    embeddings = np.eye(3, 4, dtype=np.float32)
+    found = associated(Evidence(None, None, masks, embeddings, np.array([0, 0, 1]), labels), labels)
+    assert found.embeddings.shape == (ROWS, 4)
+    np.testing.assert_array_equal(found.pixels[:2], [[5, 2], [2, 0]])
+    np.testing.assert_allclose(found.embeddings[0], unit(np.array([5.0, 0, 2, 0])), atol=1e-6)
+    np.testing.assert_allclose(found.uniform_embeddings[0], unit(np.array([1.0, 0, 1, 0])), atol=1e-6)
+    np.testing.assert_allclose(found.embeddings[1], [0, 1, 0, 0], atol=1e-6)
+    assert not found.embeddings[2:].any()
+    assert not found.pixels[2:].any()
+
+
+def test_shared_work_is_done_once_and_charged_to_each_that_asks():
+    shared, calls = Shared(), []
+
+    def work():
+        calls.append(1)
+        time.sleep(0.05)
+        return np.ones(2)
+
+    assert shared.get("a", work) is shared.get("a", work)
+    assert shared.settle() == 0  # who did it has spent the time already
+    shared.get("a", work)
+    shared.get("a", work)
+    assert shared.settle() == pytest.approx(0.05, abs=0.04)
+    assert shared.settle() == 0
+    assert len(calls) == 1
