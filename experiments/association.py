@@ -17,6 +17,9 @@ from jsecon.vision.views import SceneViews
 ROWS = 32
 """regions are counted in multiples of this, the last without pixels and embedding: scenes share compiled programs"""
 
+COVERED = 0.5
+"""part of a region that must lie in masks: what a group of Gaussians claims beside them has not been embedded"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Association:
@@ -33,16 +36,19 @@ class Association:
 
 
 def associated(evidence: Evidence, labels: np.ndarray) -> Association:
-    """The regions of `labels` (T, H, W): a mask counts for a region by the pixels that both hold."""
+    """The regions of `labels` (T, H, W): a mask counts for a region by the pixels that both hold, in the views where
+    masks hold at least `COVERED` of the region's pixels. A region that is hardly in any mask has no embedding."""
     inside = overlaps(labels, np.asarray(evidence.masks), len(evidence.embeddings))
     inside = np.pad(inside, ((0, -len(inside) % ROWS), (0, 0)))
-    frame = np.asarray(evidence.frame)
-    pixels = np.zeros((len(inside), len(labels)), np.int32)
-    for t in range(len(labels)):
-        pixels[:, t] = inside[:, frame == t].sum(1)
-    share = inside / np.maximum(pixels[:, frame], 1)
+    frame, views = np.asarray(evidence.frame), range(len(labels))
+    pixels = np.stack([np.bincount(image[image >= 0], minlength=len(inside)) for image in labels], axis=1)
+    covered = np.stack([inside[:, frame == t].sum(1) for t in views], axis=1)
+    covered = np.where(covered >= COVERED * pixels, covered, 0)
+    inside = np.where(covered[:, frame] > 0, inside, 0)
+    share = inside / np.maximum(covered[:, frame], 1)
     embeddings = np.asarray(evidence.embeddings)
-    return Association(labels.astype(np.int32), unit(inside @ embeddings), unit(share @ embeddings), pixels)
+    uniform = unit(share @ embeddings)
+    return Association(labels.astype(np.int32), unit(inside @ embeddings), uniform, pixels.astype(np.int32))
 
 
 def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int) -> Association:

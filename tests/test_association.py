@@ -20,19 +20,19 @@ def test_overlaps_count_every_pixel():
 
 def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views():
     masks = np.full((2, 2, 5), -1, np.int32)
-    masks[0, 0], masks[0, 1, :2], masks[1, 0, :2] = 0, 1, 2
+    masks[0, 0], masks[0, 1, :2], masks[1, 0, :3], masks[1, 1, :2] = 0, 1, 2, 2
     labels = np.full(masks.shape, -1, np.int32)
-    labels[0, 0], labels[1, 0] = 0, 0  # five pixels of mask 0; two of mask 2 and three of none
-    labels[0, 1] = 1
+    labels[0, 0], labels[1, 0] = 0, 0  # five pixels of mask 0; three of mask 2 and two of none
+    labels[0, 1], labels[1, 1] = 1, 2  # two of five pixels in a mask: hardly seen, twice
     embeddings = np.eye(3, 4, dtype=np.float32)
     found = associated(Evidence(None, None, masks, embeddings, np.array([0, 0, 1]), labels), labels)
     assert found.embeddings.shape == (ROWS, 4)
-    np.testing.assert_array_equal(found.pixels[:2], [[5, 2], [2, 0]])
-    np.testing.assert_allclose(found.embeddings[0], unit(np.array([5.0, 0, 2, 0])), atol=1e-6)
+    np.testing.assert_array_equal(found.pixels[:3], [[5, 5], [5, 0], [0, 5]])
+    np.testing.assert_allclose(found.embeddings[0], unit(np.array([5.0, 0, 3, 0])), atol=1e-6)
     np.testing.assert_allclose(found.uniform_embeddings[0], unit(np.array([1.0, 0, 1, 0])), atol=1e-6)
-    np.testing.assert_allclose(found.embeddings[1], [0, 1, 0, 0], atol=1e-6)
-    assert not found.embeddings[2:].any()
-    assert not found.pixels[2:].any()
+    assert not found.embeddings[1:].any()
+    assert not found.uniform_embeddings[1:].any()
+    assert not found.pixels[3:].any()
 
 
 def test_shared_work_is_done_once_and_charged_to_each_that_asks():
