@@ -7,6 +7,7 @@ import pytest
 
 from experiments.association import ROWS, Shared, associated, overlaps, unit
 from jsecon.baselines.evidence import Evidence
+from jsecon.types import Camera
 
 
 def test_overlaps_count_every_pixel():
@@ -18,14 +19,16 @@ def test_overlaps_count_every_pixel():
             assert found[r, m] == ((tracks == r) & (masks == m)).sum()
 
 
-def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views():
+def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     masks = np.full((2, 2, 5), -1, np.int32)
     masks[0, 0], masks[0, 1, :2], masks[1, 0, :3], masks[1, 1, :2] = 0, 1, 2, 2
     labels = np.full(masks.shape, -1, np.int32)
     labels[0, 0], labels[1, 0] = 0, 0  # five pixels of mask 0; three of mask 2 and two of none
     labels[0, 1], labels[1, 1] = 1, 2  # two of five pixels in a mask: hardly seen, twice
     embeddings = np.eye(3, 4, dtype=np.float32)
-    found = associated(Evidence(None, None, masks, embeddings, np.array([0, 0, 1]), labels), labels)
+    one = np.ones(2, np.float32)
+    cameras = Camera(np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)), one, one, one, one, 5, 2)
+    found = associated(Evidence(scene, cameras, masks, embeddings, np.array([0, 0, 1]), labels), labels)
     assert found.embeddings.shape == (ROWS, 4)
     np.testing.assert_array_equal(found.pixels[:3], [[5, 5], [5, 0], [0, 5]])
     np.testing.assert_allclose(found.embeddings[0], unit(np.array([5.0, 0, 3, 0])), atol=1e-6)
