@@ -2,12 +2,12 @@
 
     python -m experiments.causes [--quick]
 
-One twin of LERF-OVS as Table 1 uses it. Masks are associated over the frames by the tracker's ids as they come, by
-these reconciled with what the views say of the same Gaussians, and by consensus. For each: how many texts find a region
-of the right object; how much of the object its best region holds over all frames (recall) and how much of that is the
-object's (purity); and mIoU of the text's region, and of the best region given, by each kind of membership. Above all
-stands what the Gaussians themselves allow: true masks, membership by votes. Memberships: the share of the votes of all
-views; of the views that show the region; the lead. VALA, which needs no region, is beside.
+One twin of LERF-OVS as Table 1 uses it. Masks are associated over the frames by the tracker's ids, or by consensus. For
+each: how many texts find a region of the right object, by the largest cosine and by LERF's relevancy; how much of the
+object its best region holds over all frames (recall) and how much of that is the object's (purity); and mIoU of the
+text's region, and of the best region given, by each kind of membership: the share of the votes of all views; of the
+views that show the region; the lead. Above all stands what the Gaussians themselves allow: true masks, membership by
+votes. VALA, which needs no region, is beside.
 """
 
 import argparse
@@ -21,14 +21,15 @@ import numpy as np
 
 from experiments import lerf, results, tables
 from experiments.association import overlaps
-from experiments.methods import METHODS, Answers, Steps, ask_field, association, field_of
+from experiments.methods import METHODS, Answers, Steps, anchor_of, ask_field, association, field_of
 from experiments.setting import Setting, prepare
 from experiments.twins import Data
-from jsecon.query.anchored import query_anchored, query_region
+from jsecon.query.anchored import query_region
 from jsecon.query.outliers import remove_outliers
 from jsecon.types import Selection
 
-ASSOCIATIONS = ("tracks", "reconciled", "consensus")
+ASSOCIATIONS = ("tracks", "consensus")
+ANCHORS = ("cosine", "relevancy")
 MEMBERSHIPS = ("all_views", "votes", "lead")
 
 
@@ -86,15 +87,16 @@ def main(options: Options = Options()) -> dict:
         joint = np.pad(joint, ((0, len(regions.embeddings) - len(joint)), (0, 0)))
         size, whole = regions.pixels.sum(1), np.bincount(truth[truth >= 0], minlength=joint.shape[1])
         best = [int(joint[:, k].argmax()) for k in meant]
-        found = [int(query_anchored(field, jnp.asarray(text)).region) for text in setting.texts]
-        right = [r for r, k in zip(found, meant) if r >= 0 and joint[r].argmax() == k]
         state = {
-            "texts": f"{len(right)} of {len(meant)}",
             "recall": float(np.mean([joint[r, k] / whole[k] for r, k in zip(best, meant)])),
             "purity": float(np.mean([joint[r, k] / max(size[r], 1) for r, k in zip(best, meant)])),
         }
         for way in MEMBERSHIPS:
-            told(f"{by}, {way}", ask_field(setting, field, way), **state)
+            for anchor in ANCHORS:
+                found = [anchor_of(field, text, anchor) for text in setting.texts]
+                right = sum(r >= 0 and joint[r, k] == joint[r].max() > 0 for r, k in zip(found, meant))
+                answers = ask_field(setting, field, way, anchor=anchor)
+                told(f"{by}, {way}, {anchor}", answers, texts=f"{right} of {len(meant)}", **state)
             told(f"{by}, {way}, region given", given(setting, field, best, way), **state)
     columns = ("what", "texts", "recall", "purity", "miou", "miou_vala")
     table = results.table(columns, [tuple(row.get(name, "") for name in columns) for row in rows])

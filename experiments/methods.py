@@ -22,7 +22,6 @@ from jsecon.evaluate.opengaussian import most_similar_text, select_leaf, select_
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.distill import distill_l1, distill_votes
-from jsecon.language.reconcile import reconcile_labels
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import ALIKE_THRESHOLD, query_anchored, query_region
 from jsecon.query.canonical import query_canonical, relevancies
@@ -136,16 +135,12 @@ def _lifted(train: Callable) -> Callable[[Setting, Steps], Answers]:
 
 
 def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:
-    """The regions of a setting: by "tracks", "reconciled" tracks, "consensus", or any other name with its `labels`."""
+    """The regions of a setting: by "tracks", by "consensus", or any other name with its `labels`."""
     evidence = setting.evidence
     if by == "tracks":
         return setting.tracked
     if labels is not None:
         return setting.shared.get(by, lambda: associated(evidence, labels))
-    if by == "reconciled":
-        capacity = shared_capacity(evidence.gaussians, evidence.cameras)
-        settle = lambda: reconcile_labels(evidence.gaussians, evidence.cameras, evidence.tracks, capacity=capacity)
-        return setting.shared.get(by, lambda: associated(evidence, settle()))
     return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed))
 
 
@@ -205,6 +200,15 @@ def field_of(
     )
 
 
+def anchor_of(field: LanguageField, text, anchor: str) -> int:
+    """The region that a text (E,) finds, by the largest "cosine", or by the largest "relevancy", LERF's: what makes a
+    region alike to every text, such as its noise along the texts' cone, then cancels against the canonical phrases."""
+    embeddings, text = jnp.asarray(field.regions.embeddings), jnp.asarray(text)
+    if anchor == "cosine":
+        return int(query_anchored(field, text).region)
+    return int(jnp.argmax(relevancies(embeddings, text, jnp.asarray(field.canonical))[0]))
+
+
 def ask_field(
     setting: Setting,
     field: LanguageField,
@@ -215,14 +219,10 @@ def ask_field(
     threshold: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code
-    (all anchored), one_step or canonical; `clean` drops outliers.
-
-    anchor: a text takes the region of the largest "cosine", or of the largest "relevancy", LERF's: what makes a region
-    alike to every text, such as its noise along the texts' cone, then cancels against the canonical phrases.
-    """
+    (all anchored), one_step or canonical; `clean` drops outliers. `anchor`: see `anchor_of`."""
     means = np.asarray(setting.evidence.gaussians.means)
     by, weight = ("votes", 1.0) if way == "all_views" else (way, None)
-    embeddings, phrases = jnp.asarray(field.regions.embeddings), jnp.asarray(field.canonical)
+    phrases = jnp.asarray(field.canonical)
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
@@ -236,11 +236,12 @@ def ask_field(
         elif anchor == "cosine":
             found = query_anchored(field, text, by=by, similarity_threshold=threshold, unlabelled_weight=weight)
         else:
-            relevancy, _ = relevancies(embeddings, text, phrases)
-            best = jnp.argmax(relevancy)
+            best = anchor_of(field, text, anchor)
             options = {"similarity_threshold": threshold, "unlabelled_weight": weight}
             found = query_region(field, best, by=by, alike_threshold=ALIKE_THRESHOLD, **options)
-            found = dataclasses.replace(found, score=relevancy[best])
+            # Compared over texts: of those that find one region, it is the answer to the most relevant.
+            score = relevancies(jnp.asarray(field.regions.embeddings)[best][None], text, phrases)[0][0]
+            found = dataclasses.replace(found, score=score)
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
