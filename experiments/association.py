@@ -14,7 +14,7 @@ from jsecon.language.consensus import consensus_masklets
 from jsecon.language.masklets import clean_masklets
 from jsecon.vision.views import SceneViews
 
-ROWS = 32
+ROWS = 64
 """regions are counted in multiples of this, the last without pixels and embedding: scenes share compiled programs"""
 
 COVERED = 0.5

@@ -30,6 +30,8 @@ from jsecon.query.outliers import remove_outliers
 from jsecon.query.showing import with_shown
 from jsecon.types import LanguageField, Regions, Selection, Votes
 
+_relevancies = jax.jit(relevancies)
+
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
@@ -93,7 +95,8 @@ def langsplat(setting: Setting, steps: Steps) -> Answers:
 def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
     """Tracked ids; a text is found in the first view or not at all."""
     rates = dict(zip(("identity_rate", "classifier_rate"), steps.grouping_rates))
-    key, classes = jax.random.key(setting.seed), 1 + len(setting.tracked.embeddings)
+    # A classifier's outputs in multiples of 32, and one for no id: settings share their compiled programs.
+    key, classes = jax.random.key(setting.seed), 1 + 32 * -(-(int(setting.evidence.tracks.max()) + 1) // 32)
     model, _ = train_gaussian_grouping(setting.evidence, key=key, steps=steps.grouping, classes=classes, **rates)
     ask = lambda k: query_gaussian_grouping(
         model, setting.evidence, jnp.asarray(setting.texts[k]), jnp.asarray(setting.canonical)
@@ -206,7 +209,7 @@ def anchor_of(field: LanguageField, text, anchor: str) -> int:
     embeddings, text = jnp.asarray(field.regions.embeddings), jnp.asarray(text)
     if anchor == "cosine":
         return int(query_anchored(field, text).region)
-    return int(jnp.argmax(relevancies(embeddings, text, jnp.asarray(field.canonical))[0]))
+    return int(jnp.argmax(_relevancies(embeddings, text, jnp.asarray(field.canonical))[0]))
 
 
 def ask_field(
@@ -240,7 +243,7 @@ def ask_field(
             options = {"similarity_threshold": threshold, "unlabelled_weight": weight}
             found = query_region(field, best, by=by, alike_threshold=ALIKE_THRESHOLD, **options)
             # Compared over texts: of those that find one region, it is the answer to the most relevant.
-            score = relevancies(jnp.asarray(field.regions.embeddings)[best][None], text, phrases)[0][0]
+            score = _relevancies(jnp.asarray(field.regions.embeddings)[best][None], text, phrases)[0][0]
             found = dataclasses.replace(found, score=score)
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found

@@ -40,6 +40,8 @@ PROBABILITY = 0.3
 RELEVANT = 0.5
 """LERF relevancy below which the first view is taken not to show what the text says"""
 
+_relevancies = jax.jit(relevancies)
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +148,8 @@ def query_gaussian_grouping(
     nothing = jnp.zeros(evidence.gaussians.count)
     if not len(here):
         return Selection(nothing > 0, nothing, jnp.asarray(-1, jnp.int32), jnp.zeros(()))
-    relevancy, _ = relevancies(jnp.asarray(evidence.embeddings)[here], jnp.asarray(text), jnp.asarray(canonical))
+    first_view = jnp.asarray(evidence.embeddings)[here]
+    relevancy, _ = _relevancies(first_view, jnp.asarray(text), jnp.asarray(canonical))
     best = int(jnp.argmax(relevancy))
     if not relevancy[best] >= RELEVANT:
         return Selection(nothing > 0, nothing, jnp.asarray(-1, jnp.int32), relevancy[best])

@@ -34,6 +34,7 @@ READOUT = 0.6
 """VALA's threshold on the smoothed, normalised relevancy"""
 
 Progress = Callable[[int, int], None] | None
+_relevancies = jax.jit(relevancies)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +136,7 @@ def query_relevancy(
     Gaussians with a zero feature take no part, neither as answers nor as neighbours. Host code for the neighbours.
     """
     relevancy, known = (
-        np.asarray(a) for a in relevancies(jnp.asarray(features), jnp.asarray(text), jnp.asarray(canonical))
+        np.asarray(a) for a in _relevancies(jnp.asarray(features), jnp.asarray(text), jnp.asarray(canonical))
     )
     similarity = np.zeros(len(relevancy), np.float32)
     there = np.flatnonzero(known)
