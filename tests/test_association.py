@@ -1,12 +1,14 @@
 """Regions from labels: who holds which pixels of which mask, what that makes of the embeddings; and shared work."""
 
+import dataclasses
 import time
 
 import numpy as np
 import pytest
+from balls import ring_of_balls
 
-from experiments.association import ROWS, Shared, associated, overlaps, unit
-from jsecon.baselines.evidence import Evidence
+from experiments.association import ROWS, Shared, associated, by_consensus, overlaps, unit
+from jsecon.baselines.evidence import Evidence, evidence_of_tracks
 from jsecon.types import Camera
 
 
@@ -36,6 +38,19 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     assert not found.embeddings[1:].any()
     assert not found.uniform_embeddings[1:].any()
     assert not found.pixels[3:].any()
+
+
+def test_consensus_finds_the_balls_that_no_tracker_followed():
+    gaussians, cameras, frames, truth, _ = ring_of_balls()
+    views = np.arange(0, 24, 3)
+    units = np.eye(4, 8, dtype=np.float32)
+    evidence = evidence_of_tracks(gaussians, cameras[views], truth[views], np.tile(units, (len(views), 1, 1)))
+    shuffled = dataclasses.replace(evidence, tracks=np.full_like(evidence.tracks, -1))
+    found = by_consensus(shuffled, frames[views], seed=0)
+    for ball in (1, 2, 3):
+        region = int((found.embeddings @ units[ball]).argmax())
+        own, true = found.labels == region, truth[views] == ball
+        assert (own & true).sum() > 0.8 * (own | true).sum()
 
 
 def test_shared_work_is_done_once_and_charged_to_each_that_asks():
