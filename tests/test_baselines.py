@@ -70,7 +70,7 @@ def test_langsplat(world):
 def test_gaussian_grouping(world):
     evidence, _, _, texts, canonical = world
     model, history = train_gaussian_grouping(
-        evidence, key=jax.random.key(0), steps=150, identity_rate=0.03, classifier_rate=0.01
+        evidence, key=jax.random.key(0), steps=150, identity_rate=0.03, classifier_rate=0.01, classes=32
     )
     assert history[-20:].mean() < 0.7 * history[:5].mean()
     ask = lambda query: query_gaussian_grouping(model, evidence, texts[query], canonical)
