@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-RADIUS = 0.32
+RADIUS = 0.45
 """of a ball, in units of the distance between two"""
 
 
@@ -23,7 +23,7 @@ def camera_poses(count: int, side: int) -> np.ndarray:
     """(T, 4, 4) world-to-camera of a ring of views that all see every ball."""
     poses = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
     for pose, angle in zip(poses, np.linspace(0, 2 * np.pi, count, endpoint=False)):
-        eye = np.array([0.55 * side * np.cos(angle), 0.55 * side * np.sin(angle), 1.15 * side])
+        eye = side * np.array([0.3 * np.cos(angle), 0.3 * np.sin(angle), 1.6])
         forward = -eye / np.linalg.norm(eye)
         right = np.cross(forward, [0, 0, 1.0])
         right /= np.linalg.norm(right)

@@ -207,10 +207,10 @@ def main(options: Options = Options()) -> dict:
     """Measures every cell that is missing and writes the table."""
     rooms = Path(options.rooms or tempfile.mkdtemp())
     scenes: dict[str, Callable[[], Scene]] = {}
-    if Path(options.capture).exists():
-        scenes["replica_apartment_0"] = functools.partial(replica, options.capture)
     for seed in options.seeds:
         scenes[f"demo {seed}"] = functools.partial(demo_room, rooms / f"demo{seed}", seed)
+    if Path(options.capture).exists():
+        scenes["replica_apartment_0"] = functools.partial(replica, options.capture)
     run = RunOptions(capture=Path())
     found: dict[str, dict] = {scene: {} for scene in scenes}
     for ways in (WAYS[:-1], WAYS[-1:]):
@@ -226,7 +226,9 @@ def main(options: Options = Options()) -> dict:
                 write_text(cell_of(options, scene, way), json.dumps(cell))
                 print(scene, way, cell, flush=True)
             found[scene] |= {way: json.loads(cell_of(options, scene, way).read_text()) for way in ways}
-        write(options, found)
+            if all(found.values()):
+                write(options, found)
+    print((Path(options.out) / "table.md").read_text())
     return found
 
 
@@ -239,8 +241,7 @@ def cell_of(options: Options, scene: str, way: str) -> Path:
 
 
 def write(options: Options, found: dict[str, dict]) -> None:
-    """Writes the results of the ways that all scenes have cells of, and prints the table."""
-    measured = [way for way in WAYS if all(way in ways for ways in found.values())]
+    """Writes the results as far as they are measured; in the figure, the ways that all scenes have."""
     rows = []
     for scene, ways in found.items():
         for kind in ("objects", "ids"):
@@ -250,11 +251,14 @@ def write(options: Options, found: dict[str, dict]) -> None:
                     rows.append((name, way, cell[kind]["best_iou"], cell[kind]["lasting"], cell["seconds"]))
     demos = [ways for scene, ways in found.items() if scene.startswith("demo")]
     means = {}
-    for way in measured if demos else ():
+    for way in [way for way in WAYS if demos and all(way in room for room in demos)]:
         means[way] = [float(np.mean([room[way]["objects"][key] for room in demos])) for key in ("best_iou", "lasting")]
         seconds = float(np.mean([room[way]["seconds"] for room in demos]))
         rows.append((f"mean of {len(demos)} demos", way, *means[way], seconds))
-    table = results.table(("scene", "association", "mean best IoU", "share of views under one id", "seconds"), rows)
+    table = results.table(
+        ("scene", "association", "mean best IoU", "share of views under one id", "seconds, beside other work"), rows
+    )
+    measured = [way for way in WAYS if all(way in ways for ways in found.values())]
     groups = {f"{len(demos)} demos": means} if demos else {}
     groups |= {
         scene: {way: [ways[way]["objects"][key] for key in ("best_iou", "lasting")] for way in measured}
@@ -264,7 +268,6 @@ def write(options: Options, found: dict[str, dict]) -> None:
     labels = [f"{name}\n{figure}" for name in groups for figure in ("best IoU", "one id")]
     series = {way: [value for group in groups.values() for value in group[way]] for way in measured}
     results.save(Path(options.out), options, found, table, results.bars(labels, series, "share"))
-    print(table)
 
 
 if __name__ == "__main__":
