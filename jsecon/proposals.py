@@ -49,8 +49,8 @@ def classical_segmenter(granularity: str, capture: Capture, train: np.ndarray, g
 
     cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
     setting = GRANULARITIES[granularity]
-    if capture.depths is not None:
-        depths = np.asarray(capture.depths)[train]
+    depths = None if capture.depths is None else np.asarray(capture.depths)[train]
+    if depths is not None and depths[:, ::4, ::4].any():
         known = depths[:, ::4, ::4]
         cloud = points_from_depth(capture, voxel=GRAIN * float(np.median(known[known > 0])), stride=4)
         if len(cloud.points) > CLOUD:

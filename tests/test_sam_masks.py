@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 from scipy import ndimage
 
 from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop, stability, tidied
@@ -60,6 +60,7 @@ def test_box_nms_is_greedy(seed, count, threshold):
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.floats(0.1, 0.9))
+@example(291, 6, 0.1875)  # two islands of the same size
 def test_small_holes_are_filled_then_small_islands_removed(seed, least, density):
     mask = np.random.default_rng(seed).random((12, 15)) < density
     expected = mask.copy()
@@ -69,10 +70,14 @@ def test_small_holes_are_filled_then_small_islands_removed(seed, least, density)
             expected |= holes == label
     islands, count = ndimage.label(expected, np.ones((3, 3)))
     areas = [(islands == label).sum() for label in range(1, count + 1)]
-    for label, area in enumerate(areas, 1):
-        if area < least and (max(areas) >= least or label != 1 + int(np.argmax(areas))):
-            expected[islands == label] = False
+    largest = max(areas, default=0)
     clean, changed = tidied(mask, least)
+    # Where every island is small one of the largest stays: of several alike, any.
+    chosen = [area == largest and clean[islands == label].all() for label, area in enumerate(areas, 1)]
+    stays = 1 + chosen.index(True) if any(chosen) else 0
+    for label, area in enumerate(areas, 1):
+        if area < least and (largest >= least or label != stays):
+            expected[islands == label] = False
     np.testing.assert_array_equal(clean, expected)
     assert changed >= (expected != mask).any()
     assert clean.any() == expected.any()
