@@ -39,7 +39,7 @@ class Options:
 
     data: Data = lerf.PLAN.data
     scene: str = "figurines"
-    seed: int = 0
+    seed: int = 1
     level: str = "medium"
     fit_steps: int = lerf.PLAN.fit_steps
     out: str = str(results.HOME / "results" / "causes")
@@ -101,11 +101,21 @@ def main(options: Options = Options()) -> dict:
     columns = ("what", "texts", "recall", "purity", "miou", "miou_vala")
     table = results.table(columns, [tuple(row.get(name, "") for name in columns) for row in rows])
     text = f"{options.scene}, seed {options.seed}, a twin in LERF-OVS's layout, {options.level} noise.\n\n{table}"
-    names = [row["what"].replace(", ", "\n") for row in rows]
-    figure = results.bars(names, {"mIoU": [row["miou"] for row in rows]}, "mIoU")
-    results.save(Path(options.out), options, {"rows": rows}, text, figure)
+    results.save(Path(options.out), options, {"rows": rows}, text, draw(rows))
     print(text)
     return {"rows": rows}
+
+
+def draw(rows: list[dict]):
+    """A group of bars for each association and membership; lines for what needs no region."""
+    found = {row["what"]: row["miou"] for row in rows}
+    ways = [(by, way) for by in ASSOCIATIONS for way in MEMBERSHIPS]
+    series = {end: [found[f"{by}, {way}, {end}"] for by, way in ways] for end in (*ANCHORS, "region given")}
+    figure = results.bars([f"{by}\n{way}" for by, way in ways], series, "mIoU")
+    for name, style in (("true masks, votes", "--"), ("VALA", ":")):
+        figure.axes[0].axhline(found[name], color="0.3", linestyle=style, label=name)
+    figure.axes[0].legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5)
+    return figure
 
 
 if __name__ == "__main__":

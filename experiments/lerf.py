@@ -40,6 +40,7 @@ NOTES = (
     "of similarity, loc_mask by the mask. Labelled frames are held out. Mean over seeds ± deviation."
 )
 WHY = ""
+"""why the row held against the others does not lead where it does not: from `experiments.causes`"""
 
 
 def main(plan: tables.Plan) -> str:

@@ -71,6 +71,7 @@ def _file(plan: Plan, scene: str, seed: int, level: str, method: str) -> Path:
         plan.data.dataset,
         plan.data.root,
         plan.data.size,
+        twins.KIND,
         plan.data.every,
         plan.data.downscale,
         plan.fit_steps,

@@ -26,6 +26,8 @@ from jsecon.vision.simulated import LEVELS, Faults, SimulatedEmbedder, made_text
 
 PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)
 """true masks that agree in all views, each object embedded alike in all; texts and images lie apart, as in CLIP"""
+KIND = 2
+"""of twin: raised where what the writers write changes, so that nothing measured on another kind is taken for it"""
 WRITERS = {
     "lerf": twins.write_lerf_twin,
     "ovs3d": twins.write_ovs3d_twin,
@@ -57,7 +59,7 @@ def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict
     """
     place = root / f"{dataset}-seed{seed}-{level}"
     marker = place / scene / "made.json"
-    wanted = json.dumps({"seed": seed, "level": level, "size": size}, sort_keys=True)
+    wanted = json.dumps({"seed": seed, "level": level, "size": size, "kind": KIND}, sort_keys=True)
     if marker.exists() and marker.read_text() == wanted:
         return place
     number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
