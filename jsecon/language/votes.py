@@ -46,7 +46,7 @@ def region_votes(
     """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
 
     Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
-    is kept too (`Votes.by_view`, 4 T N bytes), as `query.showing.with_shown` wants it.
+    is kept too (`Votes.by_view`, 4 T N bytes, twice that while it is joined), as `query.showing.with_shown` wants it.
 
     Outside a trace the views are spread over jax's local devices, and over processes that all make the same call
     (`jax.distributed`), and `progress(done, total)` is called after each; inside one the views are scanned and

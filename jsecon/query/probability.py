@@ -16,8 +16,9 @@ def membership_probability(
 ) -> Float[Array, " n"]:
     """(N,) probability that most of a Gaussian belongs to what was selected, in [0, 1]; 0 where it was never seen.
 
-    `share` (N,) is what a query by votes returns as similarity: the part of all the weight with which the Gaussian was
-    seen that fell inside. Taken as draws of views, of which n count as independent, the true part has the posterior
+    `share` (N,) is what a query by votes returns as similarity: the part of the weight with which the Gaussian was
+    seen that fell inside, in the views that show the region where the votes know them. Taken as draws of views, of
+    which n count as independent (of all that see the Gaussian), the true part has the posterior
     Beta(1 + n share, 1 + n (1 - share)) under a flat prior, and the probability is what of it lies above one half.
     n is the number of views, at most the Gaussian's weight in pixels (a glimpse of a tenth of a pixel is no whole
     look), damped by `correlation` r to n / (1 + (n - 1) r). So 0.9 of one view's weight and 0.9 of twenty views' are
