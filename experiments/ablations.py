@@ -71,6 +71,8 @@ class View:
     """(K, d) codes of the texts."""
     phrases: np.ndarray
     """(C, d) of the canonical phrases."""
+    canonical: np.ndarray
+    """(C, E) the phrases themselves."""
 
 
 def built(sight: scenes.Sight, proof: scenes.Evidence, options: Options, *, tracking=True, weighting=True) -> View:
@@ -84,7 +86,7 @@ def built(sight: scenes.Sight, proof: scenes.Evidence, options: Options, *, trac
     labelled = state.votes.sum(1) >= 0.5 * state.total
     points = (state.votes @ np.asarray(table)) * labelled[:, None]
     asked, phrases = (np.asarray(encode(coder, jnp.asarray(a))) for a in (sight.texts, sight.canonical))
-    return View(state, np.asarray(table), points, asked, phrases)
+    return View(state, np.asarray(table), points, asked, phrases, sight.canonical)
 
 
 def selections(view: View, texts: np.ndarray, way: str, options: Options) -> list[np.ndarray]:
@@ -95,9 +97,9 @@ def selections(view: View, texts: np.ndarray, way: str, options: Options) -> lis
     if way == "canonical":
         ask = lambda code: query_canonical(points, code, view.phrases, options.canonical_threshold)
         return [np.asarray(ask(code).mask) for code in view.asked]
-    anchors = view.state.anchors(texts)
+    anchors = view.state.anchors(texts, view.canonical if way.endswith("contrast") else None)
     if way in VOTES:
-        shares = view.state.posteriors if way == "anchored by votes" else view.state.shares
+        shares = view.state.shares if way == VOTES[0] else view.state.posteriors
         return [share >= options.share for share in shares(view.state.joined(anchors))]
     return [np.asarray(query_one_step(points, view.table[a], options.code_threshold).mask) for a in anchors]
 
@@ -119,8 +121,8 @@ COMPONENTS = {
     "without DBSCAN": (True, True, True, False),
 }
 """row -> tracking, weighting, anchoring, DBSCAN"""
-VOTES = "anchored by votes of all views", "anchored by votes"
-"""the second, jsecon's own, by the views that show the region alone"""
+VOTES = "anchored by votes of all views", "anchored by votes", "anchored by votes, region by contrast"
+"""the second by the views that show the region alone; the third, jsecon's own, finds it by the contrast"""
 QUERIES = ("one-step", "canonical", "anchored by code", *VOTES)
 
 

@@ -6,7 +6,8 @@ Scenes: demo rooms of five seeds and replica_apartment_0 (where it lies beside t
 vision (jsecon.vision.simulated) at three levels of noise. One query an object, by its class; a class's selection is
 compared with the Gaussians whose true object it is. All ideas work on one pass of votes, kept view by view. The letters
 are those of the ideas' list: A evidence hygiene, C neutral Gaussians, D object posterior over the views that show it, E
-consensus of views, F masks that disagree, several descriptors, G neighbours, H threshold by the largest gap.
+consensus of views, F masks that disagree, several descriptors, G neighbours, H threshold by the largest gap. A text's
+region is the one with the largest cosine, "by contrast" the one that jsecon.query.retrieval finds.
 """
 
 import dataclasses
@@ -27,6 +28,7 @@ from experiments.reconcile import agree
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.grouping import group_by_consensus
 from jsecon.query.anchored import ALIKE_THRESHOLD, CODE_THRESHOLD
+from jsecon.query.retrieval import contrasts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,14 +59,22 @@ class State:
         self.votes = (proof.votes @ to_region).toarray()
         self.shows = np.zeros((views, regions), bool)
         self.shows[view[masks], ids[masks]] = True
-        flat = sight.embeddings.reshape(len(ids), -1)
-        self.embeddings = _unit(to_region.T @ (flat * sight.pixels.reshape(-1, 1)))
+        flat, pixels = sight.embeddings.reshape(len(ids), -1), sight.pixels.reshape(-1, 1)
+        self.embeddings, self.pixels = _unit(to_region.T @ (flat * pixels)), to_region.T @ pixels
         self.total = np.maximum(proof.seen.sum(1), 1e-12)
 
-    def anchors(self, texts: np.ndarray) -> np.ndarray:
-        """(K,) the region nearest to each text."""
-        known = np.any(self.embeddings != 0, 1)
-        return np.where(known[:, None], self.embeddings @ texts.T, -np.inf).argmax(0)
+    def similarities(self, texts: np.ndarray, canonical: np.ndarray | None = None) -> np.ndarray:
+        """(K, R) of texts and regions, -inf where a region has no embedding: the cosines, or with canonical phrases
+        (C, E) the contrasts."""
+        if canonical is None:
+            return np.where(np.any(self.embeddings != 0, 1), texts @ self.embeddings.T, -np.inf)
+        given = (jnp.asarray(a, jnp.float32) for a in (self.embeddings, texts, canonical, self.pixels))
+        score, known = _contrasts(*given)
+        return np.where(known, score, -np.inf)
+
+    def anchors(self, texts: np.ndarray, canonical: np.ndarray | None = None) -> np.ndarray:
+        """(K,) the region most similar to each text."""
+        return self.similarities(texts, canonical).argmax(1)
 
     def joined(self, anchors: np.ndarray, alike: float = ALIKE_THRESHOLD) -> list[np.ndarray]:
         """For each anchor the regions that are alike."""
@@ -101,6 +111,11 @@ class State:
         inside = np.asarray((self.proof.votes.T @ share)[np.arange(len(self.ids)), self.ids])
         everywhere = (self.proof.seen.T @ share)[self.view, self.ids]
         return inside, everywhere
+
+
+@jax.jit
+def _contrasts(embeddings, texts, canonical, pixels):
+    return jax.vmap(lambda text: contrasts(embeddings, text, canonical, pixels))(texts)
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:
@@ -233,6 +248,8 @@ def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence,
     tell("C entropy", [(s >= share) & ~u for s, u in zip(shares, unclear)])
     tell("C entropy and opacity <= 0.1", [(s >= share) & ~(u & (opacity <= 0.1)) for s, u in zip(shares, unclear)])
     tell("D views that show it", [p >= share for p in plain.posteriors(groups)])
+    found = plain.joined(plain.anchors(texts, sight.canonical))
+    tell("D, by contrast", [p >= share for p in plain.posteriors(found)])
     tell("D + G neighbours", [p >= share for p in neighbours_vote(plain, means, groups)])
     kept = consistent(sight, plain)
     tell("F masks dropped", [s >= share for s in kept.shares(kept.joined(kept.anchors(texts)))])
@@ -245,6 +262,8 @@ def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence,
     tell("E consensus", [s >= share for s in grouped.shares(found)])
     tell("E consensus, by lead", grouped.leads(found))
     tell("E + D", [p >= share for p in grouped.posteriors(found)])
+    found = grouped.joined(grouped.anchors(texts, sight.canonical))
+    tell("E + D, by contrast", [p >= share for p in grouped.posteriors(found)])
 
     ids = as_tracked.copy()
     ids[here] = agree(proof.votes[:, np.flatnonzero(here)], as_tracked[here])
@@ -253,6 +272,8 @@ def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence,
     found = agreed.joined(anchors)
     tell("F masks reconciled", [s >= share for s in agreed.shares(found)])
     tell("F reconciled + D", [p >= share for p in agreed.posteriors(found)])
+    by_contrast = agreed.joined(agreed.anchors(texts, sight.canonical))
+    tell("F reconciled + D, by contrast", [p >= share for p in agreed.posteriors(by_contrast)])
     tell("F reconciled + D, alike 0.9", [p >= share for p in agreed.posteriors(agreed.joined(anchors, 0.9))])
     tell("F reconciled + D + G", [p >= share for p in neighbours_vote(agreed, means, found)])
     tell("F reconciled + D + H", [p >= share for p in agreed.posteriors(by_gap(agreed, texts))])

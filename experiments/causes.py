@@ -3,7 +3,7 @@
     python -m experiments.causes [--quick]
 
 One twin of LERF-OVS as Table 1 uses it. Masks are associated over the frames by the tracker's ids, or by consensus. For
-each: how many texts find a region of the right object, by the largest cosine and by LERF's relevancy; how much of the
+each: how many texts find a region of the right object, by the cosine and by the contrast; how much of the
 object its best region holds over all frames (recall) and how much of that is the object's (purity); and mIoU of the
 text's region, and of the best region given, by each kind of membership: the share of the votes of all views; of the
 views that show the region; the lead. Above all stands what the Gaussians themselves allow: true masks, membership by
@@ -21,15 +21,15 @@ import numpy as np
 
 from experiments import lerf, results, tables
 from experiments.association import overlaps
-from experiments.methods import METHODS, Answers, Steps, anchor_of, ask_field, association, field_of
+from experiments.methods import METHODS, Answers, Steps, ask_field, association, field_of
 from experiments.setting import Setting, prepare
 from experiments.twins import Data
-from jsecon.query.anchored import query_region
+from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.outliers import remove_outliers
 from jsecon.types import Selection
 
 ASSOCIATIONS = ("tracks", "consensus")
-ANCHORS = ("cosine", "relevancy")
+RETRIEVALS = ("cosine", "contrast")
 MEMBERSHIPS = ("all_views", "votes", "lead")
 
 
@@ -92,11 +92,11 @@ def main(options: Options = Options()) -> dict:
             "purity": float(np.mean([joint[r, k] / max(size[r], 1) for r, k in zip(best, meant)])),
         }
         for way in MEMBERSHIPS:
-            for anchor in ANCHORS:
-                found = [anchor_of(field, text, anchor) for text in setting.texts]
+            for retrieval in RETRIEVALS:
+                found = [int(query_anchored(field, text, retrieval=retrieval).region) for text in setting.texts]
                 right = sum(r >= 0 and joint[r, k] == joint[r].max() > 0 for r, k in zip(found, meant))
-                answers = ask_field(setting, field, way, anchor=anchor)
-                told(f"{by}, {way}, {anchor}", answers, texts=f"{right} of {len(meant)}", **state)
+                answers = ask_field(setting, field, way, retrieval=retrieval)
+                told(f"{by}, {way}, {retrieval}", answers, texts=f"{right} of {len(meant)}", **state)
             told(f"{by}, {way}, region given", given(setting, field, best, way), **state)
     columns = ("what", "texts", "recall", "purity", "miou", "miou_vala")
     table = results.table(columns, [tuple(row.get(name, "") for name in columns) for row in rows])
@@ -110,7 +110,7 @@ def draw(rows: list[dict]):
     """A group of bars for each association and membership; lines for what needs no region."""
     found = {row["what"]: row["miou"] for row in rows}
     ways = [(by, way) for by in ASSOCIATIONS for way in MEMBERSHIPS]
-    series = {end: [found[f"{by}, {way}, {end}"] for by, way in ways] for end in (*ANCHORS, "region given")}
+    series = {end: [found[f"{by}, {way}, {end}"] for by, way in ways] for end in (*RETRIEVALS, "region given")}
     figure = results.bars([f"{by}\n{way}" for by, way in ways], series, "mIoU")
     for name, style in (("true masks, votes", "--"), ("VALA", ":")):
         figure.axes[0].axhline(found[name], color="0.3", linestyle=style, label=name)

@@ -144,7 +144,7 @@ def anchored(task: Task, codes: Any, votes: Votes, *, by: str) -> float:
     for k, text in enumerate(task.texts):
         true = task.truth == k
         if true.any():
-            mask = np.asarray(query_anchored(field, jnp.asarray(text), by=by).mask)
+            mask = np.asarray(query_anchored(field, jnp.asarray(text), by=by, retrieval="cosine").mask)
             ious.append((mask & true).sum() / (mask | true).sum())
     return float(np.mean(ious))
 

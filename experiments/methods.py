@@ -23,14 +23,12 @@ from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.distill import distill_l1, distill_votes
 from jsecon.language.votes import region_votes
-from jsecon.query.anchored import ALIKE_THRESHOLD, query_anchored, query_region
-from jsecon.query.canonical import query_canonical, relevancies
+from jsecon.query.anchored import query_anchored
+from jsecon.query.canonical import query_canonical
 from jsecon.query.one_step import query_one_step
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.showing import with_shown
 from jsecon.types import LanguageField, Regions, Selection, Votes
-
-_relevancies = jax.jit(relevancies)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +56,9 @@ class Answers:
 
     select: Callable[[int], Selection | None]
     classes: Callable[[], np.ndarray]
+
+
+Method = Callable[[Setting, Steps], Answers]
 
 
 def _by_selection(setting: Setting, select: Callable[[int], Selection | None]) -> Answers:
@@ -203,26 +204,17 @@ def field_of(
     )
 
 
-def anchor_of(field: LanguageField, text, anchor: str) -> int:
-    """The region that a text (E,) finds, by the largest "cosine", or by the largest "relevancy", LERF's: what makes a
-    region alike to every text, such as its noise along the texts' cone, then cancels against the canonical phrases."""
-    embeddings, text = jnp.asarray(field.regions.embeddings), jnp.asarray(text)
-    if anchor == "cosine":
-        return int(query_anchored(field, text).region)
-    return int(jnp.argmax(_relevancies(embeddings, text, jnp.asarray(field.canonical))[0]))
-
-
 def ask_field(
     setting: Setting,
     field: LanguageField,
     way: str,
     *,
-    anchor: str = "cosine",
+    retrieval: str = "contrast",
     clean: bool = True,
     threshold: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code
-    (all anchored), one_step or canonical; `clean` drops outliers. `anchor`: see `anchor_of`."""
+    (all anchored, by `retrieval`), one_step or canonical; `clean` drops outliers."""
     means = np.asarray(setting.evidence.gaussians.means)
     by, weight = ("votes", 1.0) if way == "all_views" else (way, None)
     phrases = jnp.asarray(field.canonical)
@@ -236,31 +228,28 @@ def ask_field(
         elif way == "canonical":
             code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
             found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
-        elif anchor == "cosine":
-            found = query_anchored(field, text, by=by, similarity_threshold=threshold, unlabelled_weight=weight)
         else:
-            best = anchor_of(field, text, anchor)
-            options = {"similarity_threshold": threshold, "unlabelled_weight": weight}
-            found = query_region(field, best, by=by, alike_threshold=ALIKE_THRESHOLD, **options)
-            # Compared over texts: of those that find one region, it is the answer to the most relevant.
-            score = _relevancies(jnp.asarray(field.regions.embeddings)[best][None], text, phrases)[0][0]
-            found = dataclasses.replace(found, score=score)
+            options = {"similarity_threshold": threshold, "unlabelled_weight": weight, "retrieval": retrieval}
+            found = query_anchored(field, text, by=by, **options)
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
     return _by_selection(setting, ask)
 
 
-def _field(way: str, *, anchor: str = "cosine", clean: bool = True, **options) -> Callable[[Setting, Steps], Answers]:
-    return lambda setting, steps: ask_field(setting, field_of(setting, **options), way, anchor=anchor, clean=clean)
+def _field(way: str, *, retrieval: str = "contrast", clean: bool = True, **options) -> Method:
+    return lambda setting, steps: ask_field(
+        setting, field_of(setting, **options), way, retrieval=retrieval, clean=clean
+    )
 
 
 def paper(setting: Setting, steps: Steps) -> Answers:
-    """The paper's own path: tracks, phi_bar, 3-d codes trained on the rendered L1, anchored by code, DBSCAN."""
-    return ask_field(setting, field_of(setting, latent=3, steps=steps), "code")
+    """The paper's own path: tracks, phi_bar, 3-d codes trained on the rendered L1, the region of the largest cosine,
+    anchored by code, DBSCAN."""
+    return ask_field(setting, field_of(setting, latent=3, steps=steps), "code", retrieval="cosine")
 
 
-METHODS: dict[str, Callable[[Setting, Steps], Answers]] = {
+METHODS: dict[str, Method] = {
     "LangSplat-m": langsplat,
     "Gaussian Grouping-m": gaussian_grouping,
     "OpenGaussian": opengaussian,
@@ -268,36 +257,36 @@ METHODS: dict[str, Callable[[Setting, Steps], Answers]] = {
     "weighted back-projection": _lifted(lifting.train_backprojection),
     "VALA": _lifted(lifting.train_vala),
     "the paper's path": paper,
-    "ours, tracks, votes": _field("votes"),
-    "ours, tracks, lead": _field("lead"),
-    "ours, consensus, votes": _field("votes", by="consensus"),
-    "ours, consensus, lead": _field("lead", by="consensus"),
-    "ours, consensus, votes, relevancy": _field("votes", by="consensus", anchor="relevancy"),
+    "ours, tracks": _field("votes"),
+    "ours, consensus": _field("votes", by="consensus"),
 }
 """the rows of Tables 1 to 3"""
-RECOMMENDED = "ours, consensus, votes"
+RECOMMENDED = "ours, consensus"
 """what jsecon does by default with masks of single frames: the row to hold against the others"""
-COMPONENTS: dict[str, Callable[[Setting, Steps], Answers]] = {
+COMPONENTS: dict[str, Method] = {
     "per-frame masks, one-step": langsplat,
     "masklets, one-step": _field("one_step", clean=False),
-    "masklets, anchored by code": _field("code", clean=False),
-    "+ DBSCAN (the paper, distilled by votes)": _field("code"),
-    "uniform instead of pixel weights": _field("code", uniform=True),
-    "3-d autoencoder codes instead of spread ones": _field("code", latent=3),
+    "masklets, anchored by code": _field("code", retrieval="cosine", clean=False),
+    "+ DBSCAN (the paper, distilled by votes)": _field("code", retrieval="cosine"),
+    "uniform instead of pixel weights": _field("code", retrieval="cosine", uniform=True),
+    "3-d autoencoder codes instead of spread ones": _field("code", retrieval="cosine", latent=3),
     "trained on the rendered L1 (the paper's path)": paper,
-    "membership by votes of all views": _field("all_views"),
-    "membership by votes of the views that show it": _field("votes"),
-    "membership by lead": _field("lead"),
-    "masks associated by consensus, by votes": _field("votes", by="consensus"),
-    "consensus, by votes, anchored by relevancy": _field("votes", by="consensus", anchor="relevancy"),
+    "membership by votes of all views": _field("all_views", retrieval="cosine"),
+    "membership by votes of the views that show it": _field("votes", retrieval="cosine"),
+    "the region by contrast": _field("votes"),
+    "masks associated by consensus, the region by cosine": _field("votes", retrieval="cosine", by="consensus"),
+    "masks associated by consensus, the region by contrast (ours)": _field("votes", by="consensus"),
+    "ours, membership by lead": _field("lead", by="consensus"),
 }
 """the rows of Table 4"""
-QUERIES: dict[str, Callable[[Setting, Steps], Answers]] = {
+QUERIES: dict[str, Method] = {
     "one-step": _field("one_step"),
     "canonical": _field("canonical"),
-    "anchored by code": _field("code"),
-    "anchored by votes of all views": _field("all_views"),
-    "anchored by votes": _field("votes"),
-    "anchored by lead": _field("lead"),
+    "anchored by code": _field("code", retrieval="cosine"),
+    "anchored by votes of all views": _field("all_views", retrieval="cosine"),
+    "anchored by votes": _field("votes", retrieval="cosine"),
+    "anchored by lead": _field("lead", retrieval="cosine"),
+    "anchored by code, the region by contrast": _field("code"),
+    "anchored by votes, the region by contrast": _field("votes"),
 }
 """the rows of Table 5"""

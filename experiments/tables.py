@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from experiments import results, twins
-from experiments.methods import Answers, Steps
+from experiments.methods import Answers, Method, Steps
 from experiments.setting import Setting, prepare
 from jsecon.data.benchmark import Benchmark
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.evaluate.points import evaluate_points
 from jsecon.files import write_text
 
-Method = Callable[[Setting, Steps], Answers]
 KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "pairs", "missing", "accuracy")
 
 

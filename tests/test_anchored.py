@@ -1,6 +1,8 @@
 """The anchored query, by votes and by codes, against NumPy; the region under a pixel against a rendering."""
 
 import dataclasses
+import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from small_field import REGIONS, make_field, true_regions, unit_rows
 from jsecon.errors import InputError
 from jsecon.query.anchored import query_anchored, query_region, region_at, region_shares_at
 from jsecon.query.pixel import pixel_weights
+from jsecon.query.retrieval import contrasts
 from jsecon.splat.render import render
 from jsecon.types import Regions, Votes
 
@@ -44,7 +47,8 @@ def test_a_text_like_a_region_finds_it_and_its_gaussians(field, region):
     text = field.regions.embeddings[region] + 0.1 * unit_rows(np.random.default_rng(region), 1, 12)[0]
     got = query_anchored(field, text)
     assert int(got.region) == region
-    assert float(got.score) == pytest.approx(exact_cosine(field.regions.embeddings[[region]], text)[0], abs=1e-6)
+    cosine = exact_cosine(field.regions.embeddings[[region]], text)[0]
+    assert float(query_anchored(field, text, retrieval="cosine").score) == pytest.approx(cosine, abs=1e-6)
     share = exact_share(field.votes, [region])
     np.testing.assert_allclose(got.similarity, share, atol=1e-6)
     np.testing.assert_array_equal(got.mask, share >= 0.5)
@@ -81,10 +85,12 @@ def test_a_region_asked_for_by_its_number_is_the_same(field):
 
 def test_nothing_passes_a_retrieval_threshold_that_no_region_reaches(field):
     text = unit_rows(np.random.default_rng(9), 1, 12)[0]
-    best = exact_cosine(field.regions.embeddings, text).max()
-    for by in ("votes", "code"):
-        assert int(query_anchored(field, text, retrieval_threshold=best - 1e-4, by=by).region) >= 0
-        nothing = query_anchored(field, text, retrieval_threshold=best + 1e-4, similarity_threshold=-1.0, by=by)
+    given = field.regions.embeddings, text, field.canonical, field.regions.pixels
+    largest = {"cosine": exact_cosine(*given[:2]).max(), "contrast": float(contrasts(*given)[0].max())}
+    for by, (retrieval, best) in itertools.product(("votes", "code"), largest.items()):
+        ask = functools.partial(query_anchored, field, text, by=by, retrieval=retrieval)
+        assert int(ask(retrieval_threshold=best - 1e-4).region) >= 0
+        nothing = ask(retrieval_threshold=best + 1e-4, similarity_threshold=-1.0)
         assert int(nothing.region) == -1
         assert not nothing.mask.any()
         assert float(nothing.score) == pytest.approx(best, abs=1e-6)  # how close it was is still told

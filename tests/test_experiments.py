@@ -182,6 +182,7 @@ def test_ideas_answer_what_the_votes_say(two_objects):
     plain = beyond.State(sight, proof, ids, ok, 2)
     groups = plain.joined(plain.anchors(sight.texts))
     assert [list(g) for g in groups] == [[0], [1]]
+    assert plain.anchors(sight.texts, sight.canonical).tolist() == [0, 1]
     np.testing.assert_allclose(plain.shares(groups)[0][[0, 30, 60]], [5 / 6, 1 / 6, 0])
     assert beyond.point_miou(plain.leads(groups), truth) == 1
     assert not any(u.any() for u in beyond.ambiguous(plain, groups))

@@ -10,7 +10,7 @@ import pytest
 from scipy import sparse
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
-from experiments import ablations, autoencoder, code_paths, distillation, scenes
+from experiments import ablations, autoencoder, code_paths, distillation, retrieval, scenes
 from jsecon import cache
 from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Regions
@@ -140,3 +140,28 @@ def test_ablated_parts_change_what_they_should():
         )
         assert ablations.scored(found, truth, means, dbscan=False) == (1.0, 1.0), way
     assert ablations.scored([np.zeros(80, bool)] * 2, truth, means, dbscan=True) == (0.0, 0.0)
+
+
+def test_every_rule_of_retrieval_is_asked_for_what_is_there_and_what_is_not(task):
+    labels, shape = np.asarray(task.labels), task.labels.shape
+    frames = np.random.default_rng(0).integers(0, 255, (*shape, 3), dtype=np.uint8)
+    scene = scenes.Scene(
+        "small", task.gaussians, task.cameras, frames, labels, REGIONS, seed=0, truth=np.asarray(task.truth)
+    )
+    space = made_text_space([f"word {i}" for i in range(40)])
+    options = retrieval.Options(levels=("low",), absent=30)
+    asked = retrieval.ask(scene, "low", space, options)
+    assert [(a.regions, a.rule) for a in asked] == [
+        (r, rule) for r in ("tracks", "consensus") for rule in retrieval.RULES
+    ]
+    assert all(len(a.right) == len(a.best) == len(a.iou) == REGIONS and 25 <= len(a.absent) <= 30 for a in asked)
+    rules, thresholds = retrieval.rows_of(asked, options)
+    found = {(row["regions"], row["rule"]): row for row in rules}
+    assert found["tracks", "contrast"]["low texts"] >= 0.8
+    assert found["tracks", "contrast"]["low there or not"] > found["tracks", "cosine"]["low there or not"]
+    for rule in retrieval.RULES:
+        own = [row for row in thresholds if (row["regions"], row["rule"]) == ("tracks", rule)]
+        refused = [row["low not there, refused"] for row in own]
+        assert refused == sorted(refused)
+        assert refused[-1] > 0
+        assert own[0]["mIoU"] >= own[-1]["mIoU"]

@@ -26,7 +26,7 @@ from jsecon.data.lerf_ovs import LERF_PAIRS
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.fit.initialise import gaussians_from_points
 
-TRACKED = "ours, tracks, votes"
+TRACKED = "ours, tracks"
 CHEAP = ("VALA", TRACKED)
 
 

@@ -1,4 +1,4 @@
-"""The anchored query (the paper's): text -> most similar region -> the Gaussians that carry that region.
+"""The anchored query (the paper's): text -> the region that answers it -> the Gaussians that carry that region.
 
 The gap between a text's and an image's embedding is crossed once, among R regions, where only the order matters; the
 Gaussians are then compared with a region of their own kind, so that almost any threshold does.
@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.query.one_step import Codes, Number, as_codes, similarities
 from jsecon.query.pixel import region_at, region_shares_at
+from jsecon.query.retrieval import answers, require_retrieval, threshold_of
 from jsecon.query.shares import gather_votes
 from jsecon.query.units import UnitCodes
 from jsecon.types import Array, LanguageField, Selection
@@ -21,7 +22,6 @@ __all__ = [
     "ALIKE_THRESHOLD",
     "CODE_THRESHOLD",
     "LEAD_THRESHOLD",
-    "RETRIEVAL_THRESHOLD",
     "SHARE_THRESHOLD",
     "query_anchored",
     "query_region",
@@ -29,11 +29,6 @@ __all__ = [
     "region_shares_at",
 ]
 
-RETRIEVAL_THRESHOLD = 0.2
-"""The paper's "low threshold to filter invalid prompts", which it does not state. In CLIP ViT-B/16 an image has a
-cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without CLIP's gap are
-far above for texts that fit. It only tells "nothing here" from "the best there is": which region is the best does not
-depend on it."""
 CODE_THRESHOLD = 0.9
 """on the cosine of codes: codes that were distilled from one region lie within a few degrees (0.9 is 26)"""
 SHARE_THRESHOLD = 0.5
@@ -52,6 +47,8 @@ class _Parts(NamedTuple):
     """What a query reads of a field; the rest need not pass into the compiled function."""
 
     embeddings: Array
+    pixels: Array
+    canonical: Array
     region_codes: Array
     codes: Codes
     regions: Array
@@ -66,17 +63,20 @@ def query_anchored(
     field: LanguageField,
     text_embedding: Float[Array, " e"],
     *,
-    retrieval_threshold: Number = RETRIEVAL_THRESHOLD,
+    retrieval_threshold: Number | None = None,
     similarity_threshold: Number | None = None,
     by: str = "votes",
+    retrieval: str = "contrast",
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     unlabelled_weight: Number | None = None,
     codes: UnitCodes | None = None,
 ) -> Selection:
-    """The Gaussians of the region that a text's embedding (E,) is most similar to.
+    """The Gaussians of the region that answers a text's embedding (E,) best.
 
-    Retrieval: the region with the largest cosine; where that is below `retrieval_threshold` nothing is selected, and
-    Selection.region is -1. Membership, `by`:
+    Retrieval: the region with the largest similarity, `retrieval`: "contrast", what sets the text apart from the
+    canonical phrases against what sets the region apart from the scene (`contrasts` has the formula), or "cosine", the
+    plain one (the paper). Where the largest is below `retrieval_threshold` (default 0.12 for contrast, 0.2 for cosine)
+    nothing is selected, and Selection.region is -1; Selection.score is how much it was. Membership, `by`:
     "votes": the region's share of the weight with which the Gaussian was seen in the views that show the region
         (`Votes.shown`, from `with_shown`), an estimate of the probability that a pixel of it belongs to the region;
         default threshold 0.5. Votes that do not know which views show what are compared with the weight of all views;
@@ -109,17 +109,19 @@ def query_anchored(
         expected="'code', 'votes' or 'lead'",
         remedy="'votes' is the default.",
     )
+    require_retrieval(retrieval, "query_anchored")
     if field.regions.count == 0:
         return _nothing(field)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
     return _query(
         _parts(field, codes),
         jnp.asarray(text_embedding),
-        retrieval_threshold,
+        threshold_of(retrieval, retrieval_threshold),
         threshold,
         alike_threshold,
         unlabelled_weight,
         by,
+        retrieval,
     )
 
 
@@ -170,6 +172,8 @@ def _parts(field: LanguageField, codes: UnitCodes | None = None) -> _Parts:
             as_codes(a)
             for a in (
                 field.regions.embeddings,
+                field.regions.pixels,
+                field.canonical,
                 field.region_codes,
                 field.codes if codes is None else codes,
                 votes.regions,
@@ -188,11 +192,11 @@ def _nothing(field: LanguageField) -> Selection:
     return Selection(jnp.zeros(n, bool), jnp.zeros(n, dtype), jnp.asarray(-1, jnp.int32), jnp.zeros((), dtype))
 
 
-def _query_body(parts, text, retrieval_threshold, threshold, alike_threshold, unlabelled_weight, by) -> Selection:
-    similarity, known = similarities(parts.embeddings, text)
+def _query_body(parts, text, least, threshold, alike_threshold, unlabelled_weight, by, retrieval) -> Selection:
+    similarity, known = answers(parts.embeddings, text, parts.canonical, parts.pixels, retrieval)
     similarity = jnp.where(known, similarity, -jnp.inf)
     anchor = jnp.argmax(similarity)
-    passed = similarity[anchor] >= retrieval_threshold
+    passed = similarity[anchor] >= least
     score = jnp.where(known[anchor], similarity[anchor], 0.0)
     return _members_body(parts, jnp.where(passed, anchor, -1), score, threshold, alike_threshold, unlabelled_weight, by)
 
@@ -228,5 +232,5 @@ def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_w
     return Selection(mask, similarity, jnp.asarray(region, jnp.int32), score)
 
 
-_query = jax.jit(_query_body, static_argnames="by")
+_query = jax.jit(_query_body, static_argnames=("by", "retrieval"))
 _members = jax.jit(_members_body, static_argnames="by")

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError, require
-from jsecon.query.anchored import ALIKE_THRESHOLD, RETRIEVAL_THRESHOLD, SHARE_THRESHOLD
+from jsecon.query.anchored import ALIKE_THRESHOLD, SHARE_THRESHOLD
 from jsecon.query.one_step import Number, similarities
+from jsecon.query.retrieval import answers, require_retrieval, threshold_of
 from jsecon.query.shares import gather_votes
 from jsecon.types import Array, LanguageField, Selection
 
@@ -16,33 +17,36 @@ NEARNESS = 0.8
 """a region answers a text with the best one where its similarity has come at least so far from that of the middle
 region to that of the best"""
 
+ROUNDING = 1e-5
+"""similarities that differ by no more are equal: one text, wanted and unwanted, answers to neither"""
+
 
 def regions_of_text(
     embeddings: Float[Array, "r e"],
-    text: Float[Array, " e"],
+    similarity: Float[Array, " r"],
+    known: Bool[Array, " r"],
     *,
+    retrieval_threshold: Number,
     several: bool = True,
     nearness: Number = NEARNESS,
-    retrieval_threshold: Number = RETRIEVAL_THRESHOLD,
     alike_threshold: Number = ALIKE_THRESHOLD,
-) -> tuple[Bool[Array, " r"], Float[Array, " r"]]:
-    """Which of R regions answer a text (E,), and all regions' cosines with it (R,), 0 where a region has no embedding.
+) -> Bool[Array, " r"]:
+    """Which of R regions answer a text that each has a similarity with (R,), where that is known (R,).
 
-    The rule: the region with the largest cosine, b, if b is at least `retrieval_threshold`; with it all regions alike
-    (cosine with it at least `alike_threshold`: one thing seen twice). With `several` also every region whose cosine is
-    at least m + nearness (b - m), m the median over the regions: texts and images lie in cones of their own, so that
-    only the place between the typical region and the best means something, not the cosine itself.
+    The rule: the region with the largest similarity, b, if b is at least `retrieval_threshold`; with it all regions
+    alike (cosine of the embeddings (R, E) at least `alike_threshold`: one thing seen twice). With `several` also every
+    region whose similarity is at least m + nearness (b - m), m the median over the regions: only the place between the
+    typical region and the best means something, whatever the similarity.
     """
-    cosines, known = similarities(embeddings, text)
-    scored = jnp.where(known, cosines, -jnp.inf)
+    scored = jnp.where(known, similarity, -jnp.inf)
     anchor = jnp.argmax(scored)
     best = scored[anchor]
     alike, known_alike = similarities(embeddings, embeddings[anchor])
     chosen = (jnp.arange(embeddings.shape[0]) == anchor) | (known_alike & (alike >= alike_threshold))
     if several:
-        middle = jnp.nanmedian(jnp.where(known, cosines, jnp.nan))
-        chosen |= known & (cosines >= middle + nearness * (best - middle)) & (best > middle)
-    return chosen & known & (best >= retrieval_threshold), cosines
+        middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
+        chosen |= known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
+    return chosen & known & (best >= retrieval_threshold)
 
 
 def query_several(
@@ -52,16 +56,18 @@ def query_several(
     *,
     several: bool = True,
     nearness: Number = NEARNESS,
-    retrieval_threshold: Number = RETRIEVAL_THRESHOLD,
+    retrieval: str = "contrast",
+    retrieval_threshold: Number | None = None,
     similarity_threshold: Number = SHARE_THRESHOLD,
 ) -> Selection:
     """The Gaussians of all regions that answer any of the wanted texts (Q, E) and none of the unwanted (U, E).
 
-    A region answers a text by the rule of `regions_of_text`. One that answers a wanted and an unwanted text belongs to
+    A region answers a text by the rule of `regions_of_text`, on the similarities that `retrieval` names, as in
+    `query_anchored`. One that answers a wanted and an unwanted text belongs to
     the one that it is more similar to, so that "mug but not handle" keeps the mug where the handle was never told
     apart. Membership is by votes, as in `query_anchored`: of the weight with which a Gaussian was seen in the views
     that show a chosen region, at least `similarity_threshold` lies on the chosen ones. Selection.region is the best of
-    the chosen, -1 where there is none; Selection.score its cosine. Pure: jit it or vmap it over texts. Raises
+    the chosen, -1 where there is none; Selection.score its similarity. Pure: jit it or vmap it over texts. Raises
     ValueError on texts of another size.
     """
     size = field.regions.embeddings.shape[1]
@@ -73,21 +79,37 @@ def query_several(
         expected=f"(Q >= 1, {size}) and (U, {size})",
         remedy="Embed the texts with the field's embedder.",
     )
-    votes = field.votes
+    require_retrieval(retrieval, "query_several")
+    votes, known = field.votes, (field.regions.embeddings, field.regions.pixels, field.canonical)
     return _several(
-        *(jnp.asarray(a) for a in (field.regions.embeddings, votes.regions, votes.weights, votes.total, votes.views)),
+        *(jnp.asarray(a) for a in (*known, votes.regions, votes.weights, votes.total, votes.views)),
         None if votes.shown is None else jnp.asarray(votes.shown),
         jnp.asarray(wanted),
         unwanted,
         several,
         nearness,
-        retrieval_threshold,
+        threshold_of(retrieval, retrieval_threshold),
         similarity_threshold,
+        retrieval,
     )
 
 
 def _several_body(
-    embeddings, regions, weights, total, views, shown, wanted, unwanted, several, nearness, retrieval, threshold
+    embeddings,
+    pixels,
+    canonical,
+    regions,
+    weights,
+    total,
+    views,
+    shown,
+    wanted,
+    unwanted,
+    several,
+    nearness,
+    least,
+    threshold,
+    retrieval,
 ) -> Selection:
     count = embeddings.shape[0]
     if count == 0:
@@ -97,15 +119,16 @@ def _several_body(
     def answering(texts):
         chosen, closeness = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, embeddings.dtype)
         for text in texts:
-            own, cosines = regions_of_text(
-                embeddings, text, several=several, nearness=nearness, retrieval_threshold=retrieval
+            similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
+            own = regions_of_text(
+                embeddings, similarity, known, retrieval_threshold=least, several=several, nearness=nearness
             )
-            chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, cosines, -jnp.inf))
+            chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, similarity, -jnp.inf))
         return chosen, closeness
 
     chosen, closeness = answering(wanted)
     refused, against = answering(unwanted)
-    chosen &= ~(refused & (against >= closeness))
+    chosen &= ~(refused & (against >= closeness - ROUNDING))
     weight, _, seen = gather_votes(regions, weights, chosen, shown)
     seen = total if seen is None else seen
     known = (views > 0) & (seen > 0) & jnp.isfinite(seen) & jnp.isfinite(weight) & jnp.any(chosen)
@@ -120,7 +143,7 @@ def _several_body(
     )
 
 
-_several = jax.jit(_several_body, static_argnames="several")
+_several = jax.jit(_several_body, static_argnames=("several", "retrieval"))
 
 
 def parts_of_question(question: str) -> tuple[list[str], list[str]]:

@@ -1,0 +1,176 @@
+"""Which region answers a text: contrasts against NumPy in float64, and what they are for."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from small_field import make_field, unit_rows
+
+from jsecon.query.anchored import query_anchored
+from jsecon.query.one_step import similarities
+from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD, contrasts as plain_contrasts
+from jsecon.types import Regions
+
+SIZE = 12
+contrasts = jax.jit(plain_contrasts)
+
+
+def unit(rows):
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def exact(embeddings, text, canonical, pixels):
+    """The formula, for sound rows."""
+    rows, weight = unit(embeddings.astype(np.float64)), pixels.sum(1).astype(np.float64)
+    weight = weight if weight.sum() else np.ones(len(rows))
+    apart = rows - len(rows) / (len(rows) + 1) * (weight @ rows) / weight.sum()
+    across = unit(text.astype(np.float64))
+    if len(canonical):
+        cone = unit(unit(canonical.astype(np.float64)).sum(0))
+        across = across - (across @ cone) * cone
+    return unit(apart) @ unit(across)
+
+
+@pytest.fixture
+def parts():
+    rng = np.random.default_rng(7)
+    rows = unit_rows(rng, 7, SIZE), unit_rows(rng, 1, SIZE)[0], unit_rows(rng, 4, SIZE)
+    return (*rows, rng.integers(0, 900, (7, 3)))
+
+
+def test_equals_the_formula(parts):
+    embeddings, text, canonical, pixels = parts
+    got, known = contrasts(*parts)
+    np.testing.assert_allclose(got, exact(*parts), atol=1e-6)
+    np.testing.assert_allclose(got, plain_contrasts(*parts)[0], atol=1e-6)  # jit equals eager
+    assert np.asarray(known).all()
+    for phrases in (np.zeros((0, SIZE), np.float32), canonical[:1]):
+        got, _ = contrasts(embeddings, text, phrases, pixels)
+        np.testing.assert_allclose(got, exact(embeddings, text, phrases, pixels), atol=1e-6)
+    got, _ = contrasts(embeddings, text, canonical, 0 * pixels)  # regions without pixels count alike
+    np.testing.assert_allclose(got, exact(embeddings, text, canonical, 0 * pixels), atol=1e-6)
+
+
+def test_of_a_single_region_without_phrases_it_is_the_cosine(parts):
+    embeddings, text, _, pixels = parts
+    got, _ = contrasts(embeddings[:1], text, np.zeros((0, SIZE), np.float32), pixels[:1])
+    np.testing.assert_allclose(got, similarities(jnp.asarray(embeddings[:1]), jnp.asarray(text))[0], atol=1e-6)
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**31), power=st.integers(-30, 30))
+def test_lengths_do_not_count(seed, power):
+    rng = np.random.default_rng(seed)
+    embeddings, text, canonical = unit_rows(rng, 5, SIZE), unit_rows(rng, 1, SIZE)[0], unit_rows(rng, 4, SIZE)
+    pixels, factor = rng.integers(0, 900, (5, 2)), np.float32(10.0**power)
+    expected, _ = contrasts(embeddings, text, canonical, pixels)
+    got, known = contrasts(embeddings * factor, text / factor, canonical * factor, pixels)
+    assert np.asarray(known).all()
+    np.testing.assert_allclose(got, expected, atol=2e-6)
+
+
+def test_what_is_no_direction_is_left_out(parts):
+    embeddings, text, canonical, pixels = parts
+    rows = np.concatenate([embeddings, np.zeros((1, SIZE), np.float32), np.full((1, SIZE), np.nan, np.float32)])
+    wider = np.concatenate([pixels, pixels[:2]])
+    got, known = contrasts(rows, text, canonical, wider)
+    np.testing.assert_array_equal(known, [True] * 7 + [False] * 2)
+    np.testing.assert_allclose(got, np.append(exact(*parts), [0, 0]), atol=1e-6)
+    phrases = np.concatenate([canonical, np.zeros((1, SIZE), np.float32), np.full((1, SIZE), np.inf, np.float32)])
+    got, _ = contrasts(embeddings, text, phrases, pixels)
+    np.testing.assert_allclose(got, exact(*parts), atol=1e-6)
+    for bad in (np.zeros_like(text), np.full_like(text, np.nan), unit(unit(canonical).sum(0)).astype(np.float32)):
+        got, known = contrasts(embeddings, bad, canonical, pixels)  # the last lies along the phrases' cone
+        assert not np.asarray(known).any()
+        np.testing.assert_array_equal(got, 0)
+    got, known = contrasts(embeddings[:0], text, canonical, pixels[:0])
+    assert got.shape == known.shape == (0,)
+
+
+def test_regions_that_are_all_alike_are_all_as_near(parts):
+    embeddings, text, canonical, pixels = parts
+    same = np.repeat(embeddings[:1], 7, 0)
+    got, known = contrasts(same, text, canonical, pixels)
+    assert np.asarray(known).all()
+    np.testing.assert_allclose(got, contrasts(same[:1], text, canonical, pixels[:1])[0][0], atol=1e-5)
+
+
+def test_jit_and_vmap_over_texts_equal_the_loop_for_many_regions():
+    rng = np.random.default_rng(3)
+    embeddings, texts, canonical = unit_rows(rng, 40_000, SIZE), unit_rows(rng, 3, SIZE), unit_rows(rng, 4, SIZE)
+    pixels = rng.integers(0, 900, (40_000, 2))
+    together, known = jax.jit(jax.vmap(lambda text: contrasts(embeddings, text, canonical, pixels)))(texts)
+    assert np.asarray(known).all()
+    for got, text in zip(together, texts):
+        np.testing.assert_allclose(got, contrasts(embeddings, text, canonical, pixels)[0], atol=1e-6)
+        np.testing.assert_allclose(got, exact(embeddings, text, canonical, pixels), atol=5e-6)
+
+
+def test_gradient_equals_central_differences(parts):
+    embeddings, text, canonical, pixels = parts
+    with jax.enable_x64(True):
+        given = tuple(jnp.asarray(a, jnp.float64) for a in (embeddings, text, canonical))
+        weights = jnp.asarray(np.random.default_rng(0).normal(size=7))
+
+        def total(*given):
+            return jnp.sum(weights * contrasts(*given, jnp.asarray(pixels))[0])
+
+        for place, gradient in enumerate(jax.grad(total, (0, 1, 2))(*given)):
+            step = np.random.default_rng(place).normal(size=given[place].shape) * 1e-6
+            moved = [total(*(a + s * step if i == place else a for i, a in enumerate(given))) for s in (1, -1)]
+            assert float(jnp.sum(gradient * step)) == pytest.approx(float(moved[0] - moved[1]) / 2, rel=1e-5)
+
+
+def clip_like(rng, *, gap):
+    """Eight objects' texts in a cone, the regions' embeddings across a gap from it with noise, and the phrases."""
+    axes = np.linalg.qr(rng.normal(size=(SIZE * 8, SIZE * 8)))[0]
+    texts = unit(axes[0] + 0.6 * axes[2:10])
+    canonical = unit(axes[0] + 0.6 * axes[10:14])
+    images = unit(texts + gap * axes[1] - 0.5 * axes[0] + 0.3 * rng.normal(size=(8, 1)) * axes[0])
+    return (a.astype(np.float32) for a in (images, texts, canonical, unit(axes[0] + 0.6 * axes[14:22])))
+
+
+def test_finds_across_a_gap_what_the_cosine_does_not():
+    rng = np.random.default_rng(0)
+    right = {"contrast": 0, "cosine": 0}
+    passed = {"there": 0, "not there": 0}
+    for _ in range(20):
+        images, texts, canonical, absent = clip_like(rng, gap=2.0)
+        pixels = rng.integers(100, 900, (8, 2))
+        for k in range(8):
+            got = np.asarray(contrasts(images, texts[k], canonical, pixels)[0])
+            right["contrast"] += got.argmax() == k
+            right["cosine"] += (images @ texts[k]).argmax() == k
+            passed["there"] += got.max() >= CONTRAST_THRESHOLD
+            passed["not there"] += (
+                np.asarray(contrasts(images, absent[k], canonical, pixels)[0]).max() >= CONTRAST_THRESHOLD
+            )
+    assert right["contrast"] == 160 > 1.2 * right["cosine"]
+    assert passed == {"there": 160, "not there": 0}
+
+
+def test_a_query_finds_its_region_by_the_one_or_the_other(scene, cameras):
+    field, _ = make_field(scene, cameras)
+    images, texts, canonical, _ = clip_like(np.random.default_rng(2), gap=2.0)
+    pixels = np.asarray(field.regions.pixels)
+    clip = dataclasses.replace(field, regions=Regions(images[:5], pixels), canonical=canonical)
+    differ = 0
+    for text in texts[:5]:
+        scores = {"cosine": images[:5] @ text, "contrast": exact(images[:5], text, canonical, pixels)}
+        for retrieval, score in scores.items():
+            got = query_anchored(clip, text, retrieval=retrieval)
+            assert int(got.region) == score.argmax()
+            assert float(got.score) == pytest.approx(score.max(), abs=1e-5)
+        differ += scores["cosine"].argmax() != scores["contrast"].argmax()
+    assert differ
+    assert float(query_anchored(clip, texts[0]).score) == float(
+        query_anchored(clip, texts[0], retrieval="contrast").score
+    )
+    low, high = (query_anchored(clip, -texts[0], retrieval="cosine", retrieval_threshold=t).region for t in (-1, None))
+    assert int(low) >= 0 > int(high)  # without a threshold it is RETRIEVAL_THRESHOLD
+    assert (images[:5] @ -texts[0]).max() < RETRIEVAL_THRESHOLD
+    with pytest.raises(ValueError, match="contrast"):
+        query_anchored(clip, texts[0], retrieval="nearest")
