@@ -69,11 +69,12 @@ def write_answers(
     renderer, parts = pictures.Renderer(field.gaussians, field.cameras), []
     for n, item in enumerate(answers):
         told = answer.write_answer(field, item, out, views=views)
-        place = (
-            f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
-            if told["place"]
-            else "nothing selected"
-        )
+        if told["place"]:
+            place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
+        elif told["region"] is None and item.by in ("votes", "code"):
+            place = "nothing selected: no region answers it"
+        else:
+            place = "nothing selected"
         reporter.say(
             f"{item.question!r}: {told['count']} of {told['of']} Gaussians, score {told['score']:.3f}, "
             f"region {told['region']}, {place}"
