@@ -27,6 +27,7 @@ from jsecon.query.anchored import query_anchored
 from jsecon.query.canonical import query_canonical
 from jsecon.query.masks import selection_mask
 from jsecon.query.one_step import query_one_step
+from jsecon.query.probability import membership_probability
 from jsecon.query.showing import with_shown
 from jsecon.types import Camera, Gaussians, LanguageField
 from jsecon.vision.simulated import LEVELS, SimulatedEmbedder
@@ -66,6 +67,13 @@ def ask(field: LanguageField, coded: str, texts, asked, phrases, threshold: floa
         kinds[f"anchored by {by}"] = lambda text, code, by=by: query_anchored(
             field, text, similarity_threshold=threshold, by=by
         )
+
+    def sure(text, code):
+        found = query_anchored(field, text)
+        probability = membership_probability(found.similarity, field.votes)
+        return dataclasses.replace(found, mask=(found.region >= 0) & (probability >= threshold))
+
+    kinds["anchored by votes, probability"] = sure
     return {
         name: np.stack([np.asarray(way(text, code).mask) for text, code in zip(texts, asked)])
         for name, way in kinds.items()
@@ -116,7 +124,7 @@ def main(options: Options = Options()) -> dict:
             once = {}
             for threshold in options.thresholds:
                 for name, masks in ask(field, coded, texts, asked, phrases, threshold).items():
-                    if name.endswith(("votes", "lead")) and "spread" not in coded:
+                    if name.endswith(("votes", "lead", "probability")) and "spread" not in coded:
                         continue  # they do not look at codes: once is enough
                     # Selections that did not change need not be rendered again.
                     if once.get(name, (None,))[0] != masks.tobytes():

@@ -206,7 +206,7 @@ def test_higher_thresholds_select_less(scene, cameras):
     texts = field.regions.embeddings
     asked = field.region_codes
     low, high = (thresholds.ask(field, "d=8", texts, asked, asked[:2], t) for t in (0.4, 0.7))
-    assert len(low) == 5
+    assert len(low) == 6
     for name, masks in low.items():
         assert (high[name] <= masks).all()
         assert masks.any()
