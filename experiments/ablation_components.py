@@ -2,20 +2,15 @@
 
     python -m experiments.ablation_components [--quick] [--root FOLDER] [--out FOLDER]
 
-On LERF-OVS or its twins, under the protocol of `experiments.lerf`.
+On LERF-OVS or its twins, under the protocol of `experiments.lerf`, whose cells are taken where a row is the same.
 """
-
-import dataclasses
 
 from experiments import lerf, tables
 from experiments.command import options_of
 from experiments.methods import COMPONENTS
-from experiments.results import HOME
 
-PLAN = dataclasses.replace(lerf.PLAN, methods=tuple(COMPONENTS), out=str(HOME / "results" / "ablation_components"))
-QUICK = dataclasses.replace(
-    lerf.QUICK, methods=tuple(COMPONENTS), out=str(HOME / "results" / "quick" / "ablation_components")
-)
+PLAN = lerf.beside(lerf.PLAN, "ablation_components", COMPONENTS)
+QUICK = lerf.beside(lerf.QUICK, "ablation_components", COMPONENTS)
 
 
 def main(plan: tables.Plan) -> str:

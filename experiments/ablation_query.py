@@ -2,18 +2,15 @@
 
     python -m experiments.ablation_query [--quick] [--root FOLDER] [--out FOLDER]
 
-On LERF-OVS or its twins, under the protocol of `experiments.lerf`.
+On LERF-OVS or its twins, under the protocol of `experiments.lerf`, whose cells are taken where a row is the same.
 """
-
-import dataclasses
 
 from experiments import lerf, tables
 from experiments.command import options_of
 from experiments.methods import QUERIES
-from experiments.results import HOME
 
-PLAN = dataclasses.replace(lerf.PLAN, methods=tuple(QUERIES), out=str(HOME / "results" / "ablation_query"))
-QUICK = dataclasses.replace(lerf.QUICK, methods=tuple(QUERIES), out=str(HOME / "results" / "quick" / "ablation_query"))
+PLAN = lerf.beside(lerf.PLAN, "ablation_query", QUERIES)
+QUICK = lerf.beside(lerf.QUICK, "ablation_query", QUERIES)
 
 
 def main(plan: tables.Plan) -> str:

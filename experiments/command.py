@@ -33,4 +33,4 @@ def options_of(plan: Any, quick: Any) -> Any:
     if given.root:
         data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)
-    return dataclasses.replace(chosen, out=given.out) if given.out else chosen
+    return dataclasses.replace(chosen, out=given.out, cells="") if given.out else chosen

@@ -10,6 +10,8 @@ Gaussians from <scene>/point_cloud.ply, or fitted.
 """
 
 import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
 
 from experiments import published, tables, twins
 from experiments.command import QUICK_STEPS, options_of
@@ -41,6 +43,12 @@ NOTES = (
 )
 WHY = ""
 """why the row held against the others does not lead where it does not: from `experiments.causes`"""
+
+
+def beside(plan: tables.Plan, name: str, methods: Iterable[str]) -> tables.Plan:
+    """The plan of a table `name` of other rows on the same settings, beside this one's: common rows share cells."""
+    place = Path(plan.out)
+    return dataclasses.replace(plan, methods=tuple(methods), out=str(place.parent / name), cells=str(place / "cells"))
 
 
 def main(plan: tables.Plan) -> str:

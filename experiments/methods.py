@@ -263,30 +263,32 @@ METHODS: dict[str, Method] = {
 """the rows of Tables 1 to 3"""
 RECOMMENDED = "ours, consensus"
 """what jsecon does by default with masks of single frames: the row to hold against the others"""
+_BY_COSINE = {"retrieval": "cosine"}
 COMPONENTS: dict[str, Method] = {
-    "per-frame masks, one-step": langsplat,
+    "LangSplat-m": langsplat,
     "masklets, one-step": _field("one_step", clean=False),
-    "masklets, anchored by code": _field("code", retrieval="cosine", clean=False),
-    "+ DBSCAN (the paper, distilled by votes)": _field("code", retrieval="cosine"),
-    "uniform instead of pixel weights": _field("code", retrieval="cosine", uniform=True),
-    "3-d autoencoder codes instead of spread ones": _field("code", retrieval="cosine", latent=3),
-    "trained on the rendered L1 (the paper's path)": paper,
-    "membership by votes of all views": _field("all_views", retrieval="cosine"),
-    "membership by votes of the views that show it": _field("votes", retrieval="cosine"),
-    "the region by contrast": _field("votes"),
-    "masks associated by consensus, the region by cosine": _field("votes", retrieval="cosine", by="consensus"),
-    "masks associated by consensus, the region by contrast (ours)": _field("votes", by="consensus"),
-    "ours, membership by lead": _field("lead", by="consensus"),
+    "masklets, anchored by code": _field("code", clean=False, **_BY_COSINE),
+    "+ DBSCAN (the paper, distilled by votes)": _field("code", **_BY_COSINE),
+    "uniform instead of pixel weights": _field("code", uniform=True, **_BY_COSINE),
+    "3-d autoencoder codes instead of spread ones": _field("code", latent=3, **_BY_COSINE),
+    "the paper's path": paper,
+    "membership by votes of all views": _field("all_views", **_BY_COSINE),
+    "membership by votes of the views that show it": _field("votes", **_BY_COSINE),
+    "ours, tracks": METHODS["ours, tracks"],
+    "ours, consensus, the region by cosine": _field("votes", by="consensus", **_BY_COSINE),
+    "ours, consensus": METHODS["ours, consensus"],
+    "ours, consensus, by lead": _field("lead", by="consensus"),
 }
-"""the rows of Table 4"""
+"""the rows of Table 4: per-frame masks asked in one step (LangSplat-m), then the paper's parts distilled by votes, the
+whole of the paper's path, and ours: the region of the largest contrast, by the tracks or by consensus"""
 QUERIES: dict[str, Method] = {
     "one-step": _field("one_step"),
     "canonical": _field("canonical"),
-    "anchored by code": _field("code", retrieval="cosine"),
-    "anchored by votes of all views": _field("all_views", retrieval="cosine"),
-    "anchored by votes": _field("votes", retrieval="cosine"),
-    "anchored by lead": _field("lead", retrieval="cosine"),
+    "anchored by code": _field("code", **_BY_COSINE),
     "anchored by code, the region by contrast": _field("code"),
-    "anchored by votes, the region by contrast": _field("votes"),
+    "anchored by votes of all views": _field("all_views", **_BY_COSINE),
+    "anchored by votes": _field("votes", **_BY_COSINE),
+    "anchored by lead": _field("lead", **_BY_COSINE),
+    "ours, tracks": METHODS["ours, tracks"],
 }
-"""the rows of Table 5"""
+"""the rows of Table 5, of one field of the tracks with spread codes; the last by votes, the region by contrast"""

@@ -34,14 +34,17 @@ class Plan:
     sweep: tuple[str, ...] = ("perfect", "low", "medium", "high")
     """levels at which the first scene and seed are run once more."""
     out: str = ""
+    cells: str = ""
+    """where the cells are kept; empty: OUT/cells. Tables of the same data have rows in common: one folder spares the
+    second its training."""
 
 
 def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:
     """All cells: {"scene", "seed", "level", "method", figures, "seconds", "peak_memory_mib", "twin"}.
 
-    A cell that an earlier run with the same options left in OUT/cells is read. `seconds` are of training and all
-    queries, without loading and fitting, what methods share charged to each; the memory is the process's highest so
-    far, so later rows hide behind earlier ones.
+    A cell that an earlier run with the same options left in the plan's folder of cells is read. `seconds` are of
+    training and all queries, without loading and fitting, what methods share charged to each; the memory is the
+    process's highest so far, so later rows hide behind earlier ones.
     """
     wanted = [(scene, seed, plan.level) for scene in plan.data.scenes for seed in plan.data.seeds]
     if not plan.data.root:
@@ -77,7 +80,7 @@ def _file(plan: Plan, scene: str, seed: int, level: str, method: str) -> Path:
         dataclasses.asdict(plan.steps),
     ]
     key = hashlib.sha1(json.dumps([*given, scene, seed, level, method], default=str).encode()).hexdigest()[:12]
-    return Path(plan.out) / "cells" / f"{scene}-{seed}-{level}-{key}.json"
+    return Path(plan.cells or Path(plan.out) / "cells") / f"{scene}-{seed}-{level}-{key}.json"
 
 
 def measure(setting: Setting, answers: Answers) -> dict:

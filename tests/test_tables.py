@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
 def small(plan, folder, name, **changes):
     """The quick plan with rows that need no training, in a folder of the test's."""
     data = dataclasses.replace(plan.data, twins=str(folder / "twins"))
-    return dataclasses.replace(plan, data=data, fit_steps=20, out=str(folder / name), **changes)
+    return dataclasses.replace(plan, data=data, fit_steps=20, out=str(folder / name), cells="", **changes)
 
 
 def with_gaussians(plan, *levels):
@@ -124,11 +124,20 @@ def test_levels_of_noise_share_a_fit(folder):
 
 @pytest.mark.slow
 def test_ablations(folder):
-    few = ("masklets, anchored by code",)
-    ablation_components.main(small(ablation_components.QUICK, folder, "components", methods=few))
+    few = ("masklets, anchored by code", TRACKED)
+    plan = small(ablation_components.QUICK, folder, "components", methods=few)
+    ablation_components.main(plan)
     assert [c["method"] for c in read(folder, "components")[0]["cells"]] == list(few)
-    ablation_query.main(small(ablation_query.QUICK, folder, "query", methods=("one-step",)))
+    both = dataclasses.replace(
+        small(ablation_query.QUICK, folder, "query", methods=("one-step", TRACKED)),
+        cells=str(folder / "components" / "cells"),
+    )
+    shared = tables._file(both, "figurines", 0, "medium", TRACKED)
+    before = shared.stat().st_mtime_ns
+    ablation_query.main(both)
     assert "| one-step |" in read(folder, "query")[1]
+    assert shared.stat().st_mtime_ns == before  # the row that both have is taken, not measured again
+    assert not (folder / "query" / "cells").exists()
 
 
 @pytest.mark.slow
