@@ -7,30 +7,14 @@ import dataclasses
 import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from jsecon.errors import InputError
 from jsecon.options import Options
 from jsecon.types import LanguageField
 from jsecon.vision.given import GivenSpace, given_dim, missing_model
-from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
-from jsecon.vision.protocols import Embedder, Tracker
-
-
-@runtime_checkable
-class NamedTracker(Tracker, Protocol):
-    """A tracker that holds a network."""
-
-    name: str
-    """of its content and settings"""
-
-    def check(self) -> None:
-        """Raises InputError where it cannot work."""
-        ...
-
-    def close(self) -> None:
-        """Drops what it holds in memory, until it is needed again."""
-        ...
+from jsecon.vision.proposal_store import StoredSegmenter
+from jsecon.vision.protocols import Embedder, NamedSegmenter, NamedTracker
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,8 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
 from jsecon.options import Options
 from jsecon.vision.given import GivenSpace
-from jsecon.vision.proposal_store import NamedSegmenter, StoredSegmenter
+from jsecon.vision.proposal_store import StoredSegmenter
+from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.sam import SamSegmenter, SamSettings
 from jsecon.vision.sam2 import Sam2Tracker
 

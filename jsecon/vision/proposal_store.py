@@ -7,32 +7,15 @@ SAM takes minutes a frame on a CPU; a run that is stopped in the middle of its f
 
 import zipfile
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from jsecon.files import written_whole
 from jsecon.vision.embedding_store import frame_digest
-from jsecon.vision.protocols import Segmenter
+from jsecon.vision.protocols import NamedSegmenter
 
 _UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile)
-
-
-@runtime_checkable
-class NamedSegmenter(Segmenter, Protocol):
-    """A segmenter that holds a network."""
-
-    name: str
-    """of its content and settings"""
-
-    def check(self) -> None:
-        """Raises InputError where it cannot work."""
-        ...
-
-    def close(self) -> None:
-        """Drops what it holds in memory, until it is needed again."""
-        ...
 
 
 class StoredSegmenter:

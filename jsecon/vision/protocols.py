@@ -33,6 +33,31 @@ class Tracker(Protocol):
         ...
 
 
+class Network(Protocol):
+    """What holds a network in memory."""
+
+    name: str
+    """of its content and settings"""
+
+    def check(self) -> None:
+        """Raises InputError where it cannot work."""
+        ...
+
+    def close(self) -> None:
+        """Drops what it holds in memory, until it is needed again."""
+        ...
+
+
+@runtime_checkable
+class NamedSegmenter(Segmenter, Network, Protocol):
+    """A segmenter that holds a network."""
+
+
+@runtime_checkable
+class NamedTracker(Tracker, Network, Protocol):
+    """A tracker that holds a network."""
+
+
 @runtime_checkable
 class Embedder(Protocol):
     """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity."""
