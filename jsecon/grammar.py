@@ -273,7 +273,7 @@ def _query(verbs) -> None:
         "--by",
         choices=("votes", "code", "one_step", "canonical"),
         default="votes",
-        help="votes, code: text -> the region that answers it -> the Gaussians whose votes, or whose code, are its own; "
+        help="votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; "
         "one_step, canonical: each Gaussian's code against the text (default votes)",
     )
     verb.add_argument(
