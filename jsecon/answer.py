@@ -71,6 +71,8 @@ def ask_text(
     for a part, and for several regions or a composite text by anything but votes.
     """
     require(by in METHODS, "by", got=by, expected=f"one of {METHODS}", remedy="votes is the default.")
+    if not len(field.canonical):  # its embeddings came from files, without phrases: those of who reads the text
+        field = dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
     wanted, unwanted = parts_of_question(text)
     if several or unwanted or len(wanted) > 1:
         if by != "votes":
@@ -92,8 +94,7 @@ def ask_text(
         if by == "one_step":
             selection = query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
         else:
-            phrases = field.canonical if len(field.canonical) else embedder.canonical
-            canonical = encode(field.autoencoder, jnp.asarray(phrases))
+            canonical = encode(field.autoencoder, jnp.asarray(field.canonical))
             selection = query_canonical(
                 field.codes, code, canonical, CANONICAL_THRESHOLD if threshold is None else threshold
             )

@@ -110,6 +110,7 @@ class Words:
     """An embedder of two words."""
 
     name, dim = "words", 12
+    canonical = unit_rows(np.random.default_rng(8), 4, 12)
 
     def __init__(self, rows):
         self.rows = {"chair": rows[0], "stool": rows[1]}
@@ -167,3 +168,13 @@ def test_probability_means_what_it_says():
         own = bins == b
         if own.sum() > 300:
             assert abs(got[own].mean() - (true[own] > 0.5).mean()) < 0.04
+
+
+def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field):
+    words = Words(field.regions.embeddings)
+    bare = dataclasses.replace(field, canonical=np.zeros((0, 12), np.float32))
+    full = dataclasses.replace(field, canonical=words.canonical)
+    for by in ("votes", "canonical"):
+        got, expected, other = (ask_text(f, words, "chair", by=by, outliers=False) for f in (bare, full, field))
+        assert float(got.selection.score) == float(expected.selection.score) != float(other.selection.score)
+        np.testing.assert_array_equal(got.mask, expected.mask)
