@@ -28,7 +28,7 @@ TEXTS = 4
 PLAN = dataclasses.replace(lerf.PLAN, sweep=(), out=str(results.HOME / "results" / "qualitative"))
 QUICK = dataclasses.replace(
     lerf.QUICK,
-    methods=("Occam's LGS", "VALA", "ours, consensus, votes"),
+    methods=("Occam's LGS", "VALA", "ours, consensus"),
     out=str(results.HOME / "results" / "quick" / "qualitative"),
 )
 

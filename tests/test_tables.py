@@ -154,6 +154,7 @@ def test_qualitative(folder):
     metrics, text = read(folder, "qualitative")
     assert 1 <= len(metrics["iou"]) <= qualitative.TEXTS
     assert "a twin in LERF-OVS's layout" in text
+    assert {*qualitative.QUICK.methods, *qualitative.PLAN.methods} <= set(METHODS)
 
 
 def test_vision_on_disk_is_what_was_simulated(folder):
