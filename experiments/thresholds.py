@@ -143,12 +143,12 @@ def main(options: Options = Options()) -> dict:
         "deviation": {n: {str(t): float(np.std(v)) for t, v in curve.items()} for n, curve in found.items()},
         "spread": {row[0]: row[-2] for row in rows},
         "mean_spread_of_a_room": {row[0]: row[-1] for row in rows},
-        "text_finds_its_region": float(np.mean(hits)),
+        "text_finds_its_region_by_cosine": float(np.mean(hits)),
     }
     table = results.table(("query", *(str(t) for t in options.thresholds), "spread", "spread in a room"), rows)
     results.save(Path(options.out), options, metrics, table, draw(means))
     print(table)
-    print(f"text finds its region: {metrics['text_finds_its_region']:.3f}")
+    print(f"text finds its region by the cosine: {metrics['text_finds_its_region']:.3f}")
     return metrics
 
 
