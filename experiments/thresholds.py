@@ -148,7 +148,7 @@ def main(options: Options = Options()) -> dict:
     table = results.table(("query", *(str(t) for t in options.thresholds), "spread", "spread in a room"), rows)
     results.save(Path(options.out), options, metrics, table, draw(means))
     print(table)
-    print(f"text finds its region by the cosine: {metrics['text_finds_its_region']:.3f}")
+    print(f"text finds its region by the cosine: {metrics['text_finds_its_region_by_cosine']:.3f}")
     return metrics
 
 
