@@ -45,7 +45,7 @@ NOTES = (
     "At the ground-truth points: miou and macc (mean recall) over the classes that occur; points without an answer are "
     "misses. Mean over seeds ± deviation."
 )
-WHY = ""
+WHY = {"miou": ""}
 
 
 def main(plan: tables.Plan) -> str:

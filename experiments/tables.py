@@ -142,12 +142,14 @@ def means(cells: list[dict], level: str, figure: str = "miou") -> dict[str, floa
     return {name: float(np.mean([c[figure] for c in chosen if c["method"] == name])) for name in names}
 
 
-def leaders(cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str, why: str = "") -> str:
-    """Where another method's mIoU of a scene is above that of the row `ours`, a line each, and `why`. Rows whose names
-    start with "ours" are not others: the best of several of one's own would be chosen by the answer."""
+def leaders(
+    cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str, why: str = "", figure: str = "miou"
+) -> str:
+    """Where another method's `figure` of a scene is above that of the row `ours`, a line each, and `why`. Rows whose
+    names start with "ours" are not others: the best of several of one's own would be chosen by the answer."""
     lines, compared = [], False
     for scene in scenes:
-        found = means([cell for cell in cells if cell["scene"] == scene], level)
+        found = means([cell for cell in cells if cell["scene"] == scene], level, figure)
         mine = found.get(ours, float("nan"))
         rivals = {name: value for name, value in found.items() if not name.startswith("ours")}
         if not rivals:
@@ -156,7 +158,8 @@ def leaders(cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str
         if not mine >= rivals[best]:
             lines.append(f"* {scene}: {best} leads with {rivals[best]:.3f} ({ours}: {mine:.3f}).")
     if not lines:
-        return f'The row "{ours}" leads on every scene.' if compared else ""
+        return f'{figure}: the row "{ours}" leads on every scene.' if compared else ""
+    lines = [f'{figure}: the row "{ours}" does not lead on every scene.', "", *lines]
     return "\n".join([*lines, "", why] if why else lines)
 
 
@@ -179,7 +182,7 @@ def make(
     *,
     notes: str,
     ours: str = "",
-    why: str = "",
+    why: dict[str, str] | None = None,
     published: str = "",
 ) -> str:
     """Fills the table, writes it, prints it, returns it."""
@@ -196,16 +199,18 @@ def write(
     *,
     notes: str,
     ours: str = "",
-    why: str = "",
+    why: dict[str, str] | None = None,
     published: str = "",
 ) -> str:
     """Writes results/<name>/{config.json, metrics.json, table.md, figure.png}; returns the table. `ours` is the row
-    that the others are held against (none: no such comparison), `why` says why it does not lead where it does not."""
+    that the others are held against (none: no such comparison) in each figure of `why`, which says why it does not lead
+    where it does not."""
     twin = any(cell["twin"] for cell in cells)
     source = f"made-up twins in {plan.data.dataset}'s layout, simulated vision ({plan.level})" if twin else "real data"
     parts = [f"Measured on {source}. {notes}", "", summarise(cells, plan.data.scenes, plan.level, figures), ""]
     if ours:
-        parts += [leaders(cells, plan.data.scenes, plan.level, ours=ours, why=why), ""]
+        for figure_of, reason in (why or {"miou": ""}).items():
+            parts += [leaders(cells, plan.data.scenes, plan.level, ours=ours, why=reason, figure=figure_of), ""]
     if twin and len(plan.sweep) > 1:
         parts += [f"mIoU over the noise of vision, {plan.data.scenes[0]}:", "", noise(cells, plan), ""]
     text = "\n".join([*parts, published]).rstrip()

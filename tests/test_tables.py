@@ -191,7 +191,11 @@ def test_tables_say_where_ours_does_not_lead():
     assert told.endswith("Because.")
     cells[1]["miou"] = 0.7
     told = tables.leaders(cells, ("a",), "medium", ours=RECOMMENDED, why="Because.")
-    assert told == f'The row "{RECOMMENDED}" leads on every scene.'
+    assert told == f'miou: the row "{RECOMMENDED}" leads on every scene.'
+    cells = [cell | {"macc": 1 - cell["miou"]} for cell in cells]
+    told = tables.leaders(cells, ("a",), "medium", ours=RECOMMENDED, figure="macc")
+    assert told.startswith(f'macc: the row "{RECOMMENDED}" does not lead')
+    assert "VALA leads with 0.400" in told
 
 
 def test_every_row_has_a_method_and_every_scene_its_denominator():
