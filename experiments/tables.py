@@ -215,7 +215,9 @@ def write(
         parts += [f"mIoU over the noise of vision, {plan.data.scenes[0]}:", "", noise(cells, plan), ""]
     text = "\n".join([*parts, published]).rstrip()
     averages = means(cells, plan.level)
-    figure = results.bars(list(averages), {"mIoU, mean of scenes": list(averages.values())}, "mIoU")
-    figure.axes[0].tick_params(axis="x", labelrotation=20)
+    figure = results.bars(list(averages), {"mIoU": list(averages.values())}, "mIoU, mean of scenes")
+    figure.axes[0].get_legend().remove()
+    for label in figure.axes[0].get_xticklabels():
+        label.set(rotation=20, ha="right", rotation_mode="anchor")
     results.save(Path(plan.out), plan, {"means": averages, "cells": cells}, text, figure)
     return text
