@@ -63,11 +63,11 @@ def query_several(
     """The Gaussians of all regions that answer any of the wanted texts (Q, E) and none of the unwanted (U, E).
 
     A region answers a text by the rule of `regions_of_text`, on the similarities that `retrieval` names, as in
-    `query_anchored`. One that answers a wanted and an unwanted text belongs to
-    the one that it is more similar to, so that "mug but not handle" keeps the mug where the handle was never told
-    apart. Membership is by votes, as in `query_anchored`: of the weight with which a Gaussian was seen in the views
-    that show a chosen region, at least `similarity_threshold` lies on the chosen ones. Selection.region is the best of
-    the chosen, -1 where there is none; Selection.score its similarity. Pure: jit it or vmap it over texts. Raises
+    `query_anchored`. One that answers a wanted and an unwanted text belongs to the one that it is more similar to, so
+    that "mug but not handle" keeps the mug where the handle was never told apart. Membership is by votes, as in
+    `query_anchored`: of the weight with which a Gaussian was seen in the views that show a chosen region, at least
+    `similarity_threshold` lies on the chosen ones. Selection.region is the best of the chosen, -1 where there is none;
+    Selection.score its similarity. Pure: jit it or vmap it over texts. Raises
     ValueError on texts of another size.
     """
     size = field.regions.embeddings.shape[1]
