@@ -47,8 +47,6 @@ class _Parts(NamedTuple):
     """What a query reads of a field; the rest need not pass into the compiled function."""
 
     embeddings: Array
-    pixels: Array
-    canonical: Array
     region_codes: Array
     codes: Codes
     regions: Array
@@ -112,17 +110,10 @@ def query_anchored(
     require_retrieval(retrieval, "query_anchored")
     if field.regions.count == 0:
         return _nothing(field)
+    given = (field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels)
+    region, score = _retrieve(*map(jnp.asarray, given), threshold_of(retrieval, retrieval_threshold), retrieval)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
-    return _query(
-        _parts(field, codes),
-        jnp.asarray(text_embedding),
-        threshold_of(retrieval, retrieval_threshold),
-        threshold,
-        alike_threshold,
-        unlabelled_weight,
-        by,
-        retrieval,
-    )
+    return _members(_parts(field, codes), region, score, threshold, alike_threshold, unlabelled_weight, by)
 
 
 def query_region(
@@ -172,8 +163,6 @@ def _parts(field: LanguageField, codes: UnitCodes | None = None) -> _Parts:
             as_codes(a)
             for a in (
                 field.regions.embeddings,
-                field.regions.pixels,
-                field.canonical,
                 field.region_codes,
                 field.codes if codes is None else codes,
                 votes.regions,
@@ -192,13 +181,13 @@ def _nothing(field: LanguageField) -> Selection:
     return Selection(jnp.zeros(n, bool), jnp.zeros(n, dtype), jnp.asarray(-1, jnp.int32), jnp.zeros((), dtype))
 
 
-def _query_body(parts, text, least, threshold, alike_threshold, unlabelled_weight, by, retrieval) -> Selection:
-    similarity, known = answers(parts.embeddings, text, parts.canonical, parts.pixels, retrieval)
+def _retrieve_body(embeddings, text, canonical, pixels, least, retrieval) -> tuple[Array, Array]:
+    """The region, -1 where none reaches `least`, and its similarity."""
+    similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
     similarity = jnp.where(known, similarity, -jnp.inf)
     anchor = jnp.argmax(similarity)
-    passed = similarity[anchor] >= least
-    score = jnp.where(known[anchor], similarity[anchor], 0.0)
-    return _members_body(parts, jnp.where(passed, anchor, -1), score, threshold, alike_threshold, unlabelled_weight, by)
+    region = jnp.where(similarity[anchor] >= least, anchor, -1)
+    return region, jnp.where(known[anchor], similarity[anchor], 0.0)
 
 
 def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_weight, by) -> Selection:
@@ -232,5 +221,6 @@ def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_w
     return Selection(mask, similarity, jnp.asarray(region, jnp.int32), score)
 
 
-_query = jax.jit(_query_body, static_argnames=("by", "retrieval"))
+# Apart, so that fields of any number of Gaussians share the one, and a text and a pixel the other.
+_retrieve = jax.jit(_retrieve_body, static_argnames="retrieval")
 _members = jax.jit(_members_body, static_argnames="by")
