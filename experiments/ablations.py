@@ -12,7 +12,6 @@ Gaussian's is the mean of its votes, d as the options say.
 Without tracking each mask of each view is a region of its own, embedded from that view alone.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
 
@@ -21,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results, scenes
-from experiments.beyond import State
+from experiments.command import rooms_of
+from experiments.state import State, tracked
 from jsecon.demo import demo
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
@@ -32,13 +32,9 @@ from jsecon.query.outliers import remove_outliers
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(scenes.Rooms):
     """What the experiment can vary."""
 
-    demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
-    texts: str = str(results.CAPTURES.parent / "text")
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     level: str = "medium"
     latent: int = 16
     code_threshold: float = 0.9
@@ -77,10 +73,9 @@ class View:
 
 def built(sight: scenes.Sight, proof: scenes.Evidence, options: Options, *, tracking=True, weighting=True) -> View:
     """The field with or without tracking and weighting."""
-    views, ids = sight.pixels.shape
-    owner = np.tile(np.arange(ids), views) if tracking else np.arange(views * ids)
     seen = sight if weighting else dataclasses.replace(sight, pixels=(sight.pixels > 0).astype(sight.pixels.dtype))
-    state = State(seen, proof, owner, sight.pixels.reshape(-1) > 0, ids if tracking else views * ids)
+    masks = sight.pixels.size
+    state = tracked(seen, proof) if tracking else State(seen, proof, np.arange(masks), seen.pixels.ravel() > 0, masks)
     units = jnp.asarray(state.embeddings, jnp.float32)
     table, coder, _ = region_codes(units, latent=options.latent, key=jax.random.key(0))
     labelled = state.votes.sum(1) >= 0.5 * state.total
@@ -128,11 +123,11 @@ QUERIES = ("one-step", "canonical", "anchored by code", *VOTES)
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    space = scenes.text_space(Path(options.texts))
+    space = options.space()
     components: dict[str, list[tuple[float, float]]] = {}
     queries: dict[tuple[str, bool], list[tuple[float, float]]] = {}
-    for seed in options.seeds:
-        scene = scenes.demo_scene(Path(options.demos) / f"demo{seed}", seed)
+    for make in options.scenes().values():
+        scene = make()
         sight = scenes.look(scene, options.level, space)
         proof = scenes.evidence(scene, sight.masks.labels, len(sight.masks.origin))
         means = np.asarray(scene.gaussians.means)
@@ -199,11 +194,8 @@ def quick() -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("demos", nargs="?")
-    parser.add_argument("--quick", action="store_true", help="one small room: two minutes at most")
-    arguments = parser.parse_args()
-    if arguments.quick:
+    chosen = rooms_of(Options(), QUICK)
+    if chosen is QUICK:
         quick()
     else:
-        main(dataclasses.replace(Options(), **({"demos": arguments.demos} if arguments.demos else {})))
+        main(chosen)

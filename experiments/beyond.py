@@ -11,7 +11,6 @@ region is the one with the largest cosine, "by contrast" the one that jsecon.que
 """
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,102 +23,22 @@ from scipy.spatial import KDTree
 from sklearn.cluster import KMeans
 
 from experiments import results, scenes
+from experiments.command import rooms_of
 from experiments.reconcile import agree
+from experiments.state import State, consensus, point_miou, tracked, unit
 from jsecon.language.codes import encode, region_codes
-from jsecon.language.grouping import group_by_consensus
-from jsecon.query.anchored import ALIKE_THRESHOLD, CODE_THRESHOLD
-from jsecon.query.retrieval import contrasts
+from jsecon.query.anchored import CODE_THRESHOLD
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(scenes.Places):
     """What the experiment can vary."""
 
-    demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
-    replica: str = str(results.CAPTURES / "replica_apartment_0")
-    texts: str = str(results.CAPTURES.parent / "text")
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     levels: tuple[str, ...] = ("low", "medium", "high")
     latents: tuple[int, ...] = (3, 8, 16, 32)
     share: float = 0.5
     """threshold on shares of votes and posteriors."""
     out: str = str(results.HOME / "results" / "beyond")
-
-
-class State:
-    """Regions and their votes: (N, R) votes, (T, R) which masks count, (R, E) embeddings; and what follows."""
-
-    def __init__(self, sight: scenes.Sight, proof: scenes.Evidence, ids: np.ndarray, ok: np.ndarray, regions: int):
-        """ids (M,) region of each mask, ok (M,) whether it counts; M = T R of the masks as they came."""
-        views, masks = sight.pixels.shape[0], np.flatnonzero(ok)
-        view = np.repeat(np.arange(views), sight.pixels.shape[1])
-        self.proof, self.ids, self.ok, self.view, self.regions = proof, ids, ok, view, regions
-        to_region = sparse.csr_matrix((np.ones(len(masks), np.float32), (masks, ids[masks])), shape=(len(ids), regions))
-        self.votes = (proof.votes @ to_region).toarray()
-        self.shows = np.zeros((views, regions), bool)
-        self.shows[view[masks], ids[masks]] = True
-        flat, pixels = sight.embeddings.reshape(len(ids), -1), sight.pixels.reshape(-1, 1)
-        self.embeddings, self.pixels = _unit(to_region.T @ (flat * pixels)), to_region.T @ pixels
-        self.total = np.maximum(proof.seen.sum(1), 1e-12)
-
-    def similarities(self, texts: np.ndarray, canonical: np.ndarray | None = None) -> np.ndarray:
-        """(K, R) of texts and regions, -inf where a region has no embedding: the cosines, or with canonical phrases
-        (C, E) the contrasts."""
-        if canonical is None:
-            return np.where(np.any(self.embeddings != 0, 1), texts @ self.embeddings.T, -np.inf)
-        given = (jnp.asarray(a, jnp.float32) for a in (self.embeddings, texts, canonical, self.pixels))
-        score, known = _contrasts(*given)
-        return np.where(known, score, -np.inf)
-
-    def anchors(self, texts: np.ndarray, canonical: np.ndarray | None = None) -> np.ndarray:
-        """(K,) the region most similar to each text."""
-        return self.similarities(texts, canonical).argmax(1)
-
-    def joined(self, anchors: np.ndarray, alike: float = ALIKE_THRESHOLD) -> list[np.ndarray]:
-        """For each anchor the regions that are alike."""
-        gram = self.embeddings @ self.embeddings.T
-        return [np.flatnonzero(gram[a] >= alike) for a in anchors]
-
-    def shares(self, groups: list[np.ndarray]) -> list[np.ndarray]:
-        """(N,) a group: its share of all votes."""
-        return [self.votes[:, g].sum(1) / self.total for g in groups]
-
-    def leads(self, groups: list[np.ndarray]) -> list[np.ndarray]:
-        """(N,) bool a group: the strongest region is not another's, and most of the weight is labelled."""
-        labelled, others = self.votes.sum(1) >= 0.5 * self.total, np.ones(self.regions, bool)
-        found = []
-        for g in groups:
-            others[g] = False
-            rival = self.votes[:, others].max(1, initial=0.0)
-            own = self.votes[:, g].sum(1)
-            found.append(labelled & (own > 0) & (own >= rival))
-            others[g] = True
-        return found
-
-    def posteriors(self, groups: list[np.ndarray]) -> list[np.ndarray]:
-        """(N,) a group: its share of what the views that show it see of the Gaussian (D)."""
-        found = []
-        for g in groups:
-            seen = self.proof.seen[:, self.shows[:, g].any(1)].sum(1)
-            found.append(self.votes[:, g].sum(1) / np.maximum(seen, 1e-12))
-        return found
-
-    def overlap(self) -> np.ndarray:
-        """(M,) IoU of each mask with the reprojection of its region: shares composited over the view."""
-        share = (self.votes / self.total[:, None]).astype(np.float32)
-        inside = np.asarray((self.proof.votes.T @ share)[np.arange(len(self.ids)), self.ids])
-        everywhere = (self.proof.seen.T @ share)[self.view, self.ids]
-        return inside, everywhere
-
-
-@jax.jit
-def _contrasts(embeddings, texts, canonical, pixels):
-    return jax.vmap(lambda text: contrasts(embeddings, text, canonical, pixels))(texts)
-
-
-def _unit(rows: np.ndarray) -> np.ndarray:
-    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
 
 
 def consistent(sight: scenes.Sight, state: State, *, part: float = 0.7, rounds: int = 2) -> State:
@@ -134,23 +53,10 @@ def consistent(sight: scenes.Sight, state: State, *, part: float = 0.7, rounds: 
     return state
 
 
-def consensus(sight: scenes.Sight, proof: scenes.Evidence, means: np.ndarray, *, agreement: float = 0.3) -> State:
-    """E: objects are groups of Gaussians that the views put together, whatever the tracker said."""
-    best = 1 / np.maximum(proof.seen.max(1), 1e-9)
-    membership = (sparse.diags(best) @ proof.votes).tocsr().astype(np.float32)
-    visible = sparse.csr_matrix((proof.seen * best[:, None]).astype(np.float32))
-    weights = proof.seen.sum(1).astype(np.float32)
-    owner = group_by_consensus(membership, visible, weights, means.astype(np.float32), agreement=agreement)
-    live, groups = np.flatnonzero(owner >= 0), int(owner.max()) + 1
-    gather = sparse.csr_matrix((np.ones(len(live), np.float32), (owner[live], live)), shape=(groups, len(owner)))
-    ids = np.asarray((gather @ proof.votes).tocsc().argmax(0)).ravel()
-    return State(sight, proof, ids, sight.pixels.reshape(-1) > 0, groups)
-
-
 def by_code(state: State, codes: np.ndarray, wanted: np.ndarray, reduce: str, threshold: float) -> list[np.ndarray]:
     """The Gaussians whose reduced code has a cosine of at least `threshold` with each of the codes wanted."""
     if reduce == "mean":
-        points = _unit(state.votes @ codes)
+        points = unit(state.votes @ codes)
     else:
         points = codes[state.votes.argmax(1)] * state.votes.any(1)[:, None]
     labelled = state.votes.sum(1) >= 0.5 * state.total
@@ -175,8 +81,8 @@ def several_descriptors(sight: scenes.Sight, state: State, *, most: int = 3) -> 
         own = flat[state.ok & (state.ids == r)]
         if len(own):
             fit = KMeans(min(most, len(own)), n_init=1, random_state=0).fit(own)
-            weight = fit.cluster_centers_ @ _unit(own.mean(0))
-            scores[r] = (weight[:, None] * (_unit(fit.cluster_centers_) @ sight.texts.T)).max(0)
+            weight = fit.cluster_centers_ @ unit(own.mean(0))
+            scores[r] = (weight[:, None] * (unit(fit.cluster_centers_) @ sight.texts.T)).max(0)
     return scores.argmax(0)
 
 
@@ -220,9 +126,8 @@ def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence,
     share, texts = options.share, sight.texts
     means = np.asarray(scene.gaussians.means)
     opacity = np.asarray(jax.nn.sigmoid(scene.gaussians.opacity_logits))
-    here = sight.pixels.reshape(-1) > 0
-    as_tracked = np.tile(np.arange(sight.pixels.shape[1]), len(sight.pixels))
-    plain = State(sight, proof, as_tracked, here, sight.pixels.shape[1])
+    plain = tracked(sight, proof)
+    here = plain.ok
     anchors = plain.anchors(texts)
     groups = plain.joined(anchors)
 
@@ -265,8 +170,8 @@ def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence,
     found = grouped.joined(grouped.anchors(texts, sight.canonical))
     tell("E + D, by contrast", [p >= share for p in grouped.posteriors(found)])
 
-    ids = as_tracked.copy()
-    ids[here] = agree(proof.votes[:, np.flatnonzero(here)], as_tracked[here])
+    ids = plain.ids.copy()
+    ids[here] = agree(proof.votes[:, np.flatnonzero(here)], ids[here])
     agreed = State(sight, proof, ids, here, plain.regions)
     anchors = agreed.anchors(texts)
     found = agreed.joined(anchors)
@@ -283,18 +188,9 @@ def selections(scene: scenes.Scene, sight: scenes.Sight, proof: scenes.Evidence,
     tell("F reconciled + D, by lead", [m & (p >= share) for m, p in zip(agreed.leads(found), agreed.posteriors(found))])
 
 
-def point_miou(masks: list[np.ndarray], truth: np.ndarray) -> float:
-    """Mean over the objects that some Gaussian belongs to of the selection's IoU with those Gaussians."""
-    return float(
-        np.mean(
-            [(m & (truth == k)).sum() / (m | (truth == k)).sum() for k, m in enumerate(masks) if (truth == k).any()]
-        )
-    )
-
-
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    space = scenes.text_space(Path(options.texts))
+    space = options.space()
     found: dict[str, dict[tuple[str, str], float]] = {}
     seconds: dict[str, list[float]] = {}
     passes = {}
@@ -311,10 +207,8 @@ def main(options: Options = Options()) -> dict:
 
             selections(scene, sight, proof, options, told)
 
-    for seed in options.seeds:
-        one_scene(scenes.demo_scene(Path(options.demos) / f"demo{seed}", seed))
-    if Path(options.replica).is_dir():
-        one_scene(scenes.replica_scene(options.replica))
+    for make in options.scenes().values():
+        one_scene(make())
 
     rows = []
     for name, values in found.items():
@@ -360,4 +254,4 @@ def draw(rows: list[dict]):
 
 
 if __name__ == "__main__":
-    main(dataclasses.replace(Options(), **({"demos": sys.argv[1]} if len(sys.argv) > 1 else {})))
+    main(rooms_of(Options()))

@@ -1,4 +1,4 @@
-"""The command line that the tables share: --quick, --root, --out."""
+"""The command lines that experiments share: of the tables (--quick, --root, --out), and of those on demo rooms."""
 
 import argparse
 import dataclasses
@@ -34,3 +34,14 @@ def options_of(plan: Any, quick: Any) -> Any:
         data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)
     return dataclasses.replace(chosen, out=given.out, cells="") if given.out else chosen
+
+
+def rooms_of(options: Any, quick: Any = None) -> Any:
+    """The options of an experiment on demo rooms that the command line asks for: [--quick] [FOLDER_OF_DEMOS]."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("demos", nargs="?", help="where demo0 .. demo4 lie, or shall be made")
+    if quick is not None:
+        parser.add_argument("--quick", action="store_true", help="one scene, a few steps: at most two minutes")
+    given = parser.parse_args()
+    chosen = quick if quick is not None and given.quick else options
+    return dataclasses.replace(chosen, demos=given.demos) if given.demos else chosen

@@ -12,9 +12,7 @@ time of all threads, without compilation, what a start costs included. Each path
 every few minutes: a run that was stopped goes on where it was.
 """
 
-import argparse
 import dataclasses
-import functools
 import hashlib
 import json
 from pathlib import Path
@@ -23,19 +21,15 @@ import numpy as np
 
 from experiments import results, scenes
 from experiments.code_paths import adam_path, task_of, votes_paths
+from experiments.command import rooms_of
 from jsecon.errors import InputError
 from jsecon.files import write_text
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(scenes.Places):
     """What the experiment can vary."""
 
-    demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
-    replica: str = str(results.CAPTURES / "replica_apartment_0")
-    texts: str = str(results.CAPTURES.parent / "text")
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     level: str = "medium"
     """of vision's faults."""
     latent: int = 3
@@ -73,9 +67,7 @@ def main(options: Options = Options()) -> dict:
     """Runs the experiment, or what is left of it, writes its results and returns the metrics."""
     out = Path(options.out)
     rows = []
-    made = {f"demo {seed}": functools.partial(_demo, options, seed) for seed in options.seeds}
-    if Path(options.replica).is_dir():
-        made["replica_apartment_0"] = lambda: scenes.replica_scene(options.replica)
+    made = options.scenes()
     if not made:
         raise InputError(
             options.replica,
@@ -85,7 +77,7 @@ def main(options: Options = Options()) -> dict:
         )
     paths = [(name, path) for name in made for path in ("votes", "Adam from zero")]
     paths += [(n, path) for n in made if n in options.all_starts for path in ("Adam from random", "Adam from votes")]
-    space, task = scenes.text_space(Path(options.texts)), None
+    space, task = options.space(), None
     for name, path in paths:
         given = {option: getattr(options, option) for option in _OF_PATH[path.split()[0]]}
         digest = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:10]
@@ -142,10 +134,6 @@ def main(options: Options = Options()) -> dict:
     return metrics
 
 
-def _demo(options: Options, seed: int) -> scenes.Scene:
-    return scenes.demo_scene(Path(options.demos) / f"demo{seed}", seed)
-
-
 def speed(rows: list[dict]) -> list[dict]:
     """For each scene the rendered L1 that the paper's path (from zero) ends at, and the fewest seconds of a path from
     votes to it; None where none reaches it."""
@@ -193,11 +181,5 @@ def draw(rows: list[dict]):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("demos", nargs="?")
-    parser.add_argument("--quick", action="store_true", help="six small views of one scene: two minutes at most")
-    arguments = parser.parse_args()
-    chosen = QUICK if arguments.quick else Options()
-    if arguments.quick and not Path(chosen.replica).is_dir():
-        chosen = dataclasses.replace(chosen, seeds=(0,))
-    main(dataclasses.replace(chosen, **({"demos": arguments.demos} if arguments.demos else {})))
+    quick = QUICK if Path(QUICK.replica).is_dir() else dataclasses.replace(QUICK, seeds=(0,))
+    main(rooms_of(Options(), quick))

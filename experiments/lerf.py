@@ -45,7 +45,7 @@ WHY = {
     "miou": "Where a text found its region, what is missing is missing in the masks (`experiments.causes`): a method "
     "that compares each Gaussian with the text averages over all masks and needs no region to be whole.",
     "miou_vala": "alpha > 10/255 counts the faint rim of the selected Gaussians too. True masks end at 0.680 there "
-    "(figurines, seed 1, `experiments.causes`), VALA at 0.692: its gate drops Gaussians that carry little of a pixel.",
+    "(figurines, seed 1, `experiments.causes`), VALA at 0.692.",
 }
 """why the row held against the others does not lead in a figure where it does not"""
 

@@ -25,6 +25,7 @@ from jsecon.language.distill import distill_l1, distill_votes
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored
 from jsecon.query.canonical import query_canonical
+from jsecon.query.classes import query_classes
 from jsecon.query.one_step import query_one_step
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.showing import with_shown
@@ -234,7 +235,9 @@ def ask_field(
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
-    return _by_selection(setting, ask)
+    if way != "votes":
+        return _by_selection(setting, ask)
+    return Answers(ask, lambda: np.asarray(query_classes(field, jnp.asarray(setting.texts), retrieval=retrieval)[0]))
 
 
 def _field(way: str, *, retrieval: str = "contrast", clean: bool = True, **options) -> Method:

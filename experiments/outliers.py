@@ -10,7 +10,6 @@ of them that its lists of neighbours leave memory for.
 
 import dataclasses
 import resource
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,18 +17,17 @@ from pathlib import Path
 import numpy as np
 from sklearn.cluster import DBSCAN
 
-from experiments import beyond, results, scenes
+from experiments import results, scenes
+from experiments.command import rooms_of
+from experiments.state import point_miou, tracked
 from jsecon.query.clusters import dbscan
 from jsecon.query.outliers import EPS_SPACINGS, MIN_SAMPLES, default_eps, remove_outliers
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(scenes.Rooms):
     """What the experiment can vary."""
 
-    demos: str = str(results.HOME.parent / "demos")
-    texts: str = str(results.CAPTURES.parent / "text")
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     level: str = "medium"
     spacings: tuple[float, ...] = (2.0, 4.0, EPS_SPACINGS, 10.0)
     """eps in the selection's own spacings."""
@@ -71,22 +69,21 @@ def cleaners(means: np.ndarray, options: Options) -> dict[str, Callable[[np.ndar
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    space = scenes.text_space(Path(options.texts))
+    space = options.space()
     found: dict[str, list[float]] = {}
     seconds: dict[str, list[float]] = {}
-    for seed in options.seeds:
-        scene = scenes.demo_scene(Path(options.demos) / f"demo{seed}", seed)
+    for make in options.scenes().values():
+        scene = make()
         sight = scenes.look(scene, options.level, space)
         proof = scenes.evidence(scene, sight.masks.labels, len(sight.masks.origin))
-        ids = np.tile(np.arange(sight.pixels.shape[1]), len(sight.pixels))
-        state = beyond.State(sight, proof, ids, sight.pixels.reshape(-1) > 0, sight.pixels.shape[1])
+        state = tracked(sight, proof)
         masks = state.leads(state.joined(state.anchors(sight.texts)))
         ways = cleaners(np.asarray(scene.gaussians.means), options)
         for name, way in ways.items():
             began = time.process_time()
             kept = [way(mask) for mask in masks]
             seconds.setdefault(name, []).append((time.process_time() - began) / len(masks))
-            found.setdefault(name, []).append(beyond.point_miou(kept, scene.truth))
+            found.setdefault(name, []).append(point_miou(kept, scene.truth))
     rows = [
         (name, float(np.mean(v)), float(np.std(v)), f"{1000 * np.mean(seconds[name]):.2f}") for name, v in found.items()
     ]
@@ -131,4 +128,4 @@ def draw(rows: list[tuple]):
 
 
 if __name__ == "__main__":
-    main(dataclasses.replace(Options(), **({"demos": sys.argv[1]} if len(sys.argv) > 1 else {})))
+    main(rooms_of(Options()))

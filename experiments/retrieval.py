@@ -10,9 +10,7 @@ is there is more similar to its best region than one of what is not (area under 
 many of either kind it refuses, with the mIoU that is left.
 """
 
-import argparse
 import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,20 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results, scenes
-from experiments.beyond import State, consensus, point_miou
+from experiments.command import rooms_of
+from experiments.state import State, consensus, point_miou, tracked
 from jsecon.query.canonical import relevancies
 from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(scenes.Places):
     """What the experiment can vary."""
 
-    demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
-    replica: str = str(results.CAPTURES / "replica_apartment_0")
-    texts: str = str(results.CAPTURES.parent / "text")
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     levels: tuple[str, ...] = ("low", "medium", "high")
     absent: int = 200
     """texts of what is not there."""
@@ -93,15 +87,13 @@ def ask(scene: scenes.Scene, level: str, space: scenes.TextSpace, options: Optio
     sight = scenes.look(scene, level, space)
     proof = scenes.evidence(scene, sight.masks.labels, len(sight.masks.origin))
     here, count = sight.pixels.reshape(-1) > 0, len(sight.texts)
-    tracked = State(
-        sight, proof, np.tile(np.arange(sight.pixels.shape[1]), len(sight.pixels)), here, len(here) // len(sight.pixels)
-    )
+    states = {"tracks": tracked(sight, proof), "consensus": consensus(sight, proof, np.asarray(scene.gaussians.means))}
     shown = np.tile(sight.masks.origin, len(sight.pixels))
     draw = np.random.default_rng(scene.seed)
     others = space.vectors[draw.permutation(len(space.names))[: options.absent]]
     others = others[(others @ sight.texts.T).max(1) < 0.999]
     found = []
-    for name, state in (("tracks", tracked), ("consensus", consensus(sight, proof, np.asarray(scene.gaussians.means)))):
+    for name, state in states.items():
         joint = np.zeros((state.regions, count + 1))
         np.add.at(joint, (state.ids[here], shown[here]), sight.pixels.reshape(-1)[here])
         texts = np.concatenate([sight.texts, others])
@@ -159,12 +151,8 @@ def rows_of(asked: list[Asked], options: Options) -> tuple[list[dict], list[dict
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    space = scenes.text_space(Path(options.texts))
-    made = [functools.partial(scenes.demo_scene, Path(options.demos) / f"demo{seed}", seed) for seed in options.seeds]
-    if options.replica and Path(options.replica).is_dir():
-        made.append(functools.partial(scenes.replica_scene, options.replica))
-    asked = []
-    for make in made:
+    space, asked = options.space(), []
+    for make in options.scenes().values():
         scene = make()
         for level in options.levels:
             asked += ask(scene, level, space, options)
@@ -194,9 +182,4 @@ def draw(asked: list[Asked]):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("demos", nargs="?")
-    parser.add_argument("--quick", action="store_true", help="one demo room at one level of noise")
-    arguments = parser.parse_args()
-    chosen = QUICK if arguments.quick else Options()
-    main(dataclasses.replace(chosen, **({"demos": arguments.demos} if arguments.demos else {})))
+    main(rooms_of(Options(), QUICK))

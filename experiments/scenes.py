@@ -1,4 +1,4 @@
-"""Scenes with true instance labels, seen by simulated vision: what `beyond.py` and `thresholds.py` measure on.
+"""Scenes with true instance labels, seen by simulated vision: what the experiments on ideas measure on.
 
 The Gaussians are those of the real pipeline: demo rooms fitted to their frames, and the points of a Replica scan. A
 Gaussian's true object is the one that most of its weight lies on when the true masks of the voting views vote.
@@ -7,6 +7,7 @@ Gaussian's true object is the one that most of its weight lies on when the true 
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import sparse
 
-from experiments import replica_apartment_0
+from experiments import replica_apartment_0, results
 from jsecon.demo import demo
 from jsecon.language.field import load_field
 from jsecon.language.votes import region_votes
@@ -31,6 +32,41 @@ from jsecon.vision.simulated import (
     made_text_space,
     simulated_masks,
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class Rooms:
+    """The demo rooms that an experiment takes, and the texts that it asks: options that such experiments share."""
+
+    demos: str = str(results.HOME.parent / "demos")
+    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
+    texts: str = str(results.CAPTURES.parent / "text")
+    """CLIP's vectors of the LVIS classes; where they are not there, made ones."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+
+    def folder(self, seed: int) -> Path:
+        """Of the demo of `seed`."""
+        return Path(self.demos) / f"demo{seed}"
+
+    def scenes(self) -> "dict[str, Callable[[], Scene]]":
+        """A function that reads the scene, or makes it first, by name."""
+        return {f"demo {seed}": lambda seed=seed: demo_scene(self.folder(seed), seed) for seed in self.seeds}
+
+    def space(self) -> TextSpace:
+        """What the classes' names are drawn from."""
+        return text_space(Path(self.texts))
+
+
+@dataclasses.dataclass(frozen=True)
+class Places(Rooms):
+    """Demo rooms, and replica_apartment_0 where it lies beside the checkout."""
+
+    replica: str = str(results.CAPTURES / "replica_apartment_0")
+
+    def scenes(self) -> "dict[str, Callable[[], Scene]]":
+        """As Rooms.scenes; the capture comes last."""
+        captures = {"replica_apartment_0": lambda: replica_scene(self.replica)}
+        return super().scenes() | (captures if self.replica and Path(self.replica).is_dir() else {})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,6 @@ object; a view counts where the object has at least 40 px there.
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import jax
@@ -17,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results, scenes
+from experiments.command import rooms_of
 from jsecon.evaluate.metrics import iou, mean_iou
 from jsecon.language.codes import Spread, encode, region_codes, spread_codes
 from jsecon.language.distill import distill_votes
@@ -34,13 +34,9 @@ from jsecon.vision.simulated import LEVELS, SimulatedEmbedder
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(scenes.Rooms):
     """What the experiment can vary."""
 
-    demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
-    texts: str = str(results.CAPTURES.parent / "text")
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     latents: tuple[int, ...] = (3, 16)
     """of LangSplat's autoencoder."""
     spread_latent: int = 16
@@ -93,13 +89,13 @@ def score(gaussians: Gaussians, cameras: Camera, masks: np.ndarray, true: np.nda
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    space = scenes.text_space(Path(options.texts))
+    space = options.space()
     found: dict[str, dict[float, list[float]]] = {}
     hits = []
     for seed in options.seeds:
-        scene = scenes.demo_scene(Path(options.demos) / f"demo{seed}", seed)
-        whole = load_field(Path(options.demos) / f"demo{seed}" / "field.npz")
-        views, true = scenes.held_out_labels(Path(options.demos) / f"demo{seed}", whole.names)
+        folder = options.folder(seed)
+        scene, whole = scenes.demo_scene(folder, seed), load_field(folder / "field.npz")
+        views, true = scenes.held_out_labels(folder, whole.names)
         cameras = jax.tree.map(jnp.asarray, whole.cameras[views])
         chosen = np.random.default_rng(seed).choice(len(space.names), scene.count, replace=False)
         classes = [space.names[i] for i in chosen]
@@ -177,4 +173,4 @@ def draw(means: dict[str, dict[float, float]]):
 
 
 if __name__ == "__main__":
-    main(dataclasses.replace(Options(), **({"demos": sys.argv[1]} if len(sys.argv) > 1 else {})))
+    main(rooms_of(Options()))

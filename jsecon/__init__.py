@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         region_at as region_at,
     )
     from jsecon.query.canonical import query_canonical as query_canonical
+    from jsecon.query.classes import query_classes as query_classes
     from jsecon.query.masks import selection_mask as selection_mask
     from jsecon.query.one_step import query_one_step as query_one_step
     from jsecon.query.outliers import remove_outliers as remove_outliers
@@ -72,6 +73,7 @@ _CONTENTS = {
     "jsecon.parallel": ("host_mesh",),
     "jsecon.query.anchored": ("query_anchored", "query_region", "region_at"),
     "jsecon.query.canonical": ("query_canonical",),
+    "jsecon.query.classes": ("query_classes",),
     "jsecon.query.masks": ("selection_mask",),
     "jsecon.query.one_step": ("query_one_step",),
     "jsecon.query.outliers": ("remove_outliers",),

@@ -10,7 +10,16 @@ import pytest
 from scipy import sparse
 from small_field import make_field
 
-from experiments import apc_bin, beyond, default_vision, outliers, replica_apartment_0 as replica, scenes, thresholds
+from experiments import (
+    apc_bin,
+    beyond,
+    default_vision,
+    outliers,
+    replica_apartment_0 as replica,
+    scenes,
+    state,
+    thresholds,
+)
 from jsecon.errors import InputError
 from jsecon.fit.initialise import gaussians_from_points, points_from_depth
 from jsecon.types import Camera, Capture
@@ -179,18 +188,18 @@ def two_objects():
 def test_ideas_answer_what_the_votes_say(two_objects):
     sight, proof, truth = two_objects
     ids, ok = np.tile([0, 1], 6), np.ones(12, bool)
-    plain = beyond.State(sight, proof, ids, ok, 2)
+    plain = state.State(sight, proof, ids, ok, 2)
     groups = plain.joined(plain.anchors(sight.texts))
     assert [list(g) for g in groups] == [[0], [1]]
     assert plain.anchors(sight.texts, sight.canonical).tolist() == [0, 1]
     np.testing.assert_allclose(plain.shares(groups)[0][[0, 30, 60]], [5 / 6, 1 / 6, 0])
-    assert beyond.point_miou(plain.leads(groups), truth) == 1
+    assert state.point_miou(plain.leads(groups), truth) == 1
     assert not any(u.any() for u in beyond.ambiguous(plain, groups))
     kept = beyond.consistent(sight, plain)
     assert not kept.ok[10:].any()
     assert kept.ok[:10].all()  # F drops the two masks that were swapped
     np.testing.assert_allclose(kept.posteriors(groups)[0][[0, 30, 60]], [1, 0, 0])
-    agreed = beyond.State(sight, proof, beyond.agree(proof.votes, ids), ok, 2)
+    agreed = state.State(sight, proof, beyond.agree(proof.votes, ids), ok, 2)
     np.testing.assert_allclose(agreed.shares(groups)[0][[0, 30, 60]], [1, 0, 0])
     assert [list(g) for g in beyond.by_gap(plain, sight.texts)] == [[0], [1]]
 
@@ -198,7 +207,7 @@ def test_ideas_answer_what_the_votes_say(two_objects):
 def test_point_miou_is_over_the_objects_that_points_belong_to():
     truth = np.array([0, 0, 1, -1])
     masks = [np.array([1, 0, 0, 1], bool), truth == 1, np.ones(4, bool)]
-    assert beyond.point_miou(masks, truth) == pytest.approx((1 / 3 + 1) / 2)
+    assert state.point_miou(masks, truth) == pytest.approx((1 / 3 + 1) / 2)
 
 
 def test_higher_thresholds_select_less(scene, cameras):

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from jsecon.errors import require
 from jsecon.query.one_step import Codes, Number, as_codes, similarities
 from jsecon.query.pixel import region_at, region_shares_at
-from jsecon.query.retrieval import answers, require_retrieval, threshold_of
+from jsecon.query.retrieval import answers, threshold_of
 from jsecon.query.shares import gather_votes
 from jsecon.query.units import UnitCodes
 from jsecon.types import Array, LanguageField, Selection
@@ -107,11 +107,11 @@ def query_anchored(
         expected="'code', 'votes' or 'lead'",
         remedy="'votes' is the default.",
     )
-    require_retrieval(retrieval, "query_anchored")
+    least = threshold_of(retrieval, retrieval_threshold, "query_anchored")
     if field.regions.count == 0:
         return _nothing(field)
     given = (field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels)
-    region, score = _retrieve(*map(jnp.asarray, given), threshold_of(retrieval, retrieval_threshold), retrieval)
+    region, score = _retrieve(*map(jnp.asarray, given), least, retrieval)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
     return _members(_parts(field, codes), region, score, threshold, alike_threshold, unlabelled_weight, by)
 

@@ -77,15 +77,8 @@ def answers(
     return contrasts(embeddings, text, canonical, pixels)
 
 
-def threshold_of(retrieval: str, given: Number | None) -> Number:
-    """The threshold that was given, or that of the kind of retrieval."""
-    if given is not None:
-        return given
-    return RETRIEVAL_THRESHOLD if retrieval == "cosine" else CONTRAST_THRESHOLD
-
-
 def require_retrieval(retrieval: str, where: str) -> None:
-    """Raises ValueError unless `retrieval` is one of RETRIEVALS."""
+    """Raises ValueError, naming the function `where`, unless `retrieval` is one of RETRIEVALS."""
     require(
         retrieval in RETRIEVALS,
         where,
@@ -93,3 +86,11 @@ def require_retrieval(retrieval: str, where: str) -> None:
         expected=" or ".join(map(repr, RETRIEVALS)),
         remedy="'contrast' is the default.",
     )
+
+
+def threshold_of(retrieval: str, given: Number | None, where: str) -> Number:
+    """The threshold that was given, or that of the kind of retrieval, which must be one of RETRIEVALS."""
+    require_retrieval(retrieval, where)
+    if given is not None:
+        return given
+    return RETRIEVAL_THRESHOLD if retrieval == "cosine" else CONTRAST_THRESHOLD

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import InputError, require
 from jsecon.query.anchored import ALIKE_THRESHOLD, SHARE_THRESHOLD
 from jsecon.query.one_step import Number, similarities
-from jsecon.query.retrieval import answers, require_retrieval, threshold_of
+from jsecon.query.retrieval import answers, threshold_of
 from jsecon.query.shares import gather_votes
 from jsecon.types import Array, LanguageField, Selection
 
@@ -79,7 +79,6 @@ def query_several(
         expected=f"(Q >= 1, {size}) and (U, {size})",
         remedy="Embed the texts with the field's embedder.",
     )
-    require_retrieval(retrieval, "query_several")
     votes, known = field.votes, (field.regions.embeddings, field.regions.pixels, field.canonical)
     return _several(
         *(jnp.asarray(a) for a in (*known, votes.regions, votes.weights, votes.total, votes.views)),
@@ -88,7 +87,7 @@ def query_several(
         unwanted,
         several,
         nearness,
-        threshold_of(retrieval, retrieval_threshold),
+        threshold_of(retrieval, retrieval_threshold, "query_several"),
         similarity_threshold,
         retrieval,
     )

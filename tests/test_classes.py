@@ -1,0 +1,128 @@
+"""Every Gaussian's class: against sums written out in float64, and where there is nothing to say."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import unit_rows
+
+from jsecon.query.classes import query_classes
+from jsecon.query.retrieval import contrasts
+from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+
+SIZE, REGIONS, KEPT = 12, 6, 3
+
+
+def made_field(count, *, regions=REGIONS, seed=0):
+    """A field of made-up votes: `KEPT` different regions a Gaussian, the last of them none for every fourth."""
+    rng = np.random.default_rng(seed)
+    ids = np.argsort(rng.random((count, regions)), axis=1)[:, :KEPT].astype(np.int32)
+    weights = -np.sort(-rng.uniform(0.1, 9, (count, KEPT)), axis=1).astype(np.float32)
+    ids[::4, -1], weights[::4, -1] = -1, 0
+    labelled = weights.sum(1)
+    votes = Votes(
+        ids, weights, labelled, labelled + 1, 0 * labelled + 0.5, np.full(count, 3, np.int32), np.int32(0), regions
+    )
+    zero = np.zeros((count, 3), np.float32)
+    gaussians = Gaussians(zero, zero, np.ones((count, 4), np.float32), zero[:, 0], np.zeros((count, 1, 3), np.float32))
+    one = np.ones(1, np.float32)
+    table = unit_rows(rng, regions, 4)
+    known = Regions(unit_rows(rng, regions, SIZE), rng.integers(1, 900, (regions, 2)).astype(np.int32))
+    return LanguageField(
+        gaussians, np.zeros((count, 4), np.float32), votes, known, table, None,
+        Camera(np.eye(4, dtype=np.float32)[None], one, one, one, one, width=4, height=4),
+        unit_rows(rng, 4, SIZE), np.eye(4), ("only",),
+    )  # fmt: skip
+
+
+def exact(field, texts, similarity):
+    """The formula in float64, from (Q, R) similarities."""
+    dense = np.asarray(field.votes.dense(), np.float64)
+    return dense @ np.asarray(similarity, np.float64).T / dense.sum(1, keepdims=True)
+
+
+@pytest.mark.parametrize(("retrieval", "count"), [("contrast", 40_000), ("cosine", 60)])
+def test_equals_the_formula(retrieval, count):
+    field, texts = made_field(count), unit_rows(np.random.default_rng(1), 5, SIZE)
+    known = field.regions
+    similarity = known.embeddings @ texts.T
+    if retrieval == "contrast":
+        similarity = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1)
+    labels, found = query_classes(field, texts, retrieval=retrieval)
+    expected = exact(field, texts, similarity.T)
+    np.testing.assert_allclose(found, expected, atol=2e-6)
+    first, second = np.sort(expected, axis=1)[:, -1], np.sort(expected, axis=1)[:, -2]
+    clear = first - second > 1e-5
+    np.testing.assert_array_equal(np.asarray(labels)[clear], expected.argmax(1)[clear])
+    assert clear.mean() > 0.99
+
+
+def test_jit_and_vmap_over_sets_of_texts_equal_the_loop():
+    field = made_field(33_000)
+    sets = unit_rows(np.random.default_rng(2), 6, SIZE).reshape(2, 3, SIZE)
+    labels, found = jax.jit(jax.vmap(lambda texts: query_classes(field, texts)))(sets)
+    for texts, own, likeness in zip(sets, labels, found):
+        alone = query_classes(field, texts)
+        np.testing.assert_allclose(likeness, alone[1], atol=1e-6)
+        assert (np.asarray(own) == np.asarray(alone[0])).mean() > 0.999  # ties within rounding
+    few = made_field(8)
+    compiled = query_classes(few, sets[0])
+    with jax.disable_jit():
+        eager = query_classes(few, sets[0])
+    np.testing.assert_array_equal(eager[0], compiled[0])
+    np.testing.assert_allclose(eager[1], compiled[1], atol=1e-6)
+
+
+def test_gradient_equals_central_differences(x64):
+    field = jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, made_field(40))
+    weights = np.random.default_rng(3).normal(size=(40, 5))
+    total = jax.jit(lambda texts: jnp.sum(weights * query_classes(field, texts)[1]))
+    texts = unit_rows(np.random.default_rng(4), 5, SIZE).astype(np.float64)
+    step = np.random.default_rng(5).normal(size=texts.shape) * 1e-6
+    slope = float(jnp.sum(jax.grad(total)(jnp.asarray(texts)) * step))
+    assert slope == pytest.approx(float(total(texts + step) - total(texts - step)) / 2, rel=1e-5)
+
+
+def test_what_is_not_known_has_no_class():
+    field, texts = made_field(8), unit_rows(np.random.default_rng(1), 3, SIZE)
+    expected, _ = query_classes(field, texts)
+    regions, weights, views = (np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.views))
+    views[0] = 0
+    regions[1], weights[2, 0], weights[3, 0] = -1, np.nan, np.inf
+    votes = dataclasses.replace(field.votes, regions=regions, weights=weights, views=views)
+    labels, found = query_classes(dataclasses.replace(field, votes=votes), texts)
+    np.testing.assert_array_equal(labels[:4], -1)
+    np.testing.assert_array_equal(found[:4], 0)
+    np.testing.assert_array_equal(labels[4:], expected[4:])
+
+
+def test_regions_and_texts_without_a_direction_are_nobodys():
+    field, texts = made_field(60), unit_rows(np.random.default_rng(1), 3, SIZE)
+    lost = np.array(field.regions.embeddings)
+    lost[2] = 0
+    known = Regions(lost, field.regions.pixels)
+    labels, found = query_classes(dataclasses.replace(field, regions=known), texts, retrieval="cosine")
+    dense = np.asarray(field.votes.dense(), np.float64)
+    dense[:, 2] = 0
+    np.testing.assert_allclose(found, dense @ (lost @ texts.T) / dense.sum(1, keepdims=True), atol=1e-6)
+    assert (np.asarray(labels) >= 0).all()
+    opposite = np.concatenate([-lost.sum(0, keepdims=True), np.zeros((1, SIZE), np.float32)]).astype(np.float32)
+    labels, _ = query_classes(field, opposite, retrieval="cosine")
+    assert not np.asarray(labels).any()  # the worst of texts is nearer than none
+    labels, _ = query_classes(field, opposite[1:])
+    assert (np.asarray(labels) == -1).all()
+    empty = dataclasses.replace(made_field(5), regions=Regions(lost[:0], field.regions.pixels[:0]))
+    labels, found = query_classes(empty, texts)
+    assert (np.asarray(labels) == -1).all()
+    assert found.shape == (5, 3)
+
+
+def test_refuses_what_it_cannot_ask():
+    field, texts = made_field(4), unit_rows(np.random.default_rng(1), 3, SIZE)
+    for wrong in (texts[:, :5], texts[:0]):
+        with pytest.raises(ValueError, match="query_classes"):
+            query_classes(field, wrong)
+    with pytest.raises(ValueError, match="contrast"):
+        query_classes(field, texts, retrieval="nearest")

@@ -1,0 +1,36 @@
+"""What the command line says of answers."""
+
+import json
+
+import numpy as np
+from small_field import make_field
+
+from jsecon.answer import Answer
+from jsecon.plan import Silent
+from jsecon.query.anchored import query_region
+from jsecon.summary import write_answers
+
+
+class Told(Silent):
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+def test_an_answer_without_a_region_says_so_and_one_without_gaussians_differs(scene, cameras, tmp_path):
+    field, _ = make_field(scene, cameras)
+    nothing = np.zeros(field.gaussians.count, bool)
+    none = Answer("unicorn", "votes", query_region(field, -1), nothing, {})
+    empty = Answer("faint", "votes", query_region(field, 1, similarity_threshold=2.0), nothing, {})
+    told = Told()
+    write_answers(field, [none, empty], tmp_path, told, views=1)
+    first, second, pictures = told.lines
+    assert first.startswith("'unicorn': 0 of 64 Gaussians")
+    assert first.endswith("region None, nothing selected: no region answers it")
+    assert second.endswith("region 1, nothing selected")
+    assert pictures.endswith("answers.html")
+    assert "no region answers it" in (tmp_path / "answers.html").read_text()
+    written = [json.loads(file.read_text()) for file in sorted(tmp_path.rglob("*.json"))]
+    assert sorted((w["query"], w["region"]) for w in written) == [("faint", 1), ("unicorn", None)]
