@@ -185,8 +185,8 @@ def engine(case: Case, cotangent: np.ndarray):
 def dense(gaussians, camera, features, cotangent):
     with jax.enable_x64(True):
         arguments = jax.tree.map(jnp.asarray, (gaussians, camera, features, cotangent))
-        # Compiled without optimisation: twice as soon ready, and it runs but a few times.
-        run = _compiled(dense_image, xla_backend_optimization_level=0)
+        # Compiled without optimisation: several times as soon ready, and it runs but a few times.
+        run = _compiled(dense_image, xla_backend_optimization_level=0, xla_cpu_use_fusion_emitters=False)
         return jax.tree.map(np.asarray, run(*arguments))
 
 

@@ -254,13 +254,11 @@ def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denomin
 
 def test_under_jit_too_small_a_capacity_is_data_and_outside_an_error(task):
     scene, cameras, labels, codes, _, _capacity = task
-    crowd = jax.tree.map(lambda a: jnp.concatenate([a] * 40), scene)
-    needed = plan_capacity(crowd, cameras)
-    assert needed > 1024
-    with pytest.raises(ValueError, match="capacity=1024"):
-        distill_l1(crowd, cameras, labels, codes, steps=2, key=KEY, init="random", capacity=1024)
+    assert plan_capacity(scene, cameras) > 64
+    with pytest.raises(ValueError, match="capacity=64"):
+        distill_l1(scene, cameras, labels, codes, steps=2, key=KEY, init="random", capacity=64)
     run = jax.jit(
-        lambda key: distill_l1(crowd, cameras, labels, codes, steps=2, key=key, init="random", capacity=1024)[1]
+        lambda key: distill_l1(scene, cameras, labels, codes, steps=2, key=key, init="random", capacity=64)[1]
     )
     assert np.isnan(run(KEY)).all()
 

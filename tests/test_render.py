@@ -13,6 +13,9 @@ from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians
 
 CAPACITY = 4096
+SOON_READY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+"""for float64 programs that run a few times: the mathematics is what they are asked for, and they compile in half the
+time"""
 
 
 def to64(tree):
@@ -108,8 +111,10 @@ def test_every_gradient_equals_central_differences(x64, scene, camera):
         return (r.features * cotangent[..., :3]).sum() + (r.alpha * cotangent[..., 3]).sum()
 
     parts = (scene64.means, scene64.log_scales, scene64.quaternions, scene64.opacity_logits)
-    analytic = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(parts, camera64.world_to_camera, features)
-    value = jax.jit(loss)
+    analytic = jax.jit(jax.grad(loss, argnums=(0, 1, 2)), compiler_options=SOON_READY)(
+        parts, camera64.world_to_camera, features
+    )
+    value = jax.jit(loss, compiler_options=SOON_READY)
     rng = np.random.default_rng(3)
     checked = 0
     for k, name in enumerate(("means", "log_scales", "quaternions", "opacity_logits")):
@@ -169,9 +174,8 @@ def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
     np.testing.assert_allclose(along, expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("channels", [3, 16])
-def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera, channels):
-    rounded = jnp.asarray(random_features(scene.count, channels)).astype(jnp.bfloat16)
+def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera):
+    rounded = jnp.asarray(random_features(scene.count, 16)).astype(jnp.bfloat16)
     draw = jax.jit(lambda f: render(scene, camera, f, capacity=CAPACITY).features)
     image = draw(rounded)
     assert image.dtype == jnp.float32
@@ -261,14 +265,6 @@ def test_colour_follows_the_view_and_depth_is_that_of_the_surface(scene, cameras
     depth, alpha = render_depth(wall, camera)
     assert float(alpha[10:30, 12:36].min()) > 0.95
     np.testing.assert_allclose(depth[10:30, 12:36], 2.0, atol=0.02)
-
-
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (9, 7), (64, 8)])
-def test_image_sizes_that_no_tile_divides(scene, width, height):
-    camera = Camera(look_at((0, 0, -2.5)), *(np.float32(v) for v in (40, 40, width / 2, height / 2)), width, height)
-    features = random_features(scene.count, 3)
-    expected, _ = render_reference(scene, camera, features)
-    np.testing.assert_allclose(render(scene, camera, features).features, expected, atol=np.abs(features).max() / 255)
 
 
 def test_nothing_to_see_and_nothing_at_all(scene, camera):
