@@ -31,6 +31,7 @@ def task(scene, cameras):
     )
 
 
+@pytest.mark.slow
 def test_the_solver_is_below_the_votes_it_starts_from(task):
     rows = {row["path"]: row for row in code_paths.votes_paths(task, loyalties=(0.1,), sweeps=(8,))}
     assert len(rows) == 5

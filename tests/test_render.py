@@ -157,9 +157,9 @@ def test_every_gradient_equals_central_differences(x64, scene, camera):
 def test_wide_features_have_the_same_gradient_as_narrow_ones(scene, camera):
     wide = random_features(scene.count, 12)
     gradient = slope(wide, scene, camera)
-    for start in (0, 4, 8):
-        part = wide[:, start : start + 4]
-        np.testing.assert_allclose(gradient[:, start : start + 4], slope(part, scene, camera), rtol=1e-4, atol=1e-4)
+    for start in (0, 3, 6, 9):
+        part = wide[:, start : start + 3]
+        np.testing.assert_allclose(gradient[:, start : start + 3], slope(part, scene, camera), rtol=1e-4, atol=1e-4)
 
 
 def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
