@@ -22,9 +22,9 @@ def made_field(count, *, regions=REGIONS, seed=0):
     weights = -np.sort(-rng.uniform(0.1, 9, (count, KEPT)), axis=1).astype(np.float32)
     ids[::4, -1], weights[::4, -1] = -1, 0
     labelled = weights.sum(1)
-    votes = Votes(
-        ids, weights, labelled, labelled + 1, 0 * labelled + 0.5, np.full(count, 3, np.int32), np.int32(0), regions
-    )
+    views, peak = np.full(count, 3, np.int32), np.full(count, 0.5, np.float32)
+    shown = np.where(ids >= 0, weights * rng.uniform(1, 3, weights.shape), 0).astype(np.float32)
+    votes = Votes(ids, weights, labelled, labelled + 1, peak, views, np.int32(0), regions, shown=shown)
     zero = np.zeros((count, 3), np.float32)
     gaussians = Gaussians(zero, zero, np.ones((count, 4), np.float32), zero[:, 0], np.zeros((count, 1, 3), np.float32))
     one = np.ones(1, np.float32)
@@ -37,10 +37,15 @@ def made_field(count, *, regions=REGIONS, seed=0):
     )  # fmt: skip
 
 
-def exact(field, texts, similarity):
-    """The formula in float64, from (Q, R) similarities."""
-    dense = np.asarray(field.votes.dense(), np.float64)
-    return dense @ np.asarray(similarity, np.float64).T / dense.sum(1, keepdims=True)
+def exact(field, similarity, least):
+    """The formula in float64, from (R, Q) similarities, one Gaussian after the other."""
+    votes, found = field.votes, []
+    speaks = np.asarray(similarity).max(1) >= least
+    for ids, weights, shown in zip(*(np.asarray(a) for a in (votes.regions, votes.weights, votes.shown))):
+        share = {r: float(w) / float(s) for r, w, s in zip(ids, weights, shown) if r >= 0}
+        share = {r: p for r, p in share.items() if speaks[r]} or share
+        found.append(sum(p * np.asarray(similarity[r], np.float64) for r, p in share.items()) / sum(share.values()))
+    return np.array(found)
 
 
 @pytest.mark.parametrize(("retrieval", "count"), [("contrast", 40_000), ("cosine", 60)])
@@ -50,8 +55,9 @@ def test_equals_the_formula(retrieval, count):
     similarity = known.embeddings @ texts.T
     if retrieval == "contrast":
         similarity = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1)
-    labels, found = query_classes(field, texts, retrieval=retrieval)
-    expected = exact(field, texts, similarity.T)
+    least = float(np.sort(similarity.max(1))[2]) - 1e-4  # two regions are none of the classes
+    labels, found = query_classes(field, texts, retrieval=retrieval, retrieval_threshold=least)
+    expected = exact(field, similarity, least)
     np.testing.assert_allclose(found, expected, atol=2e-6)
     first, second = np.sort(expected, axis=1)[:, -1], np.sort(expected, axis=1)[:, -2]
     clear = first - second > 1e-5
@@ -103,10 +109,14 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     lost = np.array(field.regions.embeddings)
     lost[2] = 0
     known = Regions(lost, field.regions.pixels)
-    labels, found = query_classes(dataclasses.replace(field, regions=known), texts, retrieval="cosine")
-    dense = np.asarray(field.votes.dense(), np.float64)
-    dense[:, 2] = 0
-    np.testing.assert_allclose(found, dense @ (lost @ texts.T) / dense.sum(1, keepdims=True), atol=1e-6)
+    ask = {"retrieval": "cosine", "retrieval_threshold": -1.0}
+    labels, found = query_classes(dataclasses.replace(field, regions=known), texts, **ask)
+    ids, weights, shown = (np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.shown))
+    ids[ids == 2] = -1
+    without = dataclasses.replace(field.votes, regions=ids, weights=np.where(ids >= 0, weights, 0), shown=shown)
+    expected, same = query_classes(dataclasses.replace(field, votes=without), texts, **ask)
+    np.testing.assert_array_equal(labels, expected)
+    np.testing.assert_allclose(found, same, atol=1e-6)
     assert (np.asarray(labels) >= 0).all()
     opposite = np.concatenate([-lost.sum(0, keepdims=True), np.zeros((1, SIZE), np.float32)]).astype(np.float32)
     labels, _ = query_classes(field, opposite, retrieval="cosine")
@@ -117,6 +127,21 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     labels, found = query_classes(empty, texts)
     assert (np.asarray(labels) == -1).all()
     assert found.shape == (5, 3)
+
+
+def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
+    field = made_field(3, regions=3)
+    known = Regions(np.eye(3, SIZE, dtype=np.float32), field.regions.pixels)
+    ids = np.int32([[2, 0, -1], [2, -1, -1], [1, 2, -1]])
+    weights = np.float32([[8, 1, 0], [8, 0, 0], [2, 2, 0]])
+    votes = dataclasses.replace(field.votes, regions=ids, weights=weights, shown=np.float32([[8, 2, 0]] * 3))
+    field = dataclasses.replace(field, regions=known, votes=votes)
+    texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
+    labels, found = query_classes(field, texts, retrieval="cosine")
+    np.testing.assert_array_equal(labels, [0, 1, 1])  # the second was seen in the region of no class alone
+    np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
+    without = dataclasses.replace(field, votes=dataclasses.replace(votes, shown=None))
+    np.testing.assert_array_equal(query_classes(without, texts, retrieval="cosine")[0], [0, 1, 1])
 
 
 def test_refuses_what_it_cannot_ask():

@@ -8,21 +8,31 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.query.retrieval import answers, require_retrieval
+from jsecon.query.one_step import Number
+from jsecon.query.retrieval import answers, threshold_of
 from jsecon.types import Array, LanguageField
 
 
 def query_classes(
-    field: LanguageField, texts: Float[Array, "q e"], *, retrieval: str = "contrast"
+    field: LanguageField,
+    texts: Float[Array, "q e"],
+    *,
+    retrieval: str = "contrast",
+    retrieval_threshold: Number | None = None,
 ) -> tuple[Int[Array, " n"], Float[Array, "n q"]]:
     """The class of each Gaussian (N,), index of `texts` (Q, E), -1 = none; and how far it answers each text (N, Q).
 
-    That is the mean of its regions' similarities with the text, `retrieval` as in `query_anchored`, weighted by the
-    votes that each region casts on the Gaussian: sum_r w_r s(r, q) / sum_r w_r over the regions with an embedding. The
-    class is the largest; which one it is does not depend on a threshold, and something that is none of the classes gets
-    the one it is nearest to. Gaussians never seen, with votes that are not finite, or without votes on a region that
-    has an embedding have no class and similarities 0. Pure: jit it or vmap it over sets of texts. Raises ValueError on
-    texts of another size, on none, and on another `retrieval`.
+        sum_r p_nr s_rq / sum_r p_nr
+
+    with s the similarities of regions and texts, `retrieval` as in `query_anchored`, and p_nr the region's share of the
+    weight with which the Gaussian was seen in the views that show the region (of all weight, where the votes do not
+    know). The class is the largest. A region whose best text stays below `retrieval_threshold` (default 0.12 for
+    contrast, 0.2 for cosine) is none of the classes, such as the wall behind: it has a say only about Gaussians that no
+    other region votes on, so that each has a class that was seen in a region with an embedding. Others (never seen,
+    votes that are not finite) have none and similarities 0. Pure: jit it or vmap it over sets of texts. Raises
+    ValueError on texts of another size, on none, and on another `retrieval`.
+
+    experiments/replica.py measures it at the points of Replica's twin.
     """
     size = field.regions.embeddings.shape[1]
     require(
@@ -32,13 +42,15 @@ def query_classes(
         expected=f"(Q >= 1, {size})",
         remedy="Embed the names of the classes with the field's embedder.",
     )
-    require_retrieval(retrieval, "query_classes")
+    least = threshold_of(retrieval, retrieval_threshold, "query_classes")
+    votes = field.votes
     known = (field.regions.embeddings, texts, field.canonical, field.regions.pixels)
-    votes = (field.votes.regions, field.votes.weights, field.votes.views)
-    return _classes(*map(jnp.asarray, (*known, *votes)), retrieval)
+    given = (*known, votes.regions, votes.weights, votes.total, votes.views)
+    shown = None if votes.shown is None else jnp.asarray(votes.shown)
+    return _classes(*map(jnp.asarray, given), shown, least, retrieval)
 
 
-def _classes_body(embeddings, texts, canonical, pixels, regions, weights, views, retrieval):
+def _classes_body(embeddings, texts, canonical, pixels, regions, weights, total, views, shown, least, retrieval):
     count = embeddings.shape[0]
     shape = regions.shape[0], texts.shape[0]
     if count == 0:
@@ -47,13 +59,22 @@ def _classes_body(embeddings, texts, canonical, pixels, regions, weights, views,
     similarity, known = jax.vmap(ask)(texts)  # (Q, R) both
     asked = jnp.any(known, axis=1)  # a text that means nothing is nobody's class
     table, known = jnp.where(known, similarity, 0.0).T, jnp.any(known, axis=0)
-    total, found = jnp.zeros(shape[0], weights.dtype), jnp.zeros(shape, weights.dtype)
-    for k in range(regions.shape[1]):
-        place = jnp.clip(regions[:, k], 0, count - 1)
-        weight = jnp.where((regions[:, k] == place) & known[place], weights[:, k], 0.0)
-        total, found = total + weight, found + weight[:, None] * table[place]
-    sound = (views > 0) & (total > 0) & jnp.isfinite(total) & jnp.any(asked)
-    mean = jnp.where(sound[:, None], found / jnp.where(sound, total, 1.0)[:, None], 0.0)
+    speaks = known & (jnp.max(jnp.where(asked, table, -jnp.inf), axis=1) >= least)
+
+    def vote(allowed):
+        whole, found = jnp.zeros(shape[0], weights.dtype), jnp.zeros(shape, weights.dtype)
+        for k in range(regions.shape[1]):
+            place = jnp.clip(regions[:, k], 0, count - 1)
+            seen = total if shown is None else shown[:, k]
+            share = jnp.where(seen > 0, weights[:, k] / jnp.where(seen > 0, seen, 1.0), 0.0)
+            share = jnp.where((regions[:, k] == place) & allowed[place], share, 0.0)
+            whole, found = whole + share, found + share[:, None] * table[place]
+        return whole, found
+
+    (some, among), (whole, found) = vote(speaks), vote(known)
+    whole, found = jnp.where(some > 0, some, whole), jnp.where((some > 0)[:, None], among, found)
+    sound = (views > 0) & (whole > 0) & jnp.isfinite(whole) & jnp.isfinite(total) & jnp.any(asked)
+    mean = jnp.where(sound[:, None], found / jnp.where(sound, whole, 1.0)[:, None], 0.0)
     best = jnp.argmax(jnp.where(asked, mean, -jnp.inf), axis=1)
     return jnp.where(sound, best, -1).astype(jnp.int32), mean
 

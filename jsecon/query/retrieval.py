@@ -77,8 +77,9 @@ def answers(
     return contrasts(embeddings, text, canonical, pixels)
 
 
-def require_retrieval(retrieval: str, where: str) -> None:
-    """Raises ValueError, naming the function `where`, unless `retrieval` is one of RETRIEVALS."""
+def threshold_of(retrieval: str, given: Number | None, where: str) -> Number:
+    """The threshold that was given, or that of the kind of retrieval. Raises ValueError, naming the function `where`,
+    unless `retrieval` is one of RETRIEVALS."""
     require(
         retrieval in RETRIEVALS,
         where,
@@ -86,11 +87,6 @@ def require_retrieval(retrieval: str, where: str) -> None:
         expected=" or ".join(map(repr, RETRIEVALS)),
         remedy="'contrast' is the default.",
     )
-
-
-def threshold_of(retrieval: str, given: Number | None, where: str) -> Number:
-    """The threshold that was given, or that of the kind of retrieval, which must be one of RETRIEVALS."""
-    require_retrieval(retrieval, where)
     if given is not None:
         return given
     return RETRIEVAL_THRESHOLD if retrieval == "cosine" else CONTRAST_THRESHOLD
