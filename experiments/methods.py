@@ -237,7 +237,8 @@ def ask_field(
 
     if way != "votes":
         return _by_selection(setting, ask)
-    return Answers(ask, lambda: np.asarray(query_classes(field, jnp.asarray(setting.texts), retrieval=retrieval)[0]))
+    texts = jnp.asarray(setting.texts)
+    return Answers(ask, lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, every=True)[0]))
 
 
 def _field(way: str, *, retrieval: str = "contrast", clean: bool = True, **options) -> Method:

@@ -38,14 +38,16 @@ def made_field(count, *, regions=REGIONS, seed=0):
 
 
 def exact(field, similarity, least):
-    """The formula in float64, from (R, Q) similarities, one Gaussian after the other."""
-    votes, found = field.votes, []
+    """The formula in float64 from (R, Q) similarities, one Gaussian after the other; and the part of its share that
+    lies in regions of some class."""
+    votes, found, parts = field.votes, [], []
     speaks = np.asarray(similarity).max(1) >= least
     for ids, weights, shown in zip(*(np.asarray(a) for a in (votes.regions, votes.weights, votes.shown))):
         share = {r: float(w) / float(s) for r, w, s in zip(ids, weights, shown) if r >= 0}
+        parts.append(sum(p for r, p in share.items() if speaks[r]) / sum(share.values()))
         share = {r: p for r, p in share.items() if speaks[r]} or share
         found.append(sum(p * np.asarray(similarity[r], np.float64) for r, p in share.items()) / sum(share.values()))
-    return np.array(found)
+    return np.array(found), np.array(parts)
 
 
 @pytest.mark.parametrize(("retrieval", "count"), [("contrast", 40_000), ("cosine", 60)])
@@ -56,13 +58,18 @@ def test_equals_the_formula(retrieval, count):
     if retrieval == "contrast":
         similarity = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1)
     least = float(np.sort(similarity.max(1))[2]) - 1e-4  # two regions are none of the classes
-    labels, found = query_classes(field, texts, retrieval=retrieval, retrieval_threshold=least)
-    expected = exact(field, similarity, least)
+    options = {"retrieval": retrieval, "retrieval_threshold": least}
+    labels, found = query_classes(field, texts, every=True, **options)
+    expected, part = exact(field, similarity, least)
     np.testing.assert_allclose(found, expected, atol=2e-6)
     first, second = np.sort(expected, axis=1)[:, -1], np.sort(expected, axis=1)[:, -2]
     clear = first - second > 1e-5
     np.testing.assert_array_equal(np.asarray(labels)[clear], expected.argmax(1)[clear])
     assert clear.mean() > 0.99
+    none, _ = query_classes(field, texts, **options)
+    sure = np.abs(part - 0.5) > 1e-5
+    np.testing.assert_array_equal(np.asarray(none)[sure], np.where(part < 0.5, -1, labels)[sure])
+    assert 0 < (np.asarray(none) < 0).mean() < 0.9
 
 
 def test_jit_and_vmap_over_sets_of_texts_equal_the_loop():
@@ -93,12 +100,12 @@ def test_gradient_equals_central_differences(x64):
 
 def test_what_is_not_known_has_no_class():
     field, texts = made_field(8), unit_rows(np.random.default_rng(1), 3, SIZE)
-    expected, _ = query_classes(field, texts)
+    expected, _ = query_classes(field, texts, every=True)
     regions, weights, views = (np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.views))
     views[0] = 0
     regions[1], weights[2, 0], weights[3, 0] = -1, np.nan, np.inf
     votes = dataclasses.replace(field.votes, regions=regions, weights=weights, views=views)
-    labels, found = query_classes(dataclasses.replace(field, votes=votes), texts)
+    labels, found = query_classes(dataclasses.replace(field, votes=votes), texts, every=True)
     np.testing.assert_array_equal(labels[:4], -1)
     np.testing.assert_array_equal(found[:4], 0)
     np.testing.assert_array_equal(labels[4:], expected[4:])
@@ -119,7 +126,7 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     np.testing.assert_allclose(found, same, atol=1e-6)
     assert (np.asarray(labels) >= 0).all()
     opposite = np.concatenate([-lost.sum(0, keepdims=True), np.zeros((1, SIZE), np.float32)]).astype(np.float32)
-    labels, _ = query_classes(field, opposite, retrieval="cosine")
+    labels, _ = query_classes(field, opposite, retrieval="cosine", every=True)
     assert not np.asarray(labels).any()  # the worst of texts is nearer than none
     labels, _ = query_classes(field, opposite[1:])
     assert (np.asarray(labels) == -1).all()
@@ -133,15 +140,16 @@ def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     field = made_field(3, regions=3)
     known = Regions(np.eye(3, SIZE, dtype=np.float32), field.regions.pixels)
     ids = np.int32([[2, 0, -1], [2, -1, -1], [1, 2, -1]])
-    weights = np.float32([[8, 1, 0], [8, 0, 0], [2, 2, 0]])
+    weights = np.float32([[8, 1, 0], [8, 0, 0], [8, 1, 0]])
     votes = dataclasses.replace(field.votes, regions=ids, weights=weights, shown=np.float32([[8, 2, 0]] * 3))
     field = dataclasses.replace(field, regions=known, votes=votes)
     texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
-    labels, found = query_classes(field, texts, retrieval="cosine")
+    labels, found = query_classes(field, texts, retrieval="cosine", every=True)
     np.testing.assert_array_equal(labels, [0, 1, 1])  # the second was seen in the region of no class alone
+    np.testing.assert_array_equal(query_classes(field, texts, retrieval="cosine")[0], [-1, -1, 1])
     np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
     without = dataclasses.replace(field, votes=dataclasses.replace(votes, shown=None))
-    np.testing.assert_array_equal(query_classes(without, texts, retrieval="cosine")[0], [0, 1, 1])
+    np.testing.assert_array_equal(query_classes(without, texts, retrieval="cosine", every=True)[0], [0, 1, 1])
 
 
 def test_refuses_what_it_cannot_ask():

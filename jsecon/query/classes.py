@@ -19,6 +19,7 @@ def query_classes(
     *,
     retrieval: str = "contrast",
     retrieval_threshold: Number | None = None,
+    every: bool = False,
 ) -> tuple[Int[Array, " n"], Float[Array, "n q"]]:
     """The class of each Gaussian (N,), index of `texts` (Q, E), -1 = none; and how far it answers each text (N, Q).
 
@@ -27,10 +28,12 @@ def query_classes(
     with s the similarities of regions and texts, `retrieval` as in `query_anchored`, and p_nr the region's share of the
     weight with which the Gaussian was seen in the views that show the region (of all weight, where the votes do not
     know). The class is the largest. A region whose best text stays below `retrieval_threshold` (default 0.12 for
-    contrast, 0.2 for cosine) is none of the classes, such as the wall behind: it has a say only about Gaussians that no
-    other region votes on, so that each has a class that was seen in a region with an embedding. Others (never seen,
-    votes that are not finite) have none and similarities 0. Pure: jit it or vmap it over sets of texts. Raises
-    ValueError on texts of another size, on none, and on another `retrieval`.
+    contrast, 0.2 for cosine) is none of the classes, such as the wall behind, and left out of the sums; a Gaussian with
+    most of its share in such regions has no class. With `every` it has one all the same, as the protocols ask, which
+    know no answer "none"; where no other region votes on it, from those that are left out elsewhere. Gaussians never
+    seen, without votes on a region that has an embedding, or with votes that are not finite never have a class, and
+    similarities 0. Pure: jit it or vmap it over sets of texts. Raises ValueError on texts of another size, on none, and
+    on another `retrieval`.
 
     experiments/replica.py measures it at the points of Replica's twin.
     """
@@ -47,10 +50,10 @@ def query_classes(
     known = (field.regions.embeddings, texts, field.canonical, field.regions.pixels)
     given = (*known, votes.regions, votes.weights, votes.total, votes.views)
     shown = None if votes.shown is None else jnp.asarray(votes.shown)
-    return _classes(*map(jnp.asarray, given), shown, least, retrieval)
+    return _classes(*map(jnp.asarray, given), shown, least, retrieval, every)
 
 
-def _classes_body(embeddings, texts, canonical, pixels, regions, weights, total, views, shown, least, retrieval):
+def _classes_body(embeddings, texts, canonical, pixels, regions, weights, total, views, shown, least, retrieval, every):
     count = embeddings.shape[0]
     shape = regions.shape[0], texts.shape[0]
     if count == 0:
@@ -71,12 +74,13 @@ def _classes_body(embeddings, texts, canonical, pixels, regions, weights, total,
             whole, found = whole + share, found + share[:, None] * table[place]
         return whole, found
 
-    (some, among), (whole, found) = vote(speaks), vote(known)
-    whole, found = jnp.where(some > 0, some, whole), jnp.where((some > 0)[:, None], among, found)
+    (some, among), (share_of_all, found) = vote(speaks), vote(known)
+    whole, found = jnp.where(some > 0, some, share_of_all), jnp.where((some > 0)[:, None], among, found)
     sound = (views > 0) & (whole > 0) & jnp.isfinite(whole) & jnp.isfinite(total) & jnp.any(asked)
     mean = jnp.where(sound[:, None], found / jnp.where(sound, whole, 1.0)[:, None], 0.0)
     best = jnp.argmax(jnp.where(asked, mean, -jnp.inf), axis=1)
-    return jnp.where(sound, best, -1).astype(jnp.int32), mean
+    decided = sound if every else sound & (some >= 0.5 * share_of_all)
+    return jnp.where(decided, best, -1).astype(jnp.int32), mean
 
 
-_classes = jax.jit(_classes_body, static_argnames="retrieval")
+_classes = jax.jit(_classes_body, static_argnames=("retrieval", "every"))
