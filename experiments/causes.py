@@ -7,7 +7,8 @@ each: how many texts find a region of the right object, by the cosine and by the
 object its best region holds over all frames (recall) and how much of that is the object's (purity); and mIoU of the
 text's region, and of the best region given, by each kind of membership: the share of the votes of all views; of the
 views that show the region; the lead. Above all stands what the Gaussians themselves allow: true masks, membership by
-votes. VALA, which needs no region, is beside.
+votes. VALA, which needs no region, is beside; and what a stricter threshold does, as the two readings of alpha, 0.7 and
+10/255, want opposite things of the rim of a selection.
 """
 
 import argparse
@@ -31,6 +32,8 @@ from jsecon.types import Selection
 ASSOCIATIONS = ("tracks", "consensus")
 RETRIEVALS = ("cosine", "contrast")
 MEMBERSHIPS = ("all_views", "votes", "lead")
+SHARES = (0.7, 0.8, 0.9)
+"""of a Gaussian's weight that must lie inside, where the default is 0.5: what strictness wins and loses"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +101,9 @@ def main(options: Options = Options()) -> dict:
                 answers = ask_field(setting, field, way, retrieval=retrieval)
                 told(f"{by}, {way}, {retrieval}", answers, texts=f"{right} of {len(meant)}", **state)
             told(f"{by}, {way}, region given", given(setting, field, best, way), **state)
+        for share in SHARES:
+            answers = ask_field(setting, field, "votes", threshold=share)
+            told(f"{by}, votes, contrast, share >= {share:g}", answers, **state)
     columns = ("what", "texts", "recall", "purity", "miou", "miou_vala")
     table = results.table(columns, [tuple(row.get(name, "") for name in columns) for row in rows])
     text = f"{options.scene}, seed {options.seed}, a twin in LERF-OVS's layout, {options.level} noise.\n\n{table}"
