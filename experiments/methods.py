@@ -28,6 +28,7 @@ from jsecon.query.canonical import query_canonical
 from jsecon.query.classes import query_classes
 from jsecon.query.one_step import query_one_step
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.probability import membership_probability
 from jsecon.query.showing import with_shown
 from jsecon.types import LanguageField, Regions, Selection, Votes
 
@@ -214,8 +215,8 @@ def ask_field(
     clean: bool = True,
     threshold: float | None = None,
 ) -> Answers:
-    """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code
-    (all anchored, by `retrieval`), one_step or canonical; `clean` drops outliers."""
+    """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code,
+    probability (of the votes; all anchored, by `retrieval`), one_step or canonical; `clean` drops outliers."""
     means = np.asarray(setting.evidence.gaussians.means)
     by, weight = ("votes", 1.0) if way == "all_views" else (way, None)
     phrases = jnp.asarray(field.canonical)
@@ -229,6 +230,11 @@ def ask_field(
         elif way == "canonical":
             code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
             found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
+        elif way == "probability":
+            found = query_anchored(field, text, retrieval=retrieval)
+            probability = membership_probability(found.similarity, field.votes)
+            inside = (found.region >= 0) & (probability >= (0.5 if threshold is None else threshold))
+            found = dataclasses.replace(found, mask=inside)
         else:
             options = {"similarity_threshold": threshold, "unlabelled_weight": weight, "retrieval": retrieval}
             found = query_anchored(field, text, by=by, **options)

@@ -15,7 +15,7 @@ from experiments import lerf, results, tables
 from experiments.command import options_of
 from experiments.methods import ask_field, field_of
 
-WAYS = ("one_step", "canonical", "code", "votes", "lead")
+WAYS = ("one_step", "canonical", "code", "votes", "probability", "lead")
 
 
 @dataclasses.dataclass(frozen=True)
