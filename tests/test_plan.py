@@ -18,8 +18,8 @@ def features_of(count: int, channels: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(2).normal(size=(count, channels)), jnp.float32)
 
 
-def test_a_planned_render_is_a_render(scene, camera):
-    channels = 3
+@pytest.mark.parametrize("channels", [3, 16])
+def test_a_planned_render_is_a_render(scene, camera, channels):
     features, background = features_of(scene.count, channels), jnp.arange(channels, dtype=jnp.float32)
     plan = plan_view(scene, camera)
     got, expected = render_plan(plan, features, background=background), render(scene, camera, features)
@@ -59,11 +59,12 @@ def test_a_plan_says_what_it_lacks(scene, camera):
     assert int(plan_view(scene, camera, capacity=32).overflow) > 0
 
 
-def test_several_devices_give_what_one_gives(scene, camera):
+@pytest.mark.parametrize("channels", [3, 16])
+def test_several_devices_give_what_one_gives(scene, camera, channels):
     mesh = host_mesh()
     assert mesh is not None
     assert mesh.size == 2
-    features = features_of(scene.count, 16)
+    features = features_of(scene.count, channels)
 
     def value_and_gradient(mesh):
         def loss(gaussians, features):

@@ -174,8 +174,9 @@ def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
     np.testing.assert_allclose(along, expected, rtol=1e-4)
 
 
-def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera):
-    rounded = jnp.asarray(random_features(scene.count, 16)).astype(jnp.bfloat16)
+@pytest.mark.parametrize("channels", [3, 16])
+def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera, channels):
+    rounded = jnp.asarray(random_features(scene.count, channels)).astype(jnp.bfloat16)
     draw = jax.jit(lambda f: render(scene, camera, f, capacity=CAPACITY).features)
     image = draw(rounded)
     assert image.dtype == jnp.float32
@@ -265,6 +266,14 @@ def test_colour_follows_the_view_and_depth_is_that_of_the_surface(scene, cameras
     depth, alpha = render_depth(wall, camera)
     assert float(alpha[10:30, 12:36].min()) > 0.95
     np.testing.assert_allclose(depth[10:30, 12:36], 2.0, atol=0.02)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (9, 7), (64, 8)])
+def test_image_sizes_that_no_tile_divides(scene, width, height):
+    camera = Camera(look_at((0, 0, -2.5)), *(np.float32(v) for v in (40, 40, width / 2, height / 2)), width, height)
+    features = random_features(scene.count, 3)
+    expected, _ = render_reference(scene, camera, features)
+    np.testing.assert_allclose(render(scene, camera, features).features, expected, atol=np.abs(features).max() / 255)
 
 
 def test_nothing_to_see_and_nothing_at_all(scene, camera):
