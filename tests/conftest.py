@@ -167,7 +167,7 @@ def room_run(room, made_once, tmp_path_factory):
     """A finished run on that room with its true masks given, and a folder as it was written, this worker's own."""
     from jsecon import pipeline
 
-    options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150, sh_degree=0)
+    options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150)
     with made_once("run") as folder:
         run = pipeline.run(options, folder)
         return run, Path(shutil.copytree(folder, tmp_path_factory.mktemp("run") / "out"))

@@ -42,7 +42,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
         "--steps",
         150,
         "--sh-degree",
-        0,
+        1,
     )
     told = capsys.readouterr().out
     assert code == 0

@@ -29,7 +29,7 @@ class Ears(Silent):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out, ears = tmp_path_factory.mktemp("demo"), Ears()
-    return demo.demo(out, steps=80, reporter=ears, room=ROOM), out, ears
+    return demo.demo(out, steps=150, reporter=ears, room=ROOM), out, ears
 
 
 def test_metrics_have_every_figure_that_is_promised(finished):
@@ -86,7 +86,7 @@ def test_the_report_shows_every_query_and_stands_alone(finished):
 def test_a_second_call_finds_it_all_done(finished):
     metrics, out, _ = finished
     before, ears = (out / "field.npz").read_bytes(), Ears()
-    again = demo.demo(out, steps=80, reporter=ears, room=ROOM)
+    again = demo.demo(out, steps=150, reporter=ears, room=ROOM)
     assert {name for name, fresh in ears.fresh.items() if fresh} == {"field"}
     assert (out / "field.npz").read_bytes() == before
     assert again["anchored"] == metrics["anchored"]

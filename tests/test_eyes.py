@@ -37,7 +37,7 @@ def models(tmp_path_factory):
 @pytest.fixture(scope="module")
 def splat(room, tmp_path_factory):
     """The room's sparse points as Gaussians: a scene that is given, so that nothing is fitted."""
-    start, _ = starting_gaussians(load_capture(room, holdout=4), sh_degree=0)
+    start, _ = starting_gaussians(load_capture(room, holdout=4), sh_degree=1)
     path = tmp_path_factory.mktemp("splat") / "scene.ply"
     save_ply(path, start)
     return path

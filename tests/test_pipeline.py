@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon import cache, eyes, pipeline
+from jsecon import cache, eyes, pipeline, recipe
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -98,7 +98,9 @@ def test_a_damaged_stage_is_said_and_computed_again_to_the_same_field(room_run, 
 
 def test_the_plan_says_what_is_left_out_and_why(room_run, room, tmp_path):
     run, _ = room_run
-    assert {"densification", "view-dependent colour", "segmenter", "association"} <= set(run.left_out)
+    assert {"densification", "segmenter", "association"} <= set(run.left_out)
+    flat = dataclasses.replace(run.options, sh_degree=0)
+    assert set(recipe.left_out(flat)) - set(recipe.left_out(run.options)) == {"view-dependent colour"}
     save_ply(tmp_path / "scene.ply", run.field.gaussians)
     reporter = Recorder()
     given = pipeline.run(
@@ -220,7 +222,7 @@ def savez_or_die(file, **arrays):
     savez(file, **arrays)
 
 np.savez = savez_or_die
-pipeline.run(Options(room, holdout=4, steps=120, sh_degree=0), out)
+pipeline.run(Options(room, holdout=4, steps=120), out)
 """
 
 

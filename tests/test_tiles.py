@@ -120,5 +120,8 @@ def test_a_plan_fits_every_view_and_leaves_room(scene, cameras):
     most = max(counted(scene, cameras[t]) for t in range(4))
     assert most <= capacity
     assert plan_capacity(scene, cameras[0]) <= plan_capacity(scene, cameras, margin=2.0)
-    assert round_capacity(0) == 1024
-    assert all(p <= round_capacity(p) <= 1.126 * p for p in (1025, 5000, 70001, 3_000_000))
+    assert round_capacity(0) == round_capacity(4096) == 4096
+    assert [round_capacity(p) for p in (4097, 8192, 8193, 16384)] == [8192, 8192, 16384, 16384]
+    assert all(p <= round_capacity(p) <= 1.126 * p for p in (16385, 70001, 3_000_000))
+    sizes = [round_capacity(p) for p in range(0, 70_000, 37)]
+    assert sizes == sorted(sizes)

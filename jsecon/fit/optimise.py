@@ -291,12 +291,12 @@ def evaluate_psnr(
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, " f"]:
     """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to [0,
-    1]."""
+    1]. `background` (3,) rgb in [0, 1], black by default."""
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
     values = []
     for n, t in enumerate(chosen):
-        backdrop = jnp.zeros(3) if background is None else background
-        image = render_rgb(gaussians, jax.tree.map(jnp.asarray, capture.cameras[int(t)]), background=backdrop).features
+        camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
+        image = render_rgb(gaussians, camera, background=background).features
         values.append(float(psnr(jnp.clip(image, 0, 1), jnp.asarray(capture.frames[t], jnp.float32) / 255.0)))
         if progress:
             progress(n + 1, len(chosen))

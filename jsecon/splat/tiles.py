@@ -249,8 +249,8 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
     """The number of (block, Gaussian) pairs to allow for, so that no view of `cameras` (one, or a batch) overflows,
     also where `devices` of them share it (by default all of this process's).
 
-    Host code: needs concrete arrays. Rounded up to an eighth of a power of two, so that captures of like size share
-    one compilation. `margin` leaves room for Gaussians that still move.
+    Host code: needs concrete arrays. Rounded up (`round_capacity`), so that captures of like size share one
+    compilation. `margin` leaves room for Gaussians that still move.
     """
     strips = jax.local_device_count() if devices is None else devices
     views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
@@ -261,7 +261,12 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
 
 
 def round_capacity(pairs: int) -> int:
-    """`pairs` rounded up to an eighth of a power of two, at least 1024."""
-    pairs = max(pairs, 1024)
-    step = 2 ** max(pairs.bit_length() - 4, 0)
+    """`pairs` rounded up to an eighth of a power of two; below 16,384 to a power of two, at least 4,096.
+
+    A compilation takes seconds, 4,096 pairs of room too much half a millisecond a render: small scenes share programs.
+    """
+    small = max(4096, 1 << (max(pairs, 1) - 1).bit_length())
+    if small <= 16384:
+        return small
+    step = 2 ** (pairs.bit_length() - 4)
     return -(-pairs // step) * step

@@ -1,15 +1,10 @@
-"""Region proposals without any weights: colour, texture and, where known, depth and normals, merged over a region
-graph.
+"""Region proposals without any weights: colour, texture and, where known, depth and normals.
 
 The frame is smoothed, cut into small regions that follow its edges (graph segmentation: Felzenszwalb & Huttenlocher
-2004), and neighbours are merged in order of dissimilarity (as in hierarchical grouping: Uijlings et al. 2013), which
-mixes the step of colour across their common border with the difference of their means: shading makes the means of one
-surface differ while its borders stay soft, and texture makes borders hard while the means agree.
+2004), and neighbours are merged over the graph of these regions (`region_graph`).
 """
 
 import dataclasses
-import heapq
-import math
 from collections.abc import Callable, Sequence
 
 import cv2
@@ -17,16 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import require
+from jsecon.vision.region_graph import borders, merge
 from jsecon.vision.relief import geometry_features
 from jsecon.vision.surfaces import Surface
-
-BORDER_SHARE = 0.4
-"""of the step across the border in a dissimilarity; the rest is the difference of the means"""
-GROWN_AREA = 0.006
-"""share of the frame from which a region counts in full"""
-SMALLEST_FACTOR = 0.22
-"""least factor on the dissimilarity of a small region, which grows with the root of its area: texture is made of
-these"""
 
 GRANULARITIES: dict[str, dict[str, float]] = {
     "fine": {"merge_distance": 10.0},
@@ -169,150 +157,6 @@ def oversegment(
     """(H, W, C) -> (H, W) int32 small connected regions that follow the edges (Felzenszwalb & Huttenlocher 2004)."""
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=scale, min_size=min_size)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
-
-
-@dataclasses.dataclass(frozen=True)
-class Borders:
-    """The region graph's edges: one row a pair of neighbours."""
-
-    pairs: np.ndarray
-    """(E, 2) atoms, the smaller number first."""
-    length: np.ndarray
-    """(E,) px of common border."""
-    colour: np.ndarray
-    """(E,) step of colour across the border, summed over its length, CIELAB units."""
-    shape: np.ndarray
-    """(E,) step of depth and normal, likewise; at most twice the unit a pixel; 0 where nothing is known."""
-
-
-def borders(
-    atoms: Int32[np.ndarray, "h w"],
-    features: Float32[np.ndarray, "h w d"],
-    shape: Float32[np.ndarray, "h w c"] | Surface | None,
-    *,
-    steepness: float = 1.0,
-    most: float = 40.0,
-) -> Borders:
-    """Who borders on whom, and how hard.
-
-    A step is measured between pixels two to either side of the border, so that the blur of an edge does not hide it. A
-    step of shape is one of its channels (H, W, C), or `steepness` times how far a surface leaves its plane; it counts
-    `most` at most: one far background does not outweigh the rest of an outline.
-    """
-    keys, colours, shapes = [], [], []
-    for axis in (0, 1):
-        n = atoms.shape[axis]
-        near, far = np.arange(n - 1), np.arange(1, n)
-        inner, outer = np.maximum(near - 2, 0), np.minimum(far + 2, n - 1)
-        a, b = np.take(atoms, near, axis), np.take(atoms, far, axis)
-        cut = a != b
-
-        def step(values, axis=axis, inner=inner, outer=outer, cut=cut):
-            return np.linalg.norm(np.take(values, outer, axis)[cut] - np.take(values, inner, axis)[cut], axis=-1)
-
-        keys.append(np.sort(np.stack([a[cut], b[cut]], -1), axis=-1))
-        colours.append(step(features))
-        if shape is None:
-            shapes.append(np.zeros(len(colours[-1])))
-        elif isinstance(shape, Surface):
-            shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], most))
-        else:
-            shapes.append(np.minimum(step(shape), most))
-    pairs, inverse = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    return Borders(
-        pairs,
-        np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
-        np.bincount(inverse, np.concatenate(colours), len(pairs)),
-        np.bincount(inverse, np.concatenate(shapes), len(pairs)),
-    )
-
-
-def merge(
-    atoms: Int32[np.ndarray, "h w"],
-    features: Float32[np.ndarray, "h w d"],
-    edges: Borders,
-    *,
-    distance: float,
-    min_area: float,
-) -> Int32[np.ndarray, "h w"]:
-    """Merges neighbours, the most alike first, until none is nearer than `distance`; then gives away what is too small
-    (below `min_area`, px) or too thin to its most alike neighbour.
-
-    Dissimilarity: the step of colour across the border and the difference of the mean colours, mixed, less for small
-    regions (they are what texture is made of); and the step of shape, as the other leg of a right triangle. Returns
-    labels (H, W) int32 0 .. M-1.
-    """
-    # Numbered as a reader meets them, so that ties fall the same way whatever the atoms are called.
-    _, first, flat = np.unique(atoms.reshape(-1), return_index=True, return_inverse=True)
-    number = np.argsort(np.argsort(first))
-    flat = number[flat]
-    atoms, pairs = flat.reshape(atoms.shape), np.sort(number[edges.pairs], axis=-1)
-    sums_of = np.stack([edges.colour, edges.shape, edges.length], -1)
-    count = len(first)
-    area = np.bincount(flat, minlength=count).astype(np.float64)
-    sums = np.stack([np.bincount(flat, features[..., c].reshape(-1), count) for c in range(features.shape[-1])], -1)
-    # neighbour -> sums of the step of colour, of the step of shape, and length of the border
-    links: list[dict[int, tuple[float, float, float]]] = [{} for _ in range(count)]
-    for row in np.lexsort((pairs[:, 1], pairs[:, 0])):
-        a, b = pairs[row].tolist()
-        links[a][b] = links[b][a] = tuple(sums_of[row].tolist())
-    parent = np.arange(count)
-    version = np.zeros(count, np.int64)
-
-    full = GROWN_AREA * atoms.size
-
-    def dissimilarity(a: int, b: int) -> float:
-        colour, shape, border = links[a][b]
-        gap = float(np.linalg.norm(sums[a] / area[a] - sums[b] / area[b]))
-        grown = min(max((min(area[a], area[b]) / full) ** 0.5, SMALLEST_FACTOR), 1.0)
-        return math.hypot(grown * (BORDER_SHARE * colour / border + (1.0 - BORDER_SHARE) * gap), shape / border)
-
-    def absorb(a: int, b: int) -> None:
-        """b becomes part of a."""
-        parent[b] = a
-        area[a] += area[b]
-        sums[a] += sums[b]
-        version[a] += 1
-        for other, (colour, shape, border) in links[b].items():
-            del links[other][b]
-            if other != a:
-                known = links[a].get(other, (0.0, 0.0, 0.0))
-                links[a][other] = links[other][a] = (known[0] + colour, known[1] + shape, known[2] + border)
-        links[b] = {}
-
-    heap = [(dissimilarity(a, b), a, b, 0, 0) for a in range(count) for b in links[a] if a < b]
-    heapq.heapify(heap)
-    while heap:
-        cost, a, b, version_a, version_b = heapq.heappop(heap)
-        if parent[a] != a or parent[b] != b or version[a] != version_a or version[b] != version_b:
-            continue
-        if cost >= distance:
-            break
-        if area[a] < area[b]:
-            a, b = b, a
-        absorb(a, b)
-        for other in links[a]:
-            heapq.heappush(heap, (dissimilarity(a, other), a, other, version[a], version[other]))
-    thin = ~np.isin(np.arange(count), _cores(_roots(parent)[atoms]))
-    for a in sorted(np.flatnonzero((parent == np.arange(count)) & (area > 0)).tolist(), key=lambda a: area[a]):
-        if parent[a] == a and (area[a] < min_area or thin[a]) and links[a]:
-            absorb(min(links[a], key=lambda other: dissimilarity(a, other)), a)
-    return np.unique(_roots(parent)[flat], return_inverse=True)[1].reshape(atoms.shape).astype(np.int32)
-
-
-def _roots(parent: np.ndarray) -> np.ndarray:
-    """Where each chain of parents ends; each pass halves the chains."""
-    while not np.array_equal(parent, parent[parent]):
-        parent = parent[parent]
-    return parent
-
-
-def _cores(labels: np.ndarray) -> np.ndarray:
-    """The labels that hold a 5x5 square: the others are slivers along an edge, blurred between its two sides."""
-    image = labels.astype(np.float32)
-    square = np.ones((5, 5), np.uint8)
-    return np.unique(labels[cv2.dilate(image, square) == cv2.erode(image, square)])
 
 
 def masks_best_first(
