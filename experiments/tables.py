@@ -17,6 +17,7 @@ from jsecon.data.benchmark import Benchmark
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.evaluate.points import evaluate_points
 from jsecon.files import write_text
+from jsecon.process import forget_programs
 
 KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "pairs", "missing", "accuracy")
 
@@ -55,6 +56,7 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
         files = {name: _file(plan, scene, seed, level, name) for name in plan.methods}
         missing = [name for name, file in files.items() if not file.exists()]
         if missing:
+            forget_programs()
             setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps)
             for name in missing:
                 began = time.perf_counter()

@@ -1,14 +1,17 @@
-"""What only a program may set, once, before jax starts: the library itself never touches the process it lives in.
+"""What only a program may do to its process: the library itself never touches the one it lives in.
 
-`jsecon` on the command line calls `prepare_process` first. A program of your own that wants both cores and the speed of
-benchmarks/results.md does the same:
+Before jax starts, once: `jsecon` on the command line calls `prepare_process` first. A program of your own that wants both
+cores and the speed of benchmarks/results.md does the same:
 
     from jsecon.process import prepare_process
     prepare_process()
     import jsecon
+
+From time to time, where it lives long and sees many scenes: `forget_programs()`.
 """
 
 import ctypes
+import gc
 import hashlib
 import os
 import sys
@@ -33,6 +36,26 @@ def prepare_process(*, keep_programs: bool = True) -> None:
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
         for parameter, value in _MALLOPT.items() if mallopt else ():
             mallopt(parameter, value)
+
+
+def forget_programs(*, above: int = 25_000) -> bool:
+    """Forgets jax's compiled programs where the process holds more than `above` memory maps; whether it did.
+
+    Linux grants a process 65,530 of them and XLA takes several a program: one that sees scene after scene, each with
+    sizes of its own, ends in "Unable to allocate section memory". Programs are compiled again, or read from disk, when
+    they are next called. Where the maps can't be counted (not Linux) nothing is forgotten.
+    """
+    try:
+        held = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return False
+    if held <= above:
+        return False
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
+    return True
 
 
 def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:

@@ -6,7 +6,6 @@ Two host devices and the import hook must be settled before jax makes its first 
 import atexit
 import contextlib
 import fcntl
-import gc
 import os
 import shutil
 import tempfile
@@ -49,6 +48,7 @@ if os.environ.get("CI"):
 
 import numpy as np  # noqa: E402
 
+from jsecon.process import forget_programs  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
 LONGEST = (
@@ -70,13 +70,9 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True, scope="module")
 def room_for_programs():
-    """Forgets compiled programs between files before they use up the memory maps that Linux grants a process (65,530;
-    XLA needs several for each program, and crashes without)."""
+    """Forgets compiled programs between files before they use up the process's memory maps."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 25_000:
-        jax.clear_caches()
-        gc.collect()
+    forget_programs()
 
 
 @pytest.fixture

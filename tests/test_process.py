@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 
-from jsecon.process import settings
+from jsecon.process import forget_programs, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -47,3 +49,14 @@ def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
     environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
     assert done.stdout.split() == [str(len(os.sched_getaffinity(0))), str(kept)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts memory maps, which Linux tells")
+def test_programs_are_forgotten_where_there_are_too_many_maps_and_work_again():
+    twice = jax.jit(lambda x: 2 * x)
+    assert twice(jnp.float32(3)) == 6
+    assert not forget_programs(above=10**9)
+    assert twice._cache_size() == 1
+    assert forget_programs(above=0)
+    assert twice._cache_size() == 0
+    assert twice(jnp.float32(4)) == 8
