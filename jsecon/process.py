@@ -1,7 +1,7 @@
 """What only a program may do to its process: the library itself never touches the one it lives in.
 
-Before jax starts, once: `jsecon` on the command line calls `prepare_process` first. A program of your own that wants both
-cores and the speed of benchmarks/results.md does the same:
+Before jax starts, once: `jsecon` on the command line calls `prepare_process` first. A program of your own that wants
+both cores and the speed of benchmarks/results.md does the same:
 
     from jsecon.process import prepare_process
     prepare_process()
