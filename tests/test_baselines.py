@@ -75,6 +75,15 @@ def test_gaussian_grouping(world):
     assert history[-20:].mean() < 0.7 * history[:5].mean()
     ask = lambda query: query_gaussian_grouping(model, evidence, texts[query], canonical)
     assert miou(world, ask) >= 0.6
+    # A text that means two things finds both.
+    first = np.flatnonzero(np.asarray(evidence.frame) == 0)
+    shown = [k for k in (1, 2, 3) if (np.asarray(evidence.masks[0]) == first[k]).sum() >= 40][:2]
+    alike = np.array(evidence.embeddings)
+    alike[first[shown[1]]] = alike[first[shown[0]]]
+    both = query_gaussian_grouping(model, dataclasses.replace(evidence, embeddings=alike), texts[shown[0]], canonical)
+    each = [np.asarray(ask(k).mask) for k in shown]
+    assert all(mask.any() for mask in each)
+    assert (np.asarray(both.mask) >= each[0] | each[1]).all()
     # What the first view does not show can't be found.
     hidden = np.asarray(evidence.frame) == 0
     blind = dataclasses.replace(evidence, embeddings=np.where(hidden[:, None], canonical[0], evidence.embeddings))

@@ -141,14 +141,14 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitte
 
     monkeypatch.setattr(optimise, "plan_capacity", narrow)
     monkeypatch.setattr(optimise, "_step", counted)
-    gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0)
+    gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0.0)
     assert asked[0] == 32
     assert asked[-1] > 32
     assert asked.count(asked[-1]) == 20
     assert np.isfinite(losses).all()
     # The schedule of the positions depends on the number of steps, so the twin is a fit of 20 steps with room enough.
     monkeypatch.undo()
-    twin, _ = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0)
+    twin, _ = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0.0)
     for a, b in zip(jax.tree.leaves(gaussians), jax.tree.leaves(twin), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
 

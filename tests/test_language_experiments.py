@@ -42,6 +42,7 @@ def test_the_solver_is_below_the_votes_it_starts_from(task):
     assert rows["votes, mode"]["anchored"] > 0.4
 
 
+@pytest.mark.slow
 def test_a_stopped_descent_ends_as_a_whole_one(task, tmp_path, monkeypatch):
     monkeypatch.setattr(code_paths, "RESTS", 3)
     way = {"steps": 8, "looks": (0.5, 1.0)}
@@ -95,6 +96,7 @@ def test_speed_names_the_first_path_that_is_as_low():
     assert second["path"] is None
 
 
+@pytest.mark.slow
 def test_autoencoder_experiment_runs_and_a_rotation_of_full_rank_loses_nothing(tmp_path):
     options = dataclasses.replace(autoencoder.QUICK, texts=str(tmp_path), regions=(6,), latents=(6,), epochs=4)
     rows = autoencoder.main(dataclasses.replace(options, out=str(tmp_path / "out")))["rows"]

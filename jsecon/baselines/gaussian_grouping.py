@@ -37,8 +37,9 @@ OVERLAP = 0.7
 """an id is kept where this part of its region in the first view lies in the text's mask"""
 PROBABILITY = 0.3
 """of the kept ids together, from which a Gaussian is selected (their removal_thresh)"""
-RELEVANT = 0.5
-"""LERF relevancy below which the first view is taken not to show what the text says"""
+RELEVANT, NEARLY = 0.5, 0.9
+"""LERF relevancy below which no mask of the first view is the text's, and the share of the best mask's from which others
+are too: their masks are the union of all that the detector found"""
 
 _relevancies = jax.jit(relevancies)
 
@@ -137,12 +138,13 @@ def query_gaussian_grouping(
     text: Float[Array, " e"],
     canonical: Float[Array, "c e"],
 ) -> Selection:
-    """The Gaussians of the ids that lie in the first view's mask of the text.
+    """The Gaussians of the ids that lie in the first view's masks of the text.
 
-    The mask: of the first frame's, the one most relevant to the text; none where its relevancy is below 0.5, and then
-    nothing is selected, which is what becomes of everything that the first view does not show. Ids: those with more
-    than 0.7 of their region there inside the mask. Gaussians: the kept ids' probability together above 0.3.
-    Selection.region is the mask's row in the evidence.
+    The masks: those of the first frame whose relevancy to the text is at least 0.5, and 0.9 of the most relevant one's:
+    a class may have several things. Without any nothing is selected, which is what becomes of everything that the first
+    view does not show. Ids: those with more than 0.7 of their region there inside the masks. Gaussians: the kept ids'
+    probability together above 0.3. Selection.region is the row in the evidence of the most relevant mask, score its
+    relevancy.
     """
     here = np.flatnonzero(np.asarray(evidence.frame) == 0)
     nothing = jnp.zeros(evidence.gaussians.count)
@@ -156,7 +158,8 @@ def query_gaussian_grouping(
     first = dataclasses.replace(evidence, cameras=evidence.cameras[:1])
     rendered = render_plan(jax.tree.map(lambda a: a[0], view_plans(first)), model.identity).features
     predicted = np.asarray(model.probabilities(rendered)).argmax(-1)
-    mask = np.asarray(evidence.masks[0]) == here[best]
+    meant = np.asarray(relevancy) >= max(RELEVANT, NEARLY * float(relevancy[best]))
+    mask = np.isin(np.asarray(evidence.masks[0]), here[meant])
     classes = len(model.bias)
     sizes, inside = (np.bincount(ids.reshape(-1), minlength=classes) for ids in (predicted, predicted[mask]))
     kept = (sizes > 0) & (inside > OVERLAP * sizes)
