@@ -38,8 +38,8 @@ OVERLAP = 0.7
 PROBABILITY = 0.3
 """of the kept ids together, from which a Gaussian is selected (their removal_thresh)"""
 RELEVANT, NEARLY = 0.5, 0.9
-"""LERF relevancy below which no mask of the first view is the text's, and the share of the best mask's from which others
-are too: their masks are the union of all that the detector found"""
+"""LERF relevancy below which no mask of the first view is the text's, and the share of the best mask's from which
+others are too: theirs take all that the detector found together"""
 
 _relevancies = jax.jit(relevancies)
 
