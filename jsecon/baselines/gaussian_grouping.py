@@ -137,14 +137,16 @@ def query_gaussian_grouping(
     evidence: Evidence,
     text: Float[Array, " e"],
     canonical: Float[Array, "c e"],
+    *,
+    nearly: float = NEARLY,
 ) -> Selection:
     """The Gaussians of the ids that lie in the first view's masks of the text.
 
-    The masks: those of the first frame whose relevancy to the text is at least 0.5, and 0.9 of the most relevant one's:
-    a class may have several things. Without any nothing is selected, which is what becomes of everything that the first
-    view does not show. Ids: those with more than 0.7 of their region there inside the masks. Gaussians: the kept ids'
-    probability together above 0.3. Selection.region is the row in the evidence of the most relevant mask, score its
-    relevancy.
+    The masks: those of the first frame whose relevancy to the text is at least 0.5, and `nearly` times the most
+    relevant one's: a class may have several things, and 1 takes one of them. Without any nothing is selected, which is
+    what becomes of everything that the first view does not show. Ids: those with more than 0.7 of their region there
+    inside the masks. Gaussians: the kept ids' probability together above 0.3. Selection.region is the row in the
+    evidence of the most relevant mask, score its relevancy.
     """
     here = np.flatnonzero(np.asarray(evidence.frame) == 0)
     nothing = jnp.zeros(evidence.gaussians.count)
@@ -158,7 +160,7 @@ def query_gaussian_grouping(
     first = dataclasses.replace(evidence, cameras=evidence.cameras[:1])
     rendered = render_plan(jax.tree.map(lambda a: a[0], view_plans(first)), model.identity).features
     predicted = np.asarray(model.probabilities(rendered)).argmax(-1)
-    meant = np.asarray(relevancy) >= max(RELEVANT, NEARLY * float(relevancy[best]))
+    meant = np.asarray(relevancy) >= max(RELEVANT, nearly * float(relevancy[best]))
     mask = np.isin(np.asarray(evidence.masks[0]), here[meant])
     classes = len(model.bias)
     sizes, inside = (np.bincount(ids.reshape(-1), minlength=classes) for ids in (predicted, predicted[mask]))
