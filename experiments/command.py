@@ -1,10 +1,11 @@
-"""The command lines that experiments share: of the tables (--quick, --root, --out), and of those on demo rooms."""
+"""The command lines that experiments share: of the tables (--quick, --root, --out, --processes), of those on rooms."""
 
 import argparse
 import dataclasses
 from typing import Any
 
 from experiments.methods import Steps
+from experiments.sharing import cores
 
 QUICK_STEPS = Steps(
     langsplat=60,
@@ -28,8 +29,9 @@ def options_of(plan: Any, quick: Any) -> Any:
     parser.add_argument("--quick", action="store_true", help="one tiny scene, a few steps: at most two minutes")
     parser.add_argument("--root", default="", help="the real dataset; without it twins are made")
     parser.add_argument("--out", default="", help="where the results go")
+    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one a core")
     given = parser.parse_args()
-    chosen = quick if given.quick else plan
+    chosen = dataclasses.replace(quick if given.quick else plan, processes=given.processes)
     if given.root:
         data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)

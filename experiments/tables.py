@@ -13,6 +13,7 @@ import numpy as np
 from experiments import results, twins
 from experiments.methods import Answers, Method, Steps
 from experiments.setting import Setting, prepare
+from experiments.sharing import alone, helpers
 from jsecon.data.benchmark import Benchmark
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.evaluate.points import evaluate_points
@@ -38,36 +39,53 @@ class Plan:
     cells: str = ""
     """where the cells are kept; empty: OUT/cells. Tables of the same data have rows in common: one folder spares the
     second its training."""
+    processes: int = 1
+    """that share the settings: this one and helpers started by the same command. 0: this one is a helper, which
+    computes what it finds free and ends."""
 
 
 def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:
     """All cells: {"scene", "seed", "level", "method", figures, "seconds", "peak_memory_mib", "twin"}.
 
-    A cell that an earlier run with the same options left in the plan's folder of cells is read. `seconds` are of
-    training and all queries, without loading and fitting, what methods share charged to each; the memory is the
+    A cell that an earlier run with the same options left in the plan's folder of cells is read. A setting is computed
+    by one process at a time, so the same command may run more than once, and does, `plan.processes` times. `seconds`
+    are of training and all queries, without loading and fitting, what methods share charged to each; the memory is the
     process's highest so far, so later rows hide behind earlier ones.
     """
     wanted = [(scene, seed, plan.level) for scene in plan.data.scenes for seed in plan.data.seeds]
     if not plan.data.root:
         first = plan.data.scenes[0], plan.data.seeds[0]
         wanted += [(*first, level) for level in plan.sweep if level != plan.level]
-    cells = []
-    for scene, seed, level in wanted:
-        files = {name: _file(plan, scene, seed, level, name) for name in plan.methods}
-        missing = [name for name, file in files.items() if not file.exists()]
-        if missing:
-            forget_programs()
-            setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps)
-            for name in missing:
-                began = time.perf_counter()
-                cell = measure(setting, methods[name](setting, plan.steps))
-                cell |= {"scene": scene, "seed": seed, "level": level, "method": name, "twin": setting.bench.twin}
-                cell["seconds"] = round(time.perf_counter() - began + setting.shared.settle(), 2)
-                cell["peak_memory_mib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
-                write_text(files[name], json.dumps(cell))
-                tell(f"{scene} seed {seed} {level}: {name}: mIoU {cell['miou']:.3f}, {cell['seconds']:.1f} s")
-        cells += [json.loads(file.read_text()) for file in files.values()]
-    return cells
+    files = {where: {name: _file(plan, *where, name) for name in plan.methods} for where in wanted}
+    todo = [where for where in wanted if not all(file.exists() for file in files[where].values())]
+    with helpers(max(0, min(plan.processes, len(todo)) - 1)):
+        for where in todo:
+            _complete(plan, methods, where, files[where], tell, wait=False)
+        if plan.processes == 0:
+            raise SystemExit(0)
+        for where in todo:  # what another process took: done by now or soon, or left undone
+            _complete(plan, methods, where, files[where], tell, wait=True)
+    return [json.loads(file.read_text()) for where in wanted for file in files[where].values()]
+
+
+def _complete(plan: Plan, methods: Mapping[str, Method], where: tuple, files: dict[str, Path], tell, *, wait: bool):
+    """Computes the missing cells of a setting; none where another process is at it, unless that one is waited for."""
+    scene, seed, level = where
+    lock = next(iter(files.values())).parent / f"{scene}-{seed}-{level}.lock"
+    with alone(lock, wait=wait) as free:
+        missing = [name for name, file in files.items() if not file.exists()] if free else []
+        if not missing:
+            return
+        forget_programs()
+        setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps)
+        for name in missing:
+            began = time.perf_counter()
+            cell = measure(setting, methods[name](setting, plan.steps))
+            cell |= {"scene": scene, "seed": seed, "level": level, "method": name, "twin": setting.bench.twin}
+            cell["seconds"] = round(time.perf_counter() - began + setting.shared.settle(), 2)
+            cell["peak_memory_mib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+            write_text(files[name], json.dumps(cell))
+            tell(f"{scene} seed {seed} {level}: {name}: mIoU {cell['miou']:.3f}, {cell['seconds']:.1f} s")
 
 
 def _file(plan: Plan, scene: str, seed: int, level: str, method: str) -> Path:
