@@ -37,15 +37,17 @@ def made_field(count, *, regions=REGIONS, seed=0):
     )  # fmt: skip
 
 
-def exact(field, similarity, least):
-    """The formula in float64 from (R, Q) similarities, one Gaussian after the other; and the part of its share that
-    lies in regions of some class."""
+def exact(field, similarity, least, clear):
+    """The formula in float64 from (R, Q) similarities and (R,) lengths, one Gaussian after the other; and the part of
+    its share that lies in regions of some class."""
     votes, found, parts = field.votes, [], []
     speaks = np.asarray(similarity).max(1) >= least
     for ids, weights, shown in zip(*(np.asarray(a) for a in (votes.regions, votes.weights, votes.shown))):
         share = {r: float(w) / float(s) for r, w, s in zip(ids, weights, shown) if r >= 0}
         parts.append(sum(p for r, p in share.items() if speaks[r]) / sum(share.values()))
-        share = {r: p for r, p in share.items() if speaks[r]} or share
+        share = {r: p * float(clear[r]) for r, p in share.items() if speaks[r]} or {
+            r: p * float(clear[r]) for r, p in share.items()
+        }
         found.append(sum(p * np.asarray(similarity[r], np.float64) for r, p in share.items()) / sum(share.values()))
     return np.array(found), np.array(parts)
 
@@ -54,13 +56,15 @@ def exact(field, similarity, least):
 def test_equals_the_formula(retrieval, count):
     field, texts = made_field(count), unit_rows(np.random.default_rng(1), 5, SIZE)
     known = field.regions
-    similarity = known.embeddings @ texts.T
+    similarity, clear = known.embeddings @ texts.T, np.ones(REGIONS)
     if retrieval == "contrast":
+        rows, pixels = np.asarray(known.embeddings, np.float64), known.pixels.sum(1)
+        clear = np.linalg.norm(rows - REGIONS / (REGIONS + 1) * pixels @ rows / pixels.sum(), axis=1)
         similarity = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1)
     least = float(np.sort(similarity.max(1))[2]) - 1e-4  # two regions are none of the classes
     options = {"retrieval": retrieval, "retrieval_threshold": least}
     labels, found = query_classes(field, texts, every=True, **options)
-    expected, part = exact(field, similarity, least)
+    expected, part = exact(field, similarity, least, clear)
     np.testing.assert_allclose(found, expected, atol=2e-6)
     first, second = np.sort(expected, axis=1)[:, -1], np.sort(expected, axis=1)[:, -2]
     clear = first - second > 1e-5
@@ -150,6 +154,21 @@ def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
     without = dataclasses.replace(field, votes=dataclasses.replace(votes, shown=None))
     np.testing.assert_array_equal(query_classes(without, texts, retrieval="cosine", every=True)[0], [0, 1, 1])
+
+
+def test_a_surface_like_the_scene_as_a_whole_is_quieter_than_a_thing_on_it():
+    field = made_field(2, regions=3)
+    rows = unit_rows(np.random.default_rng(3), 3, SIZE)
+    rows = np.linalg.qr(rows.T)[0].T.astype(np.float32)  # a table, and two things on it
+    known = Regions(rows, np.int32([[900, 900], [20, 20], [20, 20]]))
+    weights = np.float32([[6, 4, 0], [9.9, 0.1, 0]])  # the foot of a thing, and the table
+    votes = dataclasses.replace(
+        field.votes, regions=np.int32([[0, 1, -1]] * 2), weights=weights, shown=np.float32([[10, 10, 0]] * 2)
+    )
+    field = dataclasses.replace(field, regions=known, votes=votes, canonical=np.zeros((4, SIZE), np.float32))
+    labels, _ = query_classes(field, rows)
+    np.testing.assert_array_equal(labels, [1, 0])
+    np.testing.assert_array_equal(query_classes(field, rows, retrieval="cosine")[0], [0, 0])
 
 
 def test_refuses_what_it_cannot_ask():

@@ -26,6 +26,27 @@ image has a cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 wi
 CLIP's gap are far above for texts that fit."""
 
 
+def apart_from_scene(
+    embeddings: Float[Array, "r e"], pixels: Shaped[Array, "r t"]
+) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
+    """What sets each of R regions apart from the scene (R, E), and which regions have an embedding (R,); 0 elsewhere.
+
+        e_r - n / (n + 1) sum_q p_q e_q / sum_q p_q
+
+    with unit embeddings e of the n regions that have one, and p their pixels in all views (R, T) (where there are none,
+    regions count alike). The factor keeps a region from being all that it is measured against: a single region keeps
+    its own direction. Large regions, which make up most of the mean, lie nearest to it.
+    """
+    units = normalize(embeddings)
+    known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
+    units = jnp.where(known[:, None], units, 0.0)
+    weight = jnp.where(known, jnp.sum(pixels, axis=-1, dtype=units.dtype), 0.0)
+    weight = jnp.where(jnp.sum(weight) > 0, weight, known)
+    count, total = jnp.sum(known, dtype=units.dtype), jnp.sum(weight)
+    mean = jnp.sum(weight[:, None] * units, axis=0) / jnp.where(total > 0, total, 1.0)
+    return jnp.where(known[:, None], units - count / (count + 1) * mean, 0.0), known
+
+
 def contrasts(
     embeddings: Float[Array, "r e"],
     text: Float[Array, " e"],
@@ -36,28 +57,18 @@ def contrasts(
 
         cos(e_r - n / (n + 1) sum_q p_q e_q / sum_q p_q,  t - (t . c) c)
 
-    with unit embeddings e of the n regions that have one, p their pixels in all views (R, T) (where there are none,
-    regions count alike), t the unit text and c the direction of the mean canonical phrase (C, E), each of unit length;
-    phrases that are zero or not finite are left out, and without any c is zero. The factor keeps a region from being
-    all that it is measured against: a single region keeps its own direction. Removing what two sets of embeddings have
-    in common before they are compared is an old remedy for hubs and for the modality gap; experiments/retrieval.py
-    measures it here against the cosine and LERF's relevancy. A text along c is like no region.
+    with the first as in `apart_from_scene`, t the unit text and c the direction of the mean canonical phrase (C, E),
+    each of unit length; phrases that are zero or not finite are left out, and without any c is zero. Removing what two
+    sets of embeddings have in common before they are compared is an old remedy for hubs and for the modality gap;
+    experiments/retrieval.py measures it here against the cosine and LERF's relevancy. A text along c is like no region.
     """
-    units, phrases = normalize(embeddings), normalize(canonical)
-    known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
-    units = jnp.where(known[:, None], units, 0.0)
-    weight = jnp.where(known, jnp.sum(pixels, axis=-1, dtype=units.dtype), 0.0)
-    weight = jnp.where(jnp.sum(weight) > 0, weight, known)
-    count, total = jnp.sum(known, dtype=units.dtype), jnp.sum(weight)
-    mean = jnp.sum(weight[:, None] * units, axis=0) / jnp.where(total > 0, total, 1.0)
-    apart = units - count / (count + 1) * mean
-
+    (apart, known), phrases = apart_from_scene(embeddings, pixels), normalize(canonical)
     sound = jnp.all(jnp.isfinite(phrases), axis=-1, keepdims=True)
     cone = normalize(jnp.sum(jnp.where(sound, phrases, 0.0), axis=0))
     unit = normalize(text)
     across = unit - jnp.sum(unit * cone) * cone
     # What rounding leaves of a text along the cone is no direction.
-    rest = 8 * jnp.finfo(units.dtype).eps
+    rest = 8 * jnp.finfo(apart.dtype).eps
     across = jnp.where(jnp.sum(across * across) > rest**2, across, jnp.where(jnp.isfinite(unit), 0.0, jnp.nan))
     found, measured = similarities(apart, across)
     known &= measured
