@@ -5,7 +5,7 @@ import dataclasses
 from typing import Any
 
 from experiments.methods import Steps
-from experiments.sharing import cores
+from jsecon.process import cores
 
 QUICK_STEPS = Steps(
     langsplat=60,

@@ -3,7 +3,6 @@ holder, so that nothing stale is left by a process that was stopped."""
 
 import contextlib
 import fcntl
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -41,8 +40,3 @@ def helpers(count: int) -> Iterator[None]:
     finally:
         for process in started:
             process.wait()
-
-
-def cores() -> int:
-    """Those this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

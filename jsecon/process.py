@@ -27,8 +27,7 @@ def prepare_process(*, keep_programs: bool = True) -> None:
     """Sets XLA's flags (see `settings`) and keeps freed memory for the next request (glibc only). Call it before jax
     makes its first array. What the user has set in the environment stays; without `keep_programs`, compiled programs
     are not kept on disk."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    chosen = settings(os.environ, cores, _cpu_features())
+    chosen = settings(os.environ, cores(), _cpu_features())
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
     os.environ.update(chosen)
@@ -36,6 +35,11 @@ def prepare_process(*, keep_programs: bool = True) -> None:
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
         for parameter, value in _MALLOPT.items() if mallopt else ():
             mallopt(parameter, value)
+
+
+def cores() -> int:
+    """The CPU cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def forget_programs(*, above: int = 25_000) -> bool:
