@@ -1,6 +1,6 @@
 """Table 4: what each component brings, one added or exchanged at a time.
 
-    python -m experiments.ablation_components [--quick] [--root FOLDER] [--out FOLDER]
+    python -m experiments.ablation_components [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 On LERF-OVS or its twins, under the protocol of `experiments.lerf`, whose cells are taken where a row is the same.
 """

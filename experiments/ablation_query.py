@@ -1,6 +1,6 @@
 """Table 5: the ways to ask one and the same field.
 
-    python -m experiments.ablation_query [--quick] [--root FOLDER] [--out FOLDER]
+    python -m experiments.ablation_query [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 On LERF-OVS or its twins, under the protocol of `experiments.lerf`, whose cells are taken where a row is the same.
 """

@@ -1,6 +1,6 @@
 """Table 1: LERF-OVS at the points, all methods on the same Gaussians and masks.
 
-    python -m experiments.lerf [--quick] [--root FOLDER] [--out FOLDER]
+    python -m experiments.lerf [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 Protocol: point level, rendered (the selected Gaussians alone): alpha > 0.7, OpenGaussian's, beside > 10/255, VALA's;
 mAcc is IoU > 0.25; localisation by the peak of similarity and by the mask (jsecon.evaluate.lerf). Without --root the

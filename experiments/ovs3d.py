@@ -1,6 +1,6 @@
 """Table 2: 3D-OVS at the points.
 
-    python -m experiments.ovs3d [--quick] [--root FOLDER] [--out FOLDER]
+    python -m experiments.ovs3d [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 Every class of every labelled frame is a query of its own, as LangSplat and the paper ask; protocol and options as in
 `experiments.lerf`. Without --root: twins of the five scenes, three seeds.

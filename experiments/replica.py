@@ -1,6 +1,6 @@
 """Table 3: Replica at the points: mIoU and mean recall over the classes that occur.
 
-    python -m experiments.replica [--quick] [--root FOLDER] [--out FOLDER]
+    python -m experiments.replica [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 The Gaussians are the ground-truth points, one each, never densified; each gets the class that fits it best, or none,
 which is a miss. Without --root: twins of the eight scenes, three seeds, and `classes` are the shapes of their objects

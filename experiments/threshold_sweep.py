@@ -1,6 +1,6 @@
 """The threshold figure: mIoU over the threshold, for each way of asking one field.
 
-    python -m experiments.threshold_sweep [--quick] [--root FOLDER] [--out FOLDER]
+    python -m experiments.threshold_sweep [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 On LERF-OVS or its twins, under the protocol of `experiments.lerf`; outliers are left in, so that only the threshold
 acts. The spread of a way is its largest less its smallest mean: what the choice of a threshold can cost.
