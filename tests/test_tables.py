@@ -59,7 +59,6 @@ def read(folder, name):
     return json.loads((place / "metrics.json").read_text()), (place / "table.md").read_text()
 
 
-@pytest.mark.slow  # .ci/run makes the whole quick table; tests/test_sharing.py has resumption
 def test_table_1_and_its_resumption(folder, monkeypatch):
     plan = with_gaussians(small(lerf.QUICK, folder, "lerf", methods=CHEAP, level="perfect"))
     lerf.main(plan)
