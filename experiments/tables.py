@@ -13,7 +13,7 @@ import numpy as np
 from experiments import results, twins
 from experiments.methods import Answers, Method, Steps
 from experiments.setting import Setting, prepare
-from experiments.sharing import alone, helpers
+from experiments.sharing import alone, helped
 from jsecon.data.benchmark import Benchmark
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.evaluate.points import evaluate_points
@@ -40,8 +40,8 @@ class Plan:
     """where the cells are kept; empty: OUT/cells. Tables of the same data have rows in common: one folder spares the
     second its training."""
     processes: int = 1
-    """that share the settings: this one and helpers started by the same command. 0: this one is a helper, which
-    computes what it finds free and ends."""
+    """that share the settings, each on cores of its own. 0: this one is one of them, which computes what it finds free
+    and ends; 1: this one computes all, with all cores."""
 
 
 def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:
@@ -58,13 +58,14 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
         wanted += [(*first, level) for level in plan.sweep if level != plan.level]
     files = {where: {name: _file(plan, *where, name) for name in plan.methods} for where in wanted}
     todo = [where for where in wanted if not all(file.exists() for file in files[where].values())]
-    with helpers(max(0, min(plan.processes, len(todo)) - 1)):
+    if plan.processes == 0:
         for where in todo:
             _complete(plan, methods, where, files[where], tell, wait=False)
-        if plan.processes == 0:
-            raise SystemExit(0)
-        for where in todo:  # what another process took: done by now or soon, or left undone
-            _complete(plan, methods, where, files[where], tell, wait=True)
+        raise SystemExit(0)
+    if min(plan.processes, len(todo)) > 1:
+        helped(min(plan.processes, len(todo)))
+    for where in todo:  # of one process all; of several what another command took, or a helper left undone
+        _complete(plan, methods, where, files[where], tell, wait=True)
     return [json.loads(file.read_text()) for where in wanted for file in files[where].values()]
 
 

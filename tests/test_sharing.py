@@ -1,9 +1,10 @@
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-from experiments.sharing import alone
+from experiments.sharing import alone, available, shares
 
 ROOT = Path(__file__).parent.parent
 
@@ -27,7 +28,7 @@ def figures(setting, answers):
     (here / f"{os.getpid()}.here").touch()
     while len(list(here.glob("*.here"))) < 2:  # for the helper, however long its start takes
         time.sleep(0.05)
-    return {"miou": 0.5, "process": os.getpid()}
+    return {"miou": 0.5, "process": os.getpid(), "cores": sorted(os.sched_getaffinity(0))}
 
 tables.prepare = lambda *a, **k: SimpleNamespace(bench=SimpleNamespace(twin=True), shared=SimpleNamespace(settle=float))
 tables.measure = figures
@@ -78,7 +79,17 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
     lines = table(2)
     assert lines.count("whole") == 1, lines  # the helper ends without a table
     assert len(list(cells.iterdir())) == len(lines) - 1 == 4, lines  # and no lock is left
-    assert len({json.loads(file.read_text())["process"] for file in cells.iterdir()}) == 2
+    found = [json.loads(file.read_text()) for file in cells.iterdir()]
+    assert len({cell["process"] for cell in found}) == 2
+    assert {tuple(cell["cores"]) for cell in found} == {tuple(share) for share in shares(available(), 2)}
     next(cells.iterdir()).unlink()
     lines = table(2)
     assert len(lines) == 2, lines  # the lost cell alone was computed again, and nobody asked for help
+
+
+def test_cores_are_shared_out():
+    assert shares([0, 1], 2) == [[0], [1]]
+    assert shares([3, 5, 8, 9, 11], 2) == [[3, 8, 11], [5, 9]]
+    assert shares([4, 7], 5) == [[4], [7], [4], [7], [4]]
+    assert shares([], 2) == [[], []]  # unknown: the processes are left where they are
+    assert available() == sorted(os.sched_getaffinity(0))
