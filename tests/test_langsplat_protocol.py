@@ -77,7 +77,21 @@ def test_relevancy_is_the_least_over_the_phrases():
         positive, negative = unit(features) @ unit(text), unit(features) @ unit(canonical).T
     expected = 1 / (1 + np.exp(-10 * (positive - negative.max(-1))))
     np.testing.assert_allclose(found.reshape(-1)[1:], expected.reshape(-1)[1:], rtol=1e-4)
-    assert found[0, 0] == 0
+    assert found[0, 0] == 0.5
+
+
+def test_pixels_where_nothing_was_rendered_do_not_widen_the_range():
+    """A text a little nearer to its object than to the rest is found, whatever hole is in the image."""
+    text, canonical = np.array([1.0, 0, 0]), np.array([[0.0, 1, 0]])
+    features = np.tile(np.array([0.695, 0.719, 0.0]), (90, 100, 1))
+    features[20:70, 30:80] = [0.719, 0.695, 0.0]
+    whole = decide(pixel_relevancy(features, text, canonical)[None]).mask
+    features[80:, 90:] = 0
+    holed = decide(pixel_relevancy(features, text, canonical)[None]).mask
+    assert whole[25:65, 35:75].all()
+    assert not whole[:10].any()
+    assert not whole[80:].any()
+    np.testing.assert_array_equal(holed[:70], whole[:70])
 
 
 def test_pairs_are_counted_whatever_is_missing():

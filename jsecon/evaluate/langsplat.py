@@ -56,10 +56,14 @@ class PixelRow:
 def pixel_relevancy(
     features: Float[Array, "h w d"], text: Float[Array, " d"], canonical: Float[Array, "c d"]
 ) -> Float[np.ndarray, "h w"]:
-    """LERF's relevancy of each pixel of a rendered (and decoded) feature map; 0 where nothing was rendered."""
+    """LERF's relevancy of each pixel of a rendered (and decoded) feature map; 0.5 where nothing was rendered.
+
+    A zero vector's cosine is 0 with every text. With less it would set the image's least relevancy, by which `decide`
+    measures all others.
+    """
     height, width, size = features.shape
-    found, _ = relevancies(jnp.asarray(features).reshape(-1, size), jnp.asarray(text), jnp.asarray(canonical))
-    return np.asarray(found).reshape(height, width)
+    found, known = relevancies(jnp.asarray(features).reshape(-1, size), jnp.asarray(text), jnp.asarray(canonical))
+    return np.where(np.asarray(known), np.asarray(found), 0.5).reshape(height, width)
 
 
 def decide(maps: Float[np.ndarray, "l h w"], *, threshold: float = THRESHOLD) -> Decision:
