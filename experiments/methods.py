@@ -10,13 +10,14 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from experiments.association import Association, associated, by_consensus
 from experiments.setting import Setting
 from jsecon.baselines import lifting
-from jsecon.baselines.evidence import shared_capacity
+from jsecon.baselines.evidence import Evidence, shared_capacity
 from jsecon.baselines.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
-from jsecon.baselines.langsplat import train_langsplat
+from jsecon.baselines.langsplat import LangSplat, train_langsplat
 from jsecon.baselines.opengaussian import Schedule, train_opengaussian
 from jsecon.evaluate.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
 from jsecon.language.autoencoder import train_autoencoder
@@ -30,7 +31,7 @@ from jsecon.query.one_step import query_one_step
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.probability import membership_probability
 from jsecon.query.showing import with_shown
-from jsecon.types import LanguageField, Regions, Selection, Votes
+from jsecon.types import Array, LanguageField, Regions, Selection, Votes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Answers:
 
     select: Callable[[int], Selection | None]
     classes: Callable[[], np.ndarray]
+    beside: dict[str, float] = dataclasses.field(default_factory=dict)
+    """figures under a protocol of the method's own, to stand beside the table's."""
 
 
 Method = Callable[[Setting, Steps], Answers]
@@ -78,7 +81,7 @@ def _by_selection(setting: Setting, select: Callable[[int], Selection | None]) -
     return Answers(select, classes)
 
 
-def _by_features(setting: Setting, features, *, relevancy: bool) -> Answers:
+def by_features(setting: Setting, features: Float[Array, "n e"], *, relevancy: bool) -> Answers:
     """Selections by VALA's readout of the relevancy, or by the scene's most similar text; classes by the latter."""
     texts, features = jnp.asarray(setting.texts), jnp.asarray(features)
     labels, cosines = most_similar_text(features, texts)
@@ -90,9 +93,13 @@ def _by_features(setting: Setting, features, *, relevancy: bool) -> Answers:
 
 def langsplat(setting: Setting, steps: Steps) -> Answers:
     """Each frame's own masks; asked by the most similar text, as OpenGaussian asks it at the points."""
+    return by_features(setting, langsplat_of(setting, setting.evidence, steps).features(), relevancy=False)
+
+
+def langsplat_of(setting: Setting, evidence: Evidence, steps: Steps) -> LangSplat:
+    """LangSplat trained on the masks of one level."""
     key = jax.random.key(setting.seed)
-    model = train_langsplat(setting.evidence, key=key, steps=steps.langsplat, init="random", epochs=steps.epochs)
-    return _by_features(setting, model.features(), relevancy=False)
+    return train_langsplat(evidence, key=key, steps=steps.langsplat, init="random", epochs=steps.epochs)
 
 
 def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
@@ -136,7 +143,7 @@ def opengaussian(setting: Setting, steps: Steps) -> Answers:
 
 
 def _lifted(train: Callable) -> Callable[[Setting, Steps], Answers]:
-    return lambda setting, steps: _by_features(setting, train(setting.evidence).features, relevancy=True)
+    return lambda setting, steps: by_features(setting, train(setting.evidence).features, relevancy=True)
 
 
 def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:

@@ -40,6 +40,8 @@ class Setting:
     names: tuple[str, ...]
     """of the frames that are learnt from."""
     seed: int
+    folder: Path
+    """of the scene's files: masks, language_features, text_features.json."""
     shared: Shared = dataclasses.field(default_factory=Shared, compare=False)
     """what methods have in common."""
 
@@ -68,6 +70,7 @@ def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: i
         {name: capture.cameras[t] for t, name in enumerate(capture.names)},
         names,
         seed,
+        folder,
     )
 
 

@@ -128,6 +128,7 @@ def measure(setting: Setting, answers: Answers) -> dict:
     return {name: strict[name] for name in KEPT if name in strict} | {
         "miou_vala": lenient["miou"],
         "macc_vala": lenient["macc"],
+        **answers.beside,
     }
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from experiments import (
     ablation_query,
     lerf,
     ovs3d,
+    protocols,
     published,
     qualitative,
     replica,
@@ -21,6 +23,7 @@ from experiments import (
 )
 from experiments.methods import COMPONENTS, METHODS, QUERIES, RECOMMENDED
 from experiments.setting import prepare
+from jsecon.data.labels import LEVELS
 from jsecon.data.langsplat_files import load_features
 from jsecon.data.lerf_ovs import LERF_PAIRS
 from jsecon.data.ply import load_ply, save_ply
@@ -147,6 +150,31 @@ def test_threshold_sweep(folder):
     metrics, _ = read(folder, "sweep")
     assert set(metrics["curves"]) == set(threshold_sweep.WAYS)
     assert all(len(curve) == 2 and np.isfinite(curve).all() for curve in metrics["curves"].values())
+
+
+@pytest.mark.slow
+def test_protocols(folder):
+    plan = with_gaussians(small(protocols.QUICK, folder, "protocols", methods=("VALA",), level="perfect"))
+    protocols.main(plan)
+    metrics, text = read(folder, "protocols")
+    (cell,) = metrics["cells"]
+    assert cell["pairs"] > 0
+    assert min(cell["miou"], cell["miou_2d"]) > 0.02  # its objects fill 0.012 of an image
+    assert "mean miou_2d" in text
+
+
+def test_levels_that_are_alike_are_learnt_once(folder, tmp_path):
+    plan = with_gaussians(small(lerf.QUICK, folder, "levels"), "perfect")
+    setting = prepare(plan.data, "figurines", 0, "perfect", fit_steps=20)
+    assert len(protocols.levels_of(setting)) == 1  # a twin's
+    shutil.copytree(setting.folder / "language_features", tmp_path / "language_features")
+    for file in tmp_path.glob("language_features/*_s.npy"):
+        masks = np.load(file)
+        masks[LEVELS.index("s")][masks[0] == 0] = -1
+        np.save(file, masks)
+    large, smaller = protocols.levels_of(dataclasses.replace(setting, folder=tmp_path))
+    np.testing.assert_array_equal(large.masks, setting.evidence.masks)
+    assert len(smaller.embeddings) == len(large.embeddings) - len(setting.names)  # the first mask of each frame
 
 
 @pytest.mark.slow

@@ -37,8 +37,12 @@ class LangSplat:
 
     def features(self) -> Float[Array, "n e"]:
         """(N, E) decoded codes; zero where the code is unknown."""
-        decoded = self.autoencoder.decode(self.codes)
-        return jnp.where(jnp.any(self.codes != 0, axis=1, keepdims=True), decoded, 0.0)
+        return self.decode(self.codes)
+
+    def decode(self, codes: Float[Array, "... 3"]) -> Float[Array, "... e"]:
+        """Codes, or a rendered image (H, W, 3) of them -> unit embeddings; zero where there is none."""
+        decoded = self.autoencoder.decode(codes)
+        return jnp.where(jnp.any(codes != 0, axis=-1, keepdims=True), decoded, 0.0)
 
 
 def train_langsplat(
