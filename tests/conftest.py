@@ -1,6 +1,6 @@
 """What every test shares: type checks at run time, a float64 switch, a small scene, and where the real captures lie.
 
-Cores, host devices and the import hook must be settled before jax makes its first array and before jsecon is imported.
+Two host devices and the import hook must be settled before jax makes its first array and before jsecon is imported.
 """
 
 import atexit
@@ -10,13 +10,6 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
-
-from experiments.sharing import available, shares
-
-# XLA has a thread for each core that it sees: workers with all cores for each would be in one another's way.
-if "PYTEST_XDIST_WORKER" in os.environ and available():
-    worker, workers = os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"), os.environ["PYTEST_XDIST_WORKER_COUNT"]
-    os.sched_setaffinity(0, shares(available(), int(workers))[int(worker)])
 
 os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
