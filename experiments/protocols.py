@@ -49,23 +49,23 @@ def levels_of(setting: Setting) -> list[Evidence]:
 
 
 def in_the_image(setting: Setting, maps: Sequence[Map]) -> dict[str, float]:
-    """ "miou_2d", "macc_2d" and "loc_2d" of a map a level."""
-    gaussians, cameras = jax.tree.map(jnp.asarray, (setting.evidence.gaussians, setting.evidence.cameras))
-    capacity = shared_capacity(gaussians, cameras)
+    """The figures miou_2d, macc_2d and loc_2d of a map a level, at the size of the labels."""
+    gaussians = jax.tree.map(jnp.asarray, setting.evidence.gaussians)
     texts, canonical = jnp.asarray(setting.texts), jnp.asarray(setting.canonical)
-    frames = {frame.name: frame for frame in setting.bench.frames}
+    labels = setting.bench.frames
+    resize = lambda frame: resized(setting.cameras[frame.name], frame.width, frame.height)
+    cameras = {frame.name: jax.tree.map(jnp.asarray, resize(frame)) for frame in labels}
+    capacity = max(shared_capacity(gaussians, camera) for camera in cameras.values())
 
     @functools.lru_cache(maxsize=1)  # the pairs come frame by frame
     def images(name: str) -> list[Array]:
-        camera = resized(setting.cameras[name], frames[name].width, frames[name].height)
-        camera = jax.tree.map(jnp.asarray, camera)
-        return [decode(render(gaussians, camera, field, capacity=capacity).features) for field, decode in maps]
+        return [decode(render(gaussians, cameras[name], field, capacity=capacity).features) for field, decode in maps]
 
     def relevancies(frame: LabelledFrame, query: str) -> np.ndarray:
         text = texts[setting.bench.queries.index(query)]
         return np.stack([pixel_relevancy(image, text, canonical) for image in images(frame.name)])
 
-    _, told = evaluate_langsplat_2d(setting.bench.frames, relevancies, expected_pairs=setting.bench.pairs)
+    _, told = evaluate_langsplat_2d(labels, relevancies, expected_pairs=setting.bench.pairs)
     return {"miou_2d": told["miou"], "macc_2d": told["macc"], "loc_2d": told["loc_acc"]}
 
 

@@ -26,7 +26,7 @@ from experiments import tables, twins
 
 def figures(setting, answers):
     (here / f"{os.getpid()}.here").touch()
-    while len(list(here.glob("*.here"))) < 2:  # for the helper, however long its start takes
+    while len(list(here.glob("*.here"))) < 2:  # for the other process, however long its start takes
         time.sleep(0.05)
     return {"miou": 0.5, "process": os.getpid(), "cores": sorted(os.sched_getaffinity(0))}
 
@@ -77,7 +77,7 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
         return told.stdout.splitlines()
 
     lines = table(2)
-    assert lines.count("whole") == 1, lines  # the helper ends without a table
+    assert lines.count("whole") == 1, lines  # the processes that share it end without one
     assert len(list(cells.iterdir())) == len(lines) - 1 == 4, lines  # and no lock is left
     found = [json.loads(file.read_text()) for file in cells.iterdir()]
     assert len({cell["process"] for cell in found}) == 2

@@ -39,8 +39,8 @@ class LangSplat:
         """(N, E) decoded codes; zero where the code is unknown."""
         return self.decode(self.codes)
 
-    def decode(self, codes: Float[Array, "... 3"]) -> Float[Array, "... e"]:
-        """Codes, or a rendered image (H, W, 3) of them -> unit embeddings; zero where there is none."""
+    def decode(self, codes: Float[Array, "... d"]) -> Float[Array, "... e"]:
+        """Codes (..., d), of Gaussians or of rendered pixels -> unit embeddings (..., E); a zero code stays zero."""
         decoded = self.autoencoder.decode(codes)
         return jnp.where(jnp.any(codes != 0, axis=-1, keepdims=True), decoded, 0.0)
 
