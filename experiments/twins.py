@@ -6,6 +6,7 @@ learnt from them.
 """
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 
 from experiments import results
+from experiments.sharing import alone
 from jsecon.data.benchmark import Benchmark
 from jsecon.data.langsplat_files import write_features, write_text_features
 from jsecon.data.lerf_ovs import load_lerf_ovs
@@ -55,17 +57,20 @@ def load(dataset: str, root: Path, scene: str, *, every: int = 1, downscale: flo
 def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict) -> Path:
     """A twin of `scene` under `root` with simulated vision of `level`, made where it is not there yet; its root.
 
-    Each (seed, level) has a root of its own, since a scene's vision lies beside its frames.
+    Each (seed, level, size) has a root of its own: a scene's vision lies beside its frames, and twins of another size
+    have other labelled frames. One process at a time writes to a root.
     """
-    place = root / f"{dataset}-seed{seed}-{level}"
+    kind = json.dumps({"size": size, "kind": KIND}, sort_keys=True)
+    place = root / f"{dataset}-seed{seed}-{level}-{hashlib.sha1(kind.encode()).hexdigest()[:8]}"
     marker = place / scene / "made.json"
-    wanted = json.dumps({"seed": seed, "level": level, "size": size, "kind": KIND}, sort_keys=True)
-    if marker.exists() and marker.read_text() == wanted:
+    if marker.exists():
         return place
-    number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
-    WRITERS[dataset](place, scene, 1000 * seed + number, **size)
-    look(load(dataset, place, scene), place, level, seed)
-    write_text(marker, wanted)
+    with alone(place / "twin.lock", wait=True):
+        if not marker.exists():
+            number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
+            WRITERS[dataset](place, scene, 1000 * seed + number, **size)
+            look(load(dataset, place, scene), place, level, seed)
+            write_text(marker, kind)
     return place
 
 

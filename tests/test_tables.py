@@ -209,6 +209,16 @@ def test_vision_on_disk_is_what_was_simulated(folder):
     np.testing.assert_array_equal(found.labels, setting.evidence.masks)
 
 
+def test_twins_of_two_sizes_lie_side_by_side(folder):
+    data = small(lerf.QUICK, folder, "sizes").data
+    fewer = dataclasses.replace(data, size=tuple({**dict(data.size), "views": 6}.items()))
+    roots = [each.place("figurines", 0, "perfect") for each in (data, fewer, data)]
+    assert roots[0] == roots[2] != roots[1]
+    for each, root, views in zip((data, fewer), roots, (8, 6)):
+        assert len(each.load(root, "figurines").capture.names) == views
+        assert not list(root.glob("*.lock"))
+
+
 def test_tables_say_where_ours_does_not_lead():
     cells = [
         {"scene": "a", "seed": 0, "level": "medium", "method": name, "miou": value, "seconds": 1.0}
