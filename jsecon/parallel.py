@@ -78,7 +78,9 @@ def spread_over_devices(
     rank, world = jax.process_index(), jax.process_count()
     count = jax.tree.leaves(views)[0].shape[0]
     own = range(rank, count, world)
-    devices = jax.local_devices()[: max(1, min(len(own), jax.local_device_count()))]
+    # One device alone is not named: arrays bound to it would have programs of their own.
+    most = min(len(own), jax.local_device_count())
+    devices = jax.local_devices()[:most] if most > 1 else [None]
     shared = [jax.device_put(common, device) for device in devices]
     states = [jax.tree.map(lambda a, d=device: jax.device_put(a, d).copy(), start) for device in devices]
     outs = []
@@ -94,7 +96,8 @@ def spread_over_devices(
     total = states[0]
     for state in states[1:]:
         total = merge(total, jax.device_put(state, devices[0]))
-    outs = [jax.device_put(out, devices[0]) for out in outs]
+    # Bound to no device: what reads them shares its programs with what reads arrays that never were on one.
+    total, outs = jax.tree.map(lambda a: jax.device_put(np.asarray(a), may_alias=True), (total, outs))
     if world == 1:
         return total, outs
     parts = process_allgather(total)

@@ -10,6 +10,9 @@ import optax
 
 from jsecon.types import Array
 
+_LEAST = 256
+"""steps that the history has room for at least, powers of two above: schedules share their compiled programs"""
+
 
 def descend(
     loss: Callable[[Any, Any, Array, Array, Array], Array],
@@ -19,34 +22,39 @@ def descend(
     views: int,
     steps: int,
     optimizer: optax.GradientTransformation,
+    scale: float = 1.0,
     key: Array,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, Array]:
     """`steps` steps on loss(params, data, view, step, key); returns the parameters and the loss before each step.
 
     `loss` must be a module's function or a partial of one with hashable options: it is compiled once for each. `data`
-    is passed through, never baked in.
+    is passed through, never baked in, and so is `scale`, a factor on what `optimizer` makes of the gradient: stages of
+    different rates share a program.
     """
     order_key, step_key = jax.random.split(key)
     rounds = jax.random.split(order_key, -(-steps // views)) if steps else jax.random.split(order_key, 1)
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    state = params, optimizer.init(params), jnp.zeros(steps)
+    room = max(_LEAST, 1 << (steps - 1).bit_length())
+    order = jnp.pad(order, (0, room - steps))
+    state = params, optimizer.init(params), jnp.zeros(room)
     stretch = max(1, steps if progress is None else -(-steps // 20))
     for start in range(0, steps, stretch):
         stop = min(start + stretch, steps)
-        state = _run(loss, optimizer, state, data, order, step_key, start, stop)
+        state = _run(loss, optimizer, state, data, order, step_key, start, stop, scale)
         if progress is not None:
             jax.block_until_ready(state[2])
             progress(stop, steps)
-    return state[0], state[2]
+    return state[0], state[2][:steps]
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _run(loss, optimizer, state, data, order, key, start, stop):
+def _run(loss, optimizer, state, data, order, key, start, stop, scale):
     def step(index, state):
         params, moments, history = state
         value, gradient = jax.value_and_grad(loss)(params, data, order[index], index, jax.random.fold_in(key, index))
         updates, moments = optimizer.update(gradient, moments, params)
+        updates = jax.tree.map(lambda update: scale * update, updates)
         return optax.apply_updates(params, updates), moments, history.at[index].set(value)
 
     return jax.lax.fori_loop(start, stop, step, state)

@@ -20,10 +20,10 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from jsecon.baselines.descent import descend
-from jsecon.baselines.evidence import Evidence, view_plans
+from jsecon.baselines.evidence import Evidence, shared_capacity, view_plans
 from jsecon.errors import InputError
 from jsecon.query.canonical import relevancies
-from jsecon.splat.plan import render_plan
+from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.sh import C0
 from jsecon.types import Array, Selection
 
@@ -58,7 +58,12 @@ class GaussianGrouping:
 
     def probabilities(self, identity: Float[Array, "*batch 16"]) -> Float[Array, "*batch classes"]:
         """Softmax over the ids of codes, a Gaussian's or a rendered pixel's; id 0 = no mask, id k = track k - 1."""
-        return jax.nn.softmax(identity @ self.kernel + self.bias)
+        return _probabilities(identity, self.kernel, self.bias)
+
+
+@jax.jit
+def _probabilities(identity: Array, kernel: Array, bias: Array) -> Array:
+    return jax.nn.softmax(identity @ kernel + bias)
 
 
 def train_gaussian_grouping(
@@ -157,9 +162,9 @@ def query_gaussian_grouping(
     best = int(jnp.argmax(relevancy))
     if not relevancy[best] >= RELEVANT:
         return Selection(nothing > 0, nothing, jnp.asarray(-1, jnp.int32), relevancy[best])
-    first = dataclasses.replace(evidence, cameras=evidence.cameras[:1])
-    rendered = render_plan(jax.tree.map(lambda a: a[0], view_plans(first)), model.identity).features
-    predicted = np.asarray(model.probabilities(rendered)).argmax(-1)
+    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    plan = plan_view(gaussians, cameras[0], capacity=shared_capacity(gaussians, cameras))
+    predicted = np.asarray(model.probabilities(render_plan(plan, model.identity).features)).argmax(-1)
     meant = np.asarray(relevancy) >= max(RELEVANT, nearly * float(relevancy[best]))
     mask = np.isin(np.asarray(evidence.masks[0]), here[meant])
     classes = len(model.bias)

@@ -20,8 +20,6 @@ from jsecon.types import Array
 
 STEPS = 30_000
 LATENT = 3
-_ROWS = 256
-"""masks are counted in multiples of this: scenes share their compiled programs"""
 
 
 @jax.tree_util.register_dataclass
@@ -68,7 +66,7 @@ def train_langsplat(
         evidence.gaussians,
         evidence.cameras,
         jnp.asarray(evidence.masks),
-        jnp.pad(table, ((0, -len(table) % _ROWS), (0, 0))),
+        table,
         steps=steps,
         key=code_key,
         init=init,

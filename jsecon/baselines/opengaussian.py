@@ -35,8 +35,9 @@ REFRESH_COARSE, REFRESH_FINE = 200, 50
 MATCH_SILHOUETTE, MATCH_SCORE = 0.8, 0.2
 MOST_VARIANCE, LARGE = 0.006, 0.8
 """a mask whose features vary more is no pseudo label, unless it is this large a part of the view's largest"""
+_ADAM = optax.scale_by_adam(eps=1e-15)
 _LEAVES = 64
-"""leaves in use are counted in multiples of this, so that few shapes are compiled"""
+"""roots, and leaves in use, are counted in multiples of this, so that few shapes are compiled"""
 
 
 @jax.tree_util.register_dataclass
@@ -97,7 +98,8 @@ def train_opengaussian(
         data,
         views=views,
         steps=schedule.instance_steps,
-        optimizer=_adam(schedule.rate),
+        optimizer=_ADAM,
+        scale=-schedule.rate,
         key=first_key,
         progress=progress,
     )
@@ -109,11 +111,6 @@ def train_opengaussian(
     leaf_features, matches = _associate(leaf_of, codes, data, labels, names, np.asarray(evidence.embeddings))
     leaf_features = jnp.where((matches >= schedule.min_views)[:, None], leaf_features, 0.0)
     return OpenGaussian(normalize(features), leaf_of, codes, leaf_features, matches, schedule.leaves), history
-
-
-@functools.cache
-def _adam(rate: float) -> optax.GradientTransformation:
-    return optax.adam(rate, eps=1e-15)
 
 
 def _draw(plan: ViewPlan, features: Array) -> tuple[Array, Array]:
@@ -183,27 +180,25 @@ def _through(features: Array, of: Array, count: int) -> Array:
     return units + jax.lax.stop_gradient(means[of] - units)
 
 
-def _quantised_loss(
-    features: Array, data: Any, view: Array, step: Array, key: Array, *, clusters: int, squared: bool
-) -> Array:
-    """Rendered cluster means against the pseudo labels: L1 over the labelled silhouette, or L2 of one root alone."""
+def _quantised_loss(features: Array, data: Any, view: Array, step: Array, key: Array, *, clusters: int) -> Array:
+    """Rendered cluster means against the pseudo labels: L1 over the labelled silhouette, or, where `fine`, L2 of one
+    root alone. One program for both stages."""
     del step
-    plans, local, (means, valid), of, root_of = data
-    plan = jax.tree.map(lambda a: a[view], plans)
-    if squared:  # a root drawn by its Gaussians: each takes its turn as often as it is large
-        root = root_of[jax.random.randint(key, (), 0, len(root_of))]
-        plan = only(plan, root_of == root)
+    plans, local, (means, valid), of, root_of, fine = data
+    # A root drawn by its Gaussians: each takes its turn as often as it is large.
+    root = root_of[jax.random.randint(key, (), 0, len(root_of))]
+    plan = only(jax.tree.map(lambda a: a[view], plans), ~fine | (root_of == root))
     image, alpha = _draw(plan, _through(features, of, clusters))
     ids = local[view].reshape(-1)
     target = means[view][jnp.maximum(ids, 0)]
     counts = (ids >= 0) & valid[view][jnp.maximum(ids, 0)] & (alpha > SILHOUETTE)
-    error = jnp.square(image - target) if squared else jnp.abs(image - target)
+    error = jnp.where(fine, jnp.square(image - target), jnp.abs(image - target))
     return jnp.sum(jnp.where(counts[:, None], error, 0.0)) / (SIZE * jnp.maximum(counts.sum(), 1))
 
 
 @functools.cache
-def _quantised_loss_of(clusters: int, squared: bool) -> Callable:
-    return functools.partial(_quantised_loss, clusters=clusters, squared=squared)
+def _quantised_loss_of(clusters: int) -> Callable:
+    return functools.partial(_quantised_loss, clusters=clusters)
 
 
 def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key) -> tuple[Array, Array]:
@@ -217,8 +212,8 @@ def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key)
         of, centres = assign_to_centres(points(features), centres)
         return of
 
-    loss = _quantised_loss_of(roots, False)
-    given = lambda of: (*data, labels, of, of)
+    loss = _quantised_loss_of(roots * schedule.leaves)  # as many as the fine stage has; no Gaussian is of the others
+    given = lambda of: (*data, labels, of, of, jnp.asarray(False))
     steps, rate = schedule.coarse_steps, schedule.coarse_rate
     return _clustered(loss, features, assign, given, steps=steps, refresh=REFRESH_COARSE, rate=rate, key=key)
 
@@ -228,8 +223,8 @@ def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Arr
     roots, leaves = min(schedule.roots, len(features)), schedule.leaves
     number = _leaves_wanted(root_of, data, labels, roots, leaves)
     split = lambda f: split_roots(normalize(f), root_of, number, leaves)
-    loss = _quantised_loss_of(roots * leaves, True)
-    given = lambda of: (*data, labels, of, root_of)
+    loss = _quantised_loss_of(roots * leaves)
+    given = lambda of: (*data, labels, of, root_of, jnp.asarray(True))
     steps, rate = schedule.fine_steps, schedule.rate
     features, of = _clustered(loss, features, split, given, steps=steps, refresh=REFRESH_FINE, rate=rate, key=key)
     return features, of, cluster_means(normalize(features), of, jnp.zeros((roots * leaves, SIZE)))
@@ -248,7 +243,8 @@ def _clustered(
             data,
             views=len(data[1]),
             steps=min(refresh, steps - start),
-            optimizer=_adam(rate),
+            optimizer=_ADAM,
+            scale=-rate,
             key=jax.random.fold_in(key, start),
         )
         of = assign(features)
@@ -257,9 +253,10 @@ def _clustered(
 
 def _leaves_wanted(root_of, data, labels, roots: int, leaves: int) -> Int[np.ndarray, " k"]:
     """1 + the largest number of a view's labels that match the root: half of the label's pixels are the root's."""
-    both, _, pixels = _overlaps(data, root_of, roots, labels[1].shape[1])
-    matched = (both > 0.5 * pixels[:, None]) & labels[1][:, None] & (pixels[:, None] > 0)
-    most = np.asarray(matched.sum(2).max(0))
+    valid = np.asarray(labels[1])
+    both, _, pixels = (np.asarray(a) for a in _overlaps(data, root_of, _LEAVES * -(-roots // _LEAVES), valid.shape[1]))
+    matched = (both[:, :roots] > 0.5 * pixels[:, None]) & valid[:, None] & (pixels[:, None] > 0)
+    most = matched.sum(2).max(0)
     return np.minimum(1 + most, leaves)
 
 

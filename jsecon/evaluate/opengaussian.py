@@ -3,6 +3,9 @@
 What they select is measured like any other selection, rendered alone with alpha > 0.7 (REFERENCE D.5, D.6).
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -36,19 +39,25 @@ def most_similar_text(
         expected="one space, at least one text",
         remedy="Decode the features to the texts' space.",
     )
-    features = jnp.asarray(features)
+    return _most_similar_text(features, texts)
+
+
+@jax.jit
+def _most_similar_text(features: Array, texts: Array) -> tuple[Array, Array]:
     known = jnp.any(features != 0, axis=1) & jnp.all(jnp.isfinite(features), axis=1)
     cosines = cosine_matrix(jnp.where(known[:, None], features, 0.0), texts)
     return jnp.where(known, jnp.argmax(cosines, axis=1), -1), cosines
 
 
-def select_text(labels: Int[Array, " n"], cosines: Float[Array, "n q"], query: int) -> Selection:
+@jax.jit
+def select_text(labels: Int[Array, " n"], cosines: Float[Array, "n q"], query: int | Array) -> Selection:
     """The Gaussians whose most similar text is `query`."""
-    mask = jnp.asarray(labels) == query
+    mask = labels == query
     similarity = jnp.where(mask, jnp.maximum(cosines[:, query], 0.0), 0.0)
     return Selection(mask, similarity, jnp.asarray(-1, jnp.int32), jnp.max(similarity, initial=0.0))
 
 
+@functools.partial(jax.jit, static_argnames=("siblings", "reach"))
 def select_leaf(
     leaf_features: Float[Array, "l e"],
     leaf_codes: Float[Array, "l d"],
@@ -65,15 +74,13 @@ def select_leaf(
     codebook; leaf_of (N,) the leaf of each Gaussian, -1 = none; `siblings`: ids that differ by less are of one root.
     Selection.region is the best leaf; nothing is selected where no leaf has a feature.
     """
-    features = jnp.asarray(leaf_features)
-    known = jnp.any(features != 0, axis=1)
-    cosines = jnp.where(known, cosine_matrix(features, jnp.asarray(text)[None])[:, 0], -jnp.inf)
+    known = jnp.any(leaf_features != 0, axis=1)
+    cosines = jnp.where(known, cosine_matrix(leaf_features, text[None])[:, 0], -jnp.inf)
     order = jnp.argsort(-cosines)
     best, rest = order[0], order[1 : 1 + NEXT_BEST]
     near = safe_norm(leaf_codes[rest] - leaf_codes[best]) < reach
     along = (jnp.abs(rest - best) < siblings) & near & known[rest]
-    chosen = jnp.zeros(len(features), bool).at[best].set(known[best]).at[rest].max(along)
-    leaf_of = jnp.asarray(leaf_of)
+    chosen = jnp.zeros(len(leaf_features), bool).at[best].set(known[best]).at[rest].max(along)
     mask = (leaf_of >= 0) & chosen[jnp.maximum(leaf_of, 0)]
     found = jnp.where(known[best], cosines[best], 0.0)
     similarity = jnp.where(mask, jnp.maximum(cosines[jnp.maximum(leaf_of, 0)], 0.0), 0.0)

@@ -148,7 +148,8 @@ def train_autoencoder(
             jax.block_until_ready(carry)
             progress(stop, total)
     _, vector, stats = carry[1]
-    params = _unflatten(vector, _shapes(units, plan)[0])
+    vector = vector if isinstance(vector, jax.core.Tracer) else np.asarray(vector)  # whose slices compile nothing
+    params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
     return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
 
 
@@ -192,11 +193,12 @@ def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
     return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
 
 
-def _unflatten(vector: Array, shapes: Any) -> Any:
-    """The tree of parameters that `vector` holds end to end."""
+def _unflatten(vector: Any, shapes: Any) -> Any:
+    """The tree of parameters that `vector` holds end to end; of NumPy's arrays where it is one."""
     leaves, tree = jax.tree.flatten(shapes)
-    parts = jnp.split(vector, np.cumsum([leaf.size for leaf in leaves])[:-1])
-    return jax.tree.unflatten(tree, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = [vector[end - leaf.size : end].reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+    return jax.tree.unflatten(tree, parts)
 
 
 # The bounds are arguments: one compiled loop serves every stretch between two calls of `progress`.

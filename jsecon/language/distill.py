@@ -276,7 +276,8 @@ def descend(
 
     `plans` are those of `splat.plan.plan_views` with the same capacity; without them each step plans its view.
     """
-    table = jnp.asarray(region_codes)
+    # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
+    table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))
     return _descend(state, gaussians, cameras, labels, table, plans, until, learning_rate, capacity)
 
 

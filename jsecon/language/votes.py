@@ -18,7 +18,7 @@ from jsecon.errors import require
 from jsecon.numerics import NEAR
 from jsecon.parallel import spread_over_devices
 from jsecon.splat.batches import make_batches, to_tiles
-from jsecon.splat.plan import is_traced, plan_view
+from jsecon.splat.plan import ViewPlan, is_traced, plan_view
 from jsecon.splat.stored import stored
 from jsecon.splat.tiles import plan_capacity
 from jsecon.splat.walk import make_table, walk, weights
@@ -81,22 +81,22 @@ def region_votes(
     count = gaussians.means.shape[0]
     block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
     blocks = math.ceil(max(num_regions, 1) / block)
-    step = functools.partial(_add_view, capacity=capacity, near=near, by_view=by_view)
+    static = capacity, near, by_view
     kept = (jnp.full((count, 0), -1, jnp.int32), jnp.zeros((count, 0), gaussians.means.dtype))
     for b in range(blocks):
         inside = _labels_of_block(labels, b * block, block)
         start = _empty(count, block, gaussians.means.dtype)
         if traced:
-            state, totals = lax.scan(lambda s, view: step(s, gaussians, *view), start, (cameras, inside))
+            state, totals = lax.scan(lambda s, view: _add_view(s, gaussians, view, *static), start, (cameras, inside))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
             state, totals = spread_over_devices(
-                _add_view_compiled,
+                _add_view,
                 start,
                 _merge,
                 gaussians,
                 (cameras, inside),
-                static=(capacity, near, by_view),
+                static=static,
                 progress=report,
             )
         kept = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
@@ -139,19 +139,19 @@ def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int | Array,
 
 
 def _add_view(
-    state: dict[str, Array],
-    gaussians: Gaussians,
-    camera: Camera,
-    labels: Array,
-    *,
-    capacity: int,
-    near: float,
-    by_view: bool,
+    state: dict[str, Array], gaussians: Gaussians, view: tuple[Camera, Array], capacity: int, near: float, by_view: bool
 ) -> tuple[dict[str, Array], Array | None]:
     """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted."""
+    camera, labels = view
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+    return (_add_plan if is_traced((state, plan, labels)) else _add_plan_compiled)(state, plan, labels, by_view)
+
+
+def _add_plan(
+    state: dict[str, Array], plan: ViewPlan, labels: Array, by_view: bool
+) -> tuple[dict[str, Array], Array | None]:
     splats, lists = plan.splats, plan.lists
-    batches = make_batches(lists, camera.width)
+    batches = make_batches(lists, plan.width)
     tiles = to_tiles(labels + 1, lists.tile) - 1
     distinct = _distinct(tiles)
     dtype = splats.dtype
@@ -198,13 +198,7 @@ def _add_view(
     }, total if by_view else None
 
 
-_add_view_compiled = jax.jit(
-    lambda state, gaussians, view, capacity, near, by_view: _add_view(
-        state, gaussians, *view, capacity=capacity, near=near, by_view=by_view
-    ),
-    static_argnums=(3, 4, 5),
-    donate_argnums=(0,),
-)
+_add_plan_compiled = jax.jit(_add_plan, static_argnums=3, donate_argnums=0)
 
 
 def _distinct(tiles: Int[Array, "n p"]) -> Int[Array, "n q"]:

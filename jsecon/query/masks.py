@@ -58,10 +58,4 @@ def render_selection(
     if capacity is None and not is_traced((hidden, camera)):
         # Selections differ in size: in steps of four, a handful of compilations serves them all.
         capacity = 4 ** math.ceil(math.log(plan_capacity(hidden, camera, margin=1.0), 4))
-    return _render(hidden, camera, features[:, None], capacity)
-
-
-_render = jax.jit(
-    lambda gaussians, camera, features, capacity: render(gaussians, camera, features, capacity=capacity),
-    static_argnums=3,
-)
+    return render(hidden, camera, features[:, None], capacity=capacity)

@@ -6,6 +6,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
@@ -84,16 +85,17 @@ def plan_view(
     check_shapes(gaussians, camera)
     if capacity is None:
         capacity = default_capacity(gaussians, camera, mesh)
-    run = _plan if is_traced((gaussians, camera, near)) else _plan_compiled
-    return run(gaussians, camera, capacity, near, mesh)
+    # Colour has no part in it: Gaussians with and without share one program.
+    bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
+    run = _plan if is_traced((bare, camera, near)) else _plan_compiled
+    return run(bare, camera, capacity, near, mesh)
 
 
 def _plan(
     gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array, mesh: Mesh | None = None
 ) -> ViewPlan:
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    no_colour = dataclasses.replace(gaussians, sh=jnp.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
-    projection = over_rows(lambda rows, view: project(rows, view[0], near=view[1]), no_colour, (camera, near), mesh)
+    projection = over_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
     lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
     columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
     # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
@@ -118,15 +120,22 @@ def plan_views(
     of view t. None where they would take more than `most_bytes` together: then each is to be made when it is wanted.
     """
     views = cameras.world_to_camera.shape[0]
-    make = functools.partial(_plan, capacity=capacity, near=near)
+    make = functools.partial(plan_view, capacity=capacity, near=near)
     shape = jax.eval_shape(make, gaussians, cameras[0])
     size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shape))
-    return None if views * size > most_bytes else _plan_all(gaussians, cameras, capacity, near)
+    if views * size > most_bytes:
+        return None
+    if is_traced((gaussians, cameras, near)):
+        return lax.map(functools.partial(make, gaussians), cameras)
+    plans = jax.tree.map(lambda leaf: jnp.zeros((views, *leaf.shape), leaf.dtype), shape)
+    for t in range(views):  # by the program that plans a view for anything else
+        plans = _put(plans, make(gaussians, cameras[t]), t)
+    return plans
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _plan_all(gaussians: Gaussians, cameras: Camera, capacity: int, near: float | Array) -> ViewPlan:
-    return lax.map(lambda camera: _plan(gaussians, camera, capacity, near), cameras)
+@functools.partial(jax.jit, donate_argnums=0)
+def _put(plans: ViewPlan, plan: ViewPlan, t: Array) -> ViewPlan:
+    return jax.tree.map(lambda stacked, one: stacked.at[t].set(one), plans, plan)
 
 
 def render_plan(

@@ -54,11 +54,6 @@ def render(
     )
     if capacity is None:
         capacity = default_capacity(gaussians, camera, mesh)
-    run = _render if is_traced((gaussians, camera, features, background, near)) else _render_compiled
-    return run(gaussians, camera, features, background, capacity, near, depth, mesh)
-
-
-def _render(gaussians, camera, features, background, capacity, near, depth, mesh) -> Rendering:
     gaussians, camera, features = jax.tree.map(jnp.asarray, (gaussians, camera, features))
     if gaussians.means.shape[0] == 0:
         image, alpha = (
@@ -68,10 +63,8 @@ def _render(gaussians, camera, features, background, capacity, near, depth, mesh
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0), alpha if depth else None)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near, mesh=mesh)
+    # Outside a trace two programs: whatever else is rendered of a scene of this size shares the first.
     return render_plan(plan, features, background=background, depth=depth)
-
-
-_render_compiled = jax.jit(_render, static_argnums=(4, 6, 7))
 
 
 def render_rgb(
@@ -85,17 +78,12 @@ def render_rgb(
 ) -> Rendering:
     """Renders colour from spherical harmonics: features (H, W, 3), not clamped above 1. See `render`."""
     check_shapes(gaussians, camera)
-    if capacity is None:
-        capacity = default_capacity(gaussians, camera, mesh)
-    run = _render_rgb if is_traced((gaussians, camera, background, near)) else _render_rgb_compiled
-    return run(gaussians, camera, background, capacity, near, mesh)
+    colours = colours_from_sh if is_traced((gaussians, camera)) else _colours_compiled
+    rgb = colours(gaussians, camera)
+    return render(gaussians, camera, rgb, background=background, capacity=capacity, near=near, mesh=mesh)
 
 
-def _render_rgb(gaussians, camera, background, capacity, near, mesh):
-    return _render(gaussians, camera, colours_from_sh(gaussians, camera), background, capacity, near, False, mesh)
-
-
-_render_rgb_compiled = jax.jit(_render_rgb, static_argnums=(3, 5))
+_colours_compiled = jax.jit(colours_from_sh)
 
 
 def render_depth(
