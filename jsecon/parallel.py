@@ -56,6 +56,11 @@ def over_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any
     return jax.tree.map(lambda a: a[:count], out)
 
 
+def _unbound(arrays: Any) -> Any:
+    """The same numbers on the first device, by jax's leave to move them; on a CPU the same memory."""
+    return jax.tree.map(lambda a: jax.device_put(np.asarray(a), may_alias=True), arrays)
+
+
 def spread_over_devices(
     step: Callable,
     start: Any,
@@ -64,13 +69,15 @@ def spread_over_devices(
     views: Any,
     *,
     static: tuple = (),
+    most: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, list[Any]]:
     """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`, view t on device
     t mod D; returns the state and each view's `out`, in the views' order.
 
-    `start` is the neutral state of `merge`, which joins the devices' states pairwise in device order. Host code;
-    dispatch is asynchronous, so the devices work side by side. `progress(done, total)` is called as views finish.
+    `start` is the neutral state of `merge`, which joins the devices' states pairwise in device order. At most `most`
+    devices are used: jax compiles anew for each. Host code; dispatch is asynchronous, so the devices work side by side.
+    `progress(done, total)` is called as views finish.
 
     Over several processes (`jax.distributed.initialize`), each given the same arguments, process p of P takes views p,
     p + P, ...; all end with the same result.
@@ -78,9 +85,9 @@ def spread_over_devices(
     rank, world = jax.process_index(), jax.process_count()
     count = jax.tree.leaves(views)[0].shape[0]
     own = range(rank, count, world)
-    # One device alone is not named: arrays bound to it would have programs of their own.
-    most = min(len(own), jax.local_device_count())
-    devices = jax.local_devices()[:most] if most > 1 else [None]
+    # The first device is not named, nor is any in what is returned: arrays bound to one have programs of their own.
+    devices = [None, *jax.local_devices()[1 : len(own)][: None if most is None else most - 1]]
+    common, start, views = jax.tree.map(np.asarray, (common, start, views))
     shared = [jax.device_put(common, device) for device in devices]
     states = [jax.tree.map(lambda a, d=device: jax.device_put(a, d).copy(), start) for device in devices]
     outs = []
@@ -95,9 +102,8 @@ def spread_over_devices(
             progress(min((first + len(wave)) * world, count), count)
     total = states[0]
     for state in states[1:]:
-        total = merge(total, jax.device_put(state, devices[0]))
-    # Bound to no device: what reads them shares its programs with what reads arrays that never were on one.
-    total, outs = jax.tree.map(lambda a: jax.device_put(np.asarray(a), may_alias=True), (total, outs))
+        total = merge(total, _unbound(state))
+    total, outs = _unbound((total, outs))
     if world == 1:
         return total, outs
     parts = process_allgather(total)

@@ -51,6 +51,10 @@ import numpy as np  # noqa: E402
 from jsecon.process import forget_programs  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
+SOON_READY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+"""compiler options for a test's own programs that compare one way of computing with another, run a few times, and need
+not be what ships: they compile in half the time. What is compared with NumPy in float32 is compiled as it ships."""
+
 LONGEST = (
     "test_pipeline",
     "test_tables",

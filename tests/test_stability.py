@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import SOON_READY
 
 from experiments.stability import engine, evaluate
 from experiments.stability_cases import ARGUMENTS, CANCELS, GRADIENT, VALUE, cases, ordinary
@@ -70,7 +71,7 @@ def test_a_bad_feature_stays_where_it_is_seen_however_wide_and_in_its_own_set_un
     broken[1, 5, 0] = np.nan
     draw = lambda f: render(case.gaussians, case.camera, f, capacity=CAPACITY).features
     loss = lambda f: (jnp.nan_to_num(draw(f)).sum(), draw(f))
-    compiled = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))
+    compiled = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)), compiler_options=SOON_READY)
     ((_, clean), _), ((_, image), gradient) = compiled(sets), compiled(broken)
     np.testing.assert_array_equal(image[0], clean[0])
     np.testing.assert_array_equal(nan_pixels(image[1]), covered)
@@ -89,7 +90,7 @@ def test_colour_and_depth_of_bad_gaussians(touched):
         image = render_rgb(gaussians, camera, capacity=CAPACITY).features
         return jnp.nansum(image), image
 
-    compiled = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
+    compiled = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), compiler_options=SOON_READY)
     (_, image), gradients = compiled(broken, case.camera)
     assert all(bool(jnp.isfinite(g).all()) for g in jax.tree.leaves(gradients))
     assert not (nan_pixels(image) & ~covered).any()

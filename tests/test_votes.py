@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import SOON_READY
 
 from jsecon.language.votes import region_votes
 from jsecon.splat.reference import weights_reference
@@ -67,11 +68,31 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
 def test_traced_is_eager(cast, scene, cameras, labels):
     capacity = plan_capacity(scene, cameras)
     cast_by = jax.jit(
-        lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, by_view=True, capacity=capacity)
+        lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, by_view=True, capacity=capacity),
+        compiler_options=SOON_READY,
     )
     traced = cast_by(scene, labels)
     np.testing.assert_allclose(traced.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(traced.by_view, cast.by_view, rtol=1e-4, atol=1e-4)
+
+
+def test_two_devices_cast_the_votes_of_one(monkeypatch, cast, scene, cameras, labels):
+    from jsecon.language import votes as module
+
+    assert jax.local_device_count() == 2
+    placed, compiled = [], module._add_plan_compiled
+
+    def placing(state, *rest):
+        placed.append(state["total"].device)
+        return compiled(state, *rest)
+
+    monkeypatch.setattr(module, "_MANY_PIXELS", labels.size)
+    monkeypatch.setattr(module, "_add_plan_compiled", placing)
+    both = region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
+    assert placed == jax.local_devices() * 2  # view by view
+    np.testing.assert_allclose(both.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(both.by_view, cast.by_view)
+    np.testing.assert_array_equal(both.views, cast.views)
 
 
 def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):

@@ -29,6 +29,8 @@ _SLOTS = 4
 _NOBODY = -2  # a slot that no label equals
 _DENSE_BYTES = 1 << 30
 """the dense N x R block that is accumulated at once; more regions take more passes over the views"""
+_MANY_PIXELS = 1 << 20
+"""of all views together, from which a second device's work is worth the seconds that compiling for it takes"""
 
 
 def region_votes(
@@ -48,9 +50,9 @@ def region_votes(
     Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
     is kept too (`Votes.by_view`, 4 T N bytes, twice that while it is joined), as `query.showing.with_shown` wants it.
 
-    Outside a trace the views are spread over jax's local devices, and over processes that all make the same call
-    (`jax.distributed`), and `progress(done, total)` is called after each; inside one the views are scanned and
-    `capacity` must be given. Raises ValueError on shapes that disagree.
+    Outside a trace the views are spread over jax's local devices (a million pixels or more in all), and over processes
+    that all make the same call (`jax.distributed`), and `progress(done, total)` is called after each; inside one the
+    views are scanned and `capacity` must be given. Raises ValueError on shapes that disagree.
     """
     views = cameras.world_to_camera.shape[0]
     require(
@@ -97,6 +99,7 @@ def region_votes(
                 gaussians,
                 (cameras, inside),
                 static=static,
+                most=None if labels.size >= _MANY_PIXELS else 1,
                 progress=report,
             )
         kept = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))

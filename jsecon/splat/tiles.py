@@ -239,10 +239,15 @@ def _saturating_cumsum(areas: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=2)
 def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int) -> Array:
-    """The pairs of all strips, were each as long as the longest."""
+    """(2,) the pairs of the image as one strip, and of all strips, were each as long as the longest: one program for
+    whoever asks for either."""
     splats = project(gaussians, camera)
-    counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, strips)) for k in range(strips)]
-    return strips * jnp.stack([count.astype(jnp.float32).sum() for count in counts]).max()
+
+    def longest(count: int) -> Array:
+        counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, count)) for k in range(count)]
+        return count * jnp.stack([pairs.astype(jnp.float32).sum() for pairs in counts]).max()
+
+    return jnp.stack([longest(1), longest(strips)])
 
 
 def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25, devices: int | None = None) -> int:
@@ -252,10 +257,13 @@ def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25
     Host code: needs concrete arrays. Rounded up (`round_capacity`), so that captures of like size share one
     compilation. `margin` leaves room for Gaussians that still move.
     """
-    strips = jax.local_device_count() if devices is None else devices
+    local = jax.local_device_count()
+    strips = local if devices is None else devices
+    given, which = (local, 0) if strips == 1 else (strips, 1)
     views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
     pairs = max(
-        (float(_pairs_in_view(gaussians, views[t], strips)) for t in range(views.world_to_camera.shape[0])), default=0.0
+        (float(_pairs_in_view(gaussians, views[t], given)[which]) for t in range(views.world_to_camera.shape[0])),
+        default=0.0,
     )
     return round_capacity(int(np.ceil(pairs * margin * (1 + 1e-6))))  # the sum is a float32
 
