@@ -94,7 +94,7 @@ def ours(setting: Setting, steps: Steps) -> Answers:
     field = field_of(setting, by="consensus")
     embeddings = distill_votes(field.votes, jnp.asarray(field.regions.embeddings))
     beside = in_the_image(setting, [(embeddings, _as_they_are)])
-    return dataclasses.replace(ask_field(setting, field, "votes"), beside=beside)
+    return dataclasses.replace(ask_field(setting, field, "votes", pieces=True), beside=beside)
 
 
 ROWS: dict[str, Method] = {

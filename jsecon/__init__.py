@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from jsecon.query.masks import selection_mask as selection_mask
     from jsecon.query.one_step import query_one_step as query_one_step
     from jsecon.query.outliers import remove_outliers as remove_outliers
+    from jsecon.query.pieces import with_overlap as with_overlap
     from jsecon.query.probability import membership_probability as membership_probability
     from jsecon.query.several import query_several as query_several
     from jsecon.query.showing import with_shown as with_shown
@@ -79,6 +80,7 @@ _CONTENTS = {
     "jsecon.query.outliers": ("remove_outliers",),
     "jsecon.query.probability": ("membership_probability",),
     "jsecon.query.several": ("query_several",),
+    "jsecon.query.pieces": ("with_overlap",),
     "jsecon.query.showing": ("with_shown",),
     "jsecon.query.units": ("unit_codes",),
     "jsecon.splat.plan": ("plan_view", "render_plan"),

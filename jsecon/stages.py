@@ -262,6 +262,7 @@ def assemble(
     provenance: str,
 ) -> LanguageField:
     """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
+    from jsecon.query.pieces import with_overlap
     from jsecon.query.showing import with_shown
 
     pixels = np.zeros((found.count, len(capture.names)), np.int32)
@@ -269,7 +270,7 @@ def assemble(
     return LanguageField(
         gaussians=gaussians,
         codes=point_codes,
-        votes=with_shown(cast, found),
+        votes=with_overlap(with_shown(cast, found)),
         regions=Regions(found.embeddings, pixels),
         region_codes=table,
         autoencoder=coder,

@@ -142,6 +142,8 @@ class Votes:
     """(T, N) sum of alpha T over the pixels of each view, or None where it was not kept."""
     shown: Array | None = None
     """(N, K) sum of alpha T over the views that show that region, or one alike to it; None: not known."""
+    overlap: Array | None = None
+    """(R, R) in [0, 1]: of the Gaussians of the smaller of two regions, the part that is the other's; None: unknown."""
 
     @property
     def cut(self) -> Array:

@@ -8,16 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import make_field, unit_rows
+from small_field import REGIONS, make_field, unit_rows
 
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.field import load_field, save_field
+from jsecon.query.pieces import with_overlap
 
 
 @pytest.fixture(scope="module")
 def field(scene, cameras):
-    return make_field(scene, cameras)[0]
+    field = make_field(scene, cameras)[0]
+    return dataclasses.replace(field, votes=with_overlap(field.votes))
 
 
 @pytest.fixture
@@ -68,7 +70,7 @@ def test_empty_scene_and_no_regions(field, tmp_path):
 
     gaussians, votes, codes = jax.tree.map(none, (field.gaussians, field.votes, field.codes))
     regions = jax.tree.map(none, field.regions)
-    votes = dataclasses.replace(votes, num_regions=0)
+    votes = dataclasses.replace(votes, num_regions=0, overlap=np.zeros((0, 0), np.float32))
     changed = dataclasses.replace(
         field, gaussians=gaussians, votes=votes, codes=codes, regions=regions, region_codes=none(field.region_codes)
     )
@@ -159,11 +161,19 @@ def test_a_header_that_does_not_fit(path, change, match):
     fails(path, match)
 
 
+def test_a_field_written_before_regions_overlapped_is_read(field, path):
+    rewritten(path, lambda header, _: header["field"]["fields"]["votes"]["fields"].pop("overlap"))
+    back = load_field(path)
+    assert back.votes.overlap is None
+    assert_same(back, dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=None)))
+
+
 def test_fields_that_do_not_fit_together_are_not_written(field, tmp_path):
     for changed in (
         dataclasses.replace(field, codes=field.codes[:-1]),
         dataclasses.replace(field, region_codes=field.region_codes[:, :2]),
         dataclasses.replace(field, names=("one",)),
+        dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=np.eye(REGIONS - 1))),
         dataclasses.replace(field, autoencoder={"w": jnp.ones(3, jnp.bfloat16)}),
     ):
         with pytest.raises(ValueError, match="save_field"):

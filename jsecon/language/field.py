@@ -172,6 +172,8 @@ def _disagreement(field: LanguageField) -> str | None:
     }
     if field.votes.shown is not None:
         expected["votes.shown"] = (field.votes.shown, (n, k))
+    if field.votes.overlap is not None:
+        expected["votes.overlap"] = (field.votes.overlap, (r, r))
     for name, (array, shape) in expected.items():
         if tuple(array.shape) != shape:
             return f"{name} of shape {tuple(array.shape)} where the others ask for {shape}"

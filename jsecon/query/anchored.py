@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.query.one_step import Codes, Number, as_codes, similarities
+from jsecon.query.pieces import PIECE_NEARNESS, is_piece
 from jsecon.query.pixel import region_at, region_shares_at
 from jsecon.query.retrieval import answers, threshold_of
 from jsecon.query.shares import gather_votes
@@ -66,6 +67,7 @@ def query_anchored(
     by: str = "votes",
     retrieval: str = "contrast",
     alike_threshold: Number | None = ALIKE_THRESHOLD,
+    piece_nearness: Number | None = PIECE_NEARNESS,
     unlabelled_weight: Number | None = None,
     codes: UnitCodes | None = None,
 ) -> Selection:
@@ -88,6 +90,9 @@ def query_anchored(
     `alike_threshold`, not for "code": regions whose embedding has at least this cosine with the anchor's are the same
         thing as the text sees it (a track that broke, a twin), and their votes are added; None for the anchor alone.
         "code" needs no such rule, as regions that are alike have codes that are.
+    `piece_nearness`, not for "code": where the votes know which regions overlap (`with_overlap`), those that overlap
+        the anchor and answer the text nearly as well are pieces of the same thing (`is_piece` has the rule), and their
+        votes are added too; None for none.
     Gaussians never seen, without a code, or with numbers that are not finite are never selected, nor regions without
     an embedding. Pure: jit it or vmap it over texts, with the field closed over. Raises ValueError on a text of
     another size.
@@ -111,9 +116,11 @@ def query_anchored(
     if field.regions.count == 0:
         return _nothing(field)
     given = (field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels)
-    region, score = _retrieve(*map(jnp.asarray, given), least, retrieval)
+    overlap = None if piece_nearness is None or by == "code" else field.votes.overlap
+    overlap = None if overlap is None else jnp.asarray(overlap)
+    region, score, pieces = _retrieve(*map(jnp.asarray, given), overlap, least, piece_nearness, retrieval)
     threshold = _THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
-    return _members(_parts(field, codes), region, score, threshold, alike_threshold, unlabelled_weight, by)
+    return _members(_parts(field, codes), region, pieces, score, threshold, alike_threshold, unlabelled_weight, by)
 
 
 def query_region(
@@ -145,6 +152,7 @@ def query_region(
     return _members(
         _parts(field),
         jnp.where(valid, region, -1),
+        None,
         valid.astype(field.codes.dtype),
         threshold,
         alike_threshold,
@@ -181,19 +189,25 @@ def _nothing(field: LanguageField) -> Selection:
     return Selection(jnp.zeros(n, bool), jnp.zeros(n, dtype), jnp.asarray(-1, jnp.int32), jnp.zeros((), dtype))
 
 
-def _retrieve_body(embeddings, text, canonical, pixels, least, retrieval) -> tuple[Array, Array]:
-    """The region, -1 where none reaches `least`, and its similarity."""
+def _retrieve_body(
+    embeddings, text, canonical, pixels, overlap, least, nearness, retrieval
+) -> tuple[Array, Array, Array | None]:
+    """The region, -1 where none reaches `least`, its similarity, and (R,) its pieces where `overlap` is known."""
     similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
     similarity = jnp.where(known, similarity, -jnp.inf)
     anchor = jnp.argmax(similarity)
     region = jnp.where(similarity[anchor] >= least, anchor, -1)
-    return region, jnp.where(known[anchor], similarity[anchor], 0.0)
+    own = jnp.arange(similarity.shape[0]) == anchor
+    pieces = None if overlap is None else is_piece(similarity, known, own, overlap, nearness=nearness)
+    return region, jnp.where(known[anchor], similarity[anchor], 0.0), pieces
 
 
-def _members_body(parts, region, score, threshold, alike_threshold, unlabelled_weight, by) -> Selection:
+def _members_body(parts, region, pieces, score, threshold, alike_threshold, unlabelled_weight, by) -> Selection:
     anchor = jnp.maximum(region, 0)
     count = parts.embeddings.shape[0]
     chosen = jnp.arange(count) == anchor
+    if pieces is not None:
+        chosen |= pieces
     if alike_threshold is not None and by != "code":
         alike, known = similarities(parts.embeddings, parts.embeddings[anchor])
         chosen |= known & (alike >= alike_threshold)

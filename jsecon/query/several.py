@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import InputError, require
 from jsecon.query.anchored import ALIKE_THRESHOLD, SHARE_THRESHOLD
 from jsecon.query.one_step import Number, similarities
+from jsecon.query.pieces import is_piece
 from jsecon.query.retrieval import answers, threshold_of
 from jsecon.query.shares import gather_votes
 from jsecon.types import Array, LanguageField, Selection
@@ -25,6 +26,7 @@ def regions_of_text(
     embeddings: Float[Array, "r e"],
     similarity: Float[Array, " r"],
     known: Bool[Array, " r"],
+    overlap: Float[Array, "r r"] | None = None,
     *,
     retrieval_threshold: Number,
     several: bool = True,
@@ -36,7 +38,8 @@ def regions_of_text(
     The rule: the region with the largest similarity, b, if b is at least `retrieval_threshold`; with it all regions
     alike (cosine of the embeddings (R, E) at least `alike_threshold`: one thing seen twice). With `several` also every
     region whose similarity is at least m + nearness (b - m), m the median over the regions: only the place between the
-    typical region and the best means something, whatever the similarity.
+    typical region and the best means something, whatever the similarity. Where it is known how far the regions overlap
+    (R, R), with all of these their pieces (`is_piece` has the rule).
     """
     scored = jnp.where(known, similarity, -jnp.inf)
     anchor = jnp.argmax(scored)
@@ -46,6 +49,8 @@ def regions_of_text(
     if several:
         middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
         chosen |= known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
+    if overlap is not None:
+        chosen |= is_piece(similarity, known, chosen, overlap)
     return chosen & known & (best >= retrieval_threshold)
 
 
@@ -82,7 +87,7 @@ def query_several(
     votes, known = field.votes, (field.regions.embeddings, field.regions.pixels, field.canonical)
     return _several(
         *(jnp.asarray(a) for a in (*known, votes.regions, votes.weights, votes.total, votes.views)),
-        None if votes.shown is None else jnp.asarray(votes.shown),
+        *(None if a is None else jnp.asarray(a) for a in (votes.shown, votes.overlap)),
         jnp.asarray(wanted),
         unwanted,
         several,
@@ -102,6 +107,7 @@ def _several_body(
     total,
     views,
     shown,
+    overlap,
     wanted,
     unwanted,
     several,
@@ -120,7 +126,7 @@ def _several_body(
         for text in texts:
             similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
             own = regions_of_text(
-                embeddings, similarity, known, retrieval_threshold=least, several=several, nearness=nearness
+                embeddings, similarity, known, overlap, retrieval_threshold=least, several=several, nearness=nearness
             )
             chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, similarity, -jnp.inf))
         return chosen, closeness
