@@ -143,7 +143,7 @@ class Votes:
     shown: Array | None = None
     """(N, K) sum of alpha T over the views that show that region, or one alike to it; None: not known."""
     overlap: Array | None = None
-    """(R, R) in [0, 1]: of the Gaussians of the smaller of two regions, the part that is the other's; None: unknown."""
+    """(R, R) in [0, 1]: soft IoU of the Gaussians of two regions; None: not known."""
 
     @property
     def cut(self) -> Array:

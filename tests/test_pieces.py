@@ -32,9 +32,8 @@ def expected(votes: Votes) -> np.ndarray:
     for n, k in zip(*np.nonzero((votes.regions >= 0) & (seen > 0) & np.isfinite(votes.weights) & np.isfinite(seen))):
         share[n, votes.regions[n, k]] = min(float(votes.weights[n, k]) / float(seen[n, k]), 1.0)
     both = np.stack([np.minimum(share, share[:, [r]]).sum(0) for r in range(votes.num_regions)])
-    size = share.sum(0)
-    smaller = np.minimum(size[:, None], size)
-    return np.divide(both, smaller, out=np.zeros_like(both), where=smaller > 0)
+    either = np.stack([np.maximum(share, share[:, [r]]).sum(0) for r in range(votes.num_regions)])
+    return np.divide(both, either, out=np.zeros_like(both), where=either > 0)
 
 
 @pytest.mark.parametrize(("count", "shown"), [(1, True), (200, False), (40_000, True)])

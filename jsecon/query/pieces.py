@@ -14,18 +14,20 @@ from jsecon.types import Array, Votes
 
 PIECE_NEARNESS = 0.5
 """how far a piece's similarity has come from the middle region's to the best one's: it is nearer to the best"""
-PIECE_OVERLAP = 0.2
-"""the least part of the smaller region's Gaussians that is also the other's, where two are pieces of one thing"""
+PIECE_OVERLAP = 0.1
+"""the least soft IoU of two regions' Gaussians where the two are pieces of one thing. In twins of two scenes (simulated
+vision, little to much noise) 106 of the 115 pieces that are near enough reach it, and 4 of 58 other regions"""
 
 
 def with_overlap(votes: Votes) -> Votes:
-    """`votes` with `overlap` (R, R): how much of the Gaussians of the smaller of two regions is also the other's.
+    """`votes` with `overlap` (R, R), the soft IoU of two regions' Gaussians.
 
-        o_rs = sum_n min(p_nr, p_ns) / min(sum_n p_nr, sum_n p_ns)
+        o_rs = sum_n min(p_nr, p_ns) / sum_n max(p_nr, p_ns)
 
     with p_nr the region's share of the weight with which Gaussian n was seen in the views that show the region (of all
     weight, where the votes do not know), at most 1; 0 for a region without votes. Two pieces that masks cut out of one
-    object in different views overlap in its Gaussians; two objects meet only where they touch. Pure.
+    object in different views overlap in its Gaussians; two objects meet only where they touch, and what lies behind all
+    of them is far larger than any. Pure.
     """
     arrays = (votes.regions, votes.weights, votes.total, votes.shown)
     overlap = _overlap(*(None if a is None else jnp.asarray(a) for a in arrays), votes.num_regions)
@@ -46,9 +48,9 @@ def _overlap(regions: Array, weights: Array, total: Array, shown: Array | None, 
 
     both = lax.fori_loop(0, len(first), add, jnp.zeros((count, count), weights.dtype))
     size = jnp.diagonal(both)
-    smaller = jnp.minimum(size[:, None], size)
-    part = jnp.where(smaller > 0, (both + both.T) / jnp.where(smaller > 0, smaller, 1.0), 0.0)
-    return jnp.where(jnp.eye(count, dtype=bool), (size > 0).astype(part.dtype), jnp.minimum(part, 1.0))
+    both = jnp.where(jnp.eye(count, dtype=bool), both, both + both.T)
+    either = size[:, None] + size - both
+    return jnp.where(either > 0, jnp.minimum(both / jnp.where(either > 0, either, 1.0), 1.0), 0.0)
 
 
 def is_piece(
