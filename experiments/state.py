@@ -12,7 +12,6 @@ from scipy import sparse
 from experiments import scenes
 from jsecon.language.grouping import group_by_consensus
 from jsecon.query.anchored import ALIKE_THRESHOLD
-from jsecon.query.pieces import is_piece
 from jsecon.query.retrieval import contrasts
 
 
@@ -49,22 +48,6 @@ class State:
         """For each anchor the regions that are alike."""
         gram = self.embeddings @ self.embeddings.T
         return [np.flatnonzero(gram[a] >= alike) for a in anchors]
-
-    def with_pieces(self, texts: np.ndarray, canonical: np.ndarray, groups: list[np.ndarray]) -> list[np.ndarray]:
-        """For each text's regions those with what jsecon.query.pieces calls pieces of the text's best region."""
-        seen = self.proof.seen @ self.shows
-        share = np.clip(self.votes / np.maximum(seen, 1e-12), 0, 1)
-        both, either = (
-            np.stack([of(share, share[:, [r]]).sum(0) for r in range(self.regions)]) for of in (np.minimum, np.maximum)
-        )
-        overlap = both / np.maximum(either, 1e-12)
-        found = []
-        for similarity, group in zip(self.similarities(texts, canonical), groups):
-            known = np.isfinite(similarity)
-            best = np.arange(self.regions) == similarity.argmax()
-            given = np.where(known, similarity, 0.0), known, best, overlap
-            found.append(np.union1d(group, np.flatnonzero(is_piece(*map(jnp.asarray, given)))))
-        return found
 
     def shares(self, groups: list[np.ndarray]) -> list[np.ndarray]:
         """(N,) a group: its share of all votes."""
