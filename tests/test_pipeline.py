@@ -51,6 +51,7 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     assert field.gaussians.count == run.field.gaussians.count > 100
     assert field.names == run.capture.names
     assert field.codes.shape == (field.gaussians.count, field.region_codes.shape[1])
+    assert field.votes.overlap.shape == (field.regions.count, field.regions.count)
     assert len(run.psnr) == run.capture.held_out.sum() == 2
     assert (np.asarray(field.regions.pixels)[:, run.capture.held_out] == 0).all()
     assert (np.asarray(field.regions.pixels)[:, ~run.capture.held_out].sum(1) > 0).all()
