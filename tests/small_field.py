@@ -58,3 +58,11 @@ def make_field(scene, cameras, *, dim=12, latent=8):
         provenance='{"made by": "a test"}',
     )
     return field, labels
+
+
+def shares(field, regions):
+    """(N,) float64: the part of all weight that lies on the regions."""
+    votes = field.votes
+    weight = np.where(np.isin(np.asarray(votes.regions), regions), np.asarray(votes.weights, np.float64), 0).sum(1)
+    total = np.asarray(votes.total, np.float64)
+    return np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import make_field
+from small_field import make_field, shares
 
 from jsecon.query.anchored import query_anchored
 from jsecon.query.pieces import is_piece, with_overlap
@@ -99,13 +99,6 @@ def broken(scene, cameras):
 
 def with_other(field, overlap, **changes):
     return dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=overlap), **changes)
-
-
-def shares(field, regions):
-    votes = field.votes
-    weight = np.where(np.isin(np.asarray(votes.regions), regions), np.asarray(votes.weights, np.float64), 0).sum(1)
-    total = np.asarray(votes.total, np.float64)
-    return np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
 
 
 @pytest.mark.parametrize("retrieval", ["cosine", "contrast"])

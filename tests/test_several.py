@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.stats import beta
-from small_field import REGIONS, make_field, unit_rows
+from small_field import REGIONS, make_field, shares, unit_rows
 
 from jsecon.answer import ask_text, figures
 from jsecon.errors import InputError
@@ -24,13 +24,6 @@ def field(scene, cameras):
     rows = [axes[0], 0.9 * axes[0] + 0.435 * axes[1], 0.3 * axes[0] + 0.954 * axes[2], axes[3], axes[4]]
     rows = np.stack([row / np.linalg.norm(row) for row in rows])
     return dataclasses.replace(field, regions=Regions(rows, field.regions.pixels))
-
-
-def shares(field, regions):
-    votes = field.votes
-    weight = np.where(np.isin(np.asarray(votes.regions), regions), np.asarray(votes.weights, np.float64), 0).sum(1)
-    total = np.asarray(votes.total, np.float64)
-    return np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
 
 
 def test_all_of_a_kind_are_found_and_no_others(field):

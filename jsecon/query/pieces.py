@@ -53,6 +53,14 @@ def _overlap(regions: Array, weights: Array, total: Array, shown: Array | None, 
     return jnp.where(either > 0, jnp.minimum(both / jnp.where(either > 0, either, 1.0), 1.0), 0.0)
 
 
+def is_near(similarity: Float[Array, " r"], known: Bool[Array, " r"], nearness: Number) -> Bool[Array, " r"]:
+    """Which of R regions have a known (R,) similarity of at least m + nearness (b - m), b the largest and m the median
+    over the regions: only the place between the typical region and the best means something. None where b = m."""
+    middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
+    best = jnp.max(jnp.where(known, similarity, -jnp.inf))
+    return known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
+
+
 def is_piece(
     similarity: Float[Array, " r"],
     known: Bool[Array, " r"],
@@ -64,11 +72,9 @@ def is_piece(
 ) -> Bool[Array, " r"]:
     """Which of R regions are pieces of the things that the `chosen` regions (R,) are of, as a text sees them.
 
-    Those whose similarity with the text (R,), where it is known (R,), is at least m + nearness (b - m), b the largest
-    and m the median over the regions, and that overlap a chosen one (`with_overlap`) by at least `least`. A second
-    thing of the kind is as near to the text, but has Gaussians of its own.
+    Those that are near the text (`is_near`, with their similarities (R,), where known (R,)) and overlap a chosen one
+    (`with_overlap`) by at least `least`. A second thing of the kind is as near to the text, but has Gaussians of its
+    own.
     """
-    middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
-    best = jnp.max(jnp.where(known, similarity, -jnp.inf))
-    near = known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
+    near = is_near(similarity, known, nearness)
     return near & (jnp.max(jnp.where(chosen[:, None], overlap, 0.0), axis=0) >= least)

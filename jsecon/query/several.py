@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import InputError, require
 from jsecon.query.anchored import ALIKE_THRESHOLD, SHARE_THRESHOLD
 from jsecon.query.one_step import Number, similarities
-from jsecon.query.pieces import is_piece
+from jsecon.query.pieces import is_near, is_piece
 from jsecon.query.retrieval import answers, threshold_of
 from jsecon.query.shares import gather_votes
 from jsecon.types import Array, LanguageField, Selection
@@ -47,8 +47,7 @@ def regions_of_text(
     alike, known_alike = similarities(embeddings, embeddings[anchor])
     chosen = (jnp.arange(embeddings.shape[0]) == anchor) | (known_alike & (alike >= alike_threshold))
     if several:
-        middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
-        chosen |= known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
+        chosen |= is_near(similarity, known, nearness)
     if overlap is not None:
         chosen |= is_piece(similarity, known, chosen, overlap)
     return chosen & known & (best >= retrieval_threshold)
