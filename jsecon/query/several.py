@@ -35,11 +35,10 @@ def regions_of_text(
 ) -> Bool[Array, " r"]:
     """Which of R regions answer a text that each has a similarity with (R,), where that is known (R,).
 
-    The rule: the region with the largest similarity, b, if b is at least `retrieval_threshold`; with it all regions
+    The rule: the region with the largest similarity, if that is at least `retrieval_threshold`; with it all regions
     alike (cosine of the embeddings (R, E) at least `alike_threshold`: one thing seen twice). With `several` also every
-    region whose similarity is at least m + nearness (b - m), m the median over the regions: only the place between the
-    typical region and the best means something, whatever the similarity. Where it is known how far the regions overlap
-    (R, R), with all of these their pieces (`is_piece` has the rule).
+    region near the text (`is_near`, with `nearness`). Where it is known how far the regions overlap (R, R), with all of
+    these their pieces (`is_piece`).
     """
     scored = jnp.where(known, similarity, -jnp.inf)
     anchor = jnp.argmax(scored)
