@@ -171,22 +171,31 @@ def leaders(
     names start with "ours" are not others: the best of several of one's own would be chosen by the answer."""
     lines, compared = [], False
     for scene in scenes:
-        found = means([cell for cell in cells if cell["scene"] == scene], level, figure)
-        mine = found.get(ours, float("nan"))
-        rivals = {name: value for name, value in found.items() if not name.startswith("ours")}
-        if not rivals:
+        held = _held_against([cell for cell in cells if cell["scene"] == scene], level, ours, figure)
+        if held is None:
             continue
-        compared, best = True, max(rivals, key=lambda name: rivals[name])
-        if not mine >= rivals[best]:
-            lines.append(f"* {scene}: {best} leads with {rivals[best]:.3f} ({ours}: {mine:.3f}).")
+        compared, (mine, best, value) = True, held
+        if not mine >= value:
+            lines.append(f"* {scene}: {best} leads with {value:.3f} ({ours}: {mine:.3f}).")
     if not lines:
         return f'{figure}: the row "{ours}" leads on every scene.' if compared else ""
     lines = [f'{figure}: the row "{ours}" does not lead on every scene.', "", *lines]
     return "\n".join([*lines, "", why] if why else lines)
 
 
-def noise(cells: list[dict], plan: Plan) -> str:
-    """A Markdown table of mIoU over the levels of noise, on the first scene and seed."""
+def _held_against(cells: list[dict], level: str, ours: str, figure: str) -> tuple[float, str, float] | None:
+    """The figure of the row `ours` at a level of noise, and the name and figure of the best other (none: None)."""
+    found = means(cells, level, figure)
+    others = {name: value for name, value in found.items() if not name.startswith("ours")}
+    if not others:
+        return None
+    best = max(others, key=lambda name: others[name])
+    return found.get(ours, float("nan")), best, others[best]
+
+
+def noise(cells: list[dict], plan: Plan, ours: str = "") -> str:
+    """A Markdown table of mIoU over the levels of noise, on the first scene and seed, and a line for each level at
+    which the row `ours` (none: no such comparison) does not lead."""
     scene, seed = plan.data.scenes[0], plan.data.seeds[0]
     here = [cell for cell in cells if (cell["scene"], cell["seed"]) == (scene, seed)]
     levels = [level for level in plan.sweep if any(cell["level"] == level for cell in here)]
@@ -194,7 +203,12 @@ def noise(cells: list[dict], plan: Plan) -> str:
     for name in plan.methods:
         found = {cell["level"]: cell["miou"] for cell in here if cell["method"] == name}
         rows.append((name, *(f"{found[level]:.3f}" for level in levels)))
-    return results.table(("method", *levels), rows)
+    lines = []
+    for level in levels if ours else ():
+        held = _held_against(here, level, ours, "miou")
+        if held is not None and not held[0] >= held[2]:
+            lines.append(f"* noise {level}: {held[1]} leads with {held[2]:.4f} ({ours}: {held[0]:.4f}).")
+    return "\n".join([results.table(("method", *levels), rows), *([""] if lines else []), *lines])
 
 
 def make(
@@ -234,7 +248,7 @@ def write(
         for figure_of, reason in (why or {"miou": ""}).items():
             parts += [leaders(cells, plan.data.scenes, plan.level, ours=ours, why=reason, figure=figure_of), ""]
     if twin and len(plan.sweep) > 1:
-        parts += [f"mIoU over the noise of vision, {plan.data.scenes[0]}:", "", noise(cells, plan), ""]
+        parts += [f"mIoU over the noise of vision, {plan.data.scenes[0]}:", "", noise(cells, plan, ours), ""]
     text = "\n".join([*parts, published]).rstrip()
     averages = means(cells, plan.level)
     figure = results.bars(list(averages), {"mIoU": list(averages.values())}, "mIoU, mean of scenes")

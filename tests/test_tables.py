@@ -237,6 +237,22 @@ def test_tables_say_where_ours_does_not_lead():
     assert "VALA leads with 0.400" in told
 
 
+def test_the_noise_table_says_at_which_levels_ours_does_not_lead(tmp_path):
+    values = {"low": (0.6, 0.5, 0.9), "medium": (0.6, 0.7, 0.2)}
+    names = ("VALA", RECOMMENDED, "ours, another")
+    plan = dataclasses.replace(lerf.PLAN, methods=names, out=str(tmp_path))
+    common = {"scene": plan.data.scenes[0], "seed": plan.data.seeds[0]}
+    cells = [
+        common | {"level": level, "method": name, "miou": value}
+        for level, row in values.items()
+        for name, value in zip(names, row)
+    ]
+    told = tables.noise(cells, plan, RECOMMENDED)
+    assert told.endswith(f"\n\n* noise low: VALA leads with 0.6000 ({RECOMMENDED}: 0.5000).")
+    assert told.startswith(tables.noise(cells, plan))
+    assert "leads" not in tables.noise(cells, plan)
+
+
 def test_every_row_has_a_method_and_every_scene_its_denominator():
     assert RECOMMENDED in METHODS
     assert tuple(METHODS) == lerf.PLAN.methods == ovs3d.PLAN.methods == replica.PLAN.methods
