@@ -1,9 +1,9 @@
-"""LangSplat's mask NMS: time of the matrix product over atoms, and whether it keeps what the definition keeps.
+"""LangSplat's mask NMS: time of the sparse matrix product, and whether it keeps what the definition keeps.
 
     python benchmarks/mask_nms.py [--masks 500] [--height 731] [--width 988] [--repeats 5]
 
 The masks are wavy ellipses of 10 to 250 px of half axis, strewn at random: each pixel lies in about ten of them. The
-definition (REFERENCE B.2) is put to every pair, on packed bits. Times are medians in seconds.
+definition (minghanqin/LangSplat, preprocess.py) is put to every pair, on packed bits. Times are medians in seconds.
 """
 
 import argparse
@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from jsecon.vision.mask_nms import atoms_of_masks, langsplat_nms
+from jsecon.networks.sam.masks import langsplat_nms
 
 
 def strewn(count: int, height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -63,7 +63,7 @@ def main() -> None:
     start = time.perf_counter()
     same = np.array_equal(kept, by_definition(masks, scores))
     print(
-        f"{len(masks)} masks of {options.width}x{options.height}, {len(atoms_of_masks(masks)[1])} atoms: "
+        f"{len(masks)} masks of {options.width}x{options.height}: "
         f"{statistics.median(taken):.2f} s, {len(kept)} kept; the definition takes {time.perf_counter() - start:.1f} s "
         f"and keeps {'the same' if same else 'OTHERS'}"
     )

@@ -83,13 +83,13 @@ def main() -> None:
     prepare_process()
     import jax.numpy as jnp
 
-    from jsecon.fit.initialise import gaussians_from_points
-    from jsecon.language.consensus import consensus_masklets
-    from jsecon.language.masklets import masklets
+    from jsecon.association.algorithm1 import masklets
+    from jsecon.association.consensus import consensus_masklets
+    from jsecon.association.runs import remembered
+    from jsecon.association.tracker import GeometricTracker
+    from jsecon.fit.start import gaussians_from_points
     from jsecon.types import Camera
     from jsecon.vision.classical import ClassicalSegmenter
-    from jsecon.vision.geometric import GeometricTracker
-    from jsecon.vision.runs import remembered
 
     size, count = (asked.height, asked.width), asked.side**2
     poses, focal = camera_poses(asked.frames, asked.side), 1.0 * asked.height

@@ -5,9 +5,9 @@
 Table 1, components: everything, and everything but one of tracking, weighting of the views by their pixels, anchoring
 (without it: one-step) and DBSCAN. Table 2, queries: one-step, canonical, anchored by code and by votes, of all views
 and of those that show the region (jsecon's own), each without and with DBSCAN. Rooms of five seeds, seen by simulated
-vision (jsecon.vision.simulated). One text an object; point level: a selection against the Gaussians whose true object
-it is, mIoU and mAcc@0.25 (the share of IoUs above 0.25), mean and deviation over the rooms. Codes as in the paper: a
-Gaussian's is the mean of its votes, d as the options say.
+vision (experiments.simulated_vision). One text per object; point level: a selection against the Gaussians whose true
+object it is, mIoU and mAcc@0.25 (the share of IoUs above 0.25), mean and deviation over the rooms. Codes as in the
+paper: a Gaussian's is the mean of its votes, with d numbers.
 
 Without tracking each mask of each view is a region of its own, embedded from that view alone.
 """
@@ -19,15 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import results, scenes
-from experiments.command import rooms_of
-from experiments.state import State, tracked
-from jsecon.demo import demo
+from experiments import results
+from experiments.ideas import scenes
+from experiments.ideas.scenes import rooms_of
+from experiments.ideas.state import State, tracked
+from jsecon.app.demo import demo
+from jsecon.app.progress import Listener
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
-from jsecon.plan import Silent
-from jsecon.query.canonical import query_canonical
-from jsecon.query.one_step import query_one_step
+from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.outliers import remove_outliers
 
 
@@ -85,7 +85,7 @@ def built(sight: scenes.Sight, proof: scenes.Evidence, options: Options, *, trac
 
 
 def selections(view: View, texts: np.ndarray, way: str, options: Options) -> list[np.ndarray]:
-    """(N,) bool a text, by a kind of query."""
+    """(N,) bool per text, by a kind of query."""
     points = jnp.asarray(view.points, jnp.float32)
     if way == "one-step":
         return [np.asarray(query_one_step(points, code, options.code_threshold).mask) for code in view.asked]
@@ -189,7 +189,7 @@ def quick() -> dict:
     """The experiment on one small room, which is made first."""
     folder = Path(QUICK.demos) / "demo0"
     if not (folder / "field.npz").exists():
-        demo(folder, seed=0, steps=150, reporter=Silent(), room=QUICK_ROOM)
+        demo(folder, seed=0, steps=150, listener=Listener(), room=QUICK_ROOM)
     return main(QUICK)
 
 

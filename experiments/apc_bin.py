@@ -20,16 +20,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results
+from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
-from jsecon.fit.initialise import confirmed_depths, gaussians_from_points, points_from_depth
+from jsecon.fit.depth import points_from_depth
 from jsecon.fit.optimise import LearningRates, evaluate_psnr, fit_gaussians
+from jsecon.fit.start import gaussians_from_points
 from jsecon.language.distill import distill_votes
+from jsecon.language.shares import with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_region
 from jsecon.query.masks import selection_mask
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.showing import with_shown
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}

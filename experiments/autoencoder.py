@@ -19,11 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import results, scenes
+from experiments import results
+from experiments.ideas import scenes
+from experiments.simulated_vision.embeddings import SimulatedEmbedder
+from experiments.simulated_vision.masks import LEVELS
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.codes import Spread, confused_pairs, distinct_pairs, encode, principal_rotation, spread_codes
 from jsecon.numerics import cosine, cosine_matrix, normalize
-from jsecon.vision.simulated import LEVELS, SimulatedEmbedder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +121,7 @@ def main(options: Options = Options()) -> dict:
 
 
 def draw(rows: list[dict]):
-    """Retrieval and reconstruction against the latent size, a curve a coder, for the largest number of regions."""
+    """Retrieval and reconstruction against the latent size, a curve per coder, for the largest number of regions."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.6))

@@ -3,12 +3,11 @@
     python -m experiments.beyond [FOLDER_OF_DEMOS]
 
 Scenes: demo rooms of five seeds and replica_apartment_0 (where it lies beside the checkout), each seen by simulated
-vision (jsecon.vision.simulated) at three levels of noise. One query an object, by its class; a class's selection is
-compared with the Gaussians whose true object it is. All ideas work on one pass of votes, kept view by view. The letters
-are those of the ideas' list: A evidence hygiene, C neutral Gaussians, D object posterior over the views that show it, E
-consensus of views, F masks that disagree, several descriptors, G neighbours, H threshold by the largest gap. A text's
-region is the one with the largest cosine, "by contrast" the one that jsecon.query.retrieval finds.
-"""
+vision (experiments.simulated_vision) at three levels of noise. One query per object, by its class; a class's selection
+is compared with the Gaussians whose true object it is. All ideas work on one pass of votes, kept view by view. The
+letters name the ideas: A evidence hygiene, C neutral Gaussians, D object posterior over the views that
+show it, E consensus of views, F masks that disagree, several descriptors, G neighbours, H threshold by the largest gap.
+A text's region is the one with the largest cosine, "by contrast" the one that jsecon.query.retrieval finds."""
 
 import dataclasses
 import time
@@ -22,12 +21,11 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from sklearn.cluster import KMeans
 
-from experiments import results, scenes
-from experiments.command import rooms_of
-from experiments.reconcile import agree
-from experiments.state import State, consensus, point_miou, tracked, unit
-from jsecon.language.codes import encode, region_codes
-from jsecon.query.anchored import CODE_THRESHOLD
+from experiments import results
+from experiments.ideas import scenes
+from experiments.ideas.scenes import rooms_of
+from experiments.ideas.state import State, agree, consensus, point_miou, tracked, unit
+from jsecon.language.codes import CODE_THRESHOLD, encode, region_codes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +96,7 @@ def by_gap(state: State, texts: np.ndarray) -> list[np.ndarray]:
 
 
 def ambiguous(state: State, groups: list[np.ndarray]) -> list[np.ndarray]:
-    """C: (N,) a group: the entropy of "inside" over the views that show the group is above 0.9 bit."""
+    """C: (N,) per group: the entropy of "inside" over the views that show the group is above 0.9 bit."""
     found = []
     for g in groups:
         views = np.flatnonzero(state.shows[:, g].any(1))
@@ -240,7 +238,7 @@ def main(options: Options = Options()) -> dict:
 
 
 def draw(rows: list[dict]):
-    """A bar a method: mean and deviation."""
+    """A bar per method: mean and deviation."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 0.24 * len(rows) + 0.8))

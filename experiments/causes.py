@@ -20,11 +20,15 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import lerf, results, tables
-from experiments.association import overlaps
-from experiments.methods import METHODS, Answers, Steps, ask_field, association, field_of
-from experiments.setting import Setting, prepare
-from experiments.twins import Data
+from experiments import lerf, results
+from experiments.tables.answers import Answers, Steps
+from experiments.tables.association import overlaps
+from experiments.tables.fill import measure
+from experiments.tables.memberships import by_lead, of_all_views
+from experiments.tables.methods import METHODS
+from experiments.tables.ours import ask_field, association, field_of
+from experiments.tables.setting import Setting, prepare
+from experiments.tables.twins import Data
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.outliers import remove_outliers
 from jsecon.types import Selection
@@ -64,8 +68,8 @@ def given(setting: Setting, field, regions: list[int], way: str) -> Answers:
     """The answers where each query is told its region."""
 
     def ask(k: int) -> Selection:
-        by, weight = ("votes", 1.0) if way == "all_views" else (way, None)
-        found = query_region(field, regions[k], by=by, unlabelled_weight=weight)
+        found = query_region(of_all_views(field) if way == "all_views" else field, regions[k])
+        found = by_lead(field, found, alike_threshold=None) if way == "lead" else found
         kept = remove_outliers(np.asarray(setting.evidence.gaussians.means), np.asarray(found.mask))
         return dataclasses.replace(found, mask=jnp.asarray(kept))
 
@@ -79,7 +83,7 @@ def main(options: Options = Options()) -> dict:
     rows: list[dict] = []
 
     def told(name: str, answers: Answers, **more) -> None:
-        figures = tables.measure(setting, answers)
+        figures = measure(setting, answers)
         rows.append({"what": name, **more, "miou": figures["miou"], "miou_vala": figures["miou_vala"]})
 
     told("true masks, votes", given(setting, field_of(setting, by="truth", labels=truth), meant, "votes"))

@@ -19,10 +19,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from tokenizers import pre_tokenizers
 
 from experiments import results
 from jsecon.files import write_text
-from jsecon.vision.tokenizer import ClipTokenizer, byte_symbols, cleaned, words
+from jsecon.networks.tokenizer import ClipTokenizer, cleaned, word_splitter
 
 NOUNS = [
     "mug",
@@ -139,12 +140,9 @@ def texts(count: int = 1000, seed: int = 0) -> list[str]:
 
 def learned_merges(sample: list[str], count: int) -> list[tuple[str, str]]:
     """Byte pairs joined in order of how often they stand beside each other in the sample's words."""
-    symbols = byte_symbols()
-    tally = collections.Counter(word for text in sample for word in words(cleaned(text)))
-    split = {}
-    for word in tally:
-        parts = [symbols[byte] for byte in word.encode("utf-8")]
-        split[word] = [*parts[:-1], parts[-1] + "</w>"]
+    splitter = word_splitter()
+    tally = collections.Counter(word for text in sample for word, _ in splitter.pre_tokenize_str(cleaned(text)))
+    split = {word: [*word[:-1], word[-1] + "</w>"] for word in tally}
     merges: list[tuple[str, str]] = []
     while len(merges) < count:
         pairs: collections.Counter[tuple[str, str]] = collections.Counter()
@@ -167,7 +165,7 @@ def learned_merges(sample: list[str], count: int) -> list[tuple[str, str]]:
 
 def vocabulary_of(merges: list[tuple[str, str]]) -> dict[str, int]:
     """CLIP's numbering: the bytes in the order of their signs, the same at the end of a word, the merges, the ends."""
-    signs = sorted(byte_symbols())
+    signs = sorted(pre_tokenizers.ByteLevel.alphabet())
     tokens = [*signs, *(sign + "</w>" for sign in signs), *map("".join, merges), "<|startoftext|>", "<|endoftext|>"]
     return {token: number for number, token in enumerate(tokens)}
 
@@ -194,7 +192,7 @@ def main(options: Options) -> dict:
     sample = texts(options.count, options.seed)
     lines = gzip.decompress(Path(default_bpe()).read_bytes()).decode("utf-8").split("\n")
     merges = [tuple(line.split()) for line in lines[1 : 49152 - 256 - 2 + 1]]
-    theirs, ours = SimpleTokenizer(), ClipTokenizer(vocabulary_of(merges), merges, where=default_bpe())
+    theirs, ours = SimpleTokenizer(), ClipTokenizer(vocabulary_of(merges), merges)
     wrong = [text for text in sample if ours([text])[0].tolist() != theirs([text])[0].tolist()]
     metrics = {"texts": len(sample), "same_ids": len(sample) - len(wrong), "open_clip": open_clip.__version__}
     table = results.table(tuple(metrics), [tuple(metrics.values())])

@@ -11,14 +11,13 @@ objects seen twice or more. All from the pipeline's own stages: consensus (the d
 Gaussians; beside them, the same proposals left alone in each frame, and carried from frame to frame by dense optical
 flow (OpenCV's DIS).
 
-Each cell (scene, way) is kept in OUT/cells as it is finished, under a key that holds the code it comes from: a run that
-was stopped goes on, and a changed vision is measured anew. Algorithm 1, which takes longest, comes last.
+Each cell (scene, way) is kept in OUT/cells.jsonl as it is finished, under a key that names the code that it comes
+from: a run that was stopped goes on, and a changed vision is measured anew. Algorithm 1, which takes longest, comes
+last.
 """
 
 import dataclasses
 import functools
-import hashlib
-import json
 import sys
 import tempfile
 import time
@@ -34,18 +33,18 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from experiments import replica_apartment_0, results
-from jsecon import cache
+from experiments.cells import append_cell, read_cells
+from jsecon.app import cache
+from jsecon.app.demo import demo
+from jsecon.app.masklet_stages import associated, proposals_of
+from jsecon.app.options import Options as RunOptions
+from jsecon.app.progress import Listener
+from jsecon.app.stages import Work, training_frames
 from jsecon.data.capture import load_capture
-from jsecon.demo import demo
-from jsecon.eyes import Eyes
-from jsecon.files import write_text
 from jsecon.language.field import load_field
-from jsecon.options import Options as RunOptions
-from jsecon.plan import Silent
-from jsecon.proposals import proposals_of
-from jsecon.stages import masklets_from_frames, training_frames
 from jsecon.types import Capture, Gaussians
 from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
 
 LEAST = 0.01
 """share of a view that an object must fill to count there"""
@@ -136,14 +135,15 @@ def measure(options: RunOptions, capture: Capture, gaussians: Gaussians, way: st
     """(labels (T, H, W) by one of WAYS on the frames that take part, seconds with the segmentation)."""
     train = training_frames(capture)
     frames = np.asarray(capture.frames)[train]
+    options = dataclasses.replace(options, association="consensus" if way == CONSENSUS else "tracking")
+    work = Work(options, Networks(ColourEmbedder()), Path())
     start = time.perf_counter()
     if way in (ALONE, FLOW):
-        labels = alone(frames, proposals_of(options, capture, train, gaussians, None)[0])
+        labels = alone(frames, proposals_of(work, capture, gaussians)[0])
         labels = by_flow(frames, labels) if way == FLOW else labels
     else:
-        options = dataclasses.replace(options, association="consensus" if way == CONSENSUS else "tracking")
-        none = Eyes(ColourEmbedder(), None, None)
-        labels = masklets_from_frames(options, capture, gaussians, none, lambda done, total: None).value
+        proposals, _ = proposals_of(work, capture, gaussians)
+        labels = associated(work, capture, gaussians, proposals, lambda done, total: None)
     return labels, time.perf_counter() - start
 
 
@@ -188,7 +188,7 @@ def connected_parts(capture: Capture, ids: np.ndarray, *, voxel: float = 0.1, le
 def demo_room(folder: Path, seed: int) -> Scene:
     """The room of `seed` as `jsecon demo` leaves it."""
     if not (folder / "field.npz").exists():
-        demo(folder, seed=seed, reporter=Silent())
+        demo(folder, seed=seed, listener=Listener())
     capture = load_capture(folder / "capture", holdout=8)
     files = [folder / "capture" / "masks" / f"{name}.png" for name in capture.names]
     truth = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.int32) - 1
@@ -212,10 +212,12 @@ def main(options: Options = Options()) -> dict:
     if Path(options.capture).exists():
         scenes["replica_apartment_0"] = functools.partial(replica, options.capture)
     run = RunOptions(capture=Path())
-    found: dict[str, dict] = {scene: {} for scene in scenes}
+    file, found = Path(options.out) / "cells.jsonl", {scene: {} for scene in scenes}
+    source = cache.source_digest(associated, proposals_of)
     for ways in (WAYS[:-1], WAYS[-1:]):
         for scene, make in scenes.items():
-            missing = [way for way in ways if not cell_of(options, scene, way).exists()]
+            keys = {way: f"{scene}, {way}, {source}" for way in ways}
+            missing = [way for way in ways if keys[way] not in read_cells(file)]
             made = make() if missing else None
             for way in missing:
                 capture, gaussians, truths = made
@@ -223,21 +225,14 @@ def main(options: Options = Options()) -> dict:
                 cell = {"seconds": round(seconds, 1)}
                 for kind, truth in truths.items():
                     cell[kind] = dict(zip(("best_iou", "lasting"), score(labels, truth[training_frames(capture)])))
-                write_text(cell_of(options, scene, way), json.dumps(cell))
+                append_cell(file, keys[way], cell)
                 print(scene, way, cell, flush=True)
-            found[scene] |= {way: json.loads(cell_of(options, scene, way).read_text()) for way in ways}
+            known = read_cells(file)
+            found[scene] |= {way: known[keys[way]] for way in ways}
             if all(found.values()):
                 write(options, found)
     print((Path(options.out) / "table.md").read_text())
     return found
-
-
-def cell_of(options: Options, scene: str, way: str) -> Path:
-    """Where a cell is kept."""
-    rooms = ("vision", "proposals", "language.consensus", "language.grouping", "language.masklets", "options")
-    source = cache.source_digest(rooms)
-    key = hashlib.sha1(json.dumps([source, scene, way]).encode()).hexdigest()[:12]
-    return Path(options.out) / "cells" / f"{scene.replace(' ', '')}-{WAYS.index(way)}-{key}.json"
 
 
 def write(options: Options, found: dict[str, dict]) -> None:

@@ -3,13 +3,13 @@
     python -m experiments.distillation [--quick] [FOLDER_OF_DEMOS]
 
 Scenes: replica_apartment_0 (where it lies beside the checkout) and demo rooms, seen by simulated vision
-(jsecon.vision.simulated): masks with faults, one embedding a region as in the paper, LangSplat's autoencoder. Paths:
-votes reduced by mean, median, geometric median and mode; the L1 solver from the mode; and the paper's Adam on the
-rendered L1 (REFERENCE B.6, B.7), looked at several times on its way: from zero, and on one scene from random codes and
-the mode too. Points are compared through the nearest region's true object, and by the selections that the objects'
-texts anchor: by code (the last row of "Adam from zero" is the whole of the paper's path) and by votes. Seconds are CPU
-time of all threads, without compilation, what a start costs included. Each path is kept as soon as it is done, Adam's
-every few minutes: a run that was stopped goes on where it was.
+(experiments.simulated_vision): masks with faults, one embedding per region as in the paper, LangSplat's autoencoder.
+Paths: votes reduced by mean, median, geometric median and mode; the L1 solver from the mode; and the paper's Adam on
+the rendered L1 (LangSplat's train.py), looked at several times on its way: from zero, and on one scene from random
+codes and the mode too. Points are compared through the nearest region's true object, and by the selections that the
+objects' texts anchor: by code (the last row of "Adam from zero" is the whole of the paper's path) and by votes. Seconds
+are CPU time of all threads, without compilation, what a start costs included. Each path is kept as soon as it is done,
+Adam's every few minutes: a run that was stopped goes on where it was.
 """
 
 import dataclasses
@@ -19,11 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import results, scenes
-from experiments.code_paths import adam_path, task_of, votes_paths
-from experiments.command import rooms_of
+from experiments import results
+from experiments.cells import append_cell, read_cells
+from experiments.codes.paths import adam_path, task_of, votes_paths
+from experiments.ideas import scenes
+from experiments.ideas.scenes import rooms_of
 from jsecon.errors import InputError
-from jsecon.files import write_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +67,7 @@ _OF_PATH = {"votes": (*_SCENE, "loyalties", "sweeps"), "Adam": (*_SCENE, "steps"
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, or what is left of it, writes its results and returns the metrics."""
     out = Path(options.out)
-    rows = []
+    file, rows = out / "cells.jsonl", []
     made = options.scenes()
     if not made:
         raise InputError(
@@ -81,22 +82,22 @@ def main(options: Options = Options()) -> dict:
     for name, path in paths:
         given = {option: getattr(options, option) for option in _OF_PATH[path.split()[0]]}
         digest = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:10]
-        kept = out / "paths" / f"{name}-{path}-{digest}.json".replace(" ", "_")
-        if not kept.exists():
+        key = f"{name}-{path}-{digest}".replace(" ", "_")
+        if key not in read_cells(file):
             if task is None or task.name != name:
                 shrink = options.replica_shrink if name == "replica_apartment_0" else options.shrink
                 size = {"views": options.views, "shrink": shrink}
                 task = task_of(made[name](), space, level=options.level, latent=options.latent, **size)
-            record = kept.with_suffix(".npz")
-            record.parent.mkdir(parents=True, exist_ok=True)
+            record = out / f"{key}.npz"
+            out.mkdir(parents=True, exist_ok=True)
             if path == "votes":
                 found = votes_paths(task, loyalties=options.loyalties, sweeps=options.sweeps)
             else:
                 start = path.rpartition(" ")[2]
                 found = adam_path(task, start, record, steps=options.steps, looks=options.looks)
-            write_text(kept, json.dumps(found, indent=1) + "\n")
+            append_cell(file, key, found)
             record.unlink(missing_ok=True)
-        rows += [{"scene": name, **row} for row in json.loads(kept.read_text())]
+        rows += [{"scene": name, **row} for row in read_cells(file)[key]]
     metrics = {"rows": rows, "speed": speed(rows)}
     header = (
         "scene",

@@ -64,27 +64,27 @@ def main(options: Options) -> dict:
 
 
 def _clip(options: Options) -> list[dict]:
-    from experiments import export_clip
+    from experiments.export import clip
 
-    model = export_clip.official(options.clip, options.clip_weights, seed=options.seed)
+    model = clip.official(options.clip, options.clip_weights, seed=options.seed)
     folder = Path(options.out) / "clip"
-    return _rows(export_clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads))
+    return _rows(clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads))
 
 
 def _sam(options: Options) -> list[dict]:
-    from experiments import export_sam
+    from experiments.export import sam
 
     weights = None if options.sam_weights is None else Path(options.sam_weights)
-    model = export_sam.official(options.sam, weights, seed=options.seed)
-    return _rows(export_sam.export(model, Path(options.out) / "sam", seed=options.seed, threads=options.threads))
+    model = sam.official(options.sam, weights, seed=options.seed)
+    return _rows(sam.export(model, Path(options.out) / "sam", seed=options.seed, threads=options.threads))
 
 
 def _sam2(options: Options) -> dict[str, list[dict]]:
-    from experiments import export_sam2
+    from experiments.export import sam2
 
     return {
         config: _rows(
-            export_sam2.export(
+            sam2.export(
                 _sam2_model(options, config), Path(options.out) / config, seed=options.seed, threads=options.threads
             )
         )
@@ -93,22 +93,22 @@ def _sam2(options: Options) -> dict[str, list[dict]]:
 
 
 def _tracking(options: Options) -> dict[str, dict]:
-    from experiments import export_tracking
+    from experiments.export import tracking
 
     found = {}
     for config in options.sam2:
         count = options.frames if config == options.sam2[0] else options.short
-        clip = export_tracking.moving_discs(count, first=(count - 1) // 2, seed=options.seed)
+        clip = tracking.moving_discs(count, first=(count - 1) // 2, seed=options.seed)
         model, folder = _sam2_model(options, config), Path(options.out) / config
-        found[config] = export_tracking.compare(model, folder, clip, threads=options.threads)
+        found[config] = tracking.compare(model, folder, clip, threads=options.threads)
     return found
 
 
 def _sam2_model(options: Options, config: str):
-    from experiments import export_sam2
+    from experiments.export import sam2
 
     weights = options.sam2_weights if config == options.sam2[0] else None
-    return export_sam2.official(config, None if weights is None else Path(weights), seed=options.seed)
+    return sam2.official(config, None if weights is None else Path(weights), seed=options.seed)
 
 
 def _rows(agreements) -> list[dict]:
@@ -122,7 +122,7 @@ def _versions() -> dict[str, str]:
 
 
 def table(metrics: dict) -> str:
-    """Markdown: a row a graph, then a row a tracked clip."""
+    """Markdown: a row per graph, then a row per tracked clip."""
     rows = []
     groups = {"clip": metrics.get("clip", []), "sam": metrics.get("sam", [])} | metrics.get("sam2", {})
     for model, graphs in groups.items():

@@ -13,12 +13,13 @@ import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 
-from experiments import published, tables, twins
-from experiments.command import QUICK_STEPS, options_of
-from experiments.methods import METHODS, RECOMMENDED
 from experiments.results import HOME
+from experiments.tables import layout, published, twins
+from experiments.tables.answers import QUICK_STEPS
+from experiments.tables.fill import Plan, options_of
+from experiments.tables.methods import METHODS, RECOMMENDED
 
-PLAN = tables.Plan(
+PLAN = Plan(
     twins.Data("lerf", scenes=published.LERF_SCENES, size=(("views", 30), ("width", 256), ("height", 192))),
     tuple(METHODS),
     out=str(HOME / "results" / "lerf"),
@@ -52,17 +53,18 @@ WHY = {
 """why the row held against the others does not lead in a figure where it does not"""
 
 
-def beside(plan: tables.Plan, name: str, methods: Iterable[str]) -> tables.Plan:
+def beside(plan: Plan, name: str, methods: Iterable[str]) -> Plan:
     """The plan of a table `name` of other rows on the same settings, beside this one's: common rows share cells."""
     place = Path(plan.out)
-    return dataclasses.replace(plan, methods=tuple(methods), out=str(place.parent / name), cells=str(place / "cells"))
+    cells = str(place / "cells.jsonl")
+    return dataclasses.replace(plan, methods=tuple(methods), out=str(place.parent / name), cells=cells)
 
 
-def main(plan: tables.Plan) -> str:
+def main(plan: Plan) -> str:
     """The table, written."""
     columns = (*published.LERF_SCENES, "mean")
     beside = published.table("LERF-OVS", published.LERF, columns, published.LERF_REMARKS)
-    return tables.make(plan, METHODS, FIGURES, notes=NOTES, ours=RECOMMENDED, why=WHY, published=beside)
+    return layout.make(plan, METHODS, FIGURES, notes=NOTES, ours=RECOMMENDED, why=WHY, published=beside)
 
 
 if __name__ == "__main__":

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from sklearn.cluster import DBSCAN
 
-from experiments import results, scenes
-from experiments.command import rooms_of
-from experiments.state import point_miou, tracked
-from jsecon.query.clusters import dbscan
-from jsecon.query.outliers import EPS_SPACINGS, MIN_SAMPLES, default_eps, remove_outliers
+from experiments import results
+from experiments.ideas import scenes
+from experiments.ideas.scenes import rooms_of
+from experiments.ideas.state import point_miou, tracked
+from jsecon.query.outliers import EPS_SPACINGS, MIN_SAMPLES, dbscan, default_eps, remove_outliers
 
 
 @dataclasses.dataclass(frozen=True)

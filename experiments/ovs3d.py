@@ -8,14 +8,15 @@ Every class of every labelled frame is a query of its own, as LangSplat and the 
 
 import dataclasses
 
-from experiments import published, tables, twins
-from experiments.command import QUICK_STEPS, options_of
+from experiments.datasets.ovs3d import OVS3D_PAIRS
 from experiments.lerf import FIGURES, NOTES, WHY
-from experiments.methods import METHODS, RECOMMENDED
 from experiments.results import HOME
-from jsecon.data.ovs3d import OVS3D_PAIRS
+from experiments.tables import layout, published, twins
+from experiments.tables.answers import QUICK_STEPS
+from experiments.tables.fill import Plan, options_of
+from experiments.tables.methods import METHODS, RECOMMENDED
 
-PLAN = tables.Plan(
+PLAN = Plan(
     twins.Data("ovs3d", scenes=tuple(OVS3D_PAIRS), size=(("views", 28), ("width", 256), ("height", 192))),
     tuple(METHODS),
     out=str(HOME / "results" / "ovs3d"),
@@ -35,10 +36,10 @@ QUICK = dataclasses.replace(
 )
 
 
-def main(plan: tables.Plan) -> str:
+def main(plan: Plan) -> str:
     """The table, written."""
     beside = published.table("3D-OVS", published.OVS3D, ("mean of 5 scenes",), published.OVS3D_REMARKS)
-    return tables.make(plan, METHODS, FIGURES, notes=NOTES, ours=RECOMMENDED, why=WHY, published=beside)
+    return layout.make(plan, METHODS, FIGURES, notes=NOTES, ours=RECOMMENDED, why=WHY, published=beside)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python -m experiments.qualitative [--quick] [--root FOLDER] [--out FOLDER]
 
-One row a text: the frame, its label, then each method's selection rendered alone, its IoU above it. On real data the
+One row per text: the frame, its label, then each method's selection rendered alone, its IoU above it. On real data the
 picture shows the capture's own pixels and goes to pictures/, which git ignores; a twin's is figure.png.
 """
 
@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import lerf, results, tables
-from experiments.command import options_of
-from experiments.methods import METHODS, field_of
-from experiments.setting import Setting, prepare
+from experiments import lerf, results
+from experiments.tables.fill import Plan, options_of
+from experiments.tables.methods import METHODS
+from experiments.tables.ours import field_of
+from experiments.tables.setting import Setting, prepare
+from jsecon.app.pictures import selection_overlay
 from jsecon.evaluate.lerf import resized
 from jsecon.evaluate.metrics import iou
-from jsecon.pictures import selection_overlay
 from jsecon.query.masks import selection_mask
 from jsecon.splat.render import render
 
@@ -33,7 +34,7 @@ QUICK = dataclasses.replace(
 )
 
 
-def main(plan: tables.Plan) -> str:
+def main(plan: Plan) -> str:
     """Draws the first scene and seed; returns the table of the IoUs shown."""
     scene, seed = plan.data.scenes[0], plan.data.seeds[0]
     setting = prepare(plan.data, scene, seed, plan.level, fit_steps=plan.fit_steps)
@@ -84,7 +85,7 @@ def rendered_codes(setting: Setting, camera) -> np.ndarray:
 
 
 def draw(panels: dict[str, list]):
-    """A row of pictures a text."""
+    """A row of pictures per text."""
     from matplotlib.figure import Figure
 
     columns = max(map(len, panels.values()))

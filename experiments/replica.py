@@ -10,13 +10,14 @@ not name its own. ScanNet's 19, 15 and 10 classes go through the same code (`twi
 
 import dataclasses
 
-from experiments import published, tables, twins
-from experiments.command import QUICK_STEPS, options_of
-from experiments.methods import METHODS, RECOMMENDED
+from experiments.datasets.replica import REPLICA_SCENES
 from experiments.results import HOME
-from jsecon.data.replica import REPLICA_SCENES
+from experiments.tables import layout, published, twins
+from experiments.tables.answers import QUICK_STEPS
+from experiments.tables.fill import Plan, options_of
+from experiments.tables.methods import METHODS, RECOMMENDED
 
-PLAN = tables.Plan(
+PLAN = Plan(
     twins.Data("replica", scenes=REPLICA_SCENES, size=(("views", 30), ("width", 240), ("height", 136))),
     tuple(METHODS),
     out=str(HOME / "results" / "replica"),
@@ -48,10 +49,10 @@ NOTES = (
 WHY = {"miou": ""}
 
 
-def main(plan: tables.Plan) -> str:
+def main(plan: Plan) -> str:
     """The table, written."""
     beside = published.table("Replica", published.REPLICA, (*REPLICA_SCENES, "mean"))
-    return tables.make(plan, METHODS, FIGURES, notes=NOTES, ours=RECOMMENDED, why=WHY, published=beside)
+    return layout.make(plan, METHODS, FIGURES, notes=NOTES, ours=RECOMMENDED, why=WHY, published=beside)
 
 
 if __name__ == "__main__":

@@ -2,11 +2,11 @@
 
     python -m experiments.replica_apartment_0 [FOLDER]
 
-The Gaussians are the back-projected depths of all 163 views, one a voxel; nothing is fitted. The masks of every second
-view vote. Each Gaussian's code is compared with the regions' codes, and the nearest region with the label that most of
-the Gaussian's depth pixels carry: over all views, and over only those views whose masks did not vote. The ids have no
-names, so each gets the CLIP text vector of an LVIS class, drawn by the seed: a code has to keep apart what a real
-embedding space keeps apart (mean pairwise cosine 0.74).
+The Gaussians are the back-projected depths of all 163 views, one per voxel; nothing is fitted. The masks of every
+second view vote. Each Gaussian's code is compared with the regions' codes, and the nearest region with the label that
+most of the Gaussian's depth pixels carry: over all views, and over only those views whose masks did not vote. The ids
+have no names, so each gets the CLIP text vector of an LVIS class, drawn by the seed: a code has to keep apart what a
+real embedding space keeps apart (mean pairwise cosine 0.74).
 """
 
 import dataclasses
@@ -21,9 +21,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments import results
+from experiments.datasets.depth_points import labels_of_points
+from experiments.protocols.points import point_accuracy, point_class_means
 from jsecon.errors import InputError
-from jsecon.evaluate.metrics import point_accuracy, point_class_means
-from jsecon.fit.initialise import DepthPoints, gaussians_from_points, labels_of_points, points_from_depth
+from jsecon.fit.depth import DepthPoints, points_from_depth
+from jsecon.fit.start import gaussians_from_points
 from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.votes import region_votes
@@ -140,7 +142,7 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
 
 
 def points_as_gaussians(capture: Capture, options: Options) -> tuple[DepthPoints, Gaussians]:
-    """The back-projected depths of all views, one a voxel, and a Gaussian for each."""
+    """The back-projected depths of all views, one per voxel, and a Gaussian for each."""
     everything = np.arange(len(capture.names))
     points = points_from_depth(capture, voxel=options.voxel_m, stride=options.stride, frames=everything)
     gaussians = gaussians_from_points(

@@ -49,7 +49,7 @@ def table(header: tuple[str, ...], rows: list[tuple]) -> str:
 
 
 def bars(labels: list[str], series: dict[str, list[float]], ylabel: str):
-    """Grouped bars, one group a label and one colour a series: numbers only, nothing of a capture."""
+    """Grouped bars, one group per label and one colour per series: numbers only, nothing of a capture."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(1.6 * len(labels) + 2, 3.2))

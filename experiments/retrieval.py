@@ -3,12 +3,11 @@
     python -m experiments.retrieval [--quick] [FOLDER_OF_DEMOS]
 
 Scenes: demo rooms of five seeds and replica_apartment_0 (where it lies beside the checkout), each seen by simulated
-vision (jsecon.vision.simulated) at three levels of noise; masks as tracked, and by consensus. Each object is asked for
-by its class, and 200 names of the text space that no object has are asked for too. Shown: how many texts find a region
-of their object; point-level mIoU, membership by the votes of the views that show the region; how often a text of what
-is there is more similar to its best region than one of what is not (area under the curve); and, for each threshold, how
-many of either kind it refuses, with the mIoU that is left.
-"""
+vision (experiments.simulated_vision) at three levels of noise; masks as tracked, and by consensus. Each object is asked
+for by its class, and 200 names of the text space that no object has are asked for too. Shown: how many texts find a
+region of their object; point-level mIoU, membership by the votes of the views that show the region; how often a text of
+what is there is more similar to its best region than one of what is not (area under the curve); and, for each
+threshold, how many of either kind it refuses, with the mIoU that is left."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import results, scenes
-from experiments.command import rooms_of
-from experiments.state import State, consensus, point_miou, tracked
-from jsecon.query.canonical import relevancies
+from experiments import results
+from experiments.ideas import scenes
+from experiments.ideas.scenes import rooms_of
+from experiments.ideas.state import State, consensus, point_miou, tracked
+from jsecon.query.direct import relevancies
 from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
 
 
@@ -73,13 +73,13 @@ class Asked:
     regions: str
     rule: str
     right: list[bool]
-    """a text: whether its best region shows its object."""
+    """per text: whether its best region shows its object."""
     best: list[float]
-    """a text: the similarity of its best region."""
+    """per text: the similarity of its best region."""
     iou: list[float]
-    """a text of an object with Gaussians of its own: of what is selected; NaN for others."""
+    """per text: of what is selected; NaN for an object without Gaussians."""
     absent: list[float]
-    """a text of what is not there: the similarity of its best region."""
+    """per text of what is not there: the similarity of its best region."""
 
 
 def ask(scene: scenes.Scene, level: str, space: scenes.TextSpace, options: Options) -> list[Asked]:

@@ -19,11 +19,12 @@ import cv2
 import numpy as np
 import torch
 
-from experiments import export_sam, results
-from experiments.export_graph import declare_missing_operators
-from jsecon.vision.sam import SamSegmenter, SamSettings
-from jsecon.vision.sam_graphs import SamFiles, SamGraphs
-from jsecon.vision.sam_prompts import point_grid
+from experiments import results
+from experiments.export import sam
+from experiments.export.graph import declare_missing_operators
+from jsecon.networks.sam.graphs import SamFiles, SamGraphs
+from jsecon.networks.sam.masks import point_grid
+from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +51,7 @@ def small_sam(seed: int) -> torch.nn.Module:
     model = _build_sam(
         encoder_embed_dim=64, encoder_depth=2, encoder_num_heads=2, encoder_global_attn_indexes=[1], checkpoint=None
     )
-    export_sam.make_random(model, seed)
+    sam.make_random(model, seed)
     return model.eval().requires_grad_(False)
 
 
@@ -70,7 +71,7 @@ def main(options: Options) -> dict:
     colours = np.random.default_rng(options.seed).integers(0, 255, (12, 16, 3)).astype(np.uint8)
     frame = cv2.resize(colours, (options.width, options.height), interpolation=cv2.INTER_CUBIC)
     with tempfile.TemporaryDirectory() as folder:
-        export_sam.export(model, Path(folder), seed=options.seed, threads=options.threads)
+        sam.export(model, Path(folder), seed=options.seed, threads=options.threads)
         files = SamFiles(Path(folder) / "encoder.onnx", Path(folder) / "mask_decoder.onnx")
         graphs = SamGraphs(files, threads=options.threads)
         points = point_grid(options.points_per_side) * np.float32([options.width, options.height])

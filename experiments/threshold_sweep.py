@@ -11,21 +11,22 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import lerf, results, tables
-from experiments.command import options_of
-from experiments.methods import ask_field, field_of
+from experiments import lerf, results
+from experiments.tables import layout
+from experiments.tables.fill import Plan, fill, options_of
+from experiments.tables.ours import ask_field, field_of
 
 WAYS = ("one_step", "canonical", "code", "votes", "probability", "lead")
 
 
 @dataclasses.dataclass(frozen=True)
-class Sweep(tables.Plan):
+class Sweep(Plan):
     """A plan whose cells are ways and thresholds."""
 
     thresholds: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 
 
-def _sweep(plan: tables.Plan, name: str, **changes) -> Sweep:
+def _sweep(plan: Plan, name: str, **changes) -> Sweep:
     given = {field.name: getattr(plan, field.name) for field in dataclasses.fields(plan)}
     place = HOME / "quick" if plan.sweep == () else HOME
     return Sweep(**(given | {"methods": WAYS, "sweep": (), "out": str(place / name)} | changes))
@@ -51,8 +52,8 @@ def main(plan: Sweep) -> str:
         return fields[id(setting)]
 
     methods = {f"{way} {threshold:g}": at(way, threshold) for way in WAYS for threshold in plan.thresholds}
-    cells = tables.fill(dataclasses.replace(plan, methods=tuple(methods)), methods, tell=print)
-    found = tables.means(cells, plan.level)
+    cells = fill(dataclasses.replace(plan, methods=tuple(methods)), methods, tell=print)
+    found = layout.means(cells, plan.level)
     curves = {way: [found[f"{way} {threshold:g}"] for threshold in plan.thresholds] for way in WAYS}
     rows = [(way, *curve, float(np.ptp(curve))) for way, curve in curves.items()]
     header = ("asked by", *(f"{threshold:g}" for threshold in plan.thresholds), "spread")

@@ -3,7 +3,7 @@
     python -m experiments.thresholds [FOLDER_OF_DEMOS]
 
 The paper's Fig. 2, on demo rooms with their true masks and simulated CLIP embeddings at the medium level
-(jsecon.vision.simulated): what differs between the queries is only how they cross the gap between text and image.
+(experiments.simulated_vision): what differs between the queries is only how they cross the gap between text and image.
 Protocol: point level, rendered (the selected Gaussians alone, alpha > 0.7) on the held-out views' labels, one text an
 object; a view counts where the object has at least 40 px there.
 """
@@ -15,22 +15,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import results, scenes
-from experiments.command import rooms_of
+from experiments import results
+from experiments.ideas import scenes
+from experiments.ideas.scenes import rooms_of
+from experiments.simulated_vision.embeddings import SimulatedEmbedder
+from experiments.simulated_vision.masks import LEVELS
+from experiments.tables.memberships import by_lead
 from jsecon.evaluate.metrics import iou, mean_iou
 from jsecon.language.codes import Spread, encode, region_codes, spread_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field
 from jsecon.language.regions import region_embeddings
+from jsecon.language.shares import membership_probability, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored
-from jsecon.query.canonical import query_canonical
+from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.masks import selection_mask
-from jsecon.query.one_step import query_one_step
-from jsecon.query.probability import membership_probability
-from jsecon.query.showing import with_shown
 from jsecon.types import Camera, Gaussians, LanguageField
-from jsecon.vision.simulated import LEVELS, SimulatedEmbedder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +60,8 @@ def ask(field: LanguageField, coded: str, texts, asked, phrases, threshold: floa
             field, text, similarity_threshold=threshold, by="code"
         ),
     }
-    for by in ("votes", "lead"):
-        kinds[f"anchored by {by}"] = lambda text, code, by=by: query_anchored(
-            field, text, similarity_threshold=threshold, by=by
-        )
+    kinds["anchored by votes"] = lambda text, code: query_anchored(field, text, similarity_threshold=threshold)
+    kinds["anchored by lead"] = lambda text, code: by_lead(field, query_anchored(field, text), threshold=threshold)
 
     def sure(text, code):
         found = query_anchored(field, text)
@@ -149,7 +148,7 @@ def main(options: Options = Options()) -> dict:
 
 
 def draw(means: dict[str, dict[float, float]]):
-    """A curve a query."""
+    """A curve per query."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 3.8))

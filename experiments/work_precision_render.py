@@ -26,17 +26,17 @@ import numpy as np
 
 from benchmarks.scenes import ball, garden
 from experiments import results
-from jsecon.splat import batches, composite, differentiate, gradient, project, tiles, walk
+from jsecon.splat import autodiff, composite, gradient, project, tiles, walk
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.reference import render_reference
 from jsecon.splat.render import render
-from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians
 
 SCENES = {
     "deep": ball(2000, (0.05, 0.25), 160, 120, 150),
     "sparse: nothing to win": ball(150, (0.005, 0.02), 160, 120, 150),
 }
-MODULES = (batches, composite, differentiate, gradient, project, tiles, walk)
+MODULES = (autodiff, composite, gradient, project, tiles, walk)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +79,7 @@ def settings() -> list[Setting]:
 @contextlib.contextmanager
 def in_place(setting: Setting) -> Iterator[None]:
     """The engine with a setting's constants, and nothing of it remembered before or after."""
-    before, own_project = [], differentiate.view_lists
+    before, own_project = [], autodiff.view_lists
     for module in MODULES:
         for name, value in setting.constants.items():
             if hasattr(module, name):
@@ -121,7 +121,7 @@ def compiled(setting: Setting, gaussians: Gaussians, camera: Camera, features: n
 
 
 def measure(name: str, gaussians, camera, features, expected, repeats: int) -> list[dict]:
-    """A row a setting: ms (median, in turn), ratio to the recommended setting, errors."""
+    """A row per setting: ms (median, in turn), ratio to the recommended setting, errors."""
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
     calls = {(s.knob, s.label): compiled(s, gaussians, camera, features) for s in settings()}
     taken: dict[Any, list[float]] = {setting: [] for setting in calls}
@@ -151,7 +151,7 @@ def measure(name: str, gaussians, camera, features, expected, repeats: int) -> l
 
 
 def picture(rows: list[dict]):
-    """Error below which 99.9 % of numbers stay, against ms, a panel a scene and a curve a knob."""
+    """Error below which 99.9 % of numbers stay, against ms, a panel per scene and a curve per knob."""
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(row["scene"] for row in rows))

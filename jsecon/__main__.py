@@ -8,7 +8,7 @@ from jsecon.process import prepare_process
 def main() -> int:
     """Entry point: returns the exit code."""
     prepare_process()
-    from jsecon.cli import main as run
+    from jsecon.app.command_line import main as run
 
     return run(sys.argv[1:])
 

@@ -1,5 +1,8 @@
 """The one error that a user sees for bad input: what was wrong, where, and what mends it."""
 
+from collections.abc import Iterable
+from typing import Any
+
 
 class InputError(ValueError):
     """Bad input from outside: a file, an option, a capture. The command line prints it and exits with code 2.
@@ -17,3 +20,18 @@ def require(condition: bool, name: str, *, got: object, expected: str, remedy: s
     options)."""
     if not condition:
         raise ValueError(f"{name}: got {got}, expected {expected}. {remedy}")
+
+
+def require_shape(name: str, array: Any, expected: tuple[Any, ...], remedy: str) -> None:
+    """Raise ValueError unless an array has the expected shape: numbers, letters for any size, ... for leading axes."""
+    got = tuple(array.shape)
+    wanted = (*got[: len(got) - len(expected) + 1], *expected[1:]) if expected[0] is ... else expected
+    fits = len(got) == len(wanted) and all(isinstance(size, str) or size == own for own, size in zip(got, wanted))
+    told = ", ".join("..." if size is ... else str(size) for size in expected)
+    require(fits, name, got=got, expected=f"({told}{',' * (len(expected) == 1)})", remedy=remedy)
+
+
+def require_one_of(name: str, got: object, choices: Iterable[str], remedy: str) -> None:
+    """Raise ValueError unless an option is one of its choices."""
+    choices = tuple(choices)
+    require(got in choices, name, got=repr(got), expected=" or ".join(map(repr, choices)), remedy=remedy)

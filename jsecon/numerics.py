@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from jsecon.types import Array
 
@@ -68,8 +69,7 @@ sigmoid.defjvps(lambda tangent, value, x: tangent * value * jax.nn.sigmoid(-x))
 
 
 def cosine(x: Array, y: Array) -> Array:
-    """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see STYLE trap 1 (jax
-    39103)."""
+    """Cosine over the last axis, broadcasting; 0 where either is zero. Multiply-and-sum: see jax issue 39103."""
     return jnp.sum(normalize(x) * normalize(y), axis=-1)
 
 
@@ -84,3 +84,8 @@ def finite(*arrays: Array) -> Array:
     for array in arrays:
         result &= jnp.all(jnp.isfinite(array))
     return result
+
+
+def is_traced(tree) -> bool:
+    """Whether any leaf of `tree` is being traced (jit, grad, vmap)."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

@@ -89,7 +89,7 @@ def spread_over_devices(
     devices = [None, *jax.local_devices()[1 : len(own)][: None if most is None else most - 1]]
     common, start, views = jax.tree.map(np.asarray, (common, start, views))
     shared = [jax.device_put(common, device) for device in devices]
-    states = [jax.tree.map(lambda a, d=device: jax.device_put(a, d).copy(), start) for device in devices]
+    states = [jax.device_put(start, device, may_alias=False) for device in devices]  # each its own: a step takes it
     outs = []
     for first in range(0, len(own), len(devices)):
         wave = own[first : first + len(devices)]

@@ -23,6 +23,9 @@ from pathlib import Path
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
 
 
+_built: dict[str, int] = {}
+
+
 def prepare_process(*, keep_programs: bool = True) -> None:
     """Sets XLA's flags (see `settings`) and keeps freed memory for the next request (glibc only). Call it before jax
     makes its first array. What the user has set in the environment stays; without `keep_programs`, compiled programs
@@ -32,14 +35,31 @@ def prepare_process(*, keep_programs: bool = True) -> None:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
     os.environ.update(chosen)
     if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
-        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-        for parameter, value in _MALLOPT.items() if mallopt else ():
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda parameter, value: None)
+        for parameter, value in _MALLOPT.items():
             mallopt(parameter, value)
 
 
 def cores() -> int:
     """The CPU cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def programs_built() -> dict[str, int]:
+    """How many programs jax has built since this was first called: all of them, and those read from disk."""
+    import jax
+
+    if not _built:
+        _built.update(all=0, from_disk=0)
+
+        def count(event: str, *_: object, **__: object) -> None:
+            name = {"backend_compile_duration": "all", "cache_hits": "from_disk"}.get(event.rpartition("/")[2])
+            if name is not None:
+                _built[name] += 1
+
+        jax.monitoring.register_event_listener(count)
+        jax.monitoring.register_event_duration_secs_listener(count)
+    return dict(_built)
 
 
 def forget_programs(*, above: int = 25_000) -> bool:
@@ -63,7 +83,7 @@ def forget_programs(*, above: int = 25_000) -> bool:
 
 
 def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
-    """The variables to set: one host device a core, full-width vectors, compiled programs kept between runs.
+    """The variables to set: one host device per core, full-width vectors, compiled programs kept between runs.
 
     Flags already in XLA_FLAGS stay as they are. 512-bit vectors are asked for only where the CPU has them. The folder
     of compiled programs carries a digest of the CPU's features, so that a home shared by unlike machines stays safe.
@@ -78,6 +98,8 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
     if "JAX_COMPILATION_CACHE_DIR" not in environ and (home := _cache_home(environ)) is not None:
         features = hashlib.blake2b(" ".join(sorted(cpu_features)).encode(), digest_size=6).hexdigest()
         chosen["JAX_COMPILATION_CACHE_DIR"] = str(home / "jsecon" / f"xla-{features}")
+        # Programs of less than a second too: a query has half a dozen of them.
+        chosen |= {name: "0" for name in ("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",) if name not in environ}
     return chosen
 
 

@@ -1,4 +1,4 @@
-"""The pytrees that flow through the pipeline: frozen dataclasses of arrays, one line a field (shape, unit, range,
+"""The pytrees that flow through the pipeline: frozen dataclasses of arrays, one line per field (shape, unit, range,
 frame).
 
 Conventions, fixed here once: OpenCV camera axes (x right, y down, z forward); `world_to_camera` matrices; quaternions
@@ -160,7 +160,7 @@ class Votes:
 
 @_record
 class Regions:
-    """What the masklets are: one row a region."""
+    """What the masklets are: one row per region."""
 
     embeddings: Array
     """(R, E) unit length; pixel-weighted mean of the views' embeddings (paper: phi_bar); zero where never embedded."""

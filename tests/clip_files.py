@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from onnx_files import node, write_graph
+from tokenizers import pre_tokenizers
 
-from jsecon.vision.clip_folder import CLIP_MEAN, CLIP_STD
-from jsecon.vision.tokenizer import ClipTokenizer, byte_symbols
+from jsecon.networks.clip_folder import CLIP_MEAN, CLIP_STD
+from jsecon.networks.tokenizer import ClipTokenizer
 
 
 @functools.cache
@@ -20,7 +21,7 @@ def fixture() -> dict:
 
 def vocabulary() -> dict[str, int]:
     """CLIP's numbering: the bytes in the order of their signs, the same at the end of a word, the merges, the ends."""
-    signs, merges = sorted(byte_symbols()), fixture()["merges"]
+    signs, merges = sorted(pre_tokenizers.ByteLevel.alphabet()), fixture()["merges"]
     tokens = [*signs, *(sign + "</w>" for sign in signs), *map("".join, merges), "<|startoftext|>", "<|endoftext|>"]
     return {token: number for number, token in enumerate(tokens)}
 
@@ -90,7 +91,7 @@ def write_textual(path: Path, names: tuple[str, str], batch: int | str, kind: st
 
 def load_tokens(texts: list[str]) -> list[int]:
     """The last id of each word: where the small vocabulary splits it, the others are shared with other words."""
-    tokenizer = ClipTokenizer(vocabulary(), [tuple(pair) for pair in fixture()["merges"]], where="fixture")
+    tokenizer = ClipTokenizer(vocabulary(), [tuple(pair) for pair in fixture()["merges"]])
     return [tokenizer.encode(text)[-1] for text in texts]
 
 

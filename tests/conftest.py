@@ -1,17 +1,22 @@
 """What every test shares: type checks at run time, a float64 switch, a small scene, and where the real captures lie.
 
-Two host devices and the import hook must be settled before jax makes its first array and before jsecon is imported.
+Two host devices, the flags of `compiling` and the import hook must be settled before jax makes its first array and
+before jsecon is imported.
 """
 
 import atexit
 import contextlib
 import fcntl
+import gc
 import os
 import shutil
 import tempfile
+from collections import Counter
 from pathlib import Path
 
-os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+import compiling
+
+os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 {compiling.ENVIRONMENT}")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 # Programs that one test compiled are there for all others of the run: those of the other workers, of subprocesses, and
@@ -41,6 +46,8 @@ install_import_hook(
     "beartype.beartype",
 )
 
+compiling.install()
+
 # The same examples in every CI run: what a submission is judged by must not be drawn by lot.
 settings.register_profile("ci", derandomize=True, deadline=None)
 if os.environ.get("CI"):
@@ -48,17 +55,17 @@ if os.environ.get("CI"):
 
 import numpy as np  # noqa: E402
 
-from jsecon.process import forget_programs  # noqa: E402
+from jsecon.process import forget_programs, programs_built  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
-SOON_READY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
-"""compiler options for a test's own programs that compare one way of computing with another, run a few times, and need
-not be what ships: they compile in half the time. What is compared with NumPy in float32 is compiled as it ships."""
+# Tracing makes many objects and few cycles: looking for those ten times less often saves a tenth of a test's time.
+gc.freeze()
+gc.set_threshold(20_000, 20, 20)
 
 LONGEST = (
     "test_pipeline",
     "test_tables",
-    "test_baselines",
+    "test_rivals",
     "test_demo",
     "test_readme",
     "test_render",
@@ -67,16 +74,48 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items):
-    """The longest files first: one of them at the end would leave the other workers without work."""
+    """Files as shipped come first, so that a worker changes its options once; then the longest: one of them at the end
+    would leave the other workers without work."""
     place = {name: n for n, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+    items.sort(
+        key=lambda item: (
+            item.get_closest_marker("as_shipped") is None,
+            place.get(item.path.stem, len(place)),
+        )
+    )
 
 
-@pytest.fixture(autouse=True, scope="module")
-def room_for_programs():
-    """Forgets compiled programs between files before they use up the process's memory maps."""
-    yield
-    forget_programs()
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Programs are compiled as the file's mark says, those of the fixtures too; after the file they are forgotten
+    before they use up the process's memory maps."""
+    compiling.choose(shipped=item.get_closest_marker("as_shipped") is not None)
+    done = yield
+    if nextitem is None or nextitem.path != item.path:
+        forget_programs()
+    return done
+
+
+def pytest_sessionstart(session):
+    session.config.programs = Counter()
+    programs_built()
+
+
+def pytest_sessionfinish(session):
+    """What a worker of xdist built is added up in the process that prints it."""
+    session.config.programs.update(programs_built())
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["programs"] = dict(session.config.programs)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    node.config.programs.update(getattr(node, "workeroutput", {}).get("programs", {}))
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    built, read = (config.programs[name] for name in ("all", "from_disk"))
+    terminalreporter.write_line(f"{built - read} programs compiled, {read} read from disk")
 
 
 @pytest.fixture
@@ -165,7 +204,7 @@ def room(made_once) -> Path:
 @pytest.fixture(scope="session")
 def room_run(room, made_once, tmp_path_factory):
     """A finished run on that room with its true masks given, and a folder as it was written, this worker's own."""
-    from jsecon import pipeline
+    from jsecon.app import pipeline
 
     options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150)
     with made_once("run") as folder:

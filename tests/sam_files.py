@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from onnx_files import node, write_graph
 
-from jsecon.vision.sam_graphs import MEAN, STD
+from jsecon.networks.sam.graphs import MEAN, STD
 
 CHANNELS = 8
 WIDTHS = (0.02, 0.01, 0.02, 0.08)

@@ -7,9 +7,9 @@ import numpy as np
 from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.votes import region_votes
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
-from jsecon.splat.tiles import plan_capacity
-from jsecon.types import LanguageField, Regions
+from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
 REGIONS = 5
 
@@ -61,8 +61,22 @@ def make_field(scene, cameras, *, dim=12, latent=8):
 
 
 def shares(field, regions):
-    """(N,) float64: the part of all weight that lies on the regions."""
+    """(N,) float64: the part that lies on the regions of the weight in the views that show them, or of all weight."""
     votes = field.votes
-    weight = np.where(np.isin(np.asarray(votes.regions), regions), np.asarray(votes.weights, np.float64), 0).sum(1)
-    total = np.asarray(votes.total, np.float64)
-    return np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
+    inside = np.isin(np.asarray(votes.regions), regions)
+    weight = np.where(inside, np.asarray(votes.weights, np.float64), 0).sum(1)
+    seen = np.asarray(votes.total[:, None] if votes.shown is None else votes.shown, np.float64)
+    seen = np.where(inside, seen, 0).max(1)
+    return np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0)
+
+
+def field_of(votes: Votes, regions: Regions) -> LanguageField:
+    """A field of votes and regions; its Gaussians and codes mean nothing."""
+    count = votes.regions.shape[0]
+    zeros = np.zeros((count, 3), np.float32)
+    gaussians = Gaussians(zeros, zeros, np.ones((count, 4), np.float32), zeros[:, 0], zeros[:, None])
+    one = np.ones(1, np.float32)
+    camera = Camera(np.eye(4)[None], one, one, one, one, 4, 4)
+    codes = np.ones((count, 2), np.float32)
+    table, canonical = np.ones((regions.count, 2), np.float32), np.zeros((0, 8))
+    return LanguageField(gaussians, codes, votes, regions, table, None, camera, canonical, np.eye(4), ("a",))

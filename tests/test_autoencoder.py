@@ -73,19 +73,24 @@ def test_regions_come_back_from_three_numbers(trained):
     assert [done for done, _ in calls] == sorted({done for done, _ in calls})
 
 
-def test_forward_pass_equals_numpy_float64(trained):
-    embeddings, coder, _ = trained
+def encoded(coder, x):
+    """The codes of rows (..., E) in float64."""
     params, stats = jax.tree.map(
         lambda a: np.asarray(a, np.float64), (coder.encoder["params"], coder.encoder["batch_stats"])
     )
-    x = embeddings.astype(np.float64)
+    x = x.astype(np.float64)
     for layer in range(5):
         if layer:
             norm, running = params[f"BatchNorm_{layer - 1}"], stats[f"BatchNorm_{layer - 1}"]
             x = (x - running["mean"]) / np.sqrt(running["var"] + 1e-5) * norm["scale"] + norm["bias"]
             x = np.maximum(x, 0)
         x = x @ params[f"Dense_{layer}"]["kernel"] + params[f"Dense_{layer}"]["bias"]
-    codes = x / np.linalg.norm(x, axis=1, keepdims=True)
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+def test_forward_pass_equals_numpy_float64(trained):
+    embeddings, coder, _ = trained
+    codes = encoded(coder, embeddings)
     np.testing.assert_allclose(coder.encode(embeddings), codes, atol=2e-4)
     params, x = jax.tree.map(lambda a: np.asarray(a, np.float64), coder.decoder["params"]), codes
     for layer in range(7):
@@ -97,13 +102,13 @@ def test_forward_pass_equals_numpy_float64(trained):
 
 def test_one_vector_a_batch_a_vmap_and_a_jit_agree(trained):
     embeddings, coder, _ = trained
-    many = np.resize(embeddings[:40], (40_000, 48))
+    many = np.resize(embeddings[:40], (400, 48))
     codes = coder.encode(many)
-    np.testing.assert_allclose(codes[:40], codes[39_960:], atol=1e-6)
+    np.testing.assert_allclose(codes[:40], codes[360:], atol=1e-6)
     np.testing.assert_allclose(jax.jit(jax.vmap(coder.encode))(many), codes, atol=1e-5)
     np.testing.assert_allclose(coder.encode(embeddings[7]), codes[7], atol=1e-5)
     np.testing.assert_allclose(coder.decode(codes[7]), coder.decode(codes)[7], atol=1e-5)
-    np.testing.assert_allclose(coder.encode(many.reshape(40, 1000, 48)).reshape(-1, 3), codes, atol=1e-5)
+    np.testing.assert_allclose(coder.encode(many.reshape(40, 10, 48)).reshape(-1, 3), codes, atol=1e-5)
     np.testing.assert_allclose(jax.jit(lambda c, x: c.encode(x))(coder, 1e30 * embeddings[:40]), codes[:40], atol=1e-5)
 
 
@@ -116,10 +121,11 @@ def test_zero_is_unknown_and_nan_stays_nan(trained):
 
 
 def test_the_key_decides_everything(trained):
-    embeddings, coder, _ = trained
-    again = train_autoencoder(embeddings, latent=3, key=KEY, epochs=600)
+    embeddings, _, _ = trained
+    coder, again, other = (
+        train_autoencoder(embeddings, latent=3, key=jax.random.key(seed), epochs=20) for seed in (0, 0, 1)
+    )
     assert all((a == b).all() for a, b in zip(jax.tree.leaves(coder), jax.tree.leaves(again), strict=True))
-    other = train_autoencoder(embeddings, latent=3, key=jax.random.key(1), epochs=600)
     assert not np.allclose(other.encode(embeddings), coder.encode(embeddings), atol=1e-2)
 
 
@@ -157,7 +163,6 @@ def test_what_cannot_be_trained_on_is_told():
         {"latent": 0},
         {"latent": 3, "batch": 0},
         {"latent": 3, "epochs": 0},
-        {"latent": 3, "cosine_over": "x"},
     ):
         with pytest.raises(ValueError, match="train_autoencoder"):
             train_autoencoder(good, key=KEY, **options)
@@ -165,7 +170,7 @@ def test_what_cannot_be_trained_on_is_told():
 
 def test_codes_of_other_sizes_are_told(trained):
     _, coder, _ = trained
-    with pytest.raises(ValueError, match="size 48"):
+    with pytest.raises(ValueError, match=r"\.\.\., 48"):
         coder.encode(np.ones((2, 47), np.float32))
-    with pytest.raises(ValueError, match="size 3"):
+    with pytest.raises(ValueError, match=r"\.\.\., 3"):
         coder.decode(np.ones((2, 4), np.float32))

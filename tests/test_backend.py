@@ -4,6 +4,8 @@ import pytest
 
 import jsecon.backend as backend
 
+pytestmark = pytest.mark.as_shipped
+
 
 def test_our_forms_are_right_here_and_the_report_says_what_it_measured():
     report = backend.check_backend()

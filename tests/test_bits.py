@@ -5,24 +5,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.splat.bits import WORD, read_off, set_before, transpose_words
+from jsecon.splat.bits import WORD, read_off, set_bits
 
 
 @pytest.mark.parametrize(("words", "density"), [(1, 0.5), (7, 0.0), (7, 1.0), (40, 0.03), (2500, 0.25)])
-def test_lists_are_those_of_a_loop(words, density):
+@pytest.mark.parametrize("filled", [1.0, 0.4])
+def test_lists_are_those_of_a_loop(words, density, filled):
     rng = np.random.default_rng(words)
     bits = rng.random((words * WORD, 16)) < density
     bits[rng.random(words * WORD) < 0.2] = False
+    total = int(filled * words * WORD)
+    bits[total:] = False
     reached = (bits.astype(np.uint32) << np.arange(16, dtype=np.uint32)).sum(1).astype(np.uint32)
     owner = rng.permutation(words * WORD).astype(np.int32)
 
     @jax.jit
-    def lists(reached, owner):
-        members = transpose_words(reached, 16)
-        before = set_before(members)
-        return members, before, read_off(members, before, owner)
+    def lists(reached, owner, total):
+        members, before = set_bits(lambda owner, reached: reached, owner, reached, 16, total, WORD)
+        return members, before, read_off(members, before, owner, total, WORD)
 
-    members, before, got = lists(jnp.asarray(reached), jnp.asarray(owner))
+    members, before, got = lists(jnp.asarray(reached), jnp.asarray(owner), jnp.int32(total))
     expected = np.concatenate([owner[bits[:, tile]] for tile in range(16)])
     np.testing.assert_array_equal(got[: len(expected)], expected)
     assert got.shape == (16 * words * WORD,)

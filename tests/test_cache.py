@@ -2,16 +2,19 @@
 
 import dataclasses
 import os
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon import cache
+from jsecon.app import cache
+from jsecon.app.language_stages import codes, votes
+from jsecon.app.scene_stages import load
+from jsecon.app.stages import Outcome
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
-from jsecon.stages import Outcome
 
 
 def _tree(scene, cameras):
@@ -58,8 +61,8 @@ def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
     def compute():
         return {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")}
 
-    fresh = cache.fetch(tmp_path, "stage", "0" * 16, compute)
-    again = cache.fetch(tmp_path, "stage", "0" * 16, lambda: pytest.fail("computed twice"))
+    fresh = cache.fetch(tmp_path / "stage-0.npz", compute)
+    again = cache.fetch(tmp_path / "stage-0.npz", lambda: pytest.fail("computed twice"))
     assert fresh.fresh
     assert not again.fresh
     assert isinstance(fresh.value["a"], np.ndarray)
@@ -85,16 +88,16 @@ def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
 )
 def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
     value = np.random.default_rng(0).normal(size=500)
-    cache.fetch(tmp_path, "stage", "k", lambda: value)
+    cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value)
     path = cache.path_of(tmp_path, "stage", "k")
     path.write_bytes(damage(path.read_bytes()))
     said = []
-    kept = cache.fetch(tmp_path, "stage", "k", lambda: value, note=said.append)
+    kept = cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value, note=said.append)
     assert kept.fresh
     np.testing.assert_array_equal(kept.value, value)
     assert len(said) == 1
     assert "stage is computed again" in said[0]
-    assert not cache.fetch(tmp_path, "stage", "k", lambda: value).fresh
+    assert not cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value).fresh
 
 
 def test_a_failed_computation_leaves_nothing_behind(tmp_path):
@@ -102,7 +105,7 @@ def test_a_failed_computation_leaves_nothing_behind(tmp_path):
         raise InputError("x", found="a", expected="b", remedy="c")
 
     with pytest.raises(InputError):
-        cache.fetch(tmp_path, "stage", "k", fail)
+        cache.fetch(cache.path_of(tmp_path, "stage", "k"), fail)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -115,7 +118,7 @@ def test_pickles_are_neither_written_nor_read(tmp_path):
 
 
 def test_only_records_of_jsecon_are_made():
-    for record in ("os:system", "jsecon.cache:fetch", "jsecon.files:Path"):
+    for record in ("os:system", "jsecon.app.cache:fetch", "jsecon.files:Path"):
         with pytest.raises((ValueError, AttributeError)):
             cache.unpack({"record": record, "fields": {}}, {})
 
@@ -162,9 +165,27 @@ def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
     assert cache.files_digest([capture], leave_out=tmp_path / "out") != before
 
 
-def test_source_digest_follows_the_rooms_named():
-    assert cache.source_digest(["splat"]) != cache.source_digest(["splat", "language.votes"])
-    assert cache.source_digest(["splat", "fit"]) == cache.source_digest(["fit", "splat"])
+def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeypatch):
+    def digests():
+        cache._imports_of_module.cache_clear()
+        return {stage: cache.source_digest(stage) for stage in (load, codes, votes)}
+
+    before, read = digests(), Path.read_text
+    assert digests() == before
+
+    def changed(module, text):
+        """The digests that differ where a module's source has `text` behind it."""
+        real = cache._file_of(module)
+        monkeypatch.setattr(Path, "read_bytes", lambda path: read(path).encode() + text * (path == real))
+        monkeypatch.setattr(Path, "read_text", lambda path: read(path) + text.decode() * (path == real))
+        return {stage.__name__ for stage, digest in digests().items() if digest != before[stage]}
+
+    assert changed("jsecon.splat.tiles", b"# more") == {"votes"}
+    assert changed("jsecon.data.colmap", b"# more") == {"load"}
+    assert changed("jsecon.language.autoencoder", b"# more") == {"codes"}
+    assert changed("jsecon.types", b"# more") == {"load", "codes", "votes"}
+    assert changed("jsecon.query.anchored", b"# more") == set()
+    assert changed("jsecon.app.language_stages", b"def other(): pass") == set()
 
 
 def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):

@@ -31,7 +31,15 @@ def test_formats_are_detected(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options", [{"downscale": 0.5}, {"downscale": float("nan")}, {"frames": 0}, {"holdout": 1}, {"holdout": -8}]
+    "options",
+    [
+        {"downscale": 0.5},
+        {"downscale": float("nan")},
+        {"long_side": 0},
+        {"frames": 0},
+        {"holdout": 1},
+        {"holdout": -8},
+    ],
 )
 def test_options_are_checked(tmp_path, options):
     write_colmap(CAPTURE, tmp_path)
@@ -48,6 +56,9 @@ def test_options_and_progress(tmp_path):
     np.testing.assert_allclose(loaded.cameras.fy, CAPTURE.cameras.fy[[0, 1, 3, 4]] * 11 / 16)
     assert not loaded.held_out.any()
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    same = load_capture(tmp_path, long_side=16, frames=4)
+    np.testing.assert_array_equal(same.frames, loaded.frames)
+    assert load_capture(tmp_path, long_side=100).frames.shape == CAPTURE.frames.shape
     single = load_capture(tmp_path, frames=1)
     assert not single.held_out.any()
     assert any("only one" in note for note in single.notes)

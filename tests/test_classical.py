@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.language.masklets import iou_matrix
+from jsecon.association.algorithm1 import iou_matrix
 from jsecon.vision.classical import ClassicalSegmenter, adapted
 from jsecon.vision.protocols import Segmenter
 
@@ -72,7 +72,7 @@ def test_the_same_frame_gives_the_same_masks_and_its_mirror_image_nearly_the_mir
     assert (best_ious(things[:, :, ::-1], mirrored) > 0.85).all()
 
 
-def test_depth_and_normals_part_what_colour_does_not():
+def test_depth_parts_what_colour_does_not():
     frame = np.full((60, 80, 3), 150, np.uint8)
     depth = np.full((60, 80), 2.0, np.float32)
     depth[20:40, 30:60] = 1.0
@@ -80,15 +80,10 @@ def test_depth_and_normals_part_what_colour_does_not():
     assert len(ClassicalSegmenter()(frame, 0)) == 1
     by_depth = ClassicalSegmenter(depths=lambda index: depth)(frame, 0)
     assert best_ious(near[None], by_depth)[0] > 0.8
-    normal = np.zeros((60, 80, 3), np.float32)
-    normal[..., 2] = -1.0
-    normal[near] = (1.0, 0.0, 0.0)
-    by_normal = ClassicalSegmenter(normals=normal[None])(frame, 0)
-    assert best_ious(near[None], by_normal)[0] > 0.8
-    unknown = ClassicalSegmenter(depths=lambda index: np.zeros((60, 80)), normals=lambda index: None)(frame, 0)
+    unknown = ClassicalSegmenter(depths=lambda index: np.zeros((60, 80), np.float32))(frame, 0)
     assert len(unknown) == 1
-    with pytest.raises(ValueError, match="map"):
-        ClassicalSegmenter(depths=depth[None, :-1])(frame, 0)
+    with pytest.raises(ValueError, match="depths"):
+        ClassicalSegmenter(depths=lambda index: depth[:-1])(frame, 0)
 
 
 def test_dark_and_bright_frames_are_seen_by_adapted_eyes():

@@ -1,21 +1,24 @@
 """The command line: what each verb leaves behind, and one clear message and exit code 2 for each kind of bad input."""
 
+import dataclasses
 import json
 import shutil
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from jsecon import cli, grammar, pipeline
-from jsecon.console import Console
+from jsecon.app import command_line, pipeline
+from jsecon.app.arguments import parsed
+from jsecon.app.options import Options
+from jsecon.app.progress import Console, Listener
 from jsecon.data.ply import load_ply, save_ply
-from jsecon.plan import Reporter, Silent
 
 
 def _run(*arguments):
-    return cli.main([str(argument) for argument in arguments])
+    return command_line.main([str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -51,7 +54,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
     assert metrics["held_out_psnr"] > 10
     assert set(metrics["seconds"]) >= {"load", "gaussians", "votes"}
     assert "segmenter" in metrics["left_out"]
-    assert metrics["peak_memory_mib"] > 0
+    assert metrics["peak_memory_mib"] == pytest.approx(pipeline.peak_memory_mib(), rel=0.05)
     for words in ("gaussians        cached", "segmenter        left out", "held-out PSNR", "report.html"):
         assert words in told
     page = (tmp_path / "out" / "report.html").read_text()
@@ -125,8 +128,20 @@ def test_help_of_every_verb_has_words_for_every_option(capsys):
     for verb in ("demo", "run", "query", "eval", "models"):
         assert _run(verb, "--help") == 0
         assert len(capsys.readouterr().out) > 300
-    for action in grammar.parser()._subparsers._group_actions[0].choices.values():
+    for action in command_line.parser()._subparsers._group_actions[0].choices.values():
         assert all(option.help for option in action._actions), action.prog
+
+
+def test_what_is_not_given_has_the_default_of_the_dataclass():
+    parse = command_line.parser().parse_args
+    run = parsed(command_line.Run, parse(["run", "room", "--out", "out"]))
+    options = Options(Path("room"))
+    assert {field.name: getattr(run, field.name) for field in dataclasses.fields(Options)} == vars(options)
+    changed = ["--latent", "auto", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
+    run = parsed(command_line.Run, parse(["run", "room", "--out", "out", *changed]))
+    assert (run.latent, run.sh_degree, run.masks, run.downscale, run.weighting) == ("auto", 2, Path("m"), 2, "uniform")
+    query = parsed(command_line.Query, parse(["query", "f", "a", "b", "--all", "--at", "0", "1", "2", "--out", "o"]))
+    assert (query.texts, query.at, query.all, query.keep_outliers) == (["a", "b"], [["0", "1", "2"]], True, False)
 
 
 def test_wrong_usage_is_exit_code_2(capsys):
@@ -323,8 +338,8 @@ def test_labels_that_are_not_there(room_run, tmp_path, capsys):
 
 
 def test_both_reporters_keep_the_protocol():
-    assert isinstance(Console(), Reporter)
-    assert isinstance(Silent(), Reporter)
+    assert isinstance(Console(), Listener)
+    assert isinstance(Listener(), Listener)
 
 
 class _Terminal:
@@ -342,7 +357,7 @@ class _Terminal:
 
 
 def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
-    from jsecon import console
+    from jsecon.app import progress as console
 
     monkeypatch.setattr(console, "QUIET_SECONDS", 0.0)
     monkeypatch.setattr(console, "LINE_SECONDS", 0.0)

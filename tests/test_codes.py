@@ -6,8 +6,8 @@ from small_field import unit_rows
 
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import (
+    CODE_THRESHOLD,
     LATENTS,
-    SEPARATION,
     Rotation,
     Spread,
     confused_pairs,
@@ -63,7 +63,7 @@ def test_equal_and_unknown_embeddings_fit_in_one_number():
 
 def test_an_autoencoder_where_regions_do_not_fit():
     embeddings = unit_rows(np.random.default_rng(0), 12, 40)
-    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50, cosine_over="batch")
+    codes, coder, reason = region_codes(embeddings, latent=3, key=KEY, epochs=50, cosine_weight=0.01)
     assert isinstance(coder, Autoencoder)
     assert reason.startswith("run")
     np.testing.assert_allclose(encode(coder, embeddings), codes, atol=1e-6)
@@ -96,7 +96,7 @@ def test_spread_codes_of_twins_and_of_the_unknown():
     units = crowded(20)
     units[7], units[9] = units[3], 0
     codes = np.asarray(spread_codes(units, 4))
-    assert codes[3] @ codes[7] > SEPARATION  # one thing seen twice
+    assert codes[3] @ codes[7] > CODE_THRESHOLD  # one thing seen twice
     assert (codes[9] == 0).all()
     coder = Spread(units, codes)
     assert (np.asarray(coder.encode(np.zeros(64, np.float32))) == 0).all()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
 
-from jsecon.data.colmap import load_colmap, write_colmap
+from jsecon.data.capture import load_capture
+from jsecon.data.colmap import write_colmap
 from jsecon.data.colmap_model import MODELS, read_images
 from jsecon.data.images import write_image
 from jsecon.errors import InputError
@@ -32,7 +33,7 @@ def assert_same(loaded, expected, tolerance=1e-6):
 
 
 def test_binary_round_trip(folder):
-    loaded = load_colmap(folder, holdout=0)
+    loaded = load_capture(folder, holdout=0)
     assert_same(loaded, CAPTURE)
     assert loaded.notes == ()
     assert not loaded.held_out.any()
@@ -43,7 +44,7 @@ def test_text_model_in_sparse_without_a_number(tmp_path):
     """Written by the test itself, with quaternions from OpenCV: an independent witness of both readers."""
     write_text_model(CAPTURE, tmp_path / "sparse")
     write_images(CAPTURE, tmp_path / "images")
-    assert_same(load_colmap(tmp_path, holdout=0), CAPTURE)
+    assert_same(load_capture(tmp_path, holdout=0), CAPTURE)
 
 
 def test_quaternions_in_every_quadrant(tmp_path):
@@ -54,7 +55,7 @@ def test_quaternions_in_every_quadrant(tmp_path):
     cameras = Camera(poses.astype(np.float32), *([np.full(4, 20.0, np.float32)] * 4), width=24, height=16)
     capture = small_capture(4)
     write_colmap(type(capture)(**{**vars(capture), "cameras": cameras}), tmp_path)
-    np.testing.assert_array_equal(load_colmap(tmp_path).cameras.world_to_camera, poses.astype(np.float32))
+    np.testing.assert_array_equal(load_capture(tmp_path).cameras.world_to_camera, poses.astype(np.float32))
 
 
 def binary_with_tracks(path, points, colours, lengths):
@@ -74,7 +75,7 @@ def test_tracks_of_all_lengths_and_observations(folder):
     bodies = b"".join(head + struct.pack("<Q", n) + bytes(24 * n) for n, head in enumerate(heads))
     (folder / "sparse/0/images.bin").write_bytes(images[:8] + bodies)
     (folder / "sparse/0/rigs.bin").write_bytes(b"of a newer COLMAP")
-    assert_same(load_colmap(folder, holdout=0), CAPTURE)
+    assert_same(load_capture(folder, holdout=0), CAPTURE)
 
 
 def test_name_order_holdout_and_subset(folder):
@@ -83,17 +84,17 @@ def test_name_order_holdout_and_subset(folder):
     size = (len(data) - 8) // 5
     records = [data[8 + n * size : 8 + (n + 1) * size] for n in range(5)]
     images.write_bytes(data[:8] + b"".join(records[n] for n in (3, 0, 4, 2, 1)))
-    loaded = load_colmap(folder, holdout=2)
+    loaded = load_capture(folder, holdout=2)
     assert_same(loaded, CAPTURE)
     np.testing.assert_array_equal(loaded.held_out, [True, False, True, False, True])
-    some = load_colmap(folder, frames=3, holdout=3)
+    some = load_capture(folder, frames=3, holdout=3)
     assert some.names == tuple(CAPTURE.names[n] for n in (0, 2, 4))
     np.testing.assert_array_equal(some.held_out, [True, False, False])
     assert "3 of 5 frames" in some.notes[0]
 
 
 def test_downscale_is_an_area_mean(folder):
-    loaded = load_colmap(folder, downscale=2)
+    loaded = load_capture(folder, downscale=2)
     means = CAPTURE.frames.reshape(5, 8, 2, 12, 2, 3).mean((2, 4))
     assert np.abs(loaded.frames - means).max() <= 1
     np.testing.assert_allclose(loaded.cameras.fx, CAPTURE.cameras.fx / 2)
@@ -106,12 +107,12 @@ def test_smaller_images_than_the_model_says(tmp_path):
     write_text_model(CAPTURE, tmp_path / "sparse/0")
     for name, frame in zip(CAPTURE.names, CAPTURE.frames):
         write_image(tmp_path / "images" / f"{name}.png", frame[::2, ::2])
-    loaded = load_colmap(tmp_path)
+    loaded = load_capture(tmp_path)
     np.testing.assert_allclose(loaded.cameras.fx, CAPTURE.cameras.fx / 2)
     assert "5 images have another size" in loaded.notes[0]
     write_image(tmp_path / "images" / f"{CAPTURE.names[3]}.png", np.zeros((24, 16, 3), np.uint8))
     with refused("frame_003.png", "16x24", "24x16"):
-        load_colmap(tmp_path)
+        load_capture(tmp_path)
 
 
 def test_images_of_different_sizes(tmp_path):
@@ -122,7 +123,7 @@ def test_images_of_different_sizes(tmp_path):
     (tmp_path / "sparse/0/images.txt").write_text(images)
     write_images(CAPTURE, tmp_path / "images")
     write_image(tmp_path / "images/frame_002.png", np.full((24, 16, 3), 99, np.uint8))
-    loaded = load_colmap(tmp_path)
+    loaded = load_capture(tmp_path)
     assert loaded.frames.shape == (5, 16, 24, 3)
     np.testing.assert_allclose([loaded.cameras.fx[2], loaded.cameras.fy[2]], [30, 20 * 16 / 24], rtol=1e-6)
     np.testing.assert_allclose([loaded.cameras.cx[2], loaded.cameras.cy[2]], [12, 8])
@@ -177,7 +178,7 @@ def test_distorted_models(tmp_path, model, parameters):
     write_text_model(capture, tmp_path / "sparse/0", [f"1 {model} {width} {height} {' '.join(map(str, parameters))}"])
     for name in capture.names:
         write_image(tmp_path / "images" / f"{name}.png", bent(model, parameters, width, height))
-    loaded = load_colmap(tmp_path)
+    loaded = load_capture(tmp_path)
     v, u = np.mgrid[:height, :width] + 0.5
     camera = loaded.cameras[0]
     expected = picture((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
@@ -195,20 +196,20 @@ def test_models_that_opencv_lacks(tmp_path, model):
     write_text_model(CAPTURE, tmp_path / "sparse", [f"1 {model} 24 16 {' '.join(parameters)}"])
     write_images(CAPTURE, tmp_path / "images")
     with refused("cameras.txt", model, "image_undistorter"):
-        load_colmap(tmp_path)
+        load_capture(tmp_path)
 
 
 def test_missing_images_are_counted(folder):
     (folder / "images/frame_001.png").unlink()
     (folder / "images/frame_004.png").unlink()
     with refused("images", "2 of 5", "frame_001.png"):
-        load_colmap(folder)
+        load_capture(folder)
 
 
 def test_empty_image(folder):
     (folder / "images/frame_001.png").write_bytes(b"")
     with refused("frame_001.png", "empty"):
-        load_colmap(folder)
+        load_capture(folder)
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
@@ -218,18 +219,18 @@ def test_every_cut_of_a_model_file_is_told(folder, file):
     for length in {*range(0, len(data), 53), len(data) - 1}:
         path.write_bytes(data[:length])
         with refused(file, f"after {length} bytes"):
-            load_colmap(folder)
+            load_capture(folder)
 
 
 def test_absurd_counts_end_in_the_same_message(folder):
     path = folder / "sparse/0/points3D.bin"
     path.write_bytes(struct.pack("<Q", 2**60))
     with refused("points3D.bin", "breaks off"):
-        load_colmap(folder)
+        load_capture(folder)
     data = struct.pack("<Q", 1) + struct.pack("<Q3d3BdQ", 1, 0, 0, 0, 0, 0, 0, 0, 2**63)
     path.write_bytes(data)
     with refused("points3D.bin", "breaks off"):
-        load_colmap(folder)
+        load_capture(folder)
 
 
 @pytest.mark.parametrize(
@@ -250,7 +251,7 @@ def test_damaged_text(tmp_path, file, old, new, said):
     assert old in text
     (tmp_path / "sparse" / file).write_text(text.replace(old, new, 1))
     with refused(said):
-        load_colmap(tmp_path)
+        load_capture(tmp_path)
 
 
 @pytest.mark.parametrize("numbers", [(np.nan, 0, 0, 0, 0, 0, 0), (1, 0, 0, 0, 0, np.inf, 0), (0, 0, 0, 0, 0, 0, 0)])
@@ -260,22 +261,22 @@ def test_poses_that_are_none(folder, numbers):
     struct.pack_into("<7d", data, 12, *numbers)
     path.write_bytes(data)
     with refused("images.bin", "frame_000.png", "NaN"):
-        load_colmap(folder)
+        load_capture(folder)
 
 
 def test_no_points_file_and_nan_points(folder):
     (folder / "sparse/0/points3D.bin").unlink()
-    loaded = load_colmap(folder)
+    loaded = load_capture(folder)
     assert loaded.points.shape == (0, 3)
     assert "no sparse points" in loaded.notes[0]
     points = CAPTURE.points.astype(float)
     points[3] = np.nan
     binary_with_tracks(folder / "sparse/0/points3D.bin", points, CAPTURE.point_colors, [0] * len(points))
     with refused("points3D.bin", "NaN"):
-        load_colmap(folder)
+        load_capture(folder)
     (folder / "sparse/0/images.bin").unlink()
     with refused("no images.bin"):
-        load_colmap(folder)
+        load_capture(folder)
 
 
 def test_names_that_clash(tmp_path):
@@ -287,17 +288,17 @@ def test_names_that_clash(tmp_path):
     for side, name in (("left", "frame_001"), ("right", "frame_003")):
         (tmp_path / "images" / side).mkdir()
         (tmp_path / f"images/{name}.png").rename(tmp_path / f"images/{side}/a.png")
-    assert load_colmap(tmp_path).names == ("frame_000", "frame_002", "frame_004", "left_a", "right_a")
+    assert load_capture(tmp_path).names == ("frame_000", "frame_002", "frame_004", "left_a", "right_a")
     path.write_text(path.read_text().replace("right/a.png", "left/a.jpg"))
     (tmp_path / "images/right/a.png").rename(tmp_path / "images/left/a.jpg")
     with refused("left_a"):
-        load_colmap(tmp_path)
+        load_capture(tmp_path)
 
 
 def test_jpeg_output_and_unwritable_folder(tmp_path):
     write_colmap(CAPTURE, tmp_path / "a", image_format="jpg")
     assert (tmp_path / "a/images/frame_000.jpg").is_file()
-    assert load_colmap(tmp_path / "a").names == CAPTURE.names
+    assert load_capture(tmp_path / "a").names == CAPTURE.names
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError):
         write_colmap(CAPTURE, tmp_path / "file" / "deeper")
@@ -305,11 +306,11 @@ def test_jpeg_output_and_unwritable_folder(tmp_path):
 
 def test_bonsai(shared):
     """The real model: what COLMAP's tracks say it saw is where the loaded cameras see it."""
-    loaded = load_colmap(shared / "captures/bonsai", frames=4, downscale=4)
-    assert loaded.frames.shape == (4, 131, 198, 3)
-    assert loaded.points.shape == (42338, 3)
-    assert len(read_images(shared / "captures/bonsai/sparse/0")) == 126
-    np.testing.assert_allclose(loaded.cameras.fx, 205.9757, atol=0.01)
+    loaded = load_capture(shared / "captures/bonsai", frames=4, downscale=4)
+    assert loaded.frames.shape == (4, 133, 200, 3)
+    assert loaded.points.shape == (35058, 3)
+    assert len(read_images(shared / "captures/bonsai/sparse/0")) == 125
+    np.testing.assert_allclose(loaded.cameras.fx, 205.4657, atol=0.01)
     pose = loaded.cameras.world_to_camera.astype(np.float64)
     seen = np.einsum("tij,pj->tpi", pose[:, :3, :3], loaded.points) + pose[:, None, :3, 3]
     assert ((seen[..., 2] > 0).mean(1) > 0.5).all()

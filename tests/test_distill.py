@@ -5,14 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from hypothesis import given, settings, strategies as st
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
 from jsecon.language.distill import descend, descent, distill_l1, distill_votes
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
-from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Votes
 
 KEY = jax.random.key(0)
@@ -69,18 +68,6 @@ def test_reductions_equal_float64(reduce):
     np.testing.assert_allclose(jitted, got, atol=1e-6)
 
 
-@pytest.mark.parametrize("count", [16_385, 32_769, 40_000, 100_000])
-def test_reductions_of_many_gaussians_under_jit_and_vmap(count):
-    rng = np.random.default_rng(0)
-    small, tables = random_votes(rng, 100, 4, 8), np.stack([unit_rows(rng, 8, 3) for _ in range(2)])
-    rows = np.arange(count) % 100
-    votes = dataclasses.replace(jax.tree.map(lambda a: a[rows] if np.ndim(a) else a, small))
-    for reduce in ("mean", "median", "mode"):
-        got = jax.jit(jax.vmap(lambda table, reduce=reduce: distill_votes(votes, table, reduce)))(tables)
-        for index, table in enumerate(tables):
-            np.testing.assert_allclose(got[index], exact(small, table, reduce)[rows], atol=3e-5)
-
-
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_the_median_is_l1_optimal(seed):
@@ -134,9 +121,9 @@ def test_no_regions_at_all():
 
 def test_wrong_options_and_tables_are_told():
     votes = make_votes([[0, 1]], [[1, 1]], 2)
-    with pytest.raises(ValueError, match="expected one of"):
+    with pytest.raises(ValueError, match="expected 'mean' or"):
         distill_votes(votes, np.eye(2, dtype=np.float32), "sum")
-    with pytest.raises(ValueError, match="3 region codes"):
+    with pytest.raises(ValueError, match=r"got \(3, 3\)"):
         distill_votes(votes, np.eye(3, dtype=np.float32))
 
 
@@ -269,24 +256,10 @@ def test_shapes_that_disagree_are_told(task):
         ({"labels": labels[:2]}, "labels"),
         ({"labels": labels[:, :3]}, "labels"),
         ({"region_codes": codes[:0]}, "0 regions"),
-        ({"init": "mean"}, "init='mean'"),
+        ({"init": "mean"}, "init: got 'mean'"),
         ({"init": jnp.zeros((3, 3))}, "init"),
         ({"steps": 0}, "0 steps"),
     ):
         given = {"labels": labels, "region_codes": codes, "steps": 1, "init": "zero"} | wrong
         with pytest.raises(ValueError, match=match):
             distill_l1(scene, cameras, key=KEY, **given)
-
-
-def test_adam_is_pytorchs():
-    """optax.adam with eps outside the square root and bias-corrected moments, as PyTorch's: checked on one number."""
-    adam = optax.adam(0.1, eps=1e-3)
-    x = jnp.asarray(2.0)
-    state, first, second, expected = adam.init(x), 0.0, 0.0, 2.0
-    for step in range(1, 6):
-        gradient = 2 * expected
-        first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
-        update, state = adam.update(2 * x, state)
-        x = optax.apply_updates(x, update)
-        expected -= 0.1 * (first / (1 - 0.9**step)) / (np.sqrt(second / (1 - 0.999**step)) + 1e-3)
-        assert float(x) == pytest.approx(expected, rel=1e-5)

@@ -13,7 +13,7 @@ from small_field import REGIONS, make_field, unit_rows
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.field import load_field, save_field
-from jsecon.query.pieces import with_overlap
+from jsecon.language.shares import with_overlap
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import look_at
 
 from jsecon.errors import InputError
 from jsecon.fit import optimise
 from jsecon.fit.optimise import (
-    INRIA_RATES,
     LearningRates,
     cameras_extent,
     evaluate_psnr,
@@ -20,11 +20,20 @@ from jsecon.fit.optimise import (
 )
 from jsecon.splat.render import render_rgb
 from jsecon.types import Camera, Capture, Gaussians
-from tests.conftest import look_at
 
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
+INRIA_RATES = LearningRates(
+    means=1.6e-4,
+    means_last=1.6e-6,
+    log_scales=5e-3,
+    quaternions=1e-3,
+    opacity_logits=5e-2,
+    colors=2.5e-3,
+    rest_last=1.0,
+)
+"""Kerbl et al. 2023"""
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +139,7 @@ def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
 def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitted, monkeypatch):
     asked = []
 
-    def narrow(gaussians, cameras, *, margin):
+    def narrow(count, width, height):
         return 32
 
     inner = optimise._step
@@ -139,7 +148,7 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitte
         asked.append(capacity)
         return inner(*args, capacity=capacity, **options)
 
-    monkeypatch.setattr(optimise, "plan_capacity", narrow)
+    monkeypatch.setattr(optimise, "default_capacity", narrow)
     monkeypatch.setattr(optimise, "_step", counted)
     gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0.0)
     assert asked[0] == 32

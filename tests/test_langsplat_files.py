@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from capture_files import refused
 
+from experiments.datasets.feature_files import load_text_features, write_features, write_text_features
 from jsecon.data.langsplat_files import (
     feature_size,
     load_features,
-    load_text_features,
-    write_features,
-    write_text_features,
 )
 from jsecon.vision.protocols import CANONICAL
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jsecon.query.masks import render_selection, selection_mask
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
-from jsecon.splat.tiles import plan_capacity
 
 
 def cut_out(scene, chosen):

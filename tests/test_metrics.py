@@ -7,13 +7,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from sklearn.metrics import jaccard_score, recall_score
 
+from experiments.protocols.points import point_accuracy, point_class_means
 from jsecon.evaluate.metrics import (
     accuracy_at,
     iou,
     localization_accuracy,
     mean_iou,
-    point_accuracy,
-    point_class_means,
 )
 
 

@@ -5,9 +5,9 @@ from clip_files import write_clip
 from sam2_files import write_sam2
 from sam_files import write_sam
 
-from jsecon import cli
+from jsecon.app import command_line
+from jsecon.app.models import examine, report_lines, require_usable
 from jsecon.errors import InputError
-from jsecon.models import examine, report_lines, require_usable
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def folders(tmp_path_factory):
     ("model", "words"),
     [
         ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
-        ("SAM", ["decoder of transformers.js, 64 prompts a call", "images of 256 px", "--segmenter"]),
+        ("SAM", ["decoder of transformers.js, 64 prompts per call", "images of 256 px", "--segmenter"]),
         ("SAM 2", ["2.1", "--tracker"]),
     ],
 )
@@ -42,7 +42,7 @@ def test_what_a_folder_is_good_for(folders, model, words):
 
 
 def test_every_graph_is_told_with_its_tensors(folders, capsys):
-    assert cli.main(["models", "check", str(folders["CLIP"])]) == 0
+    assert command_line.main(["models", "check", str(folders["CLIP"])]) == 0
     told = capsys.readouterr().out
     for line in (
         "  textual/model.onnx",
@@ -62,12 +62,12 @@ def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):
     folder = write_clip(tmp_path / "clip", "immich")
     graph = folder / "visual" / "model.onnx"
     graph.write_bytes(graph.read_bytes()[:100])
-    assert cli.main(["models", "check", str(folder)]) == 2
+    assert command_line.main(["models", "check", str(folder)]) == 2
     told = capsys.readouterr()
     assert "cannot be opened: found what ONNX Runtime" in told.out
     assert "nothing that can be used" in told.err
     (tmp_path / "empty").mkdir()
-    assert cli.main(["models", "check", str(tmp_path / "empty")]) == 2
+    assert command_line.main(["models", "check", str(tmp_path / "empty")]) == 2
     assert "0 graphs" in capsys.readouterr().out
     with pytest.raises(InputError, match="no such folder"):
         examine(tmp_path / "nowhere")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from capture_files import refused, small_capture, transforms, write_images, write_transforms
 
-from jsecon.data.nerfstudio import load_nerfstudio
+from jsecon.data.capture import load_capture
 
 CAPTURE = small_capture()
 
@@ -18,7 +18,7 @@ def load_changed(tmp_path, change, **options):
     content = transforms(CAPTURE)
     change(content)
     write_transforms(CAPTURE, tmp_path, content)
-    return load_nerfstudio(tmp_path, **options)
+    return load_capture(tmp_path, **options)
 
 
 def test_round_trip(tmp_path):
@@ -49,7 +49,7 @@ def test_paths_without_ending_and_with_windows_separators(tmp_path, ending):
     for entry in content["frames"]:
         entry["file_path"] = ".\\" + entry["file_path"].replace("/", "\\")
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    assert load_nerfstudio(tmp_path).names == CAPTURE.names
+    assert load_capture(tmp_path).names == CAPTURE.names
 
 
 def test_camera_angle_and_sizes_from_the_images(tmp_path):
@@ -69,7 +69,7 @@ def test_missing_images_are_said_and_left_out(tmp_path):
     write_transforms(CAPTURE, tmp_path)
     (tmp_path / "images/frame_001.png").unlink()
     (tmp_path / "images/frame_002.png").unlink()
-    loaded = load_nerfstudio(tmp_path, holdout=2)
+    loaded = load_capture(tmp_path, holdout=2)
     assert loaded.names == ("frame_000", "frame_003", "frame_004")
     np.testing.assert_array_equal(loaded.frames, CAPTURE.frames[[0, 3, 4]])
     np.testing.assert_array_equal(loaded.held_out, [True, False, True])
@@ -79,7 +79,7 @@ def test_missing_images_are_said_and_left_out(tmp_path):
     for name in loaded.names:
         (tmp_path / f"images/{name}.png").unlink()
     with refused("transforms.json", "none of which"):
-        load_nerfstudio(tmp_path)
+        load_capture(tmp_path)
 
 
 def test_applied_transform_and_scale_are_undone(tmp_path):
@@ -103,14 +103,14 @@ def test_depth_maps(tmp_path):
     loaded = load_changed(tmp_path, change)
     np.testing.assert_allclose(loaded.depths[1], counts / 500, rtol=1e-6)
     assert not loaded.depths[[0, 2, 3, 4]].any()
-    small = load_nerfstudio(tmp_path, downscale=2).depths[1]
+    small = load_capture(tmp_path, downscale=2).depths[1]
     assert np.isin(small, loaded.depths[1]).all()
     assert cv2.imwrite(str(tmp_path / "d.png"), counts.T)
     with refused("d.png", "16x24"):
-        load_nerfstudio(tmp_path)
+        load_capture(tmp_path)
     (tmp_path / "d.png").unlink()
     with refused("d.png", "no such depth map"):
-        load_nerfstudio(tmp_path)
+        load_capture(tmp_path)
 
 
 def test_points_from_a_ply(tmp_path):
@@ -214,10 +214,10 @@ def test_no_focal_length(tmp_path):
 def test_not_json(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(CAPTURE))[:-9])
     with refused("transforms.json", "no JSON"):
-        load_nerfstudio(tmp_path)
+        load_capture(tmp_path)
     (tmp_path / "transforms.json").write_text("[1]")
     with refused("transforms.json", "JSON without keys"):
-        load_nerfstudio(tmp_path)
+        load_capture(tmp_path)
 
 
 def test_rounded_rotations_are_made_exact(tmp_path):
@@ -233,13 +233,13 @@ def test_content_is_only_read(tmp_path):
     content = transforms(CAPTURE)
     before = copy.deepcopy(content)
     write_transforms(CAPTURE, tmp_path, content)
-    load_nerfstudio(tmp_path / "transforms.json")
+    load_capture(tmp_path / "transforms.json")
     assert json.loads((tmp_path / "transforms.json").read_text()) == before
 
 
 def test_fox(shared):
     """67 entries, 17 of which have no image; matches between two views meet in front of both, within a pixel."""
-    loaded = load_nerfstudio(shared / "captures/fox", downscale=2)
+    loaded = load_capture(shared / "captures/fox", downscale=2)
     assert loaded.frames.shape == (50, 960, 540, 3)
     assert "17 of 67" in loaded.notes[0]
     assert loaded.held_out.sum() == 7

@@ -9,6 +9,8 @@ from hypothesis.extra import numpy as hnp
 
 from jsecon.numerics import cosine, cosine_matrix, finite, normalize, safe_norm, sigmoid
 
+pytestmark = pytest.mark.as_shipped
+
 vectors = hnp.arrays(np.float32, (3,), elements=st.floats(-(2.0**126), 2.0**126, width=32))
 
 

@@ -5,7 +5,7 @@ import pytest
 from onnx_files import node, write_graph
 
 from jsecon.errors import InputError
-from jsecon.vision.onnx_graph import Graph, Tensor, content_digest, describe, graph_files
+from jsecon.networks.onnx_graph import Graph, Tensor, content_digest, describe, graph_files
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from sklearn.cluster import DBSCAN
 
-from jsecon.query.clusters import dbscan, one_component
-from jsecon.query.outliers import default_eps, remove_outliers
+from jsecon.query.outliers import dbscan, default_eps, one_component, remove_outliers
 
 
 def crowd(rng, count, blobs):
@@ -63,7 +62,7 @@ def test_strays_at_the_end_of_the_world_cost_nothing():
     points = np.random.default_rng(0).normal(size=(200, 3))
     far = np.concatenate([points, [[1e12, -1e12, 1e12]], [[-1e25, 0, 0]]])
     near = dbscan(points, 0.5, 4)
-    assert near.max() >= 0
+    assert near.max() >= 0 > near.min()  # a cluster, and strays
     np.testing.assert_array_equal(dbscan(far, 0.5, 4), [*near, -1, -1])
 
 
@@ -126,7 +125,8 @@ def test_points_on_top_of_each_other():
     same = np.zeros((50, 3))
     assert remove_outliers(same, np.ones(50, bool)).all()
     mostly = np.concatenate([same, np.random.default_rng(0).normal(size=(20, 3))])
-    assert default_eps(mostly) > 0
+    spread = default_eps(mostly[50:])
+    assert 0 < default_eps(mostly) <= spread
     assert remove_outliers(mostly, np.ones(70, bool))[:50].all()
 
 
@@ -137,9 +137,9 @@ def test_half_a_million_points_in_seconds():
     points[:200_000] = 0.3 * points[:200_000] + [3, 0, 0]
     points[200_000:250_000] = 0.02 * points[200_000:250_000] - [3, 0, 0]  # thousands of neighbours each
     points[:2_000] = rng.uniform(-30, 30, (2_000, 3))
-    start = time.perf_counter()
+    start = time.process_time()
     kept = remove_outliers(points, np.ones(500_000, bool))
-    assert time.perf_counter() - start < 30  # about 4 s; scikit-learn runs out of memory on the dense ball's lists
+    assert time.process_time() - start < 15  # about 2 s; scikit-learn runs out of memory on the dense ball's lists
     assert kept[250_000:].all()
     assert not kept[:250_000].any()
 

@@ -1,4 +1,4 @@
-"""How far regions overlap, which of them are pieces of one thing, and what a text selects then."""
+"""Which regions are pieces of one thing, and what a text selects then."""
 
 import dataclasses
 
@@ -9,61 +9,9 @@ import pytest
 from small_field import make_field, shares
 
 from jsecon.query.anchored import query_anchored
-from jsecon.query.pieces import is_piece, with_overlap
+from jsecon.query.retrieval import is_piece
 from jsecon.query.several import query_several
-from jsecon.types import Regions, Votes
-
-
-def cast(count: int, regions: int = 6, seed: int = 0, shown: bool = True) -> Votes:
-    """Random votes of `count` Gaussians on their 4 strongest of some regions, the last of which nobody votes for."""
-    rng = np.random.default_rng(seed)
-    ids = np.argsort(rng.random((count, regions - 1)), 1)[:, :4].astype(np.int32)
-    ids[rng.random(ids.shape) < 0.3] = -1
-    weights = np.where(ids >= 0, rng.random(ids.shape), 0).astype(np.float32)
-    total = (weights.sum(1) + rng.random(count)).astype(np.float32)
-    seen = np.where(ids >= 0, rng.random(ids.shape) * 2, 0).astype(np.float32) if shown else None
-    return Votes(ids, weights, weights.sum(1), total, total, np.ones(count, np.int32), 0, regions, shown=seen)
-
-
-def expected(votes: Votes) -> np.ndarray:
-    """(R, R) in float64, from the definition."""
-    share = np.zeros((len(votes.total), votes.num_regions))
-    seen = np.broadcast_to(votes.total[:, None], votes.regions.shape) if votes.shown is None else votes.shown
-    for n, k in zip(*np.nonzero((votes.regions >= 0) & (seen > 0) & np.isfinite(votes.weights) & np.isfinite(seen))):
-        share[n, votes.regions[n, k]] = min(float(votes.weights[n, k]) / float(seen[n, k]), 1.0)
-    both = np.stack([np.minimum(share, share[:, [r]]).sum(0) for r in range(votes.num_regions)])
-    either = np.stack([np.maximum(share, share[:, [r]]).sum(0) for r in range(votes.num_regions)])
-    return np.divide(both, either, out=np.zeros_like(both), where=either > 0)
-
-
-@pytest.mark.parametrize(("count", "shown"), [(1, True), (200, False), (40_000, True)])
-def test_overlap_is_the_stated_sum(count, shown):
-    votes = cast(count, shown=shown)
-    found = np.asarray(with_overlap(votes).overlap)
-    np.testing.assert_allclose(found, expected(votes), rtol=2e-5, atol=1e-6)
-    np.testing.assert_array_equal(found, found.T)
-    assert found[5].max() == 0
-    assert found.max() <= 1
-
-
-def test_overlap_without_gaussians_or_regions_and_with_numbers_that_are_not_finite():
-    assert not np.asarray(with_overlap(cast(0)).overlap).any()
-    none = dataclasses.replace(
-        cast(5), regions=np.full((5, 1), -1), weights=np.zeros((5, 1)), num_regions=0, shown=None
-    )
-    assert with_overlap(none).overlap.shape == (0, 0)
-    votes = cast(300)
-    votes.weights[:50, 0], votes.shown[50:60, 1] = np.nan, np.inf
-    np.testing.assert_allclose(with_overlap(votes).overlap, expected(votes), rtol=2e-5, atol=1e-6)
-    huge = dataclasses.replace(votes, weights=votes.weights * 1e30, shown=votes.shown * 1e30)
-    np.testing.assert_allclose(with_overlap(huge).overlap, with_overlap(votes).overlap, rtol=1e-5)
-
-
-def test_overlap_under_jit_is_eager_and_under_vmap_a_loop():
-    several = [with_overlap(cast(100, seed=seed)) for seed in range(3)]
-    stacked = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *(cast(100, seed=s) for s in range(3)))
-    traced = jax.jit(jax.vmap(with_overlap))(stacked)
-    np.testing.assert_allclose(traced.overlap, np.stack([v.overlap for v in several]), rtol=1e-6)
+from jsecon.types import Regions
 
 
 def test_a_piece_is_near_the_text_and_shares_gaussians_with_what_was_chosen():

@@ -1,21 +1,15 @@
 """Plans of frozen geometry, and one view spread over several devices: the same image and the same gradients."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SOON_READY
 
 from jsecon.parallel import host_mesh
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.reference import project_reference, weights_reference
 from jsecon.splat.render import render, render_depth
 from jsecon.splat.walk import _exp2, running
-
-CAPACITY = 1024
-soon = functools.partial(jax.jit, compiler_options=SOON_READY)
 
 
 def features_of(count: int, channels: int) -> jax.Array:
@@ -33,31 +27,29 @@ def test_a_planned_render_is_a_render(scene, camera, channels):
     np.testing.assert_allclose(got.alpha, expected.alpha, atol=1e-6)
 
     loss = lambda features, draw: (draw(features).features ** 2).sum()
-    by_plan = soon(jax.grad(lambda f: loss(f, lambda f: render_plan(plan, f))))(features)
-    whole = soon(jax.grad(lambda f: loss(f, lambda f: render(scene, camera, f, capacity=CAPACITY))))(features)
+    by_plan = jax.jit(jax.grad(lambda f: loss(f, lambda f: render_plan(plan, f))))(features)
+    whole = jax.jit(jax.grad(lambda f: loss(f, lambda f: render(scene, camera, f))))(features)
     np.testing.assert_allclose(by_plan, whole, rtol=1e-4, atol=1e-4)
 
 
 def test_plans_are_stacked_and_differentiated_through(scene, cameras):
     features = features_of(scene.count, 3)
-    plans = soon(jax.vmap(lambda camera: plan_view(scene, camera, capacity=CAPACITY)))(cameras)
-    images = soon(jax.vmap(lambda plan: render_plan(plan, features).features))(plans)
+    plans = jax.jit(jax.vmap(lambda camera: plan_view(scene, camera)))(cameras)
+    images = jax.jit(jax.vmap(lambda plan: render_plan(plan, features).features))(plans)
     for t in range(4):
         np.testing.assert_allclose(images[t], render(scene, cameras[t], features).features, atol=1e-5)
 
     def through_plan(gaussians):
-        return (render_plan(plan_view(gaussians, cameras[0], capacity=CAPACITY), features).features ** 2).sum()
+        return (render_plan(plan_view(gaussians, cameras[0]), features).features ** 2).sum()
 
     def directly(gaussians):
-        return (render(gaussians, cameras[0], features, capacity=CAPACITY).features ** 2).sum()
+        return (render(gaussians, cameras[0], features).features ** 2).sum()
 
-    got, expected = soon(jax.grad(through_plan))(scene), soon(jax.grad(directly))(scene)
+    got, expected = jax.jit(jax.grad(through_plan))(scene), jax.jit(jax.grad(directly))(scene)
     np.testing.assert_allclose(got.means, expected.means, rtol=1e-4, atol=1e-5)
 
 
 def test_a_plan_says_what_it_lacks(scene, camera):
-    with pytest.raises(ValueError, match="capacity"):
-        soon(lambda g: plan_view(g, camera))(scene)
     with pytest.raises(ValueError, match="one row"):
         render_plan(plan_view(scene, camera), features_of(scene.count + 1, 3))
     assert int(plan_view(scene, camera, capacity=32).overflow) > 0
@@ -70,20 +62,20 @@ def test_several_devices_give_what_one_gives(scene, camera, channels):
     assert mesh.size == 2
     features = features_of(scene.count, channels)
 
-    # As it ships, to the last bit; the gradients, which add up over the devices, to rounding.
-    one, two = (render(scene, camera, features, capacity=CAPACITY, mesh=each) for each in (None, mesh))
+    # To the last bit; the gradients, which add up over the devices, to rounding.
+    one, two = (render(scene, camera, features, mesh=each) for each in (None, mesh))
     np.testing.assert_array_equal(one.features, two.features)
     np.testing.assert_array_equal(one.alpha, two.alpha)
 
     def loss(gaussians, features, mesh):
-        rendering = render(gaussians, camera, features, capacity=CAPACITY, mesh=mesh)
+        rendering = render(gaussians, camera, features, mesh=mesh)
         return (rendering.features**2).sum() + rendering.alpha.sum()
 
-    gradients = soon(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
+    gradients = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
     by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
     for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-    alone = lambda mesh: soon(jax.grad(lambda f: loss(scene, f, mesh)))(features)
+    alone = lambda mesh: jax.jit(jax.grad(lambda f: loss(scene, f, mesh)))(features)
     np.testing.assert_allclose(alone(None), alone(mesh), rtol=1e-4, atol=1e-4)
     # and mixed with arrays of one device afterwards
     assert float(jnp.abs(two.features - one.features).max()) == 0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from capture_files import refused
 
+from experiments.datasets.mesh_files import read_faces, write_mesh
 from jsecon.data.ply import SH_DC, load_ply, load_points_ply, save_ply
-from jsecon.data.ply_file import read_faces, write_mesh
 from jsecon.errors import InputError
 from jsecon.types import Gaussians
 
@@ -124,7 +124,7 @@ def test_colours_instead_of_harmonics(tmp_path):
     np.testing.assert_allclose(0.5 + 0.28209479177387814 * loaded.sh[:, 0], rgb, atol=1e-6)
     np.testing.assert_allclose(SH_DC, 0.28209479177387814)
     np.testing.assert_array_equal(loaded.means, gaussians.means)
-    with pytest.raises(ValueError, match="Give one colour a Gaussian"):
+    with pytest.raises(ValueError, match="Give one colour per Gaussian"):
         save_ply(tmp_path / "a.ply", gaussians, rgb=rgb[:49])
 
 

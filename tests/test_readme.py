@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from jsecon import grammar
+from jsecon.app import command_line
 
 HOME = Path(__file__).resolve().parent.parent
 README = (HOME / "README.md").read_text()
@@ -43,12 +43,14 @@ def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, mon
 
 def test_every_command_line_is_one_that_the_program_takes():
     lines = [line for block in _blocks("bash") for line in block.splitlines() if line.startswith("jsecon")]
-    lines += [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", grammar.EPILOG, re.MULTILINE)]
+    lines += [
+        line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", command_line.EPILOG, re.MULTILINE)
+    ]
     assert len(lines) >= 10
     for line in lines:
         with contextlib.redirect_stderr(io.StringIO()) as told:
             try:
-                grammar.parser().parse_args(shlex.split(line)[1:])
+                command_line.parser().parse_args(shlex.split(line)[1:])
             except SystemExit:
                 pytest.fail(f"{line}: {told.getvalue()}")
 
@@ -71,24 +73,15 @@ def test_the_ci_runs_exactly_the_second_command():
     assert os.access(HOME / ".ci" / "run", os.X_OK)
 
 
-def test_the_experiments_named_are_there_and_all_are_named():
-    text = (HOME / "experiments" / "README.md").read_text()
-    named = set(re.findall(r"`(\w+\.py)`", text))
-    named |= {f"{name}.py" for name in re.findall(r"`python -m experiments\.(\w+)", text)}
-    there = {
-        path.name for path in (HOME / "experiments").glob("*.py") if path.name not in ("__init__.py", "results.py")
-    }
-    assert named == there
-
-
 def test_the_package_says_what_it_needs():
     project = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
     needs = {re.split(r"[<>=\[]", line)[0] for line in project["dependencies"]}
     tree = " ".join(path.read_text() for path in (HOME / "jsecon").rglob("*.py"))
     used = {name for name in re.findall(r"^\s*(?:import|from) (\w+)", tree, re.MULTILINE)}
-    homes = {"cv2": "opencv-contrib-python-headless", "sklearn": "scikit-learn"}
+    homes = {"cv2": "opencv-contrib-python-headless", "sklearn": "scikit-learn", "PIL": "pillow"}
     outside = {homes.get(name, name) for name in used} & {
         "jax", "optax", "flax", "numpy", "scipy", "scikit-learn", "onnxruntime", "opencv-contrib-python-headless",
-        "jaxtyping", "tqdm", "matplotlib", "beartype", "PIL", "torch", "pandas",
+        "jaxtyping", "tqdm", "matplotlib", "beartype", "torch", "pandas", "pillow",
+        "tokenizers", "ftfy",
     }  # fmt: skip
     assert outside <= needs, f"imported but not required: {sorted(outside - needs)}"

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon import pictures, report
-from jsecon.plan import Step
+from jsecon.app import pictures, report
+from jsecon.app.progress import Step
 
 
 class _Reader(HTMLParser):
@@ -44,7 +44,7 @@ def page():
             report.section(
                 "Frames", "words", report.grid([report.figure(_image(), "<b>x</b>", strong="IoU 0.5", sharp=True)], 2)
             ),
-            report.section("Plan", "", report.plan([Step("photometric fit", "left out", "a .ply is given")])),
+            report.section("Plan", "", report.steps([Step("photometric fit", "left out", "a .ply is given")])),
             report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0})),
             report.table(["a", "b"], [[1, "<script>"]]),
             report.preformatted("{}"),

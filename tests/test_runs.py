@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
-from jsecon.vision.runs import remembered, runs_of_masks, runs_of_rows
+from jsecon.association.runs import remembered, runs_of_masks, runs_of_rows
 
 
 @settings(deadline=None, max_examples=40)

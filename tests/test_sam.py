@@ -9,12 +9,10 @@ from sam_files import IOUS, write_decoder, write_encoder, write_sam
 from scipy import ndimage
 
 from jsecon.errors import InputError
-from jsecon.vision.mask_nms import langsplat_nms
+from jsecon.networks.sam.graphs import SamFiles, SamGraphs, find_sam
+from jsecon.networks.sam.masks import box_nms, box_of, crops_of, cut_by_crop, langsplat_nms, point_grid
+from jsecon.networks.sam.segmenter import TOKENS, SamSegmenter, SamSettings
 from jsecon.vision.protocols import Segmenter
-from jsecon.vision.sam import TOKENS, SamSegmenter, SamSettings
-from jsecon.vision.sam_graphs import SamFiles, SamGraphs, find_sam
-from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop
-from jsecon.vision.sam_prompts import crops_of, point_grid
 
 KINDS = [
     ("segment-anything", 1),
@@ -46,7 +44,8 @@ def segmenter(folders):
 
 
 def by_definition(folder, frame, token_of_level, side=8):
-    """The generator of REFERENCE B.1, one point a call, without any packing: masks and scores of one level."""
+    """SAM's automatic mask generator with LangSplat's levels, one point a call, without any packing: masks and scores
+    of one level."""
     graphs = SamGraphs(find_sam(folder), batch=1, threads=1)
     height, width = frame.shape[:2]
     found = []

@@ -8,15 +8,15 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from sam2_files import CHANNELS, GRID, LOW, MEMORY, SIZE, SLOTS, write_sam2
 
 from jsecon.errors import InputError
-from jsecon.vision.onnx_graph import Graph
+from jsecon.networks.onnx_graph import Graph
+from jsecon.networks.sam2.graphs import open_sam2
+from jsecon.networks.sam2.heads import Prompt, fill_holes
+from jsecon.networks.sam2.tracker import Sam2Tracker, at_size, follow
 from jsecon.vision.protocols import Tracker
-from jsecon.vision.resample import resample
-from jsecon.vision.sam2 import Sam2Tracker, at_size, follow, strongest
-from jsecon.vision.sam2_graphs import open_sam2
-from jsecon.vision.sam2_heads import Prompt, box_prompt, fill_holes
 
 HEIGHT, WIDTH = 20, 28
 TOLERANCE = 0.01
@@ -41,7 +41,7 @@ def a_mask(left, top, right, bottom):
 
 
 class Twin:
-    """The official predictor's procedure (REFERENCE G.2), one object at a time; nothing is ever dropped."""
+    """The official predictor's procedure, one object at a time; nothing is ever dropped."""
 
     def __init__(self, folder, frames):
         self.graphs = {path.name.removesuffix("_small.onnx"): Graph(path) for path in folder.glob("*.onnx")}
@@ -49,7 +49,7 @@ class Twin:
         self.frames, self.outputs = frames, {}
 
     def encode(self, t):
-        image = resample(self.frames[t], (SIZE, SIZE), kernel="bicubic") / 255.0
+        image = np.asarray(Image.fromarray(self.frames[t]).resize((SIZE, SIZE), Image.Resampling.BICUBIC)) / 255.0
         image = (image - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
         return self.graphs["image_encoder"].run({"input_image": np.moveaxis(image, 2, 0)[None].astype(np.float32)})
 
@@ -91,8 +91,10 @@ class Twin:
             image = image + self.constants["no_mem_embed"].reshape(1, -1, 1, 1)
             mask, pointer, score = self.decode(found, image, points, prompt.labels, multimask=len(points) == 1)
         else:
-            whole = resample(prompt.mask.astype(np.float32), (SIZE, SIZE)) >= 0.5
-            mask = resample(np.where(whole, 10, -10).astype(np.float32), (LOW, LOW))
+            whole = Image.fromarray(prompt.mask.astype(np.float32)).resize((SIZE, SIZE), Image.Resampling.BILINEAR)
+            whole = np.asarray(whole) >= 0.5
+            square = Image.fromarray(np.where(whole, 10, -10).astype(np.float32))
+            mask = np.asarray(square.resize((LOW, LOW), Image.Resampling.BILINEAR))
             hint = np.zeros((1, LOW, LOW), np.float32)
             for i in range(LOW):
                 for j in range(LOW):
@@ -169,7 +171,7 @@ def test_frames_forward_and_backward_equal_the_twin(folder):
     frames, start = a_clip(24), 9
     prompts = [
         [Prompt(start, a_mask(3, 4, 15, 13)), Prompt(17, a_mask(8, 2, 20, 11))],
-        [box_prompt(start, a_mask(12, 6, 25, 18))],
+        [Prompt(start, points=np.array([[12, 6], [25, 18]], np.float32), labels=np.array([2, 3], np.int32))],
         [Prompt(start, points=np.array([[6.0, 9.0]], np.float32), labels=np.array([1], np.int32))],
         [Prompt(12, a_mask(2, 2, 9, 9))],
     ]
@@ -220,7 +222,7 @@ def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(tmp_path):
     other = write_sam2(tmp_path / "other", seed=5)
     tracker = Sam2Tracker(one)
     assert tracker.name == Sam2Tracker(same).name
-    assert len({tracker.name, Sam2Tracker(other).name, Sam2Tracker(one, box=True).name}) == 3
+    assert len({tracker.name, Sam2Tracker(other).name, Sam2Tracker(one, hole_area=0).name}) == 3
     frames, prompts = a_clip(3), a_mask(3, 4, 15, 13)[None]
     before = tracker(frames, 1, prompts)
     tracker.close()
@@ -229,16 +231,6 @@ def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(tmp_path):
     (one / "mlp_small.onnx").write_bytes((one / "mask_decoder_small.onnx").read_bytes())
     with pytest.raises(InputError, match="mlp_small"):
         tracker.check()
-
-
-def test_box_prompts_are_the_masks_boxes(folder):
-    frames, mask = a_clip(3), a_mask(10, 6, 25, 18)
-    labels = Sam2Tracker(folder, box=True, hole_area=0)(frames, 1, mask[None])
-    own = Prompt(1, points=np.array([[10, 6], [25, 18]], np.float32), labels=np.array([2, 3], np.int32))
-    for t, logits in follow(open_sam2(folder), frames, [[own]], hole_area=0):
-        np.testing.assert_array_equal(labels[t], strongest(logits, (HEIGHT, WIDTH)))
-    with pytest.raises(ValueError, match="empty"):
-        box_prompt(0, np.zeros((3, 3), bool))
 
 
 def test_a_thousand_frames_hold_no_more_than_a_hundred(folder, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.vision.sam2_bank import (
+from jsecon.networks.sam2.bank import (
     POINTERS,
     Bank,
     Memory,

@@ -5,8 +5,18 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from scipy import ndimage
 
-from jsecon.vision.sam_masks import box_nms, box_of, cut_by_crop, stability, tidied
-from jsecon.vision.sam_prompts import Crop
+from jsecon.networks.sam.masks import (
+    Crop,
+    box_nms,
+    box_of,
+    crops_of,
+    cut_by_crop,
+    langsplat_nms,
+    point_grid,
+    shared_areas,
+    stability,
+    tidied,
+)
 
 
 def test_stability_is_the_iou_of_two_thresholds():
@@ -81,3 +91,101 @@ def test_small_holes_are_filled_then_small_islands_removed(seed, least, density)
     np.testing.assert_array_equal(clean, expected)
     assert changed >= (expected != mask).any()
     assert clean.any() == expected.any()
+
+
+def by_definition(masks, scores, iou_threshold=0.8, score_threshold=0.7, inner_threshold=0.5):
+    """LangSplat's mask_nms (preprocess.py), two loops over the masks in order of score and two triangles of a
+    matrix."""
+    order = np.argsort(-scores, kind="stable")
+    count = len(order)
+    iou, inner = np.zeros((count, count)), np.zeros((count, count))
+    for i in range(count):
+        for j in range(i, count):
+            a, b = masks[order[i]], masks[order[j]]
+            common = (a & b).sum()
+            iou[i, j] = common / (a | b).sum()
+            of_a, of_b = common / a.sum(), common / b.sum()
+            if of_a < 0.5 and of_b >= 0.85:
+                inner[i, j] = 1 - of_b * of_a
+            if of_a >= 0.85 and of_b < 0.5:
+                inner[j, i] = 1 - of_b * of_a
+    kept = np.triu(iou, 1).max(0) <= iou_threshold
+    kept &= scores[order] > score_threshold
+    kept &= np.triu(inner, 1).max(0) <= 1 - inner_threshold
+    kept &= np.tril(inner, 1).max(0) <= 1 - inner_threshold
+    return order[kept]
+
+
+def blobs(rng, count, height=24, width=30):
+    """Boxes of all sizes, so that many are alike, inside of one another, or apart."""
+    masks = np.zeros((count, height, width), bool)
+    for mask in masks:
+        y, x = rng.integers(0, height - 1), rng.integers(0, width - 1)
+        mask[y : y + rng.integers(1, height), x : x + rng.integers(1, width)] = True
+        mask &= rng.random(mask.shape) < rng.choice([1.0, 0.95, 0.6])
+        mask[y, x] = True
+    return masks
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40))
+def test_the_kept_set_is_that_of_the_definition(seed, count):
+    rng = np.random.default_rng(seed)
+    masks, scores = blobs(rng, count), rng.choice([0.6, 0.7, 0.75, 0.8, 0.9, 0.99], count)
+    masks[rng.integers(0, count)] = masks[0]
+    np.testing.assert_array_equal(langsplat_nms(masks, scores), by_definition(masks, scores))
+    loose = {"iou_threshold": 0.5, "score_threshold": 0.0, "inner_threshold": 0.2}
+    np.testing.assert_array_equal(langsplat_nms(masks, scores, **loose), by_definition(masks, scores, **loose))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 80))
+def test_shared_areas_are_exact(seed, count):
+    masks = blobs(np.random.default_rng(seed), count)
+    flat = masks.reshape(count, 24 * 30).astype(np.int64)
+    np.testing.assert_array_equal(shared_areas(masks), flat @ flat.T)
+
+
+def test_empty_masks_are_dropped_and_no_masks_stay_none():
+    masks = np.zeros((2, 4, 5), bool)
+    masks[1, 1:3, 1:3] = True
+    assert langsplat_nms(masks, np.asarray([0.9, 0.8])).tolist() == [1]
+    assert langsplat_nms(masks[:0], np.zeros(0)).tolist() == []
+    with pytest.raises(ValueError, match="One score per mask"):
+        langsplat_nms(masks, np.zeros(3))
+
+
+def test_the_grid_has_the_centres_of_its_cells_and_x_runs_fastest():
+    np.testing.assert_allclose(point_grid(2), [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+    assert point_grid(32).shape == (1024, 2)
+    np.testing.assert_allclose(point_grid(32)[:2, 0], [1 / 64, 3 / 64])
+    with pytest.raises(ValueError, match="at least 1"):
+        point_grid(0)
+
+
+def test_crops_are_those_of_the_automatic_mask_generator():
+    """1500 x 1000, by hand: overlap int(512/1500 * 1000 * 2/2) = 341; lengths are half of 341 + 1500 and 341 + 1000."""
+    assert crops_of(1000, 1500, 1, 512 / 1500) == [
+        Crop(0, 0, 1500, 1000, 0),
+        Crop(0, 0, 921, 671, 1),
+        Crop(0, 330, 921, 1000, 1),
+        Crop(580, 0, 1500, 671, 1),
+        Crop(580, 330, 1500, 1000, 1),
+    ]
+    assert crops_of(1000, 1500, 0, 512 / 1500) == [Crop(0, 0, 1500, 1000, 0)]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(8, 300), st.integers(8, 300), st.integers(0, 2))
+def test_the_crops_of_each_layer_cover_the_frame(height, width, layers):
+    crops = crops_of(height, width, layers, 512 / 1500)
+    assert len(crops) == sum(4**k for k in range(layers + 1))
+    for layer in range(layers + 1):
+        seen = np.zeros((height, width), bool)
+        for crop in crops:
+            if crop.layer == layer:
+                assert 0 <= crop.left < crop.right <= width
+                assert 0 <= crop.top < crop.bottom <= height
+                assert crop.area == (crop.right - crop.left) * (crop.bottom - crop.top)
+                seen[crop.top : crop.bottom, crop.left : crop.right] = True
+        assert seen.all()

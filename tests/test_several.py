@@ -1,19 +1,18 @@
-"""Several regions, composite questions and the probability of belonging: against NumPy and simulated votes."""
+"""Several regions and composite questions, against NumPy."""
 
 import dataclasses
 
 import jax
 import numpy as np
 import pytest
-from scipy.stats import beta
-from small_field import REGIONS, make_field, shares, unit_rows
+from small_field import make_field, shares, unit_rows
 
-from jsecon.answer import ask_text, figures
+from jsecon.app.question import ask_text, write_answer
 from jsecon.errors import InputError
 from jsecon.query.anchored import query_anchored
-from jsecon.query.probability import CORRELATION, membership_probability
-from jsecon.query.several import parts_of_question, query_several, regions_of_text
-from jsecon.types import Regions, Votes
+from jsecon.query.retrieval import regions_of_text
+from jsecon.query.several import parts_of_question, query_several
+from jsecon.types import Regions
 
 
 @pytest.fixture(scope="module")
@@ -112,55 +111,16 @@ class Words:
         return np.stack([self.rows[text] for text in texts])
 
 
-def test_a_question_put_to_a_field(field):
+def test_a_question_put_to_a_field(field, tmp_path):
     words = Words(field.regions.embeddings)
     every = ask_text(field, words, "chair", several=True, outliers=False)
     np.testing.assert_array_equal(every.mask, shares(field, [0, 1]) >= 0.5)
     but = ask_text(field, words, "chair but not stool", outliers=False)
     np.testing.assert_array_equal(but.mask, shares(field, [0]) >= 0.5)
-    told = figures(field, but)
+    told = write_answer(field, but, tmp_path, {})
     assert 0.5 < told["probability"]["tenth"] <= told["probability"]["mean"] <= 1
     with pytest.raises(InputError, match="by votes"):
         ask_text(field, words, "chair but not stool", by="code")
-
-
-def votes_of(views, total):
-    count = len(views)
-    return Votes(
-        np.zeros((count, 1), np.int32),
-        np.ones((count, 1), np.float32),
-        total,
-        total,
-        total,
-        views,
-        np.int32(0),
-        REGIONS,
-    )
-
-
-def test_probability_equals_the_beta_distribution():
-    rng = np.random.default_rng(0)
-    share, views = rng.random(200).astype(np.float32), rng.integers(1, 60, 200).astype(np.int32)
-    total = (views * rng.uniform(0.01, 40, 200)).astype(np.float32)
-    looks = np.minimum(views, total.astype(np.float64))
-    looks = looks / (1 + np.maximum(looks - 1, 0) * CORRELATION)
-    expected = beta.sf(0.5, 1 + share * looks, 1 + (1 - share) * looks)
-    np.testing.assert_allclose(membership_probability(share, votes_of(views, total)), expected, atol=2e-5)
-    unknown = votes_of(np.array([0, 3], np.int32), np.float32([0, np.nan]))
-    np.testing.assert_array_equal(membership_probability(np.float32([1, 1]), unknown), 0)
-
-
-def test_probability_means_what_it_says():
-    """Gaussians whose true part is drawn evenly, seen in 1 to 12 independent views: p of those at p do."""
-    rng = np.random.default_rng(1)
-    true, views = rng.random(40_000), rng.integers(1, 13, 40_000).astype(np.int32)
-    share = (rng.binomial(views, true) / views).astype(np.float32)
-    got = np.asarray(membership_probability(share, votes_of(views, views * np.float32(9)), correlation=0.0))
-    bins = np.minimum((got * 10).astype(int), 9)
-    for b in range(10):
-        own = bins == b
-        if own.sum() > 300:
-            assert abs(got[own].mean() - (true[own] > 0.5).mean()) < 0.04
 
 
 def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field):

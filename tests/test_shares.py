@@ -1,56 +1,294 @@
+"""Votes made ready to be asked: which views show a region, how much of a Gaussian regions have, how far they overlap.
+
+`exact_share` and `exact_overlap` are the definitions, Gaussian by Gaussian in float64.
+"""
+
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.stats import beta
 
-from jsecon.query.shares import gather_votes
+from jsecon.language.shares import (
+    CORRELATION,
+    finish_votes,
+    membership_probability,
+    share_of,
+    vote_shares,
+    with_overlap,
+    with_shown,
+)
+from jsecon.types import Regions, Votes
+
+VIEWS, REGIONS, KEPT = 7, 6, 3
 
 
-def weight_inside(regions, weights, chosen):
-    return gather_votes(regions, weights, chosen).weight
+def cast(count, *, regions=REGIONS, seed=0):
+    """Votes of `count` Gaussians in 7 views on their 3 strongest of some regions; of these nobody votes for the last, 3
+    and 4 are alike, 2 has no embedding."""
+    rng = np.random.default_rng(seed)
+    by_view = rng.random((VIEWS, count), np.float32) * (rng.random((VIEWS, count)) < 0.8)
+    pixels = rng.integers(1, 50, (regions, VIEWS)) * (rng.random((regions, VIEWS)) < 0.5)
+    ids = np.argsort(rng.random((count, regions - 1)), 1)[:, :KEPT].astype(np.int32)
+    ids[rng.random(ids.shape) < 0.3] = -1
+    weights = np.where(ids >= 0, rng.random(ids.shape, np.float32), 0) * by_view.sum(0)[:, None] / KEPT
+    embeddings = np.eye(regions, regions + 2, dtype=np.float32)
+    embeddings[2], embeddings[4] = 0, embeddings[3]
+    views, peak = (by_view > 0).sum(0).astype(np.int32), by_view.max(0, initial=0)
+    votes = Votes(
+        ids, weights.astype(np.float32), weights.sum(1).astype(np.float32), by_view.sum(0), peak, views, np.int32(0),
+        regions, by_view,
+    )  # fmt: skip
+    return votes, Regions(embeddings, pixels)
 
 
-def exact(regions, weights, chosen):
-    inside = (regions >= 0) & (regions < len(chosen)) & np.append(chosen, False)[np.clip(regions, 0, len(chosen))]
-    return np.where(inside, weights.astype(np.float64), 0.0).sum(-1)
+def known_votes(count, *, shown=True, **options):
+    votes, regions = cast(count, **options)
+    return with_shown(votes, regions) if shown else dataclasses.replace(votes, by_view=None)
+
+
+def exact_shown(votes, regions):
+    shows = np.asarray(regions.pixels) > 0
+    shows[3] = shows[4] = shows[3] | shows[4]
+    of_region = np.stack([np.asarray(votes.by_view, np.float64)[row].sum(0) for row in shows], 1)
+    place = np.asarray(votes.regions)
+    return np.where(place >= 0, np.take_along_axis(of_region, np.maximum(place, 0), 1), 0.0)
+
+
+def exact_share(votes, chosen):
+    votes = jax.tree.map(np.asarray, votes)
+    share = np.zeros(len(votes.total))
+    for n in range(len(share)):
+        weight, seen = 0.0, 0.0
+        for k, region in enumerate(np.asarray(votes.regions[n])):
+            if 0 <= region < len(chosen) and chosen[region]:
+                weight += float(votes.weights[n, k])
+                seen = max(seen, float(votes.total[n] if votes.shown is None else votes.shown[n, k]))
+        share[n] = min(weight / seen, 1.0) if seen > 0 and votes.views[n] > 0 else 0.0
+    return share
+
+
+def exact_overlap(votes):
+    votes = jax.tree.map(np.asarray, votes)
+    seen = np.asarray(votes.total[:, None] if votes.shown is None else votes.shown, np.float64)
+    ratio = np.divide(votes.weights, seen, out=np.zeros(votes.regions.shape), where=seen > 0)
+    share = np.zeros((len(votes.total), votes.num_regions))
+    n, k = np.nonzero(votes.regions >= 0)
+    share[n, votes.regions[n, k]] = np.minimum(ratio[n, k], 1.0)
+    both = np.stack([np.minimum(share, share[:, [r]]).sum(0) for r in range(votes.num_regions)])
+    either = np.stack([np.maximum(share, share[:, [r]]).sum(0) for r in range(votes.num_regions)])
+    return np.divide(both, either, out=np.zeros_like(both), where=either > 0)
+
+
+@pytest.mark.parametrize("count", [1, 400])
+def test_shown_is_the_sum_over_the_views_that_show_the_region(count):
+    votes, regions = cast(count)
+    found = with_shown(votes, regions)
+    assert found.by_view is None
+    np.testing.assert_allclose(found.shown, exact_shown(votes, regions), rtol=1e-5, atol=1e-6)
+    assert (np.asarray(found.shown) <= np.asarray(votes.total)[:, None] * (1 + 1e-5)).all()
+
+
+def test_shown_under_jit_is_eager_and_without_gaussians_or_regions_empty():
+    votes, regions = cast(300)
+    traced = jax.jit(with_shown)(jax.tree.map(jnp.asarray, votes), jax.tree.map(jnp.asarray, regions))
+    np.testing.assert_allclose(traced.shown, with_shown(votes, regions).shown, rtol=1e-6)
+    assert with_shown(cast(0)[0], regions).shown.shape == (0, KEPT)
+    none = dataclasses.replace(votes, regions=np.full((300, 1), -1), weights=np.zeros((300, 1)), num_regions=0)
+    found = with_shown(none, Regions(np.zeros((0, 8)), np.zeros((0, VIEWS), int)))
+    assert not np.asarray(found.shown).any()
+
+
+def test_votes_without_views_or_of_other_views_are_refused():
+    votes, regions = cast(10)
+    with pytest.raises(ValueError, match=r"by_view=True"):
+        with_shown(with_shown(votes, regions), regions)
+    with pytest.raises(ValueError, match="same regions in the same views"):
+        with_shown(votes, dataclasses.replace(regions, pixels=regions.pixels[:, 1:]))
+
+
+def test_finished_votes_know_both():
+    votes, regions = cast(100)
+    found, shown = finish_votes(votes, regions), with_shown(votes, regions)
+    np.testing.assert_array_equal(found.shown, shown.shown)
+    np.testing.assert_array_equal(found.overlap, with_overlap(shown).overlap)
+
+
+@pytest.mark.parametrize(("count", "shown"), [(500, False), (400, True)])
+def test_share_is_the_definition_under_jit_and_vmap(count, shown):
+    votes = jax.tree.map(jnp.asarray, known_votes(count, shown=shown))
+    chosen = np.random.default_rng(1).random((3, REGIONS)) < 0.5
+    together = jax.jit(jax.vmap(share_of, in_axes=(None, 0)))(votes, chosen)
+    for n, one in enumerate(chosen):
+        alone = share_of(votes, one)
+        np.testing.assert_array_equal(alone.share, together.share[n])
+        np.testing.assert_array_equal(alone.known, np.asarray(alone.share) > 0)  # of random votes none is for nothing
+        np.testing.assert_allclose(alone.share, exact_share(votes, one), atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 256, 257, 1000])
-def test_equals_a_lookup_of_every_vote(count):
+def test_any_number_of_regions(count):
     rng = np.random.default_rng(count)
-    regions = rng.integers(-1, count + 2, (500, 5)).astype(np.int32)
-    weights = rng.random((500, 5)).astype(np.float32)
-    chosen = rng.random((3, count)) < 0.3
-    got = jax.jit(jax.vmap(weight_inside, in_axes=(None, None, 0)))(regions, weights, chosen)
-    for row, one in zip(got, chosen):
-        np.testing.assert_allclose(row, exact(regions, weights, one), rtol=1e-6)
-        np.testing.assert_allclose(weight_inside(*map(jnp.asarray, (regions, weights, one))), row, rtol=1e-6)
+    ids, weights = rng.integers(-1, count + 2, (500, 5)).astype(np.int32), rng.random((500, 5), np.float32)
+    some = cast(500)[0]
+    votes = dataclasses.replace(some, regions=ids, weights=weights, by_view=None, num_regions=count)
+    for chosen in (rng.random(count) < 0.3, np.zeros(count, bool), np.ones(count, bool)):
+        np.testing.assert_allclose(share_of(votes, chosen).share, exact_share(votes, chosen), rtol=1e-6)
 
 
-@pytest.mark.parametrize("count", [16385, 32769, 40000, 100000])
-def test_many_gaussians(count):
+def test_jit_is_eager():
+    votes = known_votes(300)
+    for chosen in (np.arange(REGIONS) < 3, np.zeros(REGIONS, bool)):
+        compiled = share_of(votes, chosen), vote_shares(votes), with_overlap(votes).overlap
+        with jax.disable_jit():
+            eager = share_of(votes, chosen), vote_shares(votes), with_overlap(votes).overlap
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), compiled, eager)
+
+
+def test_numbers_that_are_not_finite_are_not_known_where_they_are_asked_for():
+    votes = Votes(
+        np.int32([[0, 1], [1, 0], [-1, 5], [1, 1], [0, -1]]),
+        np.float32([[1e30, np.nan], [np.inf, 2], [3, 4], [1e-30, 0], [1, 0]]),
+        *np.float32([[1] * 5, [1e30, 4, 1, 1e-30, np.nan], [1] * 5]), np.ones(5, np.int32), np.int32(0), 2,
+    )  # fmt: skip
+    first, second = (share_of(votes, np.arange(2) == r) for r in range(2))
+    np.testing.assert_array_equal(first.share, np.float32([1, 0.5, 0, 0, 0]))  # what is not chosen does not spread
+    np.testing.assert_array_equal(first.known, [True, True, False, False, False])
+    np.testing.assert_array_equal(second.share, np.float32([0, 0, 0, 1, 0]))
+    np.testing.assert_array_equal(second.known, [False, False, False, True, False])
+    np.testing.assert_array_equal(vote_shares(votes)[:2], np.float32([[1, np.nan], [np.nan, 0.5]]))
+    unseen = dataclasses.replace(votes, views=np.zeros(5, np.int32))
+    assert not np.asarray(share_of(unseen, np.ones(2, bool)).known).any()
+    none = dataclasses.replace(votes, regions=np.zeros((5, 0), np.int32), weights=np.zeros((5, 0), np.float32))
+    assert not np.asarray(share_of(none, np.ones(2, bool)).share).any()
+
+
+COUNT, MANY = 3, 40
+_rows = lambda numbers: arrays(np.float32, (COUNT, KEPT), elements=numbers)
+_numbers = st.just(0.0) | st.floats(2.0**-80, 2.0**80, width=32)
+
+
+@st.composite
+def votes_and_regions(draw):
+    """Finite votes, of regions that views show as they like, and two sets of regions, one in the other. All are of one
+    size and share their compiled programs."""
+    ids = np.int32([draw(st.permutations(range(-KEPT, MANY)))[:KEPT] for _ in range(COUNT)]).clip(-1)
+    weights, total = np.where(ids >= 0, draw(_rows(_numbers)), 0), draw(_rows(_numbers)).max(1)
+    views = draw(arrays(np.int32, COUNT, elements=st.integers(0, 3)))
+    shown = draw(_rows(_numbers))
+    votes = Votes(ids, weights, weights.sum(1), total, total, views, np.int32(0), MANY, shown=shown)
+    more = draw(arrays(bool, MANY))
+    return votes, more & draw(arrays(bool, MANY)), more
+
+
+@settings(deadline=None)
+@given(votes_and_regions())
+def test_laws_of_the_share(drawn):
+    votes, fewer, more = drawn
+    share, known = (np.asarray(a) for a in share_of(votes, fewer))
+    assert ((share >= 0) & (share <= 1)).all()
+    voted = (votes.regions >= 0) & fewer[votes.regions] & (votes.shown > 0)
+    np.testing.assert_array_equal(known, (votes.views > 0) & voted.any(1))
+    assert not share[~known].any()
+    # Where one region is shown the others are: then more of them never have less of a Gaussian.
+    together = dataclasses.replace(votes, shown=None)
+    assert (np.asarray(share_of(together, fewer).share) <= np.asarray(share_of(together, more).share)).all()
+    # Two sets have together at most what each has alone, where a region has no weight in views that do not show it.
+    shown = dataclasses.replace(votes, shown=np.maximum(votes.shown, votes.weights))
+    both, one, other = (np.asarray(share_of(shown, chosen).share) for chosen in (more, fewer, more & ~fewer))
+    assert (both <= (one + other) * (1 + 1e-5)).all()
+    # One region alone has the share of its vote.
+    alone = np.asarray(jax.vmap(share_of, (None, 0))(votes, np.eye(MANY, dtype=bool)).share)
+    own = np.where((votes.regions >= 0) & (votes.views > 0)[:, None], vote_shares(votes), 0)
+    np.testing.assert_array_equal(alone[votes.regions, np.arange(COUNT)[:, None]] * (votes.regions >= 0), own)
+    # Neither the unit of the weights, nor the order of the votes, nor the regions' numbers mean anything.
+    scaled = {name: getattr(votes, name) * np.float32(2**-20) for name in ("weights", "total", "shown")}
+    np.testing.assert_allclose(
+        share_of(dataclasses.replace(votes, **scaled), fewer).share, share, rtol=1e-6, atol=1e-30
+    )
+    turned = {name: getattr(votes, name)[:, ::-1] for name in ("regions", "weights", "shown")}
+    np.testing.assert_allclose(share_of(dataclasses.replace(votes, **turned), fewer).share, share, rtol=1e-6)
+    renamed = np.where(votes.regions >= 0, MANY - 1 - votes.regions, -1)
+    np.testing.assert_array_equal(share_of(dataclasses.replace(votes, regions=renamed), fewer[::-1]).share, share)
+
+
+def test_gradient_equals_central_differences(x64):
+    votes = jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, known_votes(60))
+    slope = np.random.default_rng(2).normal(size=60)
+    chosen = np.arange(REGIONS) % 2 == 0
+
+    def total(weights, shown):
+        return jnp.sum(slope * share_of(dataclasses.replace(votes, weights=weights, shown=shown), chosen).share)
+
+    given = [jnp.asarray(a) for a in (votes.weights, votes.shown)]
+    for place, gradient in enumerate(jax.grad(total, (0, 1))(*given)):
+        assert np.isfinite(gradient).all()
+        step = np.random.default_rng(place).normal(size=given[place].shape) * 1e-7
+        moved = [total(*(a + s * step if i == place else a for i, a in enumerate(given))) for s in (1, -1)]
+        assert float(jnp.sum(gradient * step)) == pytest.approx(float(moved[0] - moved[1]) / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(("count", "shown"), [(1, True), (200, False), (400, True)])
+def test_overlap_is_the_stated_sum(count, shown):
+    votes = known_votes(count, shown=shown)
+    found = np.asarray(with_overlap(votes).overlap)
+    np.testing.assert_allclose(found, exact_overlap(votes), rtol=2e-5, atol=1e-6)
+    np.testing.assert_array_equal(found, found.T)
+    assert found[-1].max() == 0
+    assert found.max() <= 1
+
+
+def test_overlap_without_gaussians_or_regions_and_with_numbers_that_are_not_finite():
+    assert not np.asarray(with_overlap(known_votes(0)).overlap).any()
+    none = {"regions": np.full((5, 1), -1), "weights": np.zeros((5, 1), np.float32), "num_regions": 0}
+    assert with_overlap(dataclasses.replace(known_votes(5, shown=False), **none)).overlap.shape == (0, 0)
+    votes = known_votes(300)
+    weights, shown = np.array(votes.weights), np.array(votes.shown)
+    weights[:50, 0], shown[50:60, 1] = np.nan, np.inf
+    broken = dataclasses.replace(votes, weights=weights, shown=shown)
+    without = np.where(np.isfinite(weights) & np.isfinite(shown), votes.regions, -1)
+    expected = with_overlap(dataclasses.replace(votes, regions=without)).overlap
+    np.testing.assert_allclose(with_overlap(broken).overlap, expected, rtol=1e-6)
+    huge = dataclasses.replace(votes, weights=votes.weights * 1e30, shown=votes.shown * 1e30)
+    np.testing.assert_allclose(with_overlap(huge).overlap, with_overlap(votes).overlap, rtol=1e-5)
+
+
+def test_overlap_under_vmap_is_a_loop():
+    several = [known_votes(100, shown=False, seed=seed) for seed in range(3)]
+    stacked = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *several)
+    traced = jax.jit(jax.vmap(with_overlap))(stacked)
+    np.testing.assert_allclose(traced.overlap, np.stack([with_overlap(v).overlap for v in several]), rtol=1e-6)
+
+
+def votes_of(views, total):
+    nobody = np.zeros((len(views), 1), np.int32), np.ones((len(views), 1), np.float32)
+    return Votes(*nobody, total, total, total, views, np.int32(0), REGIONS)
+
+
+def test_probability_equals_the_beta_distribution():
     rng = np.random.default_rng(0)
-    regions = rng.integers(-1, 40, (count, 2)).astype(np.int32)
-    weights = rng.random((count, 2)).astype(np.float32)
-    chosen = rng.random(40) < 0.5
-    np.testing.assert_allclose(jax.jit(weight_inside)(regions, weights, chosen), exact(regions, weights, chosen), 1e-6)
+    share, views = rng.random(200).astype(np.float32), rng.integers(1, 60, 200).astype(np.int32)
+    total = (views * rng.uniform(0.01, 40, 200)).astype(np.float32)
+    looks = np.minimum(views, total.astype(np.float64))
+    looks = looks / (1 + np.maximum(looks - 1, 0) * CORRELATION)
+    expected = beta.sf(0.5, 1 + share * looks, 1 + (1 - share) * looks)
+    np.testing.assert_allclose(membership_probability(share, votes_of(views, total)), expected, atol=2e-5)
+    unknown = votes_of(np.array([0, 3], np.int32), np.float32([0, np.nan]))
+    np.testing.assert_array_equal(membership_probability(np.float32([1, 1]), unknown), 0)
 
 
-def test_extremes():
-    regions = np.asarray([[0, 1], [1, 0], [-1, 5], [1, 1]], np.int32)
-    weights = np.asarray([[1e30, np.nan], [np.inf, 2.0], [3.0, 4.0], [1e-30, 0.0]], np.float32)
-    got = np.asarray(weight_inside(*map(jnp.asarray, (regions, weights, np.asarray([True, False])))))
-    np.testing.assert_array_equal(got, np.float32([1e30, 2.0, 0.0, 0.0]))  # what is not chosen does not spread
-    assert (np.asarray(weight_inside(jnp.zeros((3, 0), jnp.int32), jnp.zeros((3, 0)), jnp.ones(2, bool))) == 0).all()
-
-
-@pytest.mark.parametrize("count", [1, 32, 257, 1000])
-def test_the_rival_is_the_strongest_region_not_chosen(count):
-    rng = np.random.default_rng(count)
-    regions = rng.integers(-1, count + 2, (500, 5)).astype(np.int32)
-    weights = rng.random((500, 5)).astype(np.float32)
-    chosen = rng.random(count) < 0.3
-    outside = (regions >= 0) & (regions < count) & ~chosen[np.clip(regions, 0, count - 1)]
-    weight, rival, _ = gather_votes(*map(jnp.asarray, (regions, weights, chosen)))
-    np.testing.assert_allclose(weight, exact(regions, weights, chosen), rtol=1e-6)
-    np.testing.assert_array_equal(rival, np.where(outside, weights, 0).max(1))
+def test_probability_means_what_it_says():
+    """Gaussians whose true part is drawn evenly, seen in 1 to 12 independent views: p of those at p do."""
+    rng = np.random.default_rng(1)
+    true, views = rng.random(40_000), rng.integers(1, 13, 40_000).astype(np.int32)
+    share = (rng.binomial(views, true) / views).astype(np.float32)
+    got = np.asarray(membership_probability(share, votes_of(views, views * np.float32(9)), correlation=0.0))
+    bins = np.minimum((got * 10).astype(int), 9)
+    for b in range(10):
+        own = bins == b
+        if own.sum() > 300:
+            assert abs(got[own].mean() - (true[own] > 0.5).mean()) < 0.04

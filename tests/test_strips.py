@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.project import project
 from jsecon.splat.strips import BLOCK, WHOLE, Strip, join, split, tile_rows
-from jsecon.splat.tiles import grid, pair_counts, plan_capacity, tile_lists
+from jsecon.splat.tiles import grid, pair_counts, tile_lists
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))

@@ -5,13 +5,13 @@ import json
 import numpy as np
 from small_field import make_field
 
-from jsecon.answer import Answer
-from jsecon.plan import Silent
+from jsecon.app.progress import Listener
+from jsecon.app.question import Answer
+from jsecon.app.summary import write_answers
 from jsecon.query.anchored import query_region
-from jsecon.summary import write_answers
 
 
-class Told(Silent):
+class Told(Listener):
     def __init__(self):
         self.lines = []
 

@@ -10,8 +10,8 @@ import pytest
 from conftest import look_at
 
 from jsecon.data.capture import load_capture
-from jsecon.data.labels import load_labels
-from jsecon.data.lerf import load_lerf_labels
+from jsecon.data.lerf_labels import load_lerf_labels
+from jsecon.data.mask_files import load_labels
 from jsecon.data.synthetic import make_room, render_views, room_cameras, room_capture, write_room
 from jsecon.data.synthetic.light import lamp_points, lamp_visibility
 from jsecon.data.synthetic.raycast import trace

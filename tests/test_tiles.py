@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jsecon.splat.capacity import plan_capacity, round_capacity
 from jsecon.splat.project import project
 from jsecon.splat.reference import project_reference
 from jsecon.splat.tiles import (
@@ -15,8 +16,6 @@ from jsecon.splat.tiles import (
     depth_order,
     grid,
     pair_counts,
-    plan_capacity,
-    round_capacity,
     tile_lists,
 )
 from jsecon.types import Gaussians

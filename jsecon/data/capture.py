@@ -4,10 +4,11 @@ import itertools
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import nnls
 
-from jsecon.data.colmap import find_model, load_colmap
-from jsecon.data.frames import Progress
-from jsecon.data.nerfstudio import load_nerfstudio
+from jsecon.data.colmap import find_model, read_colmap
+from jsecon.data.frames import Posed, Progress, assemble, check_options
+from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.errors import InputError
 from jsecon.types import Camera, Capture
 
@@ -18,6 +19,7 @@ def load_capture(
     path: str | Path,
     *,
     downscale: float | int | None = None,
+    long_side: int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
     progress: Progress = None,
@@ -25,18 +27,24 @@ def load_capture(
     """Loads a capture folder: COLMAP (sparse/0 and images/), or nerfstudio / instant-ngp (transforms.json; also that
     file itself, under any name).
 
-    Frames come in name order. `downscale` (>= 1) divides width and height; None keeps them. `frames`: at most so many,
-    evenly spaced. `holdout` = k holds out the frames 0, k, 2k, ... of those taken; 0 or None none. What was left out or
-    changed is in Capture.notes. A folder that holds both formats is read as COLMAP, which has the points.
-    `progress(done, total)` counts frames.
+    Frames come in name order. `downscale` (>= 1) divides width and height; where it is None, the longer side is brought
+    to `long_side` px at most (None: kept). `frames`: at most so many, evenly spaced. `holdout` = k holds out the frames
+    0, k, 2k, ... of those taken; 0 or None none. What was left out or changed is in Capture.notes. A folder that holds
+    both formats is read as COLMAP, which has the points. `progress(done, total)` counts frames.
     Raises InputError where the path holds neither, or what it holds is damaged.
     """
-    path = Path(path)
-    options = {"downscale": downscale, "frames": frames, "holdout": holdout, "progress": progress}
-    if path.is_dir() and find_model(path) is not None:
-        return load_colmap(path, **options)
-    if (path / "transforms.json").is_file() or (path.is_file() and path.suffix == ".json"):
-        return load_nerfstudio(path, **options)
+    check_options(downscale, frames, holdout, long_side)
+    return assemble(
+        _posed(Path(path)), downscale=downscale, long_side=long_side, frames=frames, holdout=holdout, progress=progress
+    )
+
+
+def _posed(path: Path) -> Posed:
+    if path.is_dir() and (model := find_model(path)) is not None:
+        return read_colmap(path, model)
+    file = path / "transforms.json" if path.is_dir() else path
+    if file.is_file() and file.suffix == ".json":
+        return read_nerfstudio(file)
     found = "nothing there" if not path.exists() else "a file" if path.is_file() else "neither of them"
     raise InputError(
         path,
@@ -102,12 +110,8 @@ def _frusta_meet(a: Camera, b: Camera) -> bool:
     """Whether the two pyramids have a point in common.
 
     They do exactly where b's apex - a's apex = (a ray of a) - (a ray of b), that is where it lies in the cone of a's
-    corner rays and b's negated ones; by Caratheodory then in the cone of some three of these eight.
+    corner rays and b's negated ones: a sum of them with weights that are not negative.
     """
     rays = np.concatenate([_corner_rays(a), -_corner_rays(b)])
     gap = np.asarray(b.centres, np.float64) - np.asarray(a.centres, np.float64)
-    triples = np.array(list(itertools.combinations(range(8), 3)))
-    bases = rays[triples].transpose(0, 2, 1)
-    bases = bases[np.abs(np.linalg.det(bases)) > 1e-9]
-    weights = np.linalg.solve(bases, np.broadcast_to(gap[:, None], (len(bases), 3, 1)))[..., 0]
-    return bool((weights >= -1e-9 * max(1.0, np.abs(gap).max())).all(-1).any())
+    return bool(nnls(rays.T, gap)[1] <= 1e-9 * max(1.0, np.abs(gap).max()))

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from jsecon.data.colmap_model import MODELS, REMEDY, model_file, read_cameras, read_images, read_points
-from jsecon.data.frames import Progress, Shot, assemble, check_options
+from jsecon.data.frames import Posed, Shot
 from jsecon.data.images import write_image
 from jsecon.errors import InputError
 from jsecon.files import written_whole
+from jsecon.splat.transform import quaternion_of
 from jsecon.types import Capture
 
 
@@ -27,31 +28,13 @@ def find_model(path: str | Path) -> Path | None:
     return None
 
 
-def load_colmap(
-    path: str | Path,
-    *,
-    downscale: float | int | None = None,
-    frames: int | None = None,
-    holdout: int | None = 8,
-    progress: Progress = None,
-) -> Capture:
-    """A COLMAP capture: `path`/sparse/0 (or sparse) and `path`/images. Options as in `load_capture`.
+def read_colmap(path: Path, model: Path) -> Posed:
+    """A COLMAP capture: the model in `model` and the images in `path`/images.
 
     Every camera model that OpenCV can undistort is read. Raises InputError on a model that is cut short or names images
     that are not there, and on the models that OpenCV lacks (FOV, thin prisms).
     """
-    path = Path(path)
-    check_options(downscale, frames, holdout)
-    model = find_model(path)
-    if model is None:
-        raise InputError(
-            path,
-            found="no COLMAP model",
-            expected="sparse/0/cameras.bin (or .txt)",
-            remedy="Run colmap mapper, and keep its output in sparse/0 beside images/.",
-        )
-    lenses, notes = read_cameras(model), []
-    images = read_images(model)
+    lenses, images = read_cameras(model), read_images(model)
     missing = [name for name, _, _ in images if not (path / "images" / name).is_file()]
     if missing:
         raise InputError(
@@ -71,36 +54,9 @@ def load_colmap(
             )
         shots.append(Shot(name, path / "images" / name, lenses[camera], pose))
     if model_file(model, "points3D") is None:
-        notes.append("The model has no points3D file: there are no sparse points.")
-        points, colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    else:
-        points, colours = read_points(model)
-    return assemble(
-        shots,
-        points,
-        colours,
-        where=model,
-        downscale=downscale,
-        frames=frames,
-        holdout=holdout,
-        notes=notes,
-        progress=progress,
-    )
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz, w >= 0: the eigenvector of Bar-Itzhack's matrix, which has no singular case."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    matrix = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quaternion = np.linalg.eigh(matrix)[1][:, -1]
-    return -quaternion if quaternion[0] < 0 else quaternion
+        note = "The model has no points3D file: there are no sparse points."
+        return Posed(shots, model, notes=(note,))
+    return Posed(shots, model, *read_points(model))
 
 
 def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png") -> None:
@@ -125,7 +81,8 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
     for n, (file, pose, camera) in enumerate(
         zip(files, np.asarray(cameras.world_to_camera, np.float64), which.ravel()), start=1
     ):
-        numbers = itertools.chain(_quaternion(pose[:3, :3]), pose[:3, 3])
+        quaternion = quaternion_of(pose[:3, :3])
+        numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])
         image_bytes.append(struct.pack("<i7di", n, *numbers, camera + 1) + file.encode() + b"\0" + struct.pack("<Q", 0))
     points = np.zeros(len(capture.points), "<u8, 3<f8, 3u1, <f8, <u8")
     points["f0"] = np.arange(1, len(points) + 1)

@@ -36,6 +36,11 @@ _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEY
 REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 
 
+def bad_model(file: Path, found: str, expected: str, remedy: str = REMEDY) -> InputError:
+    """What is wrong with a file of a model."""
+    return InputError(file, found=found, expected=expected, remedy=remedy)
+
+
 def model_file(model: Path, kind: str) -> Path | None:
     return next((model / (kind + ending) for ending in (".bin", ".txt") if (model / (kind + ending)).is_file()), None)
 
@@ -43,9 +48,7 @@ def model_file(model: Path, kind: str) -> Path | None:
 def _existing(model: Path, kind: str) -> Path:
     file = model_file(model, kind)
     if file is None:
-        raise InputError(
-            model, found=f"no {kind}.bin or {kind}.txt", expected="cameras, images and points3D", remedy=REMEDY
-        )
+        raise bad_model(model, f"no {kind}.bin or {kind}.txt", "cameras, images and points3D")
     return file
 
 
@@ -56,12 +59,7 @@ class _Bytes:
         self.file, self.data, self.offset = file, file.read_bytes(), 0
 
     def cut(self) -> InputError:
-        return InputError(
-            self.file,
-            found=f"a file that breaks off after {len(self.data)} bytes",
-            expected="the records it announces",
-            remedy=REMEDY,
-        )
+        return bad_model(self.file, f"a file that breaks off after {len(self.data)} bytes", "the records it announces")
 
     def take(self, form: str) -> tuple:
         size = struct.calcsize("<" + form)
@@ -88,34 +86,31 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
 
 
 def _bad_line(file: Path, number: int, line: str, expected: str) -> InputError:
-    return InputError(file, found=f"line {number}: {line.strip()[:80]!r}", expected=expected, remedy=REMEDY)
+    return bad_model(file, f"line {number}: {line.strip()[:80]!r}", expected)
 
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
     if model not in MODELS or model in ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"):
-        raise InputError(
+        raise bad_model(
             file,
-            found=f"camera model {model}",
-            expected="one that OpenCV can undistort: "
-            + ", ".join(name for name, (number, _) in MODELS.items() if number not in (7, 10, 11)),
-            remedy="Run colmap image_undistorter and load its output.",
+            f"camera model {model}",
+            (
+                "one that OpenCV can undistort: "
+                + ", ".join(name for name, (number, _) in MODELS.items() if number not in (7, 10, 11))
+            ),
+            "Run colmap image_undistorter and load its output.",
         )
     if len(parameters) != MODELS[model][1]:
-        raise InputError(
-            file,
-            found=f"{len(parameters)} parameters of a {model} camera",
-            expected=str(MODELS[model][1]),
-            remedy=REMEDY,
-        )
+        raise bad_model(file, f"{len(parameters)} parameters of a {model} camera", str(MODELS[model][1]))
     focals = 1 if model in _ONE_FOCAL else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
     if not (np.isfinite(parameters).all() and fx > 0 and fy > 0 and width > 0 and height > 0):
-        raise InputError(
+        raise bad_model(
             file,
-            found=f"a camera of {width}x{height} px with parameters {parameters}",
-            expected="positive size and focal length",
-            remedy="Estimate the cameras again.",
+            f"a camera of {width}x{height} px with parameters {parameters}",
+            "positive size and focal length",
+            "Estimate the cameras again.",
         )
     return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="FISHEYE" in model)
 
@@ -139,11 +134,11 @@ def read_cameras(model: Path) -> dict[int, Lens]:
     for _ in range(data.take("Q")[0]):
         identity, number, width, height = data.take("iiQQ")
         if number not in _BY_NUMBER:
-            raise InputError(
+            raise bad_model(
                 file,
-                found=f"camera model number {number}",
-                expected=f"one of 0 to {max(_BY_NUMBER)}",
-                remedy="Run colmap image_undistorter and load its output.",
+                f"camera model number {number}",
+                f"one of 0 to {max(_BY_NUMBER)}",
+                "Run colmap image_undistorter and load its output.",
             )
         name, count = _BY_NUMBER[number]
         lenses[identity] = _lens(file, name, width, height, data.take(f"{count}d"))
@@ -155,11 +150,11 @@ def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     quaternion = np.array(numbers[:4], np.float64)
     length = np.linalg.norm(quaternion)
     if not np.isfinite(numbers).all() or not length > 1e-6:
-        raise InputError(
+        raise bad_model(
             file,
-            found=f"a pose of {name} with NaN or infinite numbers, or without rotation: {numbers}",
-            expected="finite poses",
-            remedy="Estimate the poses again, or delete this image from the model.",
+            f"a pose of {name} with NaN or infinite numbers, or without rotation: {numbers}",
+            "finite poses",
+            "Estimate the poses again, or delete this image from the model.",
         )
     w, x, y, z = quaternion / length
     pose = np.eye(4)
@@ -220,11 +215,8 @@ def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray
     else:
         points, colours = _read_binary_points(file)
     if not np.isfinite(points).all():
-        raise InputError(
-            file,
-            found="sparse points with NaN or infinite coordinates",
-            expected="finite points",
-            remedy="Estimate the model again.",
+        raise bad_model(
+            file, "sparse points with NaN or infinite coordinates", "finite points", "Estimate the model again."
         )
     return points, colours
 

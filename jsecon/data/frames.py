@@ -40,6 +40,20 @@ class Shot:
     """world units of one count in the depth file."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Posed:
+    """A capture before any pixel is read: what every format's reader gives to `assemble`."""
+
+    shots: Sequence[Shot]
+    where: object
+    """names the capture in errors."""
+    points: Float[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """sparse points, world."""
+    colours: UInt8[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    to_source: Float[np.ndarray, "4 4"] = dataclasses.field(default_factory=lambda: np.eye(4))
+    notes: tuple[str, ...] = ()
+
+
 def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
     """The pose with its rotation made exactly orthonormal; InputError where it is not finite or not rigid at all."""
     pose = np.asarray(pose, np.float64)
@@ -64,12 +78,16 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     return result
 
 
-def check_options(downscale: float | int | None, frames: int | None, holdout: int | None) -> None:
+def check_options(
+    downscale: float | int | None, frames: int | None, holdout: int | None, long_side: int | None = None
+) -> None:
     """Raises InputError on options that no capture can be loaded with."""
     if downscale is not None and not (np.isfinite(downscale) and downscale >= 1):
         raise InputError(
             "downscale", found=str(downscale), expected="a number of at least 1", remedy="2 halves width and height."
         )
+    if long_side is not None and long_side < 1:
+        raise InputError("long_side", found=str(long_side), expected="at least 1 px", remedy="400 is the default.")
     if frames is not None and frames < 1:
         raise InputError("frames", found=str(frames), expected="at least 1", remedy="Leave it out to take every frame.")
     if holdout is not None and (holdout < 0 or holdout == 1):
@@ -132,34 +150,31 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def assemble(
-    shots: Sequence[Shot],
-    points: Float[np.ndarray, "p 3"],
-    point_colors: UInt8[np.ndarray, "p 3"],
+    posed: Posed,
     *,
-    where: object,
     downscale: float | int | None = None,
+    long_side: int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
-    to_source: Float[np.ndarray, "4 4"] | None = None,
-    notes: Sequence[str] = (),
     progress: Progress = None,
 ) -> Capture:
     """Reads the images and makes the Capture: name order, lenses undistorted, one size, some frames held out.
 
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by
-    `downscale` (area average). Where the sizes differ, the commonest is taken and the others are resized to it, focal
-    lengths with them. `where` names the capture in errors. Raises InputError on images that are missing, damaged or of
-    another aspect, and on poses that are not finite and rigid.
+    `downscale` (area average), or where that is None so that the longer side is at most `long_side`. Where the sizes
+    differ, the commonest is taken and the others are resized to it, focal lengths with them. Raises InputError on
+    images that are missing, damaged or of another aspect, and on poses that are not finite and rigid.
     """
-    check_options(downscale, frames, holdout)
-    if not shots:
+    check_options(downscale, frames, holdout, long_side)
+    where = posed.where
+    if not posed.shots:
         raise InputError(
             where, found="no frame", expected="at least one posed image", remedy="Estimate the poses again."
         )
-    shots = sorted(shots, key=lambda shot: shot.name)
+    shots = sorted(posed.shots, key=lambda shot: shot.name)
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
-    notes = list(notes)
+    notes = list(posed.notes)
     chosen = spread(len(shots), frames)
     if len(chosen) < len(shots):
         notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
@@ -182,6 +197,8 @@ def assemble(
         notes.append(
             f"{odd} images were resized to {width}x{height}, the commonest size, and their intrinsics with them."
         )
+    if downscale is None and long_side is not None:
+        downscale = max(max(width, height) / long_side, 1.0)
     if downscale is not None:
         width, height = (max(1, round(size / downscale)) for size in (width, height))
     final = [pinholes[lens].resized(width, height) for lens in lenses]
@@ -228,27 +245,15 @@ def assemble(
     if out.all():
         out[:] = False
         notes.append("No frame was held out, since there is only one.")
-
-    def each(field: str) -> np.ndarray:
-        return np.array([getattr(lens, field) for lens in final], np.float32)
-
-    cameras = Camera(
-        world_to_camera=poses.astype(np.float32),
-        fx=each("fx"),
-        fy=each("fy"),
-        cx=each("cx"),
-        cy=each("cy"),
-        width=width,
-        height=height,
-    )
+    fx, fy, cx, cy = np.array([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in final], np.float32).T
     return Capture(
         frames=result,
-        cameras=cameras,
-        points=np.asarray(points, np.float32),
-        point_colors=np.asarray(point_colors, np.uint8),
+        cameras=Camera(poses.astype(np.float32), fx, fy, cx, cy, width, height),
+        points=np.asarray(posed.points, np.float32),
+        point_colors=np.asarray(posed.colours, np.uint8),
         held_out=out,
         depths=depths,
-        to_source=np.eye(4) if to_source is None else np.asarray(to_source, np.float64),
+        to_source=np.asarray(posed.to_source, np.float64),
         names=names,
         notes=tuple(notes),
     )

@@ -1,5 +1,6 @@
 """Image files, read whole or not at all: RGB frames, integer label images, depth maps."""
 
+import io
 import struct
 import zlib
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
+from PIL import Image
 
 from jsecon.errors import InputError
 from jsecon.files import written_whole
@@ -127,7 +129,7 @@ def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
         raise InputError(
             path,
             found=f"pixels of type {image.dtype}",
-            expected="8 or 16 bits a channel",
+            expected="8 or 16 bits per channel",
             remedy="Convert the image to PNG or JPEG.",
         )
     if image.ndim == 2:
@@ -166,17 +168,16 @@ def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
     """
     path = Path(path)
     data = _read_bytes(path)
-    expected = "a PNG of integers: grey (1 to 16 bits), palette, or RGB of 8 bits a channel"
-    remedy = "Write one id a pixel as an 8 or 16 bit grey PNG (lossless, no transparency)."
+    expected = "a PNG of integers: grey (1 to 16 bits), palette, or RGB of 8 bits per channel"
+    remedy = "Write one id per pixel as an 8 or 16 bit grey PNG (lossless, no transparency)."
     if not data.startswith(_PNG):
         raise InputError(path, found="a file that is no PNG", expected=expected, remedy=remedy)
-    chunks = list(_png_chunks(path, data))
-    bits, colour_type = chunks[0][1][8], chunks[0][1][9]
-    if colour_type == 3:
-        # The same indices under a header that calls them grey: OpenCV would look up their colours otherwise.
-        data = _as_grey(chunks)
+    (_, header), *_ = _png_chunks(path, data)
+    bits, colour_type = header[8], header[9]
+    if colour_type == 3:  # OpenCV would look up the colours; Pillow leaves the indices as they are
+        return np.asarray(Image.open(io.BytesIO(data)), np.int32), False
     image = _decode(path, data)
-    if colour_type in (0, 3) and image.ndim == 2:
+    if colour_type == 0 and image.ndim == 2:
         step = 255 // (2**bits - 1) if bits < 8 else 1  # fewer than 8 bits come stretched to 0..255
         return image.astype(np.int32) // step, False
     if colour_type == 2 and image.dtype == np.uint8 and image.shape[2] == 3:
@@ -189,17 +190,6 @@ def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
         expected=expected,
         remedy=remedy,
     )
-
-
-def _as_grey(chunks: list[tuple[bytes, bytes]]) -> bytes:
-    pieces = [_PNG]
-    for kind, body in chunks:
-        if kind in (b"PLTE", b"tRNS", b"sBIT", b"hIST", b"bKGD"):
-            continue
-        if kind == b"IHDR":
-            body = body[:9] + b"\0" + body[10:]
-        pieces.append(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)))
-    return b"".join(pieces)
 
 
 def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:

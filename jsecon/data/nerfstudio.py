@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.frames import Progress, Shot, assemble, check_options, rigid
+from jsecon.data.frames import Posed, Shot, rigid
 from jsecon.data.images import IMAGE_ENDINGS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
 from jsecon.errors import InputError
-from jsecon.types import Capture
 
 MILLIMETRE = 0.001
 """nerfstudio's default depth unit, metres"""
@@ -27,23 +26,13 @@ _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEY
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
-def load_nerfstudio(
-    path: str | Path,
-    *,
-    downscale: float | int | None = None,
-    frames: int | None = None,
-    holdout: int | None = 8,
-    progress: Progress = None,
-) -> Capture:
-    """A capture with transforms.json (`path`: its folder, or the file). Options as in `load_capture`.
+def read_nerfstudio(file: Path) -> Posed:
+    """The capture of a transforms.json.
 
     Entries whose image is not there are left out and counted in the notes. Depth maps (depth_file_path) and sparse
     points (ply_file_path) come with it where named. Raises InputError on a file that is no JSON or lacks a key, on
     camera models that are neither perspective nor fisheye, and where no image is left.
     """
-    check_options(downscale, frames, holdout)
-    file = Path(path)
-    file = file / "transforms.json" if file.is_dir() else file
     scene = _parse(file)
     entries = _key(file, scene, "frames", "the file", list)
     notes, shots, missing = [], [], []
@@ -51,12 +40,7 @@ def load_nerfstudio(
     for index, entry in enumerate(entries):
         where = f"frame {index}"
         if not isinstance(entry, dict):
-            raise InputError(
-                file,
-                found=f"{where} that is no object",
-                expected="frames with file_path and transform_matrix",
-                remedy=_REMEDY,
-            )
+            raise _bad(file, f"{where} that is no object", "frames with file_path and transform_matrix")
         name = _key(file, entry, "file_path", where, str)
         pose = _matrix(
             file, _key(file, entry, "transform_matrix", f"{where} ({name})", list), f"transform_matrix of {name}"
@@ -67,12 +51,7 @@ def load_nerfstudio(
             continue
         depth = entry.get("depth_file_path")
         if depth is not None and not (file.parent / depth).is_file():
-            raise InputError(
-                file.parent / depth,
-                found="no such depth map",
-                expected=f"the depth_file_path of {name}",
-                remedy=_REMEDY,
-            )
+            raise _bad(file.parent / depth, "no such depth map", f"the depth_file_path of {name}")
         unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
         shots.append(
             Shot(
@@ -90,65 +69,49 @@ def load_nerfstudio(
             f"(the first: {missing[0]})."
         )
     if not shots:
-        raise InputError(
+        first = f" (the first: {missing[0]})" if missing else ""
+        raise _bad(
             file,
-            found=f"{len(entries)} frames, none of which has its image"
-            + (f" (the first: {missing[0]})" if missing else ""),
-            expected="images where file_path says, relative to this file",
-            remedy="Copy the images beside it.",
+            f"{len(entries)} frames, none of which has its image{first}",
+            "images where file_path says, relative to this file",
+            "Copy the images beside it.",
         )
     if any("mask_path" in entry for entry in entries):
         notes.append("The masks named by mask_path (pixels to ignore) were not used.")
-    points, colours = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    found = {"to_source": _to_source(file, scene, scale), "notes": tuple(notes)}
     if scene.get("ply_file_path"):
-        points, colours = load_points_ply(file.parent / str(scene["ply_file_path"]))
-    return assemble(
-        shots,
-        points,
-        colours,
-        where=file,
-        downscale=downscale,
-        frames=frames,
-        holdout=holdout,
-        to_source=_to_source(file, scene, scale),
-        notes=notes,
-        progress=progress,
-    )
+        return Posed(shots, file, *load_points_ply(file.parent / str(scene["ply_file_path"])), **found)
+    return Posed(shots, file, **found)
+
+
+def _bad(file: Path, found: str, expected: str, remedy: str = _REMEDY) -> InputError:
+    return InputError(file, found=found, expected=expected, remedy=remedy)
 
 
 def _parse(file: Path) -> dict[str, Any]:
     try:
         scene = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(
-            file, found=error.strerror or "an error on reading", expected="a transforms.json", remedy="Check the path."
-        ) from error
+        raise _bad(file, error.strerror or "an error on reading", "a transforms.json", "Check the path.") from error
     except ValueError as error:
-        raise InputError(
-            file, found=f"text that is no JSON ({error})", expected="a transforms.json", remedy=_REMEDY
-        ) from error
+        raise _bad(file, f"text that is no JSON ({error})", "a transforms.json") from error
     if not isinstance(scene, dict):
-        raise InputError(file, found="JSON without keys", expected="an object with frames", remedy=_REMEDY)
+        raise _bad(file, "JSON without keys", "an object with frames")
     return scene
 
 
 def _key(file: Path, record: dict[str, Any], key: str, where: str, kind: type) -> Any:
     if key not in record:
-        raise InputError(file, found=f"no key {key!r} in {where}", expected=f"{key!r} there", remedy=_REMEDY)
+        raise _bad(file, f"no key {key!r} in {where}", f"{key!r} there")
     if not isinstance(record[key], kind):
-        raise InputError(
-            file,
-            found=f"{key!r} of type {type(record[key]).__name__} in {where}",
-            expected=kind.__name__,
-            remedy=_REMEDY,
-        )
+        raise _bad(file, f"{key!r} of type {type(record[key]).__name__} in {where}", kind.__name__)
     return record[key]
 
 
 def _number(file: Path, record: dict[str, Any], key: str, default: float) -> float:
     value = record.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(file, found=f"{key} = {value!r}", expected="a finite number", remedy=_REMEDY)
+        raise _bad(file, f"{key} = {value!r}", "a finite number")
     return float(value)
 
 
@@ -157,11 +120,9 @@ def _matrix(file: Path, rows: list, what: str) -> Float[np.ndarray, "4 4"]:
     try:
         matrix = np.array(rows, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            file, found=f"{what} that holds more than numbers", expected="4 rows of 4 numbers", remedy=_REMEDY
-        ) from error
+        raise _bad(file, f"{what} that holds more than numbers", "4 rows of 4 numbers") from error
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise InputError(file, found=f"{what} of shape {matrix.shape}", expected="4 rows of 4 numbers", remedy=_REMEDY)
+        raise _bad(file, f"{what} of shape {matrix.shape}", "4 rows of 4 numbers")
     return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0, 0, 0, 1]]])
 
 
@@ -180,12 +141,7 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
         transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
     scaled = np.diag([scale, scale, scale, 1.0]) @ transform
     if not np.isfinite(scaled).all() or abs(np.linalg.det(scaled)) < 1e-12:
-        raise InputError(
-            file,
-            found="an applied_transform or applied_scale that cannot be inverted",
-            expected="a similarity",
-            remedy=_REMEDY,
-        )
+        raise _bad(file, "an applied_transform or applied_scale that cannot be inverted", "a similarity")
     return np.linalg.inv(scaled)
 
 
@@ -207,11 +163,11 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     keys = {**scene, **entry}
     model = str(keys.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE | _FISHEYE:
-        raise InputError(
+        raise _bad(
             file,
-            found=f"camera_model {model}",
-            expected="one of " + ", ".join(sorted(_PERSPECTIVE | _FISHEYE)),
-            remedy="Undistort the images first.",
+            f"camera_model {model}",
+            "one of " + ", ".join(sorted(_PERSPECTIVE | _FISHEYE)),
+            "Undistort the images first.",
         )
     fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     width, height = (keys.get("w"), keys.get("h"))
@@ -221,29 +177,19 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     fx = _focal(file, keys, "fl_x", "camera_angle_x", width)
     fy = _focal(file, keys, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
-        raise InputError(
-            file,
-            found=f"no focal length for {name}",
-            expected="fl_x or camera_angle_x, in the file or the frame",
-            remedy=_REMEDY,
-        )
+        raise _bad(file, f"no focal length for {name}", "fl_x or camera_angle_x, in the file or the frame")
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None or min(width, height, fx, fy) <= 0:
-        raise InputError(
-            file,
-            found=f"{width}x{height} px and focal lengths {fx}, {fy} for {name}",
-            expected="positive numbers",
-            remedy=_REMEDY,
-        )
+        raise _bad(file, f"{width}x{height} px and focal lengths {fx}, {fy} for {name}", "positive numbers")
     order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     distortion = tuple(_number(file, keys, key, 0.0) for key in order)
     if model == "OPENCV" and not fisheye and distortion[5] != 0:
         # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
-        raise InputError(
+        raise _bad(
             file,
-            found=f"k4 = {keys['k4']} with camera_model OPENCV",
-            expected="k1 k2 p1 p2 k3, or FULL_OPENCV",
-            remedy="Undistort the images first.",
+            f"k4 = {keys['k4']} with camera_model OPENCV",
+            "k1 k2 p1 p2 k3, or FULL_OPENCV",
+            "Undistort the images first.",
         )
     cx, cy = _number(file, keys, "cx", width / 2), _number(file, keys, "cy", height / 2)
     return Lens(width, height, fx, fy, cx, cy, distortion, fisheye)
@@ -255,8 +201,6 @@ def _focal(file: Path, keys: dict[str, Any], direct: str, angle: str, size: int)
     if angle in keys:
         value = _number(file, keys, angle, 0.0)
         if not 0 < value < math.pi:
-            raise InputError(
-                file, found=f"{angle} = {value}", expected="an angle between 0 and pi (radians)", remedy=_REMEDY
-            )
+            raise _bad(file, f"{angle} = {value}", "an angle between 0 and pi (radians)")
         return 0.5 * size / math.tan(0.5 * value)
     return None

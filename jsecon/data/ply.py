@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jsecon.data.ply_file import bad_ply, read_vertices
-from jsecon.errors import require
+from jsecon.errors import require_shape
 from jsecon.files import written_whole
 from jsecon.types import Array, Gaussians
 
@@ -38,7 +38,8 @@ def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str]) -> np.nda
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Gaussians from a .ply in INRIA's layout (REFERENCE A.7), binary or ascii; N may be 0.
+    """Gaussians from a .ply in INRIA's layout (graphdeco-inria/gaussian-splatting, gaussian_model.py), binary or ascii;
+    N may be 0.
 
     The degree of the spherical harmonics follows from the number of f_rest properties (0, 9, 24, 45; channel-major).
     Other properties (normals, OpenGaussian's ins_feat, Gaussian Grouping's obj_dc) are ignored. Raises InputError on a
@@ -84,7 +85,7 @@ def load_ply(path: str | Path) -> Gaussians:
                 "finite numbers",
                 clean,
             )
-    zero = ~arrays["quaternions"].any(axis=1)
+    zero = (arrays["quaternions"] == 0).all(axis=1)
     if zero.any():
         raise bad_ply(
             path,
@@ -106,13 +107,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, rgb: Float[Array, "n 3"]
     if rgb is None:
         sh = np.asarray(gaussians.sh, np.float32)
     else:
-        require(
-            rgb.shape == (count, 3),
-            "rgb",
-            got=rgb.shape,
-            expected=f"({count}, 3)",
-            remedy="Give one colour a Gaussian.",
-        )
+        require_shape("rgb", rgb, (count, 3), "Give one colour per Gaussian.")
         sh = ((np.asarray(rgb, np.float64) - 0.5) / SH_DC).astype(np.float32)[:, None]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
     rest_names = (f"f_rest_{index}" for index in range(rest.shape[1]))

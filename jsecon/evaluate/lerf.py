@@ -2,30 +2,26 @@
 
 For every labelled frame and every category labelled in it: the Gaussians selected for the category (once a scene, not a
 frame) are rendered without all others at the size of the labels, alpha > 0.7 is the mask, its IoU with the labelled
-mask is the pair's. mIoU and mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0 (REFERENCE C,
-D.5).
+mask is the pair's. mIoU and mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.data.lerf import LabelledFrame
+from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
 from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
-from jsecon.splat.tiles import plan_capacity
 from jsecon.types import Camera, Gaussians, Selection
 
 VALA_THRESHOLD = 10 / 255
 """VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
-FEW = 1 << 16
-"""Gaussians up to which the room that all of them take serves every selection, in one compilation; with more of them
-each rendering makes room for its own selection alone"""
 LOCALISATION_WINDOW = 0.04
 """side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px of 730"""
 
@@ -63,31 +59,11 @@ def evaluate_point_level_rendered(
     select: Callable[[str], Selection | None],
     *,
     alpha_threshold: float = ALPHA_THRESHOLD,
-    expected_pairs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
 ) -> tuple[list[Row], dict]:
-    """Rows, one for each labelled (frame, query) pair, and their summary, under the module's protocol.
-
-    cameras: by frame name, of any size with the labels' aspect; they are brought to the labels' size.
-    select: category -> Selection over the Gaussians; None (no answer to this text) counts as missing.
-    expected_pairs: the protocol's denominator where it is known (`jsecon.data.lerf_ovs.LERF_PAIRS`), checked.
-
-    Localisation has two readings, since the paper's own two tables do not agree on one (REFERENCE 0.3). By the peak,
-    summary["loc_acc"]: the point of maximum of the selected Gaussians' similarity, composited by sum alpha T s over
-    them alone and smoothed by a mean over a window of 4 % of the image's height, lies in a labelled box of the
-    category, edges included. By the mask, summary["loc_mask"]: the same smoothing of the binary mask, and any of the
-    pixels where it is largest (LangSplat's rule for ties), lies in one. Raises InputError for a labelled frame without
-    a camera or of another aspect, for labels without pairs, and where the number of pairs is not the expected one.
-    """
-    return evaluate_at_thresholds(
-        gaussians,
-        cameras,
-        labels,
-        select,
-        alpha_thresholds=(alpha_threshold,),
-        expected_pairs=expected_pairs,
-        progress=progress,
-    )[alpha_threshold]
+    """`evaluate_at_thresholds` at one threshold, the protocol's own."""
+    found = evaluate_at_thresholds(gaussians, cameras, labels, select, alpha_thresholds=(alpha_threshold,), **options)
+    return found[alpha_threshold]
 
 
 def evaluate_at_thresholds(
@@ -100,19 +76,30 @@ def evaluate_at_thresholds(
     expected_pairs: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[float, tuple[list[Row], dict]]:
-    """`evaluate_point_level_rendered` at several silhouette thresholds, from one rendering a pair: OpenGaussian's and
-    VALA's by default, to stand side by side."""
+    """By silhouette threshold (OpenGaussian's, and VALA's to stand beside it): rows, one for each labelled (frame,
+    query) pair, and their summary, under the module's protocol, from one rendering per pair.
+
+    cameras: by frame name, of any size with the labels' aspect; they are brought to the labels' size.
+    select: category -> Selection over the Gaussians; None (no answer to this text) counts as missing.
+    expected_pairs: the protocol's denominator where it is known (`experiments.datasets.lerf_ovs.LERF_PAIRS`), checked.
+
+    Localisation has two readings, since the paper's own two tables do not agree on one. By the peak,
+    summary["loc_acc"]: the point of maximum of the selected Gaussians' similarity, composited by sum alpha T s over
+    them alone and smoothed by a mean over a window of 4 % of the image's height, lies in a labelled box of the
+    category, edges included. By the mask, summary["loc_mask"]: the same smoothing of the binary mask, and any of the
+    pixels where it is largest (LangSplat's rule for ties), lies in one. Raises InputError for a labelled frame without
+    a camera or of another aspect, for labels without pairs, and where the number of pairs is not the expected one.
+    """
     for frame in labels:
         _check(frame, cameras)
     pairs = labelled_pairs(labels, expected_pairs)
-    capacity = _capacity(gaussians, cameras, labels) if gaussians.count <= FEW else None
     answers: dict[str, Selection | None] = {}
     rows: dict[float, list[Row]] = {threshold: [] for threshold in alpha_thresholds}
     for done, (frame, category) in enumerate(pairs, start=1):
         if category not in answers:
             answers[category] = select(category)
         camera = resized(cameras[frame.name], frame.width, frame.height)
-        found = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds, capacity)
+        found = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds)
         for threshold, row in zip(alpha_thresholds, found):
             rows[threshold].append(row)
         if progress is not None:
@@ -158,16 +145,6 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _capacity(gaussians: Gaussians, cameras: Mapping[str, Camera], labels: Sequence[LabelledFrame]) -> int:
-    """Room for all Gaussians in any labelled frame, in powers of two: scenes of one kind share a compilation."""
-    given = jax.tree.map(jnp.asarray, gaussians)
-    sizes = [
-        plan_capacity(given, jax.tree.map(jnp.asarray, resized(cameras[f.name], f.width, f.height)), margin=1.0)
-        for f in labels
-    ]
-    return 1 << (max(sizes) - 1).bit_length()
-
-
 def _rows(
     gaussians: Gaussians,
     camera: Camera,
@@ -175,7 +152,6 @@ def _rows(
     category: str,
     selection: Selection | None,
     thresholds: tuple[float, ...],
-    capacity: int | None,
 ) -> list[Row]:
     true, boxes = frame.objects[category]
     if selection is None or not np.asarray(selection.mask).any():
@@ -183,7 +159,7 @@ def _rows(
         nothing = np.zeros(true.shape, bool)
         return [Row(frame.name, category, 0.0, False, False, None, 0, region, score, nothing) for _ in thresholds]
     camera = jax.tree.map(jnp.asarray, camera)
-    rendering = render_selection(gaussians, camera, selection.mask, selection.similarity, capacity=capacity)
+    rendering = render_selection(gaussians, camera, selection.mask, selection.similarity)
     alpha, point = np.asarray(rendering.alpha), _middle(_peak(np.asarray(rendering.features[..., 0])))
     rows = []
     for threshold in thresholds:

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jsecon.errors import require
 from jsecon.types import Array
@@ -29,7 +29,7 @@ def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array,
 def mean_iou(ious: Iterable[float | None]) -> float:
     """Plain mean over (frame, query) pairs of their IoU; None or NaN, a missing prediction, counts as 0.
 
-    The denominator is the number of pairs (REFERENCE 0.2): pass every pair. NaN for none at all.
+    The denominator is the number of pairs (208 on LERF, over its 22 frames): pass every pair. NaN for none at all.
     """
     values = _values(ious)
     return float(values.mean()) if values.size else float("nan")
@@ -48,7 +48,7 @@ def localization_accuracy(points: Iterable[Point | None], boxes: Iterable[Float[
     """Share of (frame, query) pairs whose point (x, y) lies inside, edges included, any of the pair's boxes.
 
     Boxes are x1 y1 x2 y2. None, a missing prediction, counts as a failure. What the point is, is the caller's
-    definition: say it beside the number, as published ones mean different things (REFERENCE 0.3). NaN for no pairs.
+    definition: say it beside the number, as published ones mean different things. NaN for no pairs.
     """
     hits = [point is not None and inside_any(point, box) for point, box in zip(points, boxes, strict=True)]
     return float(np.mean(hits)) if hits else float("nan")
@@ -59,38 +59,6 @@ def inside_any(point: Point, boxes: Float[Array, "b 4"]) -> bool:
     x, y = point
     boxes = np.asarray(boxes)
     return bool(((boxes[:, 0] <= x) & (x <= boxes[:, 2]) & (boxes[:, 1] <= y) & (y <= boxes[:, 3])).any())
-
-
-def point_accuracy(predicted: Int[Array, " n"], true: Int[Array, " n"], *, ignore: int = -1) -> float:
-    """Share of the points with a true label (not `ignore`) whose predicted label equals it. NaN for none."""
-    predicted, true = np.asarray(predicted), np.asarray(true)
-    counted = true != ignore
-    return float((predicted == true)[counted].mean()) if counted.any() else float("nan")
-
-
-def point_class_means(predicted: Int[Array, " n"], true: Int[Array, " n"], *, ignore: int = -1) -> tuple[float, float]:
-    """(mIoU, mAcc) at the level of points: means over the classes that occur in the truth of IoU and of recall.
-
-    OpenGaussian's ScanNet script, and the likely meaning of mAcc on Replica (REFERENCE D.7, 0.2), not "IoU > 0.25".
-    Points of true label `ignore` are left out of both sides. NaN where no point has a label.
-    """
-    scores = list(class_scores(predicted, true, ignore=ignore).values())
-    miou, macc = np.mean(scores, axis=0) if scores else (np.nan, np.nan)
-    return float(miou), float(macc)
-
-
-def class_scores(
-    predicted: Int[Array, " n"], true: Int[Array, " n"], *, ignore: int = -1
-) -> dict[int, tuple[float, float]]:
-    """(IoU, recall) of each class that occurs in the truth; points of true label `ignore` are left out."""
-    predicted, true = np.asarray(predicted), np.asarray(true)
-    predicted, true = predicted[true != ignore], true[true != ignore]
-    scores = {}
-    for label in np.unique(true):
-        both = np.sum((predicted == label) & (true == label))
-        either = np.sum((predicted == label) | (true == label))
-        scores[int(label)] = float(both / either), float(both / np.sum(true == label))
-    return scores
 
 
 def _values(ious: Iterable[float | None]) -> np.ndarray:

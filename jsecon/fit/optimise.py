@@ -1,4 +1,4 @@
-"""Fits Gaussians to a capture's frames: Adam on the photometric loss with the INRIA learning rates (REFERENCE A.6).
+"""Fits Gaussians to a capture's frames: Adam on the photometric loss with the learning rates of Kerbl et al. 2023.
 
 The number of Gaussians stays what it was at the start. The state between chunks of steps is a record of arrays, so a
 fit can be stopped after any chunk and gone on with, to the same result.
@@ -18,18 +18,15 @@ from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 from jsecon.errors import InputError, require
 from jsecon.fit.photometric import photometric_loss, psnr
 from jsecon.numerics import finite
+from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.render import render_rgb
-from jsecon.splat.tiles import plan_capacity, round_capacity
 from jsecon.types import Array, Camera, Capture, Gaussians
-
-CAPACITY_MARGIN = 1.5
-"""room for Gaussians that grow or move within a fit; what still does not fit is rerun with more, never left out"""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LearningRates:
-    """Step sizes of Adam per group, for fits of hundreds to a few thousand steps; `INRIA_RATES` are for 30,000.
+    """Step sizes of Adam per group, for fits of hundreds to a few thousand steps.
 
     Positions are in units of the cameras' extent. All decay log-linearly over the fit.
     """
@@ -45,18 +42,6 @@ class LearningRates:
     """of the constant band of the spherical harmonics; the higher bands take a twentieth"""
     rest_last: Any = 0.3
     """what the other rates have decayed to at the last step, log-linearly too, as a share of their first"""
-
-
-INRIA_RATES = LearningRates(
-    means=1.6e-4,
-    means_last=1.6e-6,
-    log_scales=5e-3,
-    quaternions=1e-3,
-    opacity_logits=5e-2,
-    colors=2.5e-3,
-    rest_last=1.0,
-)
-"""Kerbl et al. 2023 (REFERENCE A.6)"""
 
 
 @jax.tree_util.register_dataclass
@@ -87,24 +72,29 @@ def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.n
     """The views of steps first..last-1: each round of `views` steps takes every view once, in an order drawn by
     `key`."""
     rounds = range(first // views, -(-last // views))
-    order = [np.asarray(jax.random.permutation(jax.random.fold_in(key, r), views)) for r in rounds]
+    order = [np.asarray(_round(key, r, views)) for r in rounds]
     start = first - (first // views) * views
     joined = np.concatenate(order) if order else np.zeros(0, np.int64)
     return joined[start : start + last - first].astype(np.int64)
 
 
+@functools.partial(jax.jit, static_argnums=2)
+def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
+    return jax.random.permutation(jax.random.fold_in(key, index), views)
+
+
 def start_state(gaussians: Gaussians, steps: int) -> FitState:
     """The state before the first of `steps` steps."""
-    gaussians = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), gaussians)
-    zeros = jax.tree.map(jnp.zeros_like, gaussians)
-    return FitState(gaussians, zeros, zeros, jnp.int32(0), jnp.full(steps, jnp.nan, jnp.float32))
+    gaussians = jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians)
+    zeros = jax.tree.map(np.zeros_like, gaussians)
+    return FitState(gaussians, zeros, zeros, np.zeros((), np.int32), np.full(steps, np.nan, np.float32))
 
 
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, step, band_every: Array) -> Gaussians:
-    """One rate an array (one a band for sh), in the shape of Gaussians."""
+    """One rate per array (one per band for sh), in the shape of Gaussians."""
     bands = gaussians.sh.shape[1]
     degree = np.floor(np.sqrt(np.arange(bands))).astype(np.int32)
     active = degree <= step // band_every
@@ -118,18 +108,16 @@ def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, 
     )
 
 
-@functools.partial(jax.jit, static_argnames=("ssim_weight", "capacity"))
+@functools.partial(jax.jit, static_argnames="capacity")
 def _step(
     current: tuple[Gaussians, optax.ScaleByAdamState],
     camera: Camera,
     frame: UInt8[Array, "h w 3"],
-    background: Float[Array, "3"],
     extent: Array,
     rates: LearningRates,
     band_every: Array,
     total: Array,
     *,
-    ssim_weight: float,
     capacity: int,
 ):
     """One Adam step on one view. Returns the Gaussians and moments after it, the loss before it, the pairs that
@@ -138,8 +126,8 @@ def _step(
     target = frame.astype(jnp.float32) / 255.0
 
     def loss(gaussians):
-        rendering = render_rgb(gaussians, camera, background=background, capacity=capacity)
-        return photometric_loss(rendering.features, target, ssim_weight=ssim_weight), rendering.overflow
+        rendering = render_rgb(gaussians, camera, background=jnp.zeros(3), capacity=capacity)
+        return photometric_loss(rendering.features, target), rendering.overflow
 
     (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(gaussians)
     step = moments.count
@@ -149,22 +137,22 @@ def _step(
 
 
 def _chunk(
-    state: FitState, pictures: list, background: Array, extent: Array, rates: LearningRates, band_every: int, **static
+    state: FitState, pictures: list, extent: Array, rates: LearningRates, band_every: int, capacity: int
 ) -> tuple[FitState, int]:
     """A step on each of `pictures`, (camera, frame) pairs; and the most pairs that overflowed in any of them."""
     steps = state.losses.shape[0]
     moments: Any = optax.ScaleByAdamState(state.step, _tree(state.first_moment), _tree(state.second_moment))
-    gaussians, losses, overflow = state.gaussians, [], jnp.int32(0)
+    gaussians, losses, overflow = state.gaussians, [], []
     for camera, frame in pictures:
         (gaussians, moments), loss, missing = _step(
-            (gaussians, moments), camera, frame, background, extent, rates, band_every, steps, **static
+            (gaussians, moments), camera, frame, extent, rates, band_every, steps, capacity=capacity
         )
         losses.append(loss)
-        overflow = jnp.maximum(overflow, missing)
-    first = int(state.step)
-    taken = jnp.asarray(state.losses).at[first : first + len(losses)].set(jnp.stack(losses))
-    step = jnp.int32(first + len(losses))
-    return FitState(gaussians, moments.mu, moments.nu, step, taken), int(overflow)
+        overflow.append(missing)
+    first, taken = int(state.step), np.array(state.losses)
+    taken[first : first + len(losses)] = jax.device_get(losses)
+    step = np.asarray(first + len(losses), np.int32)
+    return FitState(gaussians, moments.mu, moments.nu, step, taken), int(max(jax.device_get(overflow)))
 
 
 def _tree(record: Gaussians) -> Any:
@@ -197,8 +185,6 @@ def fit_gaussians(
     start: Gaussians | None = None,
     state: FitState | None = None,
     rates: LearningRates = LearningRates(),
-    ssim_weight: float = 0.2,
-    background: Float[Array, "3"] | None = None,
     band_every: int | None = None,
     coarse: float = 0.5,
     chunk: int = 50,
@@ -210,7 +196,7 @@ def fit_gaussians(
     One view a step, all views once before any comes again, in an order drawn by `key`; the first `coarse` of the steps
     on frames of half the size, which costs a quarter and moves what is large first. The degree of the spherical
     harmonics grows by one every `band_every` steps (by default 1000, in a short fit a quarter of it) up to what
-    `start.sh` holds. `background` (3,) rgb in [0, 1], black by default. After every `chunk` steps `on_checkpoint` is
+    `start.sh` holds. The background is black. After every `chunk` steps `on_checkpoint` is
     given the state. A chunk in which a view overflowed its tile lists is taken again with more room, so the result does
     not depend on the capacity. Raises ValueError where not exactly one of `start` and `state` is given or the state is
     of another number of steps, InputError where every frame is held out or the numbers stop being finite.
@@ -237,10 +223,9 @@ def fit_gaussians(
         expected=f"{steps} steps",
         remedy="Go on with the options that the fit was started with.",
     )
-    current: FitState = jax.tree.map(jnp.asarray, begun)
-    cameras = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), capture.cameras[used])
-    extent = jnp.float32(cameras_extent(cameras))
-    backdrop = jnp.zeros(3) if background is None else jnp.asarray(background, jnp.float32)
+    current: FitState = jax.device_put(begun)
+    cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[used])  # whose items compile nothing
+    extent = np.asarray(cameras_extent(cameras), np.float32)
     switch = int(coarse * steps)
     every = max(1, min(1000, steps // 4)) if band_every is None else band_every
     whole = cameras, np.asarray(capture.frames[used])
@@ -249,26 +234,17 @@ def fit_gaussians(
         if first >= switch > 0:
             sized, capacity, switch = whole, 0, 0
         if capacity == 0:
-            capacity = plan_capacity(current.gaussians, sized[0], margin=CAPACITY_MARGIN)
+            capacity = default_capacity(current.gaussians.count, sized[0].width, sized[0].height)
         views = view_order(key, len(used), first, last)
         pictures = [(sized[0][int(v)], sized[1][int(v)]) for v in views]
         while True:
-            after, overflow = _chunk(
-                current,
-                pictures,
-                backdrop,
-                extent,
-                rates,
-                every,
-                ssim_weight=float(ssim_weight),
-                capacity=capacity,
-            )
+            after, overflow = _chunk(current, pictures, extent, rates, every, capacity)
             if overflow == 0:
                 break
-            capacity = round_capacity(int(CAPACITY_MARGIN * (capacity + overflow)))
+            capacity = enough_capacity(capacity, np.array([overflow]))
         current = after
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        if not bool(finite(current.losses[last - 1], *jax.tree.leaves(current.gaussians))):
+        if not (np.isfinite(current.losses[last - 1]) and bool(_all_finite(current.gaussians))):
             raise InputError(
                 "fit",
                 found=f"numbers that are not finite after step {last}",
@@ -282,22 +258,30 @@ def fit_gaussians(
     return current.gaussians, np.asarray(current.losses)
 
 
+@jax.jit
+def _all_finite(gaussians: Gaussians) -> Array:
+    return finite(*jax.tree.leaves(gaussians))
+
+
+@jax.jit
+def _psnr_of_photograph(image: Array, frame: UInt8[Array, "h w 3"]) -> Array:
+    return psnr(jnp.clip(image, 0, 1), frame.astype(jnp.float32) / 255.0)
+
+
 def evaluate_psnr(
     gaussians: Gaussians,
     capture: Capture,
     *,
     frames: Int[np.ndarray, " f"] | None = None,
-    background: Float[Array, "3"] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, " f"]:
-    """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to [0,
-    1]. `background` (3,) rgb in [0, 1], black by default."""
+    """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to
+    [0, 1]."""
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
-    values = []
+    gaussians, values = jax.device_put(gaussians), []
     for n, t in enumerate(chosen):
-        camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
-        image = render_rgb(gaussians, camera, background=background).features
-        values.append(float(psnr(jnp.clip(image, 0, 1), jnp.asarray(capture.frames[t], jnp.float32) / 255.0)))
+        image = render_rgb(gaussians, capture.cameras[int(t)]).features
+        values.append(float(_psnr_of_photograph(image, np.asarray(capture.frames[t]))))
         if progress:
             progress(n + 1, len(chosen))
     return np.array(values)

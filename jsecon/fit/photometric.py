@@ -1,7 +1,7 @@
 """How far a rendered image is from a photograph: L1, SSIM, their mixture (the 3DGS loss), and PSNR.
 
-Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 with the constants that 3DGS training uses (REFERENCE
-A.6): an 11 x 11 Gaussian window of sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
+Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 with the constants that 3DGS training
+uses: an 11 x 11 Gaussian window of sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
 channels.
 """
 

@@ -1,12 +1,20 @@
-"""Chooses where a capture's Gaussians start from, by what the capture holds, and says so."""
+"""Where a fit starts from: what the capture holds, and Gaussians made of points."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial import KDTree
 
-from jsecon.fit.initialise import gaussians_from_points, points_from_depth
+from jsecon.errors import require
+from jsecon.fit.depth import points_from_depth
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
-from jsecon.types import Capture, Gaussians
+from jsecon.splat.sh import sh_from_rgb
+from jsecon.types import Array, Capture, Gaussians
+
+MIN_SQUARED_DISTANCE = 1e-7
+"""floor under a squared neighbour distance, world units^2 (INRIA): duplicate points still get a scale"""
 
 
 def starting_gaussians(
@@ -59,3 +67,66 @@ def starting_gaussians(
     gaussians = gaussians_from_points(points, colors, opacity=opacity, scale=scale, sh_degree=sh_degree)
     few = f"only {count} points" if count else "no points"
     return gaussians, f"the capture has {few}: {len(points)} points triangulated from feature matches between its views"
+
+
+def neighbour_distances(points: Float[Array, "p 3"], neighbours: int = 3) -> Float[np.ndarray, " p"]:
+    """Root of the mean squared distance to the nearest other points, world units (simple-knn of graphdeco-inria).
+
+    With fewer than `neighbours` other points, the mean is over those there are; a lone point gets the floor.
+    """
+    points = np.asarray(points, np.float64)
+    count = len(points)
+    others = min(neighbours, count - 1)
+    if others < 1:
+        return np.full(count, math.sqrt(MIN_SQUARED_DISTANCE))
+    distances, _ = KDTree(points).query(points, k=others + 1, workers=-1)
+    return np.sqrt(np.maximum(np.mean(distances[:, 1:] ** 2, axis=1), MIN_SQUARED_DISTANCE))
+
+
+def gaussians_from_points(
+    points: Float[Array, "p 3"],
+    colors: UInt8[Array, "p 3"],
+    *,
+    opacity: float = 0.1,
+    scale: float = 1.0,
+    max_scale: float | None = None,
+    sh_degree: int = 0,
+    neighbours: int = 3,
+) -> Gaussians:
+    """One round Gaussian a point (Kerbl et al. 2023, section 5.1).
+
+    The standard deviation is `scale` times `neighbour_distances`, at most `max_scale` world units; the colour is the
+    point's in every direction; the rotation is the identity. Raises ValueError where there is no point, a coordinate
+    is not finite, or an option is outside its range.
+    """
+    points, colors = np.asarray(points), np.asarray(colors)
+    require(
+        len(points) > 0,
+        "points",
+        got="none",
+        expected="at least one point",
+        remedy="Give points, or triangulate them from the frames (jsecon.fit.triangulate).",
+    )
+    require(
+        bool(np.isfinite(points).all()),
+        "points",
+        got="a coordinate that is not finite",
+        expected="finite coordinates",
+        remedy="Drop such points first.",
+    )
+    require(0 < opacity < 1, "opacity", got=opacity, expected="between 0 and 1", remedy="0.1 is usual, 0.9 on depth.")
+    require(scale > 0, "scale", got=scale, expected="positive", remedy="1 is usual.")
+    require(sh_degree in (0, 1, 2, 3), "sh_degree", got=sh_degree, expected="0 to 3", remedy="0 is colour alone.")
+    deviations = scale * neighbour_distances(points, neighbours)
+    if max_scale is not None:
+        deviations = np.minimum(deviations, max_scale)
+    count = len(points)
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, :1] = sh_from_rgb(colors.astype(np.float64) / 255.0)
+    return Gaussians(
+        means=points.astype(np.float32),
+        log_scales=np.repeat(np.log(deviations)[:, None], 3, axis=1).astype(np.float32),
+        quaternions=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (count, 1)),
+        opacity_logits=np.full(count, math.log(opacity / (1 - opacity)), np.float32),
+        sh=sh,
+    )

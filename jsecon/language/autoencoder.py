@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from flax import linen as nn
 from jaxtyping import Float, PRNGKeyArray, UInt32
 
-from jsecon.errors import require
-from jsecon.numerics import cosine, normalize
+from jsecon.errors import require, require_shape
+from jsecon.numerics import cosine, is_traced, normalize
 from jsecon.types import Array
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
@@ -44,12 +42,11 @@ class Autoencoder:
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
         """(..., E) embeddings of any length -> (..., d) unit codes; a zero embedding stays a zero (unknown) code."""
-        require(
-            embeddings.shape[-1] == self.dim,
-            "Autoencoder.encode",
-            got=f"embeddings of size {embeddings.shape[-1]}",
-            expected=f"size {self.dim}",
-            remedy="Encode embeddings of the embedder that the autoencoder was trained on.",
+        require_shape(
+            "embeddings",
+            embeddings,
+            (..., self.dim),
+            "Encode embeddings of the embedder that the autoencoder was trained on.",
         )
         units = normalize(jnp.asarray(embeddings))
         rows = units.reshape(-1, self.dim)
@@ -58,13 +55,7 @@ class Autoencoder:
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
         """(..., d) codes -> (..., E) unit embeddings."""
-        require(
-            codes.shape[-1] == self.latent,
-            "Autoencoder.decode",
-            got=f"codes of size {codes.shape[-1]}",
-            expected=f"size {self.latent}",
-            remedy="Decode codes of this autoencoder.",
-        )
+        require_shape("codes", codes, (..., self.latent), "Decode codes of this autoencoder.")
         codes = jnp.asarray(codes)
         rows = _decode(self.decoder, codes.reshape(-1, self.latent))
         return rows.reshape(*codes.shape[:-1], self.dim)
@@ -79,18 +70,15 @@ def train_autoencoder(
     batch: int = 64,
     learning_rate: float = 7e-4,
     cosine_weight: float = 0.001,
-    cosine_over: str = "features",
     progress: Callable[[int, int], None] | None = None,
 ) -> Autoencoder:
-    """Trains LangSplat's autoencoder (REFERENCE B.5) on the regions' embeddings; the same key gives the same
-    parameters.
+    """Trains LangSplat's autoencoder (minghanqin/LangSplat, autoencoder/) on the regions' embeddings; the same key
+    gives the same parameters.
 
     embeddings: (R, E), R >= 1, brought to unit length first; zero rows (never embedded) are left out.
     epochs: passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
     batch: largest batch. The regions are dealt into batches of like size, so that no batch is a remnant of one or two,
         from which batch normalisation would learn nothing.
-    cosine_over: "features" for the cosine of each region with its reconstruction; "batch" for LangSplat's own form,
-        which takes it along the batch.
     The parameters returned are the best, by the loss in evaluation mode, of the last twentieth of the epochs.
     Raises ValueError for no usable row, numbers that are not finite, or options out of range.
     """
@@ -101,13 +89,6 @@ def train_autoencoder(
         got=f"batch={batch}, epochs={epochs}",
         expected="both at least 1",
         remedy="Leave epochs out to have it chosen.",
-    )
-    require(
-        cosine_over in ("features", "batch"),
-        "train_autoencoder",
-        got=f"cosine_over={cosine_over!r}",
-        expected="'features' or 'batch'",
-        remedy="'batch' reproduces LangSplat.",
     )
     rows = np.asarray(embeddings)
     require(
@@ -136,7 +117,6 @@ def train_autoencoder(
         batches,
         learning_rate,
         cosine_weight,
-        cosine_over,
     )
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
@@ -148,7 +128,7 @@ def train_autoencoder(
             jax.block_until_ready(carry)
             progress(stop, total)
     _, vector, stats = carry[1]
-    vector = vector if isinstance(vector, jax.core.Tracer) else np.asarray(vector)  # whose slices compile nothing
+    vector = vector if is_traced(vector) else np.asarray(vector)  # whose slices compile nothing
     params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
     return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
 
@@ -161,7 +141,6 @@ class _Plan(NamedTuple):
     batches: int
     learning_rate: float
     cosine_weight: float
-    cosine_over: str
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -181,15 +160,16 @@ def _start(units: Array, key: Key, plan: _Plan) -> Any:
     stats = {
         name: {"mean": jnp.zeros_like(norm["mean"]), "var": jnp.ones_like(norm["var"])} for name, norm in stats.items()
     }
-    moments = optax.adam(plan.learning_rate).init(vector)
+    moments = _optimizer(plan).init(vector)
     return (vector, stats, moments), (jnp.asarray(jnp.inf, units.dtype), vector, stats)
 
 
 def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
     """Shapes of the parameters {"encoder", "decoder"} and of the batch statistics."""
     key, codes = jax.random.key(0), jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
-    first = jax.eval_shape(lambda: _Encoder(plan.encoder_widths).init(key, units[:1], train=False))
-    second = jax.eval_shape(lambda: _Decoder(plan.decoder_widths).init(key, codes))
+    encoder, decoder = _layers()
+    first = jax.eval_shape(lambda: encoder(plan.encoder_widths).init(key, units[:1], train=False))
+    second = jax.eval_shape(lambda: decoder(plan.decoder_widths).init(key, codes))
     return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
 
 
@@ -201,6 +181,12 @@ def _unflatten(vector: Any, shapes: Any) -> Any:
     return jax.tree.unflatten(tree, parts)
 
 
+def _optimizer(plan: _Plan) -> Any:
+    import optax
+
+    return optax.adam(plan.learning_rate)
+
+
 # The bounds are arguments: one compiled loop serves every stretch between two calls of `progress`.
 @functools.partial(jax.jit, static_argnames="plan")
 def _epochs(
@@ -208,14 +194,13 @@ def _epochs(
 ) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
-    encoder, decoder = _Encoder(plan.encoder_widths), _Decoder(plan.decoder_widths)
-    optimizer = optax.adam(plan.learning_rate)
+    encoder, decoder = (layers(widths) for layers, widths in zip(_layers(), (plan.encoder_widths, plan.decoder_widths)))
+    optimizer = _optimizer(plan)
     shapes, _ = _shapes(units, plan)
 
     def difference(params, codes, x, weight):
         out: Any = decoder.apply({"params": params["decoder"]}, codes)
-        alike = cosine(out, x) if plan.cosine_over == "features" else cosine(out.T, x.T)
-        return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(alike))
+        return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(cosine(out, x)))
 
     def loss(vector, stats, x):
         params = _unflatten(vector, shapes)
@@ -227,7 +212,7 @@ def _epochs(
         vector, stats, moments = state
         gradient, stats = jax.grad(loss, has_aux=True)(vector, stats, x)
         updates, moments = optimizer.update(gradient, moments)
-        return (optax.apply_updates(vector, updates), stats, moments), None
+        return (vector + updates, stats, moments), None
 
     def epoch(index, carry):
         state, best = carry
@@ -256,33 +241,39 @@ def _widths(params: Any) -> tuple[int, ...]:
 
 @jax.jit
 def _encode(variables: Any, rows: Array) -> Array:
-    codes: Any = _Encoder(_widths(variables["params"])).apply(variables, rows, train=False)
+    codes: Any = _layers()[0](_widths(variables["params"])).apply(variables, rows, train=False)
     return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
 
 
 @jax.jit
 def _decode(variables: Any, rows: Array) -> Any:
-    return _Decoder(_widths(variables["params"])).apply(variables, rows)
+    return _layers()[1](_widths(variables["params"])).apply(variables, rows)
 
 
-class _Encoder(nn.Module):
-    widths: tuple[int, ...]
+@functools.cache
+def _layers() -> tuple[Any, Any]:
+    """Encoder and decoder, by their widths. flax is imported here, late: a field is read without it."""
+    from flax import linen as nn
 
-    @nn.compact
-    def __call__(self, x, train: bool):
-        x = nn.Dense(self.widths[0], param_dtype=x.dtype)(x)
-        for width in self.widths[1:]:
-            norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
-            x = nn.relu(norm(x))
-            x = nn.Dense(width, param_dtype=x.dtype)(x)
-        return normalize(x)
+    class Encoder(nn.Module):
+        widths: tuple[int, ...]
 
+        @nn.compact
+        def __call__(self, x, train: bool):
+            x = nn.Dense(self.widths[0], param_dtype=x.dtype)(x)
+            for width in self.widths[1:]:
+                norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
+                x = nn.relu(norm(x))
+                x = nn.Dense(width, param_dtype=x.dtype)(x)
+            return normalize(x)
 
-class _Decoder(nn.Module):
-    widths: tuple[int, ...]
+    class Decoder(nn.Module):
+        widths: tuple[int, ...]
 
-    @nn.compact
-    def __call__(self, x):
-        for index, width in enumerate(self.widths):
-            x = nn.Dense(width, param_dtype=x.dtype)(nn.relu(x) if index else x)
-        return normalize(x)
+        @nn.compact
+        def __call__(self, x):
+            for index, width in enumerate(self.widths):
+                x = nn.Dense(width, param_dtype=x.dtype)(nn.relu(x) if index else x)
+            return normalize(x)
+
+    return Encoder, Decoder

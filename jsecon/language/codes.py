@@ -1,7 +1,7 @@
 """Small codes for the regions: which kind, of how many numbers, and why.
 
 A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact where the regions' span fits), `Spread`
-(a code a region, placed on the sphere so that distinct regions stay apart), LangSplat's `Autoencoder`
+(a code per region, placed on the sphere so that distinct regions stay apart), LangSplat's `Autoencoder`
 (jsecon.language.autoencoder), or None (the embeddings themselves). `region_codes` chooses.
 """
 
@@ -12,20 +12,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Bool, Float, PRNGKeyArray, UInt32
 
 from jsecon.errors import require
 from jsecon.language.autoencoder import train_autoencoder
+from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.types import Array
 
 MAX_COSINE_LOSS = 1e-4
 """a rotation counts as lossless when no cosine between two regions moves by more than this"""
-SEPARATION = 0.9
-"""cosine of two codes from which a query by code takes one for the other (query.anchored.CODE_THRESHOLD)"""
-ALIKE = 0.95
-"""cosine of two embeddings from which two regions are one thing seen twice, and may share a code"""
+CODE_THRESHOLD = 0.9
+"""on the cosine of codes: from it on a query takes one for the other. Codes distilled from one region lie within a few
+degrees (0.9 is 26)"""
 LATENTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """sizes of code that "auto" tries"""
 SHARPNESS = 40.0
@@ -93,15 +92,15 @@ def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "
 def region_codes(
     embeddings: Float[Array, "r e"], *, latent: int | str, key: Key, **training: Any
 ) -> tuple[Float[Array, "r d"], Coder, str]:
-    """The cheapest code of at most `latent` numbers a region that keeps the regions' cosines, and why that one.
+    """The cheapest code of at most `latent` numbers per region that keeps the regions' cosines, and why that one.
 
     embeddings: (R, E); a zero row (never embedded) gets a zero code. `training` goes to `train_autoencoder`.
     Returns (codes (R, d) of unit length, coder, reason), d = min(latent, E):
     E <= latent: the unit embeddings, coder None; regions whose span has at most `latent` dimensions: coordinates in it,
     a `Rotation`, no cosine moved by more than 1e-4; else the codes of an `Autoencoder` trained on them.
     latent="auto": the smallest of `LATENTS`, and of a `Rotation` and `Spread` codes the first, that keeps every pair of
-    distinct regions (embeddings' cosine below `ALIKE`) apart at a query's threshold (codes' cosine below `SEPARATION`);
-    None where no code shorter than the embeddings does.
+    distinct regions (embeddings' cosine below `ALIKE_THRESHOLD`) apart at a query's threshold (codes' cosine below
+    `CODE_THRESHOLD`); None where no code shorter than the embeddings does.
     Raises ValueError for numbers that are not finite.
     """
     require(
@@ -147,7 +146,7 @@ def _smallest_codes(units: Array) -> tuple[Array, Coder, str]:
             codes, coder = make(units, latent)
             if not confused_pairs(units, codes):
                 told = f"{kind} of {latent} numbers: all {distinct} pairs of {count} regions stay apart"
-                return codes, coder, f"left out: {told} (cosine below {SEPARATION:g})"
+                return codes, coder, f"left out: {told} (cosine below {CODE_THRESHOLD:g})"
     return units, None, f"left out: no code shorter than {dim} numbers keeps all {distinct} pairs of regions apart"
 
 
@@ -162,13 +161,15 @@ def _spread_out(units: Array, latent: int) -> tuple[Array, Spread]:
 
 
 def distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
-    """(R, R) where two regions with an embedding are two things: their cosine is below `ALIKE`."""
+    """(R, R) where two regions with an embedding are two things: their cosine is below `ALIKE_THRESHOLD`."""
     exact = np.asarray(units, np.float64)
     known = np.any(exact != 0, axis=1)
-    return (exact @ exact.T < ALIKE) & known[:, None] & known[None]
+    return (exact @ exact.T < ALIKE_THRESHOLD) & known[:, None] & known[None]
 
 
-def confused_pairs(units: Float[Array, "r e"], codes: Float[Array, "r d"], *, separation: float = SEPARATION) -> int:
+def confused_pairs(
+    units: Float[Array, "r e"], codes: Float[Array, "r d"], *, separation: float = CODE_THRESHOLD
+) -> int:
     """Pairs of distinct regions whose unit codes have a cosine of at least `separation`."""
     exact = np.asarray(codes, np.float64)
     return int((distinct_pairs(units) & (exact @ exact.T >= separation)).sum()) // 2
@@ -187,7 +188,7 @@ def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
 
 
 def spread_codes(
-    units: Float[Array, "r e"], latent: int, *, separation: float = SEPARATION, steps: int = 400
+    units: Float[Array, "r e"], latent: int, *, separation: float = CODE_THRESHOLD, steps: int = 400
 ) -> Float[Array, "r d"]:
     """Unit codes (R, d) whose cosines are those of the regions (R, E) as far as that leaves distinct ones apart.
 
@@ -231,9 +232,11 @@ def _spread(start: Array, target: Array, distinct: Array, alike: Array, separati
         # A pair that is confused weighs as much as all cosines together, however many regions there are.
         return jnp.sum(error**2) / pairs + 10.0 * jnp.sum(too_near**2 + 0.1 * too_far**2)
 
+    import optax  # late: a field is read without it
+
     optimizer = optax.adam(optax.cosine_decay_schedule(0.05, steps))
 
-    def step(state, _):
+    def step(state, _) -> tuple[Any, None]:
         points, moments = state
         updates, moments = optimizer.update(jax.grad(loss)(points), moments)
         return (optax.apply_updates(points, updates), moments), None

@@ -1,8 +1,7 @@
 """Codes of the regions to codes of the Gaussians: closed forms on the votes, and the paper's path on the rendered L1.
 
 With the geometry frozen the rendered map is linear in the Gaussians' features, so the votes (weight that each region
-casts on each Gaussian) hold what a closed form needs. The paper instead descends on the rendered L1 with Adam;
-`distill_l1` is that path, kept to reproduce it and to measure against.
+casts on each Gaussian) hold what a closed form needs. `distill_l1` is the paper's path, Adam on the rendered L1.
 """
 
 import dataclasses
@@ -15,10 +14,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Float, Int, PRNGKeyArray, UInt32
 
-from jsecon.errors import require
-from jsecon.numerics import normalize, safe_norm
-from jsecon.splat.plan import ViewPlan, is_traced, plan_view, plan_views, render_plan
-from jsecon.splat.tiles import plan_capacity
+from jsecon.errors import require, require_one_of, require_shape
+from jsecon.numerics import is_traced, normalize, safe_norm
+from jsecon.splat.capacity import plan_capacity
+from jsecon.splat.plan import ViewPlan, plan_view, plan_views, render_plan
 from jsecon.types import Array, Camera, Gaussians, Votes
 
 ADAM_EPS = 1e-15
@@ -56,19 +55,9 @@ def distill_votes(
     the votes' weight is for regions that have no code themselves (zero rows), and those of which less than
     `least_labelled` of all weight lies on labelled pixels (0 keeps them). Raises ValueError on shapes that disagree.
     """
-    require(
-        reduce in _REDUCTIONS,
-        "distill_votes",
-        got=f"reduce={reduce!r}",
-        expected=f"one of {sorted(_REDUCTIONS)}",
-        remedy="'mode' is the default.",
-    )
-    require(
-        region_codes.shape[0] == votes.num_regions,
-        "distill_votes",
-        got=f"{region_codes.shape[0]} region codes",
-        expected=f"{votes.num_regions}, the votes' regions",
-        remedy="Pass one code a region, in the regions' order.",
+    require_one_of("reduce", reduce, _REDUCTIONS, "'mode' is the default.")
+    require_shape(
+        "region_codes", region_codes, (votes.num_regions, "d"), "Pass one code per region, in the regions' order."
     )
     if votes.num_regions == 0 or votes.regions.shape[1] == 0:
         return jnp.zeros((votes.regions.shape[0], region_codes.shape[1]), region_codes.dtype)
@@ -148,7 +137,7 @@ def distill_l1(
     capacity: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Float[Array, "n d"], Float[Array, " steps"]]:
-    """The paper's distillation (as LangSplat's, REFERENCE B.6): Adam on the L1 between rendered and target codes.
+    """The paper's distillation (as LangSplat's, train.py): Adam on the L1 between rendered and target codes.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
     numbers of |F m - G m|: F the rendering of f / (|f| + 1e-9) without background or renormalisation, G the code of the
@@ -158,21 +147,19 @@ def distill_l1(
 
     init: "zero" is LangSplat's, and a trap: the gradient through f / (|f| + 1e-9) at zero is 1e9 times too large,
     Adam's second moment remembers it for about 15,000 steps, and until then a Gaussian's code hardly moves from the
-    corner of the cube that its first step took it to (REFERENCE B.7). "random" (length 0.01) or codes to start from,
+    corner of the cube that its first step took it to. "random" (length 0.01) or codes to start from,
     (N, d) such as those of `distill_votes`, escape it. Gaussians that no labelled pixel sees get a zero code, or keep
     the one given.
 
-    Returns the unit codes (N, d) (zero where still zero) and the loss before each step. capacity is planned from the
-    data outside jit, and needed inside it. Raises ValueError on shapes that disagree and, outside jit, where the
-    capacity given is too small.
+    Returns the unit codes (N, d) (zero where still zero) and the loss before each step, NaN where the view overflowed
+    its capacity (as for `render`: outside a trace only a given one can). Raises ValueError on shapes that disagree and,
+    outside a trace, on such a NaN.
     """
-    start = descent(
-        gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init, learning_rate=learning_rate
-    )
-    if capacity is None:
-        capacity = plan_capacity(gaussians, cameras, margin=1.0)
+    start = descent(gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init)
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
+    if plans is None and capacity is None and not is_traced((gaussians, cameras)):
+        capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
         state = descend(
@@ -195,7 +182,7 @@ def distill_l1(
             "distill_l1",
             got=f"capacity={capacity}, too small for a view, or NaN",
             expected="every view within the capacity, finite Gaussians and codes",
-            remedy="Leave capacity out to have it planned, and check the Gaussians with jsecon.numerics.finite.",
+            remedy="Leave capacity out, and check the Gaussians with jsecon.numerics.finite.",
         )
     codes = normalize(state.features)
     if isinstance(init, str) and init == "random":
@@ -213,17 +200,11 @@ def descent(
     steps: int,
     key: Key,
     init: str | Float[Array, "n d"] = "zero",
-    learning_rate: float = 0.0025,
 ) -> Descent:
     """The state before the first step of `distill_l1`; see there for the arguments."""
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
-    require(
-        labels.shape[1:] == (cameras.height, cameras.width) and cameras.world_to_camera.shape[:-2] == (views,),
-        "distill_l1",
-        got=f"labels {labels.shape}",
-        expected=f"one (H, W) = ({cameras.height}, {cameras.width}) image a camera",
-        remedy="Pass the labels and the cameras of the same views at the same size.",
-    )
+    expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
+    require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
     require(
         views > 0 and steps > 0 and region_codes.shape[0] > 0,
         "distill_l1",
@@ -234,30 +215,20 @@ def descent(
     order_key, init_key = jax.random.split(key)
     dtype = region_codes.dtype
     if isinstance(init, str):
-        require(
-            init in ("zero", "random"),
-            "distill_l1",
-            got=f"init={init!r}",
-            expected="'zero', 'random' or codes (N, d)",
-            remedy="Start from distill_votes(...) where you have votes.",
+        require_one_of(
+            "init", init, ("zero", "random"), "Start from distill_votes(...), codes (N, d), where you have votes."
         )
         features = jnp.zeros((count, size), dtype)
         if init == "random":
             features = RANDOM_LENGTH * normalize(jax.random.normal(init_key, (count, size), dtype))
     else:
-        require(
-            init.shape == (count, size),
-            "distill_l1",
-            got=f"init {init.shape}",
-            expected=f"{(count, size)}",
-            remedy="Codes to start from have one row a Gaussian, of the regions' code size.",
+        require_shape(
+            "init", init, (count, size), "Codes to start from have one row per Gaussian, of the regions' code size."
         )
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    return Descent(
-        features, _optimizer(learning_rate).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32)
-    )
+    return Descent(features, _optimizer(0.0).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
 
 
 def descend(
@@ -268,13 +239,13 @@ def descend(
     region_codes: Float[Array, "r d"],
     *,
     until: int,
-    capacity: int,
+    capacity: int | None = None,
     learning_rate: float = 0.0025,
     plans: ViewPlan | None = None,
 ) -> Descent:
     """Takes `state` on to `until` steps. In stretches or at once, with one compilation and one result.
 
-    `plans` are those of `splat.plan.plan_views` with the same capacity; without them each step plans its view.
+    `plans` are those of `splat.plan.plan_views`; without them each step plans its view.
     """
     # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
     table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))

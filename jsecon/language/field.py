@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jsecon.errors import InputError, require
@@ -142,7 +141,7 @@ def _unpack(node: dict, members: Any) -> Any:
         raise ValueError(
             f"{node['array']} is {array.dtype}{array.shape}, header says {node['dtype']}{tuple(node['shape'])}"
         )
-    return jnp.asarray(array) if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype else array
+    return jax.device_put(array) if jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype else array
 
 
 def _disagreement(field: LanguageField) -> str | None:

@@ -1,27 +1,27 @@
 """Votes: the weight that each region casts on each Gaussian, W^T onto one-hot labels, in one pass over the views.
 
 With the geometry frozen, rendering is linear in the features (image = W f, W the alpha T weights), and the masklet
-targets take only R values. The N x R votes therefore hold all that distillation needs (DESIGN section 3; REFERENCE
-I.1).
+targets take only R values. The N x R votes therefore hold all that distillation needs.
 """
 
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Int
 
-from jsecon.errors import require
-from jsecon.numerics import NEAR
+from jsecon.errors import require, require_shape
+from jsecon.numerics import NEAR, is_traced
 from jsecon.parallel import spread_over_devices
-from jsecon.splat.batches import make_batches, to_tiles
-from jsecon.splat.plan import ViewPlan, is_traced, plan_view
-from jsecon.splat.stored import stored
-from jsecon.splat.tiles import plan_capacity
-from jsecon.splat.walk import make_table, walk, weights
+from jsecon.splat.capacity import default_capacity, enough_capacity
+from jsecon.splat.fusion import stored
+from jsecon.splat.plan import ViewPlan, plan_view
+from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
 from jsecon.types import Array, Camera, Gaussians, Votes
 
 # A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
@@ -48,46 +48,38 @@ def region_votes(
     """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
 
     Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
-    is kept too (`Votes.by_view`, 4 T N bytes, twice that while it is joined), as `query.showing.with_shown` wants it.
+    is kept too (`Votes.by_view`, 4 T N bytes, twice that while it is joined), as `language.shares.with_shown` wants it.
 
     Outside a trace the views are spread over jax's local devices (a million pixels or more in all), and over processes
     that all make the same call (`jax.distributed`), and `progress(done, total)` is called after each; inside one the
-    views are scanned and `capacity` must be given. Raises ValueError on shapes that disagree.
+    views are scanned. `capacity` as for `render`, but overflow is looked at once, when all views are done: where there
+    is any, outside a trace and without a capacity given, all votes are cast again with enough. Raises ValueError on
+    shapes that disagree.
     """
     views = cameras.world_to_camera.shape[0]
-    require(
-        cameras.world_to_camera.ndim == 3,
-        "cameras",
-        got=cameras.world_to_camera.shape,
-        expected="a batch (T, 4, 4)",
-        remedy="Add a leading axis to every array of a single camera.",
+    require_shape(
+        "cameras.world_to_camera",
+        cameras.world_to_camera,
+        ("T", 4, 4),
+        "Add a leading axis to every array of a single camera.",
     )
-    require(
-        labels.shape == (views, cameras.height, cameras.width),
-        "labels",
-        got=labels.shape,
-        expected=f"({views}, {cameras.height}, {cameras.width})",
-        remedy="Give one label image of the camera's size a view.",
+    require_shape(
+        "labels", labels, (views, cameras.height, cameras.width), "Give one label image per view, of the camera's size."
     )
     require(num_regions >= 0, "num_regions", got=num_regions, expected=">= 0", remedy="Count the regions.")
     traced = is_traced((gaussians, cameras, labels))
-    if capacity is None:
-        require(
-            not traced,
-            "capacity",
-            got=None,
-            expected="a static int inside jit",
-            remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras).",
-        )
-        capacity = plan_capacity(gaussians, cameras, margin=1.0)
     count = gaussians.means.shape[0]
+    size = default_capacity(count, cameras.width, cameras.height) if capacity is None else capacity
     block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
     blocks = math.ceil(max(num_regions, 1) / block)
-    static = capacity, near, by_view
-    kept = (jnp.full((count, 0), -1, jnp.int32), jnp.zeros((count, 0), gaussians.means.dtype))
+    static = size, near, by_view
+    xp = jnp if traced else np  # NumPy compiles nothing
+    totals: Any = None
+    kept = (np.full((count, 0), -1, np.int32), np.zeros((count, 0), gaussians.means.dtype))
     for b in range(blocks):
-        inside = _labels_of_block(labels, b * block, block)
-        start = _empty(count, block, gaussians.means.dtype)
+        local = xp.asarray(labels, np.int32) - b * block
+        inside = xp.where((local >= 0) & (local < block), local, -1)  # counted from the block of regions
+        start = _empty(xp, count, block, gaussians.means.dtype)
         if traced:
             state, totals = lax.scan(lambda s, view: _add_view(s, gaussians, view, *static), start, (cameras, inside))
         else:
@@ -102,8 +94,21 @@ def region_votes(
                 most=None if labels.size >= _MANY_PIXELS else 1,
                 progress=report,
             )
-        kept = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
-        labelled = state["votes"].sum(-1) if b == 0 else labelled + state["votes"].sum(-1)
+            if capacity is None and (missing := np.asarray(state["missing"])):
+                size = enough_capacity(size, missing[None])
+                return region_votes(
+                    gaussians,
+                    cameras,
+                    labels,
+                    num_regions,
+                    top=top,
+                    by_view=by_view,
+                    capacity=size,
+                    near=near,
+                    progress=progress,
+                )
+        kept, own = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
+        labelled = own if b == 0 else labelled + own
     seen = None
     if by_view:
         seen = totals if traced else jnp.stack(totals)
@@ -112,33 +117,31 @@ def region_votes(
     )
 
 
-def _labels_of_block(labels: Array, first: int, block: int) -> Array:
-    """Labels counted from `first`, -1 outside the block of regions."""
-    local = jnp.asarray(labels, jnp.int32) - first
-    return jnp.where((local >= 0) & (local < block), local, -1)
-
-
-def _empty(count: int, regions: int, dtype) -> dict[str, Array]:
+def _empty(xp: Any, count: int, regions: int, dtype) -> dict[str, Array]:
     return {
-        "votes": jnp.zeros((count, regions), dtype),
-        "total": jnp.zeros(count, dtype),
-        "peak": jnp.zeros(count, dtype),
-        "views": jnp.zeros(count, jnp.int32),
-        "overflow": jnp.zeros((), jnp.int32),
+        "votes": xp.zeros((count, regions), dtype),
+        "total": xp.zeros(count, dtype),
+        "peak": xp.zeros(count, dtype),
+        "views": xp.zeros(count, np.int32),
+        "overflow": xp.zeros((), np.int32),
+        "missing": xp.zeros((), np.int32),  # the largest overflow of a view
     }
 
 
+@jax.jit
 def _merge(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
-    return {key: jnp.maximum(a[key], b[key]) if key == "peak" else a[key] + b[key] for key in a}
+    return {key: jnp.maximum(a[key], b[key]) if key in ("peak", "missing") else a[key] + b[key] for key in a}
 
 
 @functools.partial(jax.jit, static_argnums=(3,))
-def _keep_strongest(kept: tuple[Array, Array], votes: Array, first: int | Array, top: int) -> tuple[Array, Array]:
-    """Merges a dense block of votes into the strongest ones kept so far."""
+def _keep_strongest(
+    kept: tuple[Array, Array], votes: Array, first: int | Array, top: int
+) -> tuple[tuple[Array, Array], Array]:
+    """Merges a dense block of votes into the strongest ones kept so far; and (N,) the block's weight."""
     ids = jnp.broadcast_to(first + jnp.arange(votes.shape[1], dtype=jnp.int32), votes.shape)
     ids, weights = jnp.concatenate([kept[0], ids], 1), jnp.concatenate([kept[1], votes], 1)
     weights, place = lax.top_k(weights, min(top, weights.shape[1]))
-    return jnp.where(weights > 0, jnp.take_along_axis(ids, place, axis=1), -1), weights
+    return (jnp.where(weights > 0, jnp.take_along_axis(ids, place, axis=1), -1), weights), votes.sum(-1)
 
 
 def _add_view(
@@ -156,7 +159,7 @@ def _add_plan(
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, plan.width)
     tiles = to_tiles(labels + 1, lists.tile) - 1
-    distinct = _distinct(tiles)
+    distinct = distinct_labels(tiles, _SLOTS)
     dtype = splats.dtype
     in_image = to_tiles(jnp.ones(labels.shape, dtype), lists.tile)
 
@@ -198,18 +201,19 @@ def _add_plan(
         "peak": peak,
         "views": state["views"] + (total > 0).astype(jnp.int32),
         "overflow": state["overflow"] + plan.overflow,
+        "missing": jnp.maximum(state["missing"], plan.overflow),
     }, total if by_view else None
 
 
 _add_plan_compiled = jax.jit(_add_plan, static_argnums=3, donate_argnums=0)
 
 
-def _distinct(tiles: Int[Array, "n p"]) -> Int[Array, "n q"]:
-    """Each tile's distinct labels, ascending and to the left; _NOBODY after them, padded by a pass's slots."""
+def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
+    """Each tile's distinct labels, ascending and to the left; _NOBODY after them, `slots` more columns than pixels."""
     ordered = jnp.sort(tiles, axis=1)
     new = jnp.concatenate([jnp.ones_like(ordered[:, :1], bool), ordered[:, 1:] != ordered[:, :-1]], axis=1) & (
         ordered >= 0
     )
-    place = jnp.where(new, jnp.cumsum(new, axis=1) - 1, tiles.shape[1] + _SLOTS)
-    table = jnp.full((tiles.shape[0], tiles.shape[1] + _SLOTS), _NOBODY, tiles.dtype)
+    place = jnp.where(new, jnp.cumsum(new, axis=1) - 1, tiles.shape[1] + slots)
+    table = jnp.full((tiles.shape[0], tiles.shape[1] + slots), _NOBODY, tiles.dtype)
     return table.at[jnp.arange(tiles.shape[0])[:, None], place].set(ordered, mode="drop")

@@ -1,15 +1,13 @@
 """A selection as a 2D mask: render the selected Gaussians alone, threshold their alpha (OpenGaussian's protocol)."""
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from jsecon.errors import require
-from jsecon.splat.render import is_traced, render
-from jsecon.splat.tiles import plan_capacity
+from jsecon.errors import require_shape
+from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
 ALPHA_THRESHOLD = 0.7
@@ -28,9 +26,10 @@ def selection_mask(
 ) -> Bool[Array, "h w"]:
     """(H, W) bool: where the rendering of the selected Gaussians alone, all others deleted, has alpha > threshold.
 
-    Occlusion by what is not selected is not taken into account: that is the protocol. capacity as for `render`.
+    Occlusion by what is not selected is not taken into account: that is the protocol. capacity as for `render`; inside
+    a trace `render_selection` tells what overflowed it.
     """
-    return render_selection(gaussians, camera, mask, capacity=capacity).alpha > threshold
+    return _rendered(gaussians, camera, mask, None, capacity).alpha > threshold
 
 
 def render_selection(
@@ -45,17 +44,21 @@ def render_selection(
 
     Those not selected become transparent instead of being cut out, so that every selection shares one compilation.
     """
-    require(
-        mask.shape == (gaussians.count,),
-        "mask",
-        got=mask.shape,
-        expected=f"({gaussians.count},)",
-        remedy="Pass one truth value a Gaussian.",
-    )
-    logits = jnp.where(mask, gaussians.opacity_logits, _HIDDEN_LOGIT)
+    rendering = _rendered(gaussians, camera, mask, similarity, capacity)
+    return dataclasses.replace(rendering, features=rendering.features[..., :1])
+
+
+def _rendered(
+    gaussians: Gaussians, camera: Camera, mask: Array, similarity: Array | None, capacity: int | None
+) -> Rendering:
+    require_shape("mask", mask, (gaussians.count,), "Pass one truth value per Gaussian.")
+    logits, features = _alone(gaussians.opacity_logits, mask, similarity)
+    return render(dataclasses.replace(gaussians, opacity_logits=logits), camera, features, capacity=capacity)
+
+
+@jax.jit
+def _alone(logits: Array, mask: Array, similarity: Array | None) -> tuple[Array, Array]:
+    """Opacity logits that hide what is not selected, and what of each Gaussian is rendered: in three columns, so that
+    the program that renders colours serves."""
     features = jnp.where(mask, jnp.ones_like(logits) if similarity is None else similarity, 0.0)
-    hidden = jax.tree.map(jnp.asarray, dataclasses.replace(gaussians, opacity_logits=logits))
-    if capacity is None and not is_traced((hidden, camera)):
-        # Selections differ in size: in steps of four, a handful of compilations serves them all.
-        capacity = 4 ** math.ceil(math.log(plan_capacity(hidden, camera, margin=1.0), 4))
-    return render(hidden, camera, features[:, None], capacity=capacity)
+    return jnp.where(mask, logits, _HIDDEN_LOGIT), jnp.broadcast_to(features[:, None], (*features.shape, 3))

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
+from jsecon.language.shares import vote_shares
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.project import project
 from jsecon.types import Array, Camera, Gaussians, LanguageField
@@ -19,7 +20,7 @@ def pixel_weights(
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Ids (M,) front to back and weights alpha T (M,) of the Gaussians that make up pixel (column x, row y) of a view.
 
-    By the definition of the image (DESIGN section 5), without tiles: O(N) for one pixel, where a render is O(N) too
+    By the definition of the image (jsecon.splat.render), without tiles: O(N) for one pixel, where a render is O(N) too
     and would have to carry every region as a channel. Host code.
     """
     alpha, depths = (np.asarray(a) for a in _alphas(gaussians, camera, x + 0.5, y + 0.5))
@@ -42,9 +43,11 @@ def _alphas(gaussians: Gaussians, camera: Camera, x: Array | float, y: Array | f
 
 
 def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[np.ndarray, " r"]:
-    """(R,) how much of pixel (column x, row y) of frame `frame` each region makes up: the rendered shares of votes.
+    """(R,) how much of pixel (column x, row y) of frame `frame` each region makes up: the rendered shares p_nr,
 
-    They sum to at most the pixel's alpha; what is missing is unlabelled, beyond the strongest votes, or background.
+        sum_n w_n p_nr
+
+    with w the weights alpha T of the Gaussians there. Each is at most the pixel's alpha.
     Raises InputError for a frame or a pixel that the field does not have.
     """
     frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
@@ -64,12 +67,8 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
         )
     gaussians, camera = jax.tree.map(jnp.asarray, (field.gaussians, _view(field.cameras, frame)))
     ids, weights = pixel_weights(gaussians, camera, x, y)
-    regions, votes = np.asarray(field.votes.regions)[ids], np.asarray(field.votes.weights)[ids].astype(np.float64)
-    total = np.asarray(field.votes.total)[ids].astype(np.float64)
-    share = (
-        np.where(np.isfinite(votes) & (regions >= 0) & (total[:, None] > 0), votes, 0.0)
-        / np.where(total > 0, total, 1.0)[:, None]
-    )
+    regions = np.asarray(field.votes.regions)[ids]
+    share = np.nan_to_num(np.asarray(vote_shares(field.votes))[ids].astype(np.float64))
     shares = np.zeros(field.regions.count)
     np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
     return shares

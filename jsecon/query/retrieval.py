@@ -1,5 +1,5 @@
 """From a text to the regions that answer it: what sets the text apart from other texts against what sets a region apart
-from the other regions.
+from the other regions; and which regions are the same thing, of the same kind, or pieces of it.
 
 In a space such as CLIP's all texts lie in one narrow cone and all images in another. A cosine between the two is mostly
 that of the cones, and where a region's embedding is noisy it is decided by how far the noise points along them. Both
@@ -7,11 +7,12 @@ are the same for every text and every region of a scene, so that both can be tak
 """
 
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
-from jsecon.errors import require
+from jsecon.errors import require_one_of
+from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.numerics import normalize
-from jsecon.query.one_step import Number, similarities
+from jsecon.query.direct import Number, similarities
 from jsecon.types import Array
 
 RETRIEVALS = ("contrast", "cosine")
@@ -24,6 +25,13 @@ RETRIEVAL_THRESHOLD = 0.2
 """The paper's "low threshold to filter invalid prompts" on the cosine, which it does not state. In CLIP ViT-B/16 an
 image has a cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without
 CLIP's gap are far above for texts that fit."""
+NEARNESS = 0.8
+"""all of a kind: how far a region's similarity has come from that of the middle region to that of the best"""
+PIECE_NEARNESS = 0.5
+"""a piece: nearer to the best than to the middle region"""
+PIECE_OVERLAP = 0.1
+"""the least soft IoU of two regions' Gaussians where the two are pieces of one thing. In twins of two scenes (simulated
+vision, little to much noise) 106 of the 115 pieces that are near enough reach it, and 4 of 58 other regions"""
 
 
 def apart_from_scene(
@@ -91,13 +99,83 @@ def answers(
 def threshold_of(retrieval: str, given: Number | None, where: str) -> Number:
     """The threshold that was given, or that of the kind of retrieval. Raises ValueError, naming the function `where`,
     unless `retrieval` is one of RETRIEVALS."""
-    require(
-        retrieval in RETRIEVALS,
-        where,
-        got=f"retrieval={retrieval!r}",
-        expected=" or ".join(map(repr, RETRIEVALS)),
-        remedy="'contrast' is the default.",
-    )
+    require_one_of(where, retrieval, RETRIEVALS, "'contrast' is the default.")
     if given is not None:
         return given
     return RETRIEVAL_THRESHOLD if retrieval == "cosine" else CONTRAST_THRESHOLD
+
+
+def regions_of_text(
+    embeddings: Float[Array, "r e"],
+    similarity: Float[Array, " r"],
+    known: Bool[Array, " r"],
+    overlap: Float[Array, "r r"] | None = None,
+    *,
+    retrieval_threshold: Number,
+    several: bool = True,
+    nearness: Number = NEARNESS,
+    alike_threshold: Number | None = ALIKE_THRESHOLD,
+    piece_nearness: Number | None = PIECE_NEARNESS,
+) -> Bool[Array, " r"]:
+    """Which of R regions answer a text, from the similarity s_r of each with it (R,), where that is known (R,).
+
+    None where the largest, s_a, is below `retrieval_threshold`. Else a and every r with one of
+
+        s_r >= m + nearness (s_a - m)              with `several`: of the same kind (`is_near`)
+        s_r >= m + piece_nearness (s_a - m), o_rc >= PIECE_OVERLAP     with c = a or of its kind: a piece (`is_piece`)
+        cos(e_r, e_a) >= alike_threshold           the same thing seen twice (`is_alike`)
+
+    with m the median of the known s, o the soft IoU of two regions' Gaussians, `overlap` (R, R), and e the embeddings
+    (R, E). No pieces where `overlap` or `piece_nearness` is None, none alike where `alike_threshold` is.
+    """
+    scored = jnp.where(known, similarity, -jnp.inf)
+    anchor = jnp.argmax(scored)
+    chosen = jnp.arange(embeddings.shape[0]) == anchor
+    if several:
+        chosen |= is_near(similarity, known, nearness)
+    if overlap is not None and piece_nearness is not None:
+        chosen |= is_piece(similarity, known, chosen, overlap, nearness=piece_nearness)
+    if alike_threshold is not None:
+        chosen |= is_alike(embeddings, anchor, alike_threshold)
+    return chosen & known & (scored[anchor] >= retrieval_threshold)
+
+
+def is_alike(
+    embeddings: Float[Array, "r e"], region: Int[Array, ""], threshold: Number = ALIKE_THRESHOLD
+) -> Bool[Array, " r"]:
+    """Which of R regions have an embedding whose cosine with that of `region` is at least `threshold`."""
+    cosines, known = similarities(embeddings, embeddings[region])
+    return known & (cosines >= threshold)
+
+
+def is_near(similarity: Float[Array, " r"], known: Bool[Array, " r"], nearness: Number) -> Bool[Array, " r"]:
+    """Which of R regions are about as similar to a text as the best one is:
+
+        s_r >= m + nearness (b - m),  b > m
+
+    with s the similarities (R,) where known (R,), b the largest and m the median of them: only the place between the
+    typical region and the best means something.
+    """
+    middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
+    best = jnp.max(jnp.where(known, similarity, -jnp.inf))
+    return known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
+
+
+def is_piece(
+    similarity: Float[Array, " r"],
+    known: Bool[Array, " r"],
+    chosen: Bool[Array, " r"],
+    overlap: Float[Array, "r r"],
+    *,
+    nearness: Number = PIECE_NEARNESS,
+    least: Number = PIECE_OVERLAP,
+) -> Bool[Array, " r"]:
+    """Which of R regions are pieces of the things that the `chosen` regions (R,) are of, as a text sees them:
+
+        s_r >= m + nearness (b - m),  b > m,  max_{c chosen} o_rc >= least
+
+    the first two as in `is_near`, o the overlap (R, R) of `with_overlap`. A second thing of the kind is as near to the
+    text, but has Gaussians of its own.
+    """
+    near = is_near(similarity, known, nearness)
+    return near & (jnp.max(jnp.where(chosen[:, None], overlap, 0.0), axis=0) >= least)

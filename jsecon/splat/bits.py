@@ -5,17 +5,27 @@ slot of the output finds its bit, which costs vector arithmetic and a few loads 
 words of 32; the bits of one word for one tile are a segment, whose set bits fill neighbouring slots.
 """
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, UInt
 
-from jsecon.splat.stored import stored
+from jsecon.splat.fusion import stored
 from jsecon.types import Array
 
 WORD = 32
 """pairs in a word"""
 _SLOTS = 32768
 # slots at a time: what they need fits the second cache
+
+
+def in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
+    """`carry = step(first, carry)` for first = 0, size, 2 size and so on below `total`."""
+    onward = lambda state: (state[0] + size, step(*state))
+    return lax.while_loop(lambda state: state[0] < total, onward, (jnp.int32(0), carry))[1]
 
 
 def transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, "words t"]:
@@ -25,34 +35,59 @@ def transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, "
     return lax.reduce(bits, jnp.uint32(0), lax.bitwise_or, (1,))
 
 
-def set_before(members: UInt[Array, "words t"]) -> Int[Array, "words t"]:
-    """Set bits in all segments before each: tile after tile, and word after word within a tile."""
-    counts = lax.population_count(members).astype(jnp.int32)
-    return jnp.cumsum(counts.T.reshape(-1)).reshape(counts.T.shape).T - counts
+def set_bits(
+    reach: Callable[[Array, Array], Array], owner: Array, blocks: Array, tiles: int, total: Array, chunk: int
+) -> tuple[UInt[Array, "words t"], Int[Array, "words t"]]:
+    """The bits of all segments, `reach(owner, blocks)` transposed, and the set bits before each: tile after tile, and
+    word after word within a tile. Pairs from `total` on have none; all come in whole chunks of pairs."""
+    part = lambda a, first: lax.dynamic_slice(a, (first,), (chunk,))
+
+    def step(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        so_far, members, before = carry
+        reached = stored(first < total, reach, part(owner, first), part(blocks, first))
+        own = transpose_words(reached, tiles)
+        ends = so_far + lax.cumsum(lax.population_count(own).astype(jnp.int32))
+        put = lambda whole, part: lax.dynamic_update_slice_in_dim(whole, part, first // WORD, 0)
+        return ends[-1], put(members, own), put(before, ends - lax.population_count(own).astype(jnp.int32))
+
+    words = owner.shape[0] // WORD
+    nothing = jnp.zeros(tiles, jnp.int32), jnp.zeros((words, tiles), jnp.uint32), jnp.zeros((words, tiles), jnp.int32)
+    of_tile, members, before = in_chunks(total, chunk, step, nothing)
+    # Words that no pair fills count as after all others of their tile.
+    filled = (lax.iota(jnp.int32, words) * WORD < total)[:, None]
+    return members, jnp.where(filled, before, of_tile) + (lax.cumsum(of_tile) - of_tile)
 
 
-def read_off(members: UInt[Array, "words t"], before: Int[Array, "words t"], owner: Int[Array, " pairs"]) -> Array:
-    """(32 words t,) int32 the owners of the set bits, in the order of `set_before`; anything after the last."""
+def read_off(
+    members: UInt[Array, "words t"],
+    before: Int[Array, "words t"],
+    owner: Int[Array, " pairs"],
+    total: Array,
+    chunk: int,
+) -> Array:
+    """(32 words t,) int32 the owners of the set bits, in the order of `before`, and anything after the last. Pairs from
+    `total` on have no bits."""
     words, tiles = members.shape
-    bits, starts = members.T.reshape(-1), before.T.reshape(-1)
-    total = starts[-1] + lax.population_count(bits[-1]).astype(jnp.int32)
-    segments, slots = bits.shape[0], -(-WORD * words * tiles // _SLOTS) * _SLOTS
-    filled = bits > 0
-    # The filled segments without gaps: bits, first slot, first pair.
-    place = jnp.where(filled, jnp.cumsum(filled.astype(jnp.int32)) - 1, segments)
-    rows = [lax.bitcast_convert_type(bits, jnp.int32), starts, lax.iota(jnp.int32, segments) % words * WORD]
-    table = jnp.zeros((segments + 1, 3), jnp.int32).at[place].set(jnp.stack(rows, -1), mode="promise_in_bounds")
+    slots, chunk = -(-WORD * words * tiles // _SLOTS) * _SLOTS, chunk // WORD
+    # The filled segments without gaps: bits, first slot, first pair; and one bit for each slot where one begins.
+    nowhere = words * tiles, slots // WORD
+    counts = (members > 0).sum(0, dtype=jnp.int32)
+
+    def gather(first: Array, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Array, Array, Array]:
+        so_far, table, begins = carry
+        own, starts = (lax.dynamic_slice_in_dim(a, first, chunk) for a in (members, before))
+        filled = own > 0
+        ends = so_far + lax.cumsum(filled.astype(jnp.int32))
+        pairs = jnp.broadcast_to((first + lax.iota(jnp.int32, chunk))[:, None] * WORD, own.shape)
+        rows = jnp.stack([lax.bitcast_convert_type(own, jnp.int32), starts, pairs], -1)
+        table = table.at[jnp.where(filled, ends - 1, nowhere[0])].set(rows, mode="promise_in_bounds")
+        mark = jnp.uint32(1) << (starts % WORD).astype(jnp.uint32)
+        place = jnp.where(filled, starts // WORD, nowhere[1])
+        return ends[-1], table, begins.at[place].add(mark, mode="promise_in_bounds")
+
+    nothing = jnp.zeros((nowhere[0] + 1, 3), jnp.int32), jnp.zeros(nowhere[1] + 1, jnp.uint32)
+    _, table, begins = in_chunks(-(-total // WORD), chunk, gather, (lax.cumsum(counts) - counts, *nothing))
     columns = [table[:, i] for i in range(3)]
-    # One bit for each slot where a segment begins, and how many begin before each 32 slots.
-    nowhere = slots // WORD
-    mark = jnp.uint32(1) << (starts % WORD).astype(jnp.uint32)
-    begins = (
-        jnp.zeros(nowhere + 1, jnp.uint32)
-        .at[jnp.where(filled, starts // WORD, nowhere)]
-        .add(mark, mode="promise_in_bounds")[:-1]
-    )
-    begun = lax.population_count(begins).astype(jnp.int32)
-    begun = jnp.cumsum(begun) - begun
     until = (jnp.uint32(2) << lax.iota(jnp.uint32, WORD)) - 1
 
     def segment_of(begins: Array, begun: Array) -> Array:
@@ -70,13 +105,16 @@ def read_off(members: UInt[Array, "words t"], before: Int[Array, "words t"], own
             half //= 2
         return jnp.minimum(pair, owner.shape[0] - 1)
 
-    def step(carry):
-        first, out = carry
-        part = lambda a: lax.dynamic_slice(a, (first // WORD,), (_SLOTS // WORD,))
-        always = first < total
-        segment = stored(always, segment_of, part(begins), part(begun))
-        pairs = stored(always, pair_of, first, *stored(always, lambda s: [c[s] for c in columns], segment))
-        return first + _SLOTS, lax.dynamic_update_slice(out, owner[pairs], (first,))
+    last = before[-1, -1] + lax.population_count(members[-1, -1]).astype(jnp.int32)
 
-    out = lax.while_loop(lambda carry: carry[0] < total, step, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
+    def fill(first: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        begun, out = carry
+        own = lax.dynamic_slice(begins, (first // WORD,), (_SLOTS // WORD,))
+        begun = begun + lax.cumsum(lax.population_count(own).astype(jnp.int32))
+        always = first < last
+        segment = stored(always, segment_of, own, begun - lax.population_count(own).astype(jnp.int32))
+        pairs = stored(always, pair_of, first, *stored(always, lambda s: [c[s] for c in columns], segment))
+        return begun[-1], lax.dynamic_update_slice(out, owner[pairs], (first,))
+
+    out = in_chunks(last, _SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
     return out[: WORD * words * tiles]

@@ -11,11 +11,10 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from jsecon.numerics import MIN_TRANSMITTANCE
-from jsecon.splat.batches import make_batches, to_image, to_tiles
-from jsecon.splat.stored import stored
+from jsecon.splat.fusion import stored
 from jsecon.splat.strips import join, over_strips, split
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import CHUNK, make_table, walk, weights
+from jsecon.splat.walk import CHUNK, make_batches, make_table, to_image, to_tiles, walk, weights
 from jsecon.types import Array
 
 # `splats` (N, 6) throughout: centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity.

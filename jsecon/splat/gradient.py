@@ -11,11 +11,10 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.numerics import MAX_ALPHA
-from jsecon.splat.batches import make_batches, to_tiles
-from jsecon.splat.stored import stored
+from jsecon.splat.fusion import stored
 from jsecon.splat.strips import over_strips, split
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import ATTRIBUTES, make_table, pixel_centres, running, walk, weights
+from jsecon.splat.walk import ATTRIBUTES, make_batches, make_table, pixel_centres, running, to_tiles, walk, weights
 from jsecon.types import Array
 
 _UNROLLED = 8

@@ -11,13 +11,13 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from jsecon.errors import require
-from jsecon.numerics import NEAR, finite
+from jsecon.errors import require_shape
+from jsecon.numerics import NEAR, finite, is_traced
 from jsecon.parallel import over_rows
-from jsecon.splat.contain import splat_contained
-from jsecon.splat.differentiate import view_lists
+from jsecon.splat.autodiff import splat_contained, view_lists
+from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import check_shapes, project
-from jsecon.splat.tiles import TileLists, plan_capacity
+from jsecon.splat.tiles import TileLists
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering
 
 PLAN_BYTES = 1 << 30
@@ -50,24 +50,6 @@ class ViewPlan:
         return self.lists.overflow.sum(-1)
 
 
-def is_traced(tree) -> bool:
-    """Whether any leaf of `tree` is being traced (jit, grad, vmap)."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
-
-
-def default_capacity(gaussians: Gaussians, camera: Camera, mesh: Mesh | None = None) -> int:
-    """(block, Gaussian) pairs to allow for: planned from the data; under a trace, where there is none, it must be
-    given."""
-    require(
-        not is_traced((gaussians, camera)),
-        "capacity",
-        got=None,
-        expected="a static int inside jit, grad or vmap",
-        remedy="Pass capacity=jsecon.plan_capacity(gaussians, cameras), and check Rendering.overflow == 0.",
-    )
-    return plan_capacity(gaussians, camera, margin=1.0, devices=1 if mesh is None else mesh.size)
-
-
 def plan_view(
     gaussians: Gaussians,
     camera: Camera,
@@ -79,16 +61,24 @@ def plan_view(
     """Projects and lists one view once, for any number of `render_plan(plan, features)`.
 
     Differentiable like `render`; where only features are to be differentiated, make the plan outside of what is, and
-    no gradient of the geometry is computed. `capacity` and `mesh` as for `render`; over a mesh, each device plans its
-    strip of the image (strips.py) and keeps it. Raises ValueError on shapes that disagree.
+    no gradient of the geometry is computed. `capacity` and `mesh` as for `render`: outside a trace and without a
+    capacity it waits for the view's overflow, and where there is any, plans again with enough. Over a mesh, each device
+    plans its strip of the image (strips.py) and keeps it. Raises ValueError on shapes that disagree.
     """
     check_shapes(gaussians, camera)
-    if capacity is None:
-        capacity = default_capacity(gaussians, camera, mesh)
+    size = capacity
+    if size is None:
+        strips = 1 if mesh is None else mesh.size
+        size = default_capacity(gaussians.means.shape[0], camera.width, camera.height, strips=strips)
     # Colour has no part in it: Gaussians with and without share one program.
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
-    run = _plan if is_traced((bare, camera, near)) else _plan_compiled
-    return run(bare, camera, capacity, near, mesh)
+    if is_traced((bare, camera, near)):
+        return _plan(bare, camera, size, near, mesh)
+    plan = _plan_compiled(bare, camera, size, near, mesh)
+    # Inside a jit whose arguments are others, what was concrete here is traced in the result.
+    if capacity is None and not is_traced(plan) and (overflow := np.asarray(plan.lists.overflow)).any():
+        plan = _plan_compiled(bare, camera, enough_capacity(size, overflow), near, mesh)
+    return plan
 
 
 def _plan(
@@ -112,30 +102,40 @@ def plan_views(
     gaussians: Gaussians,
     cameras: Camera,
     *,
-    capacity: int,
+    capacity: int | None = None,
     near: float | Array = NEAR,
     most_bytes: int = PLAN_BYTES,
 ) -> ViewPlan | None:
     """The plans of all views of a batch (T), stacked on a leading axis: `jax.tree.map(lambda a: a[t], plans)` is that
     of view t. None where they would take more than `most_bytes` together: then each is to be made when it is wanted.
+
+    Outside a trace the lists are cut to what the views need.
     """
-    views = cameras.world_to_camera.shape[0]
-    make = functools.partial(plan_view, capacity=capacity, near=near)
-    shape = jax.eval_shape(make, gaussians, cameras[0])
-    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shape))
-    if views * size > most_bytes:
-        return None
-    if is_traced((gaussians, cameras, near)):
-        return lax.map(functools.partial(make, gaussians), cameras)
-    plans = jax.tree.map(lambda leaf: jnp.zeros((views, *leaf.shape), leaf.dtype), shape)
-    for t in range(views):  # by the program that plans a view for anything else
-        plans = _put(plans, make(gaussians, cameras[t]), t)
-    return plans
+    make = functools.partial(plan_view, gaussians, capacity=capacity, near=near)
+    views, first = cameras.world_to_camera.shape[0], make(cameras[0])
+    if is_traced(first):
+        return None if views * _bytes(first) > most_bytes else lax.map(make, cameras)
+    plans, largest = [], 0
+    for t in range(views):
+        plans.append(_cut(first if t == 0 else make(cameras[t])))
+        largest = max(largest, _bytes(plans[-1]))
+        if views * largest > most_bytes:
+            return None
+    length = round_capacity(max(plan.lists.gaussians.shape[0] for plan in plans))
+    return jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows)), *(_cut(plan, length) for plan in plans))
 
 
-@functools.partial(jax.jit, donate_argnums=0)
-def _put(plans: ViewPlan, plan: ViewPlan, t: Array) -> ViewPlan:
-    return jax.tree.map(lambda stacked, one: stacked.at[t].set(one), plans, plan)
+def _bytes(plan: ViewPlan) -> int:
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(plan))
+
+
+def _cut(plan: ViewPlan, length: int | None = None) -> ViewPlan:
+    """The plan in NumPy, its lists without what lies behind the last, or filled up to `length`."""
+    plan = jax.tree.map(np.asarray, plan)
+    used = int((plan.lists.starts + plan.lists.lengths).max(initial=0))
+    ids = np.zeros(used if length is None else length, np.int32)
+    ids[:used] = plan.lists.gaussians[:used]
+    return dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, gaussians=ids))
 
 
 def render_plan(
@@ -150,13 +150,7 @@ def render_plan(
     Differentiable, under jit, grad and vmap, on the devices of the plan; features, `background` and `depth` as for
     `render`. Raises ValueError on shapes that disagree.
     """
-    require(
-        features.ndim == 2 and features.shape[0] == plan.splats.shape[0],
-        "features",
-        got=features.shape,
-        expected=f"({plan.splats.shape[0]}, D)",
-        remedy="Give one row of features a Gaussian.",
-    )
+    require_shape("features", features, (plan.splats.shape[0], "D"), "Give one row of features per Gaussian.")
     run = _render_plan if is_traced((plan, features, background)) else _render_plan_compiled
     return run(plan, features, background, depth)
 

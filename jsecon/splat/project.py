@@ -1,15 +1,39 @@
-"""From 3D Gaussians to 2D splats: EWA projection with a determinant that does not cancel and tight, exact extents."""
+"""From 3D Gaussians to 2D splats: EWA projection with a determinant that does not cancel and tight, exact extents.
+
+Numbers that are none: which Gaussians they make unusable, and how many there are. Nothing is dropped unsaid.
+"""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
-from jsecon.errors import require
+from jsecon.errors import require, require_shape
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, finite, normalize, sigmoid
-from jsecon.splat.sound import usable
-from jsecon.splat.stored import stored, surely
+from jsecon.splat.fusion import stored, surely
 from jsecon.types import Array, Camera, Gaussians, Leaf
+
+
+def usable(gaussians: Gaussians) -> Bool[Array, " n"]:
+    """(N,) the Gaussians that can be drawn; the others are hidden, and harm neither image nor gradient of the rest.
+
+    A NaN, an infinite mean or quaternion, or an infinite size is no Gaussian. Minus infinity as a log scale is the
+    logarithm of a size of 0, and an infinite opacity logit that of an opacity of 0 or 1: both are drawn.
+    """
+    geometry = jnp.concatenate([gaussians.means, gaussians.quaternions], axis=1)
+    sizes = jnp.isnan(gaussians.log_scales) | jnp.isposinf(gaussians.log_scales)
+    return jnp.isfinite(geometry).all(1) & ~sizes.any(1) & ~jnp.isnan(gaussians.opacity_logits)
+
+
+def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None = None) -> Int[Array, ""]:
+    """() int32 Gaussians that are not usable, or whose features (None: their spherical harmonics) are not finite.
+
+    `render` hides the former, and shows the latter as NaN on the pixels that they touch.
+    """
+    channels = gaussians.sh.reshape(gaussians.sh.shape[0], -1) if features is None else features
+    return jnp.sum(~(usable(gaussians) & jnp.isfinite(channels).all(1)), dtype=jnp.int32)
+
 
 # An axis longer than this (px) is flat over any image; it is shrunk to it, so that squares stay in float32.
 _WIDEST_PX = 1e15
@@ -104,20 +128,18 @@ def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
             f"gaussians.{name}",
             got=got,
             expected=f"{expected} with N = {n}",
-            remedy="Every array of Gaussians has one row a Gaussian.",
+            remedy="Every array of Gaussians has one row per Gaussian.",
         )
-    require(
-        camera.world_to_camera.shape == (4, 4),
+    require_shape(
         "camera.world_to_camera",
-        got=camera.world_to_camera.shape,
-        expected="(4, 4), a single camera",
-        remedy="Index the batch (cameras[t]) or use jax.vmap over it.",
+        camera.world_to_camera,
+        (4, 4),
+        "Give a single camera: index the batch (cameras[t]) or use jax.vmap over it.",
     )
 
 
 def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR) -> Projection:
-    """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023; conventions in DESIGN section
-    5).
+    """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023).
 
     Differentiable in every array of both. Raises ValueError on shapes that disagree. Gaussians that are not usable
     (NaN, infinite) come back invisible, with gradient zero; before a camera that is not finite, all do.
@@ -127,7 +149,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     w2c = camera.world_to_camera
     width, height = camera.width, camera.height
 
-    # A number a row, written out: exact float32 on every backend, and loops over rows that XLA makes vectors of.
+    # A number per row, written out: exact float32 on every backend, and loops over rows that XLA makes vectors of.
     # Matrices of 3x3 as arrays took five times as long.
     mean_x, mean_y, mean_z = (gaussians.means[:, i] for i in range(3))
     x, y, z = (mean_x * w2c[i, 0] + mean_y * w2c[i, 1] + mean_z * w2c[i, 2] + w2c[i, 3] for i in range(3))

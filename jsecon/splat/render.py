@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from jsecon.errors import require
-from jsecon.numerics import NEAR
-from jsecon.splat.plan import default_capacity, is_traced, plan_view, render_plan
+from jsecon.errors import require_shape
+from jsecon.numerics import NEAR, is_traced
+from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.project import check_shapes
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
@@ -26,10 +26,15 @@ def render(
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) into one view: sum over the depth-sorted Gaussians of alpha T f.
 
-    Exact by definition (DESIGN section 5): equal to the brute-force sum over all Gaussians, whatever the tiling.
-    Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. Outside a trace the
-    capacity is planned from the data; inside one pass the static `capacity` (see `plan_capacity`): pairs that do not
-    fit are counted in `.overflow`, never dropped unsaid. With frozen geometry, `plan_view` once and `render_plan`.
+    Exact by definition: equal to the brute-force sum over all Gaussians, whatever the tiling.
+    Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. With frozen geometry,
+    `plan_view` once and `render_plan`.
+
+    The tile lists have room for a static number of (block, Gaussian) pairs, by default `default_capacity`: a multiple
+    of what scenes need, from the sizes alone, so one program serves all views of a size. A view that needs more is
+    rendered again with enough room outside a trace. Inside one (jit, grad, vmap) that cannot be: what did not fit is
+    counted in `.overflow`, never dropped unsaid; 0 there means that the image is exact. Such a scene takes an explicit
+    `capacity` (`plan_capacity`), which is taken as it is, in and outside of a trace.
 
     Gaussians with NaN or infinite numbers are hidden, and a feature that is not finite makes NaN of the pixels that its
     Gaussian touches; neither has a gradient, nor spoils another's (`sound.count_non_finite` counts them). A camera that
@@ -45,16 +50,7 @@ def render(
     expected z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
     """
     check_shapes(gaussians, camera)
-    require(
-        features.ndim == 2 and features.shape[0] == gaussians.means.shape[0],
-        "features",
-        got=features.shape,
-        expected=f"({gaussians.means.shape[0]}, D)",
-        remedy="Give one row of features a Gaussian.",
-    )
-    if capacity is None:
-        capacity = default_capacity(gaussians, camera, mesh)
-    gaussians, camera, features = jax.tree.map(jnp.asarray, (gaussians, camera, features))
+    require_shape("features", features, (gaussians.count, "D"), "Give one row of features per Gaussian.")
     if gaussians.means.shape[0] == 0:
         image, alpha = (
             jnp.zeros((camera.height, camera.width, *rest), gaussians.means.dtype)
@@ -89,8 +85,15 @@ _colours_compiled = jax.jit(colours_from_sh)
 def render_depth(
     gaussians: Gaussians, camera: Camera, *, capacity: int | None = None, near: float = NEAR
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Expected z-depth (H, W) = sum(w z) / sum(w), world units, 0 where nothing is covered; and alpha (H, W)."""
+    """Expected z-depth (H, W) = sum(w z) / sum(w), world units, 0 where nothing is covered; and alpha (H, W). NaN where
+    pairs overflowed the capacity, which has no other place here (see `render`)."""
     nothing = jnp.zeros((gaussians.means.shape[0], 0), jnp.asarray(gaussians.means).dtype)
     rendering = render(gaussians, camera, nothing, capacity=capacity, near=near, depth=True)
-    assert rendering.depth is not None
-    return rendering.depth, rendering.alpha
+    return _unless_overflow(rendering)
+
+
+@jax.jit
+def _unless_overflow(rendering: Rendering) -> tuple[Array, Array]:
+    return jax.tree.map(
+        lambda image: jnp.where(rendering.overflow > 0, jnp.nan, image), (rendering.depth, rendering.alpha)
+    )

@@ -1,4 +1,4 @@
-"""Real spherical harmonics of colour, degrees 0 to 3, in the order and signs of the INRIA layout (REFERENCE A.4)."""
+"""Real spherical harmonics of colour, degrees 0 to 3, in the order and signs of the INRIA layout."""
 
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -18,11 +18,11 @@ def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]
     """The first `bands` (1, 4, 9 or 16) basis functions at unit `directions`."""
     require(bands in (1, 4, 9, 16), "bands", got=bands, expected="1, 4, 9 or 16", remedy="Pad sh to a whole degree.")
     x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    xx, yy, zz = x * x, y * y, z * z
     basis = [jnp.full_like(x, C0)]
     if bands > 1:
         basis += [-C1 * y, C1 * z, -C1 * x]
     if bands > 4:
-        xx, yy, zz = x * x, y * y, z * z
         basis += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)]
     if bands > 9:
         basis += [C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy),

@@ -16,15 +16,16 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.splat.bits import WORD, read_off, set_before, transpose_words
-from jsecon.splat.project import Projection, project
-from jsecon.splat.stored import stored
+from jsecon.splat.bits import WORD, in_chunks, read_off, set_bits
+from jsecon.splat.project import Projection
 from jsecon.splat.strips import BLOCK, WHOLE, Strip, tile_rows
-from jsecon.types import Array, Camera, Gaussians, Leaf
+from jsecon.types import Array, Leaf
 
 TILE = 8
 """tile edge, px; speed only"""
 _TILES = BLOCK * BLOCK
+PAIRS = 8192
+"""pairs at a time: what they need fits the second cache, and what is not there takes no time"""
 # Slack of the ellipse test, px: far above the rounding of a float32 exponent at the rim, far below a pixel.
 _SLACK_PX = 0.02
 
@@ -137,9 +138,11 @@ def tile_lists(
         "capacity",
         got=capacity,
         expected="a positive number of (block, Gaussian) pairs whose tiles int32 can count",
-        remedy="Pass jsecon.plan_capacity(gaussians, cameras), and render so large an image in parts.",
+        remedy="Render so large an image in parts.",
     )
-    capacity = -(-capacity // WORD) * WORD
+    capacity = whole_words(capacity)
+    chunk = min(PAIRS, capacity)
+    room = -(-capacity // chunk) * chunk
     edge = BLOCK * tile
     rows = tile_rows(height, tile, strip.count)
     across, down = -(-width // edge), -(-rows // BLOCK)
@@ -149,24 +152,31 @@ def tile_lists(
     # past 2^31 pairs, so the sum saturates: beyond the capacity its exact value is needed only for the overflow.
     areas = (x1 - x0) * (y1 - y0)
     ends = _saturating_cumsum(areas)
-    starts = ends - areas
-    marks = jnp.zeros(capacity + 1, jnp.int32).at[jnp.minimum(starts, capacity)].add(1, mode="promise_in_bounds")
-    owner = jnp.minimum(jnp.cumsum(marks[:capacity]) - 1, areas.shape[0] - 1)
-    box = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)[owner]
-    within = lax.iota(jnp.int32, capacity) - box[:, 0]
-    blocks = (box[:, 2] + within // box[:, 3]) * across + box[:, 1] + within % box[:, 3]
-    blocks = jnp.where(lax.iota(jnp.int32, capacity) < ends[-1], blocks, number)
+    starts, total = ends - areas, jnp.minimum(ends[-1], capacity)
+    marks = jnp.zeros(room + 1, jnp.int32).at[jnp.minimum(starts, room)].add(1, mode="promise_in_bounds")
+    boxes = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)
+
+    def lay_out(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        before, blocks, owners = carry
+        owner = before + lax.cumsum(lax.dynamic_slice(marks, (first,), (chunk,)))
+        pair, box = first + lax.iota(jnp.int32, chunk), boxes[owner]
+        within = pair - box[:, 0]
+        block = (box[:, 2] + within // box[:, 3]) * across + box[:, 1] + within % box[:, 3]
+        block = jnp.where(pair < total, block, number)
+        put = lambda whole, part: lax.dynamic_update_slice(whole, part, (first,))
+        return owner[-1], put(blocks, block), put(owners, owner)
+
+    nothing = jnp.full(room, number, jnp.int32), jnp.zeros(room, jnp.int32)
+    _, blocks, owner = in_chunks(total, chunk, lay_out, (jnp.int32(-1), *nothing))
     nowhere = jnp.asarray(1.0, projection.depths.dtype)
     depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), nowhere))
     blocks, owner = _sorted_pairs(blocks, owner, depths, number)
 
-    always = ends[-1] >= 0
-    reach = functools.partial(_reached_tiles, across=across, number=number, tile=tile, strip=strip)
     ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
-    reached = stored(always, reach, lax.stop_gradient(jnp.concatenate(ellipses, axis=1)), owner, blocks)
-    members = transpose_words(reached, _TILES)
-    before = set_before(members)
-    gaussians = read_off(members, before, owner)
+    ellipses = lax.stop_gradient(jnp.concatenate(ellipses, axis=1))
+    reach = functools.partial(_reached_tiles, ellipses, across=across, number=number, tile=tile, strip=strip)
+    members, before = set_bits(reach, owner, blocks, _TILES, total, chunk)
+    gaussians = read_off(members, before, owner, total, chunk)
 
     # A tile's list runs from its block's first pair to the next block's.
     first = jnp.searchsorted(blocks, lax.iota(jnp.int32, number + 1)).astype(jnp.int32)
@@ -237,44 +247,6 @@ def _saturating_cumsum(areas: Array) -> Array:
     return jnp.where(wrapped, largest, exact)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int) -> Array:
-    """(2,) the pairs of the image as one strip, and of all strips, were each as long as the longest: one program for
-    whoever asks for either."""
-    splats = project(gaussians, camera)
-
-    def longest(count: int) -> Array:
-        counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, count)) for k in range(count)]
-        return count * jnp.stack([pairs.astype(jnp.float32).sum() for pairs in counts]).max()
-
-    return jnp.stack([longest(1), longest(strips)])
-
-
-def plan_capacity(gaussians: Gaussians, cameras: Camera, *, margin: float = 1.25, devices: int | None = None) -> int:
-    """The number of (block, Gaussian) pairs to allow for, so that no view of `cameras` (one, or a batch) overflows,
-    also where `devices` of them share it (by default all of this process's).
-
-    Host code: needs concrete arrays. Rounded up (`round_capacity`), so that captures of like size share one
-    compilation. `margin` leaves room for Gaussians that still move.
-    """
-    local = jax.local_device_count()
-    strips = local if devices is None else devices
-    given, which = (local, 0) if strips == 1 else (strips, 1)
-    views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
-    pairs = max(
-        (float(_pairs_in_view(gaussians, views[t], given)[which]) for t in range(views.world_to_camera.shape[0])),
-        default=0.0,
-    )
-    return round_capacity(int(np.ceil(pairs * margin * (1 + 1e-6))))  # the sum is a float32
-
-
-def round_capacity(pairs: int) -> int:
-    """`pairs` rounded up to an eighth of a power of two; below 16,384 to a power of two, at least 4,096.
-
-    A compilation takes seconds, 3,000 pairs of room too much 0.3 ms of a forward render: small scenes share programs.
-    """
-    small = max(4096, 1 << (max(pairs, 1) - 1).bit_length())
-    if small <= 16384:
-        return small
-    step = 2 ** (pairs.bit_length() - 4)
-    return -(-pairs // step) * step
+def whole_words(pairs: int) -> int:
+    """Pairs rounded up to whole words of bits."""
+    return -(-pairs // WORD) * WORD

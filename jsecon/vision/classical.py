@@ -5,7 +5,8 @@ The frame is smoothed, cut into small regions that follow its edges (graph segme
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,18 +14,15 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import require
 from jsecon.vision.region_graph import borders, merge
-from jsecon.vision.relief import geometry_features
-from jsecon.vision.surfaces import Surface
+from jsecon.vision.surfaces import Surface, log_depth
 
-GRANULARITIES: dict[str, dict[str, float]] = {
+GRANULARITIES: dict[str, dict[str, Any]] = {
     "fine": {"merge_distance": 10.0},
     "medium": {"merge_distance": 16.0},
     "coarse": {"merge_distance": 28.0, "depth_jump": 0.06},
 }
 """settings of ClassicalSegmenter by how large its regions are; the coarse one joins the colours of one thing, and so
 needs depth to part things"""
-Maps = Callable[[int], np.ndarray | None] | Sequence[np.ndarray] | np.ndarray | None
-"""per-frame maps: a function of the frame's index, or an array or list with one map a frame, or None"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,17 +40,15 @@ class ClassicalSegmenter:
     """smaller regions are given to their most alike neighbour or dropped; share of the frame"""
     max_regions: int = 64
     """the best so many are returned"""
-    depths: Maps = None
+    depths: Callable[[int], np.ndarray] | None = None
     """z-depth (H, W) of a frame, 0 = unknown: a jump between neighbours keeps them apart"""
-    normals: Maps = None
-    """unit normals (H, W, 3) of a frame, 0 = unknown: a crease keeps neighbours apart"""
     depth_jump: float = 0.04
     """relative step of depth that counts as much as `merge_distance`"""
     crease_degrees: float = 50.0
     """angle between normals that counts as much as `merge_distance`"""
     surfaces: Callable[[int], Surface | None] | None = None
-    """the surface of a frame, None = unknown, in place of `depths` and `normals`: then regions also keep apart by their
-    mean normals, and a step of depth is one off the plane, since on a wall seen from its side depth jumps all along"""
+    """the surface of a frame, None = unknown, in place of `depths`: a crease keeps neighbours apart, too, and a step of
+    depth is one off the plane, since on a wall seen from its side depth jumps all along"""
 
     def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
         """frame (H, W, 3) uint8 -> masks (M, H, W) bool, a partition of the frame but for specks, best first."""
@@ -76,13 +72,17 @@ class ClassicalSegmenter:
             atoms = oversegment(seeds)
             edges = borders(atoms, features, surface, steepness=self.merge_distance / self.depth_jump)
             return merge(atoms, features, edges, distance=self.merge_distance, min_area=minimum)
-        shape = geometry_features(
-            _map_of(self.depths, index, frame.shape[:2]),
-            _map_of(self.normals, index, frame.shape),
-            unit=self.merge_distance,
-            depth_jump=self.depth_jump,
-            crease_degrees=self.crease_degrees,
-        )
+        shape = None
+        if self.depths is not None:
+            depth = self.depths(index)
+            require(
+                depth.shape == frame.shape[:2],
+                "depths",
+                got=depth.shape,
+                expected=str(frame.shape[:2]),
+                remedy="Give depth of the frame's own size.",
+            )
+            shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
         return merge(atoms, features, borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum)
 
@@ -103,21 +103,6 @@ class ClassicalSegmenter:
             0.5 * self.merge_distance / np.log1p(self.depth_jump)
         )
         return np.concatenate([colour, turned], -1), np.concatenate([colour, 0.5 * turned, depth], -1)
-
-
-def _map_of(maps: Maps, index: int, shape: tuple[int, ...]) -> np.ndarray | None:
-    found = maps(index) if callable(maps) else None if maps is None else maps[index]
-    if found is None:
-        return None
-    found = np.asarray(found, np.float32)
-    require(
-        found.shape == shape,
-        "depth or normal map",
-        got=found.shape,
-        expected=str(shape),
-        remedy="Give one map a frame, of the frame's own size.",
-    )
-    return found
 
 
 def colour_features(

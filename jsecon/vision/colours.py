@@ -1,19 +1,18 @@
 """The default embedder, without any weights: regions and texts in one space of named colours.
 
-Both sides become a distribution over points of CIELAB: a region through its pixels, a text through its colour words. A
-smooth kernel between colours turns a distribution into a vector (its kernel mean, expressed at the prototypes of a
-fixed palette), so that the cosine of two vectors is 1 for like distributions and falls with the distance of the
-colours. The palette's names are the basic colour terms (Berlin & Kay 1969), each dark, plain and light, and the common
-mixed names.
+Both sides become a distribution over points of CIELAB, and by a smooth kernel a vector at the prototypes of a palette,
+whose names are the basic colour terms (Berlin & Kay 1969) and the common mixed ones.
 """
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError, require_shape
+from jsecon.process import cores
 
 # name -> sRGB of a typical matt object of that name. A name of two words is a variant of the basic term in it.
 # fmt: off
@@ -140,28 +139,27 @@ class ColourEmbedder:
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
         self.dim = int(kept.sum()) + 2
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
-        colours = [self._mean(self._points, np.ones(len(self._points)))]
-        colours += [self._mean(point[None], np.ones(1)) for point in neutral]
+        colours = [self._mean(self._points)]
+        colours += [self._mean(point[None]) for point in neutral]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
 
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
     ) -> Float32[np.ndarray, "m e"]:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
-        require(
-            masks.shape[1:] == frame.shape[:2],
-            "masks",
-            got=masks.shape,
-            expected=f"(M, {frame.shape[0]}, {frame.shape[1]})",
-            remedy="Give masks of the frame's own size.",
-        )
+        require_shape("masks", masks, ("M", *frame.shape[:2]), "Give masks of the frame's own size.")
         lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+
         out = np.zeros((len(masks), self.dim), np.float32)
-        for row, mask in zip(out, masks.astype(bool)):
-            pixels = lab[_inside(mask)]
+
+        def embed(row: np.ndarray, mask: np.ndarray) -> None:
+            pixels = _pixels_inside(lab, mask)
             if len(pixels):
-                pixels = _without_shadow_and_shine(pixels)
-                row[:] = _joined(self._mean(pixels, np.ones(len(pixels))), mask.mean() / EXTENT_FULL)
+                colour = self._mean(_without_shadow_and_shine(pixels))
+                row[:] = _joined(colour, np.count_nonzero(mask) / mask.size / EXTENT_FULL)
+
+        with ThreadPoolExecutor(cores()) as pool:
+            list(pool.map(embed, out, masks.astype(bool)))
         return out
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
@@ -176,9 +174,10 @@ class ColourEmbedder:
             )
         return out
 
-    def _mean(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Unit kernel mean of weighted CIELAB points (n, 3), in the span of the palette."""
+    def _mean(self, points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+        """Unit kernel mean of CIELAB points (n, 3), weighted or all alike, in the span of the palette."""
         likeness = _kernel(points, self._points)
+        weights = np.ones(len(points)) if weights is None else weights
         mean = (weights.astype(np.float32) @ likeness / weights.sum()) @ self._projection
         return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
@@ -259,8 +258,13 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n, 3), (m, 3) CIELAB -> (n, m) Gaussian likeness, 1 for equal colours."""
     scale = np.asarray([LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32) / KERNEL_WIDTH
     x, y = x * scale, y * scale
-    squared = (x * x).sum(-1)[:, None] + (y * y).sum(-1) - 2.0 * (x @ y.T)
-    return np.exp(-0.5 * np.maximum(squared, 0.0))
+    products = x @ y.T
+    products *= 2.0
+    squared = (x * x).sum(-1)[:, None] + (y * y).sum(-1)
+    squared -= products
+    np.maximum(squared, 0.0, out=squared)
+    squared *= -0.5
+    return np.exp(squared, out=squared)
 
 
 def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
@@ -272,11 +276,14 @@ def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
     return both.astype(np.float32)
 
 
-def _inside(mask: np.ndarray) -> np.ndarray:
-    """The mask without its one-pixel rim, whose colours mix with the neighbours'; the mask itself where nothing is
-    left."""
-    core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE).astype(bool)
-    return core if core.sum() >= 0.3 * mask.sum() else mask
+def _pixels_inside(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(n, 3) the pixels of a mask without its one-pixel rim, whose colours mix with the neighbours'; all of them where
+    little is left."""
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+    box = slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1)
+    mask = mask[box]
+    core = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE).view(bool)
+    return lab[box][core if np.count_nonzero(core) >= 0.3 * np.count_nonzero(mask) else mask]
 
 
 def _without_shadow_and_shine(lab: np.ndarray) -> np.ndarray:

@@ -4,6 +4,8 @@ place.
 Everything here lives on the host: NumPy in, NumPy out. Frames are uint8 RGB.
 """
 
+import dataclasses
+from collections.abc import Collection
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -76,3 +78,28 @@ class Embedder(Protocol):
     def embed_text(self, texts: list[str]) -> np.ndarray:
         """Q texts -> (Q, E) float32 unit. Raises InputError on a text that this space has no words for."""
         ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """What looks at a run's frames. Networks are opened when first needed, and closed when their stage is done."""
+
+    embedder: Embedder
+    segmenter: NamedSegmenter | None = None
+    """None: what needs no weights."""
+    tracker: NamedTracker | None = None
+    """None: through the Gaussians."""
+
+    def require_ready(self, stages: Collection[str]) -> None:
+        """Raises InputError where a network cannot do what `stages` want of it: before the long work starts."""
+        for stage, used in (("masklets", self.segmenter), ("masklets", self.tracker), ("regions", self.embedder)):
+            check = getattr(used, "check", None)
+            if stage in stages and check is not None:
+                check()
+
+    def close(self) -> None:
+        """Drops what they hold in memory, until it is needed again."""
+        for used in (self.embedder, self.segmenter, self.tracker):
+            drop = getattr(used, "close", None)
+            if drop is not None:
+                drop()

@@ -11,7 +11,7 @@ import math
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int, Int32, Int64
 
 from jsecon.vision.surfaces import Surface
 
@@ -71,10 +71,11 @@ def borders(
             shapes.append(np.minimum(steepness * shape.off_plane(axis, inner, outer)[cut], most))
         else:
             shapes.append(np.minimum(step(shape), most))
-    pairs, inverse = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
+    count = int(atoms.max()) + 1
+    first, second = np.concatenate(keys).T.astype(np.int64)
+    pairs, inverse = np.unique(first * count + second, return_inverse=True)
     return Borders(
-        pairs,
+        np.stack(np.divmod(pairs, count), -1),
         np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
         np.bincount(inverse, np.concatenate(colours), len(pairs)),
         np.bincount(inverse, np.concatenate(shapes), len(pairs)),
@@ -97,27 +98,32 @@ def merge(
     labels (H, W) int32 0 .. M-1.
     """
     # Numbered as a reader meets them, so that ties fall the same way whatever the atoms are called.
-    _, first, flat = np.unique(atoms.reshape(-1), return_index=True, return_inverse=True)
+    flat = renumbered(atoms.reshape(-1))
+    count = int(flat.max()) + 1
+    first = np.empty(count, np.int64)
+    first[flat[::-1]] = np.arange(flat.size)[::-1]
     number = np.argsort(np.argsort(first))
-    flat = number[flat]
-    atoms, pairs = flat.reshape(atoms.shape), np.sort(number[edges.pairs], axis=-1)
+    atoms, pairs = number[flat].reshape(atoms.shape), np.sort(number[edges.pairs], axis=-1)
+    flat = atoms.reshape(-1)
     sums_of = np.stack([edges.colour, edges.shape, edges.length], -1)
-    count = len(first)
-    area = np.bincount(flat, minlength=count).astype(np.float64)
-    sums = np.stack([np.bincount(flat, features[..., c].reshape(-1), count) for c in range(features.shape[-1])], -1)
+    # Plain numbers from here on: NumPy takes longer over a handful of them than the sums themselves.
+    area = np.bincount(flat, minlength=count).astype(np.float64).tolist()
+    channels = [np.bincount(flat, features[..., c].reshape(-1), count) for c in range(features.shape[-1])]
+    sums = np.stack(channels, -1).tolist()
+    means = [[value / size for value in row] for row, size in zip(sums, area)]
     # neighbour -> sums of the step of colour, of the step of shape, and length of the border
     links: list[dict[int, tuple[float, float, float]]] = [{} for _ in range(count)]
-    for row in np.lexsort((pairs[:, 1], pairs[:, 0])):
-        a, b = pairs[row].tolist()
-        links[a][b] = links[b][a] = tuple(sums_of[row].tolist())
-    parent = np.arange(count)
-    version = np.zeros(count, np.int64)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    for (a, b), steps in zip(pairs[order].tolist(), sums_of[order].tolist()):
+        links[a][b] = links[b][a] = tuple(steps)
+    parent = list(range(count))
+    version = [0] * count
 
     full = GROWN_AREA * atoms.size
 
     def dissimilarity(a: int, b: int) -> float:
         colour, shape, border = links[a][b]
-        gap = float(np.linalg.norm(sums[a] / area[a] - sums[b] / area[b]))
+        gap = math.dist(means[a], means[b])
         grown = min(max((min(area[a], area[b]) / full) ** 0.5, SMALLEST_FACTOR), 1.0)
         return math.hypot(grown * (BORDER_SHARE * colour / border + (1.0 - BORDER_SHARE) * gap), shape / border)
 
@@ -125,7 +131,8 @@ def merge(
         """b becomes part of a."""
         parent[b] = a
         area[a] += area[b]
-        sums[a] += sums[b]
+        sums[a] = [x + y for x, y in zip(sums[a], sums[b])]
+        means[a] = [value / area[a] for value in sums[a]]
         version[a] += 1
         for other, (colour, shape, border) in links[b].items():
             del links[other][b]
@@ -148,14 +155,22 @@ def merge(
         for other in links[a]:
             heapq.heappush(heap, (dissimilarity(a, other), a, other, version[a], version[other]))
     thin = ~np.isin(np.arange(count), _cores(_roots(parent)[atoms]))
-    for a in sorted(np.flatnonzero((parent == np.arange(count)) & (area > 0)).tolist(), key=lambda a: area[a]):
+    for a in sorted((a for a in range(count) if parent[a] == a), key=lambda a: area[a]):
         if parent[a] == a and (area[a] < min_area or thin[a]) and links[a]:
             absorb(min(links[a], key=lambda other: dissimilarity(a, other)), a)
-    return np.unique(_roots(parent)[flat], return_inverse=True)[1].reshape(atoms.shape).astype(np.int32)
+    return renumbered(_roots(parent)[atoms]).astype(np.int32)
 
 
-def _roots(parent: np.ndarray) -> np.ndarray:
+def renumbered(ids: Int[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
+    """Small ids >= 0 as 0 .. K-1 in their own order: np.unique's inverse by a table, which takes no sorting."""
+    used = np.zeros(int(ids.max()) + 1, bool)
+    used[ids] = True
+    return (np.cumsum(used) - 1)[ids]
+
+
+def _roots(parents: list[int]) -> np.ndarray:
     """Where each chain of parents ends; each pass halves the chains."""
+    parent = np.asarray(parents)
     while not np.array_equal(parent, parent[parent]):
         parent = parent[parent]
     return parent

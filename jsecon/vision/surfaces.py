@@ -8,12 +8,44 @@ of the joint cloud gets the normal of its neighbourhood, and each pixel that of 
 from collections.abc import Callable
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float, Float32, Float64, Int, Shaped
+from scipy.spatial import KDTree
 
 from jsecon.types import Camera
-from jsecon.vision.relief import steadied_depth
+
+
+def steadied_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, rounds: int = 3) -> np.ndarray:
+    """z-depth (H, W), 0 = unknown, as Gaussians render it -> the same without what is noise (relative steps below about
+    `noise`), its jumps kept: a median, then bilateral filters on its logarithm. Unknown pixels are filled from the
+    nearest known one; all 0 stays so."""
+    known = np.asarray(depth > 0)
+    if not known.any():
+        return depth
+    logarithm = cv2.medianBlur(log_depth(depth)[..., 0], 5)
+    for _ in range(rounds):
+        logarithm = cv2.bilateralFilter(logarithm, 9, noise, 4)
+    return np.exp(logarithm)
+
+
+def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
+    """Natural logarithm of z-depth (H, W), 0 = unknown, filled from the nearest known pixel; 0 where none is known."""
+    known = np.asarray(depth > 0)
+    depth = filled(depth, known) if known.any() else np.ones_like(depth)
+    return np.log(np.maximum(depth, 1e-12))[..., None].astype(np.float32)
+
+
+def filled(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
+    """values (H, W) with those of the unknown pixels taken from the nearest known one."""
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(nearest, np.int64)
+    table = np.zeros(int(nearest.max()) + 1, values.dtype)
+    table[nearest[known]] = values[known]
+    return table[nearest]
+
 
 NEIGHBOURS = 24
 """points whose plane is a point's own"""
@@ -45,7 +77,7 @@ def cloud_normals(points: Float[np.ndarray, "p 3"], *, neighbours: int = NEIGHBO
     neighbours' normals, each weighted by how well it agrees, which leaves creases sharp (a bilateral filter).
     """
     points = np.asarray(points, np.float64)
-    near = cKDTree(points).query(points, k=min(neighbours, len(points)), workers=-1)[1]
+    near = np.asarray(KDTree(points).query(points, k=min(neighbours, len(points)), workers=-1)[1])
     normals = np.empty_like(points)
     for part in np.array_split(np.arange(len(points)), len(points) // 65536 + 1):
         spread = points[near[part]] - points[near[part]].mean(1, keepdims=True)
@@ -66,7 +98,7 @@ def surfaces_from_depth(
     points (P, 3), world: those of all frames together, thinned (a few centimetres apart in a room). The depth is
     steadied (`steadied_depth`), which also fills what is unknown. None for a frame without any depth.
     """
-    tree, normals = cKDTree(points), cloud_normals(points)
+    tree, normals = KDTree(points), cloud_normals(points)
     poses = np.asarray(cameras.world_to_camera, np.float64)
 
     def surface_of(t: int) -> Surface | None:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int16, UInt
 
 from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_options, held_out
-from jsecon.data.lerf import LabelledFrame, write_lerf_labels
+from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
 from jsecon.data.synthetic.raycast import render_views
 from jsecon.data.synthetic.room import Room, make_room
 from jsecon.errors import require

@@ -1,4 +1,4 @@
-"""The recipe of the demo room: which objects, of which shapes and colours, with which textures, stand where.
+"""What the demo room holds: which objects, of which shapes and colours, with which textures, stand where.
 
 Everything follows from the seed. World: metres, z up, the origin in the middle of the table's top.
 """
@@ -140,7 +140,7 @@ def make_room(seed: int, *, num_objects: int = 12) -> Room:
         "num_objects",
         got=num_objects,
         expected=f"2 to {len(PALETTE)}",
-        remedy="There is one object a colour name.",
+        remedy="There is one object per colour name.",
     )
     draw = np.random.default_rng([seed, 2])
     colours = list(PALETTE)[:num_objects]

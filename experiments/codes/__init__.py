@@ -1,0 +1,1 @@
+"""The paths to the Gaussians' codes that `experiments.distillation` compares."""

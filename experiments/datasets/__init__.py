@@ -1,0 +1,1 @@
+"""LERF, 3D-OVS, Replica and ScanNet: loaders, and twins of them in their own layouts."""

@@ -1,0 +1,61 @@
+"""Depths that other views confirm, and the labels of back-projected points."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jsecon.fit.depth import DepthPoints, back_projected, require_depths
+from jsecon.types import Array, Capture
+
+
+def confirmed_depths(
+    capture: Capture,
+    *,
+    tolerance: float,
+    min_views: int = 2,
+    frames: Int[np.ndarray, " f"] | None = None,
+) -> Float[np.ndarray, "t h w"]:
+    """The depths without those that the other views do not confirm: sensor noise, and pixels that mix two surfaces.
+
+    A depth stays where at least `min_views` other views measure the same point, to within `tolerance` (relative to
+    their depth), and no more views look past it than do; everything else becomes 0, unknown. Only `frames` are filtered
+    and compared (by default those that are not held out); the depths of the others are returned as they are. Raises
+    InputError where the capture has no depth.
+    """
+    require_depths(capture)
+    depths = np.array(capture.depths, np.float32)
+    chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
+    height, width = depths.shape[1:]
+    filtered = depths.copy()
+    for t in chosen:
+        world, _, pixels = back_projected(capture, int(t), 1)
+        same, past = np.zeros(len(world), np.int32), np.zeros(len(world), np.int32)
+        for other in chosen[chosen != t]:
+            camera = capture.cameras[int(other)]
+            pose = np.asarray(camera.world_to_camera, np.float64)
+            seen = world @ pose[:3, :3].T + pose[:3, 3]
+            z = np.where(seen[:, 2] > 0, seen[:, 2], 1.0)
+            x = float(camera.fx) * seen[:, 0] / z + float(camera.cx)
+            y = float(camera.fy) * seen[:, 1] / z + float(camera.cy)
+            inside = np.flatnonzero((seen[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+            measured = depths[other, y[inside].astype(int), x[inside].astype(int)]
+            off = np.where(measured > 0, (measured - z[inside]) / np.maximum(measured, 1e-9), np.nan)
+            same[inside] += np.abs(off) <= tolerance
+            past[inside] += off > tolerance
+        bad = pixels[(same < min_views) | (past > same)]
+        filtered[t, bad[:, 0], bad[:, 1]] = 0
+    return filtered
+
+
+def labels_of_points(points: DepthPoints, labels: Int[Array, "t h w"], num_labels: int) -> Int[np.ndarray, " p"]:
+    """(P,) int32 the label that most of each point's pixels carry; -1 where none is labelled. Ties go to the
+    smaller."""
+    frame, row, column = points.sample_pixels.T
+    sample = np.asarray(labels)[frame, row, column].astype(np.int64)
+    known = sample >= 0
+    key = points.sample_points[known].astype(np.int64) * num_labels + sample[known]
+    pairs, counts = np.unique(key, return_counts=True)
+    result = np.full(len(points.points), -1, np.int32)
+    # Ascending by count, and within a count descending by label: the last assignment to a point is its winner.
+    order = np.lexsort((-pairs, counts))
+    result[pairs[order] // num_labels] = pairs[order] % num_labels
+    return result

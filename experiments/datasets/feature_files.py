@@ -1,0 +1,50 @@
+"""Features as LangSplat keeps them, written for twins; and vectors of texts in a JSON."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jsecon.data.mask_files import LEVELS
+from jsecon.errors import InputError
+from jsecon.files import write_text, written_whole
+from jsecon.vision.protocols import CANONICAL
+
+
+def write_features(
+    folder: Path, name: str, labels: Int[np.ndarray, "h w"], embeddings: Float[np.ndarray, "m e"]
+) -> None:
+    """Writes one frame's masks (ids 0 .. M-1, -1 = none) to all four levels, with their embeddings."""
+    levels = np.repeat(labels[None].astype(np.float32), len(LEVELS), axis=0)
+    for ending, array in (("_s", levels), ("_f", embeddings.astype(np.float32))):
+        with written_whole(folder / f"{name}{ending}.npy") as temporary:
+            np.save(temporary, array)
+
+
+def load_text_features(file: Path, queries: Sequence[str]) -> tuple[Float[np.ndarray, "q e"], Float[np.ndarray, "4 e"]]:
+    """Embeddings (Q, E) of the queries and (4, E) of the canonical phrases, from a JSON of text -> numbers. Raises
+    InputError for a text that the file does not have."""
+    try:
+        table = json.loads(file.read_text(encoding="utf-8"))
+        missing = [text for text in (*queries, *CANONICAL) if text not in table]
+        if missing:
+            raise InputError(
+                file,
+                found=f"no vector of {', '.join(missing)}",
+                expected="every query and the four canonical phrases",
+                remedy="Embed them with the text encoder of the embedder that made the masks' features.",
+            )
+        found = [np.array([table[text] for text in texts], np.float32) for texts in (queries, CANONICAL)]
+    except (OSError, json.JSONDecodeError, TypeError, AttributeError) as error:
+        raise InputError(
+            file, found=str(error), expected="a JSON of text -> vector", remedy="Write it again."
+        ) from error
+    return found[0].reshape(len(queries), -1), found[1]
+
+
+def write_text_features(file: Path, texts: Sequence[str], vectors: Float[np.ndarray, "q e"]) -> None:
+    """Writes what `load_text_features` reads."""
+    rows = {text: [round(float(x), 7) for x in vector] for text, vector in zip(texts, vectors, strict=True)}
+    write_text(file, json.dumps(rows))

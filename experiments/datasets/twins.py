@@ -1,0 +1,260 @@
+"""Twins: made-up rooms written in the exact layouts of LERF-OVS, 3D-OVS, Replica and ScanNet.
+
+What the real datasets can't be had for is run on these: the loader, the protocol and the table see files of the true
+form. ROOT/twin.json says of each scene what the generator put there; ROOT/truth/<scene>/<frame>.png is the object of
+each pixel, for simulated vision: its number from 1, objects first and then walls, floor, ceiling and table, which a
+segmenter finds too. Without masks around the objects every method that averages over masks grows halos.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Int
+
+from experiments.datasets.benchmark import TWIN_FILE
+from experiments.datasets.mesh import CEILING, SURROUNDINGS, Mesh, mesh_of, surfaces_of
+from experiments.datasets.mesh_files import write_mesh
+from experiments.datasets.ovs3d import write_poses_bounds, write_segmentations
+from experiments.datasets.scannet import CLASS_SETS, NYU40
+from jsecon.data.colmap import write_colmap
+from jsecon.data.images import write_image
+from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
+from jsecon.data.synthetic.capture import captured, labelled, look_at, room_cameras, write_ids
+from jsecon.data.synthetic.room import Room, make_room
+from jsecon.files import write_text, written_whole
+from jsecon.types import Camera, Capture
+
+FURNISHINGS = (5, 3, 8, 11, 10, 14, 12, 24, 34, 33, 36, 16)
+"""NYU40 ids that the objects of a ScanNet twin take in turn"""
+
+
+def write_lerf_twin(
+    root: Path,
+    scene: str,
+    seed: int,
+    *,
+    views: int = 30,
+    width: int = 320,
+    height: int = 240,
+    annotated_every: int = 6,
+    num_objects: int = 12,
+    label_pixels: int = 40,
+) -> Path:
+    """A room as a scene of LERF-OVS; every `annotated_every`-th frame is labelled, with the objects of at least
+    `label_pixels` pixels there. Returns the root."""
+    room = make_room(seed, num_objects=num_objects)
+    cameras = room_cameras(room, views=views, width=width, height=height)
+    names = tuple(f"frame_{view + 1:05d}" for view in range(views))
+    out = np.arange(views) % annotated_every == 0
+    capture, instances, frames = _labelled_capture(root / scene, room, cameras, names, out, label_pixels)
+    write_lerf_labels(root / "label" / scene, frames, image_ending=".jpg")
+    pairs = sum(len(frame.objects) for frame in frames)
+    queries = sorted({name for frame in frames for name in frame.objects})
+    _, owners = surfaces_of(room, capture, instances)
+    objects = (*room.names, *SURROUNDINGS)
+    _finish(root, scene, capture, owners, frames, seed=seed, pairs=pairs, queries=queries, objects=objects)
+    return root
+
+
+def write_ovs3d_twin(
+    root: Path,
+    scene: str,
+    seed: int,
+    *,
+    views: int = 28,
+    width: int = 320,
+    height: int = 240,
+    labelled_frames: int = 5,
+    num_objects: int = 6,
+) -> Path:
+    """A room as a scene of 3D-OVS: views from the front, `labelled_frames` of them with a mask of every class."""
+    room = make_room(seed, num_objects=num_objects)
+    cameras = _forward_cameras(room, views, width, height)
+    names = tuple(f"{view:02d}" for view in range(views))
+    out = np.isin(np.arange(views), np.linspace(0, views - 1, labelled_frames + 2).round()[1:-1])
+    capture, instances, frames = _labelled_capture(root / scene, room, cameras, names, out, 1)
+    assert capture.depths is not None
+    sizes = np.tile([height, width, float(cameras.fx[0])], (views, 1))
+    bounds = np.stack([capture.depths.min((1, 2)), capture.depths.max((1, 2))], axis=1)
+    poses = np.asarray(cameras.world_to_camera, np.float64)
+    write_poses_bounds(root / scene / "poses_bounds.npy", poses, sizes, bounds)
+    write_segmentations(root / scene / "segmentations", frames, names, room.names)
+    pairs, queries = len(frames) * num_objects, sorted(room.names)
+    _, owners = surfaces_of(room, capture, instances)
+    objects = (*room.names, *SURROUNDINGS)
+    _finish(root, scene, capture, owners, frames, seed=seed, pairs=pairs, queries=queries, objects=objects)
+    return root
+
+
+def write_replica_twin(
+    root: Path,
+    scene: str,
+    seed: int,
+    *,
+    views: int = 30,
+    width: int = 300,
+    height: int = 170,
+    num_objects: int = 12,
+    fine_m: float = 0.012,
+    coarse_m: float = 0.05,
+    ready_labels: bool = False,
+) -> Path:
+    """A room as a scene of Replica in NICE-SLAM's rendering. Classes are the objects' shapes, wall, floor, ceiling and
+    table; `ready_labels` writes them a line per vertex instead of as habitat's semantic mesh."""
+    names = tuple(f"frame{view:06d}" for view in range(views))
+    room, capture, owners, mesh = _scanned(seed, names, width, height, num_objects, fine_m, coarse_m)
+    classes = [item.shape for item in room.objects] + list(SURROUNDINGS)
+    table = {name: n for n, name in enumerate(sorted(set(classes)), start=1)}
+    ids = np.array([table[name] for name in classes])
+    scale, fx = 6553.5, float(capture.cameras.fx[0])
+    camera = {"w": width, "h": height, "fx": fx, "fy": fx, "scale": scale}
+    camera |= {"cx": width / 2 - 0.5, "cy": height / 2 - 0.5}
+    write_text(root / "cam_params.json", json.dumps({"camera": camera}))
+    poses = np.linalg.inv(np.asarray(capture.cameras.world_to_camera, np.float64))
+    write_text(root / scene / "traj.txt", "".join(" ".join(map(repr, map(float, p.ravel()))) + "\n" for p in poses))
+    assert capture.depths is not None
+    for t in range(views):
+        write_image(root / scene / "results" / f"frame{t:06d}.jpg", capture.frames[t])
+        _write_png16(root / scene / "results" / f"depth{t:06d}.png", np.rint(capture.depths[t] * scale))
+    write_mesh(root / f"{scene}_mesh.ply", mesh.vertices, mesh.faces)
+    if ready_labels:
+        write_text(root / f"semantic_labels_{scene}.txt", "".join(f"{n}\n" for n in ids[mesh.vertex_owners]))
+        lines = ["-1 undefined", *(f"{n} {name}" for name, n in table.items())]
+        write_text(root / "replica_class_id_to_names.txt", "\n".join(lines) + "\n")
+    else:
+        habitat = root / f"{scene[:-1]}_{scene[-1]}" / "habitat"
+        numbers = mesh.face_owners.astype(np.int32) + 1
+        write_mesh(habitat / "mesh_semantic.ply", mesh.vertices, mesh.faces, {"object_id": numbers})
+        info = {
+            "classes": [{"id": n, "name": name, "children": [], "parents": []} for name, n in table.items()],
+            "objects": [{"id": k + 1, "class_id": table[c], "class_name": c} for k, c in enumerate(classes)],
+            "id_to_label": [-1, *(table[c] for c in classes)],
+            "gravity_dir": [0.0, 0.0, -1.0],
+        }
+        write_text(habitat / "info_semantic.json", json.dumps(info))
+    queries = sorted({item.shape for item in room.objects} | {"table"})
+    occurring = {classes[k] for k in np.unique(mesh.vertex_owners)} & set(queries)
+    pairs = len(occurring)
+    _finish(root, scene, capture, owners, seed=seed, pairs=pairs, queries=queries, objects=classes)
+    return root
+
+
+def write_scannet_twin(
+    root: Path,
+    scene: str,
+    seed: int,
+    *,
+    views: int = 30,
+    width: int = 320,
+    height: int = 240,
+    num_objects: int = 12,
+    fine_m: float = 0.012,
+    coarse_m: float = 0.05,
+    lost: Sequence[int] = (),
+) -> Path:
+    """A room as a scan of ScanNet, its objects under NYU40 ids in turn; frames `lost` have infinite poses."""
+    numbers = tuple(map(str, range(views)))
+    room, capture, owners, mesh = _scanned(seed, numbers, width, height, num_objects, fine_m, coarse_m)
+    surroundings = {"wall": 1, "floor": 2, "table": 7, CEILING: 22}
+    of_objects = [FURNISHINGS[k % len(FURNISHINGS)] for k in range(len(room.objects))]
+    ids = np.array(of_objects + [surroundings[name] for name in SURROUNDINGS])
+    poses = np.linalg.inv(np.asarray(capture.cameras.world_to_camera, np.float64))
+    poses[list(lost)] = -np.inf
+    focal = float(capture.cameras.fx[0])
+    matrix = np.diag([focal, focal, 1.0, 1.0])
+    matrix[:2, 2] = width / 2 - 0.5, height / 2 - 0.5
+    folder = root / scene
+    _write_matrix(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+    for t in range(views):
+        write_image(folder / "color" / f"{t}.jpg", capture.frames[t])
+        _write_matrix(folder / "pose" / f"{t}.txt", poses[t])
+    write_mesh(folder / f"{scene}_vh_clean_2.ply", mesh.vertices, mesh.faces)
+    names = ("x", "y", "z", "red", "green", "blue")
+    kinds = [(name, mesh.vertices.dtype[name].str) for name in names] + [("label", "<u2")]
+    vertices = np.zeros(len(mesh.vertices), np.dtype(kinds))
+    for name in names:
+        vertices[name] = mesh.vertices[name]
+    vertices["label"] = ids[mesh.vertex_owners]
+    write_mesh(folder / f"{scene}_vh_clean_2.labels.ply", vertices, mesh.faces)
+    present = set(np.unique(vertices["label"]).tolist())
+    pairs = {str(size): len(present & set(chosen)) for size, chosen in CLASS_SETS.items()}
+    objects = [NYU40.get(number, CEILING) for number in ids]
+    queries = list(NYU40.values())
+    _finish(root, scene, capture, owners, seed=seed, pairs=pairs, queries=queries, objects=objects)
+    return root
+
+
+def _scanned(
+    seed: int,
+    names: tuple[str, ...],
+    width: int,
+    height: int,
+    num_objects: int,
+    fine: float,
+    coarse: float,
+) -> tuple[Room, Capture, Int[np.ndarray, "t h w"], Mesh]:
+    room = make_room(seed, num_objects=num_objects)
+    cameras = room_cameras(room, views=len(names), width=width, height=height)
+    capture, instances = captured(room, cameras, names, np.zeros(len(names), bool), points=100)
+    points, owners = surfaces_of(room, capture, instances)
+    return room, capture, owners, mesh_of(points, owners, capture.frames, num_objects, fine=fine, coarse=coarse)
+
+
+def _forward_cameras(room: Room, views: int, width: int, height: int) -> Camera:
+    """Views from the front, in three rows over some 50 degrees; 60 degrees across."""
+    draw = np.random.default_rng([room.seed, 9])
+    along = np.radians(25) * (2 * np.arange(views) / max(views - 1, 1) - 1) + draw.uniform(0, 2 * np.pi)
+    lift = 0.75 + 0.12 * (np.arange(views) % 3) + draw.normal(0, 0.01, views)
+    centres = np.stack([1.5 * np.cos(along), 1.5 * np.sin(along), lift], -1)
+    poses = np.stack([look_at(centre, np.zeros(3)) for centre in centres])
+    focal, cx, cy = (
+        np.full(views, value, np.float32) for value in (0.5 * width / np.tan(np.radians(30)), width / 2, height / 2)
+    )
+    return Camera(poses, focal, focal, cx, cy, width, height)
+
+
+def _labelled_capture(
+    folder: Path,
+    room: Room,
+    cameras: Camera,
+    names: tuple[str, ...],
+    out: Bool[np.ndarray, " t"],
+    label_pixels: int,
+) -> tuple[Capture, Int[np.ndarray, "t h w"], list[LabelledFrame]]:
+    """The room seen by `cameras`, written for COLMAP; its instances, and the labels of the frames `out`."""
+    capture, instances = captured(room, cameras, names, out, points=200 * len(names))
+    write_colmap(capture, folder, image_format="jpg")
+    frames = [labelled(names[t], instances[t], room.names, label_pixels) for t in np.flatnonzero(out)]
+    return capture, instances, frames
+
+
+def _finish(
+    root: Path,
+    scene: str,
+    capture: Capture,
+    owners: Int[np.ndarray, "t h w"],
+    frames: Sequence[LabelledFrame] = (),
+    **told: Any,
+) -> None:
+    """The truth of each pixel, and, last, what was written of the scene."""
+    for name, image in zip(capture.names, owners):
+        write_ids(root / "truth" / scene / f"{name}.png", (image + 1).astype(np.uint8))
+    file = root / TWIN_FILE
+    scenes = json.loads(file.read_text())["scenes"] if file.exists() else {}
+    told |= {"frames": [frame.name for frame in frames]}
+    write_text(file, json.dumps({"scenes": scenes | {scene: told}}, indent=1) + "\n")
+
+
+def _write_png16(path: Path, values: np.ndarray) -> None:
+    with written_whole(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", values.astype(np.uint16))[1].tobytes())
+
+
+def _write_matrix(path: Path, matrix: np.ndarray) -> None:
+    write_text(path, "".join(" ".join(map(repr, map(float, row))) + "\n" for row in matrix))

@@ -1,0 +1,91 @@
+"""CLIP as two ONNX graphs with its vocabulary, in the folder layout `immich` that jsecon.networks.clip reads
+(immich-app/ml-models, exporters/onnx/models/openclip.py); batches of any size."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import torch
+
+from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
+from jsecon.files import write_text
+
+
+def official(name: str, weights: str | None, *, seed: int) -> torch.nn.Module:
+    """open_clip's model of that name; `weights` is one of its tags or a file, None random numbers."""
+    declare_missing_operators()
+    import open_clip
+
+    torch.manual_seed(seed)
+    torch.backends.mha.set_fastpath_enabled(False)  # one fused operator that ONNX does not have
+    model = open_clip.create_model(name, pretrained=weights, precision="fp32", device="cpu")
+    if weights is None:
+        shake(model, seed)
+    return model.eval().requires_grad_(False)
+
+
+def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> list[Agreement]:
+    """Writes both graphs, the preprocessing and the vocabulary into `folder`; each graph is compared on five inputs."""
+    generator = torch.Generator().manual_seed(seed)
+    size, length = model.visual.image_size[0], model.context_length
+    images = torch.randn(5, 3, size, size, generator=generator)
+    rows = [
+        write_graph(
+            folder / "visual" / "model.onnx",
+            Image(model),
+            {"image": images[:2]},
+            ["embedding"],
+            free={"image": {0: "batch"}, "embedding": {0: "batch"}},
+            other={"image": images},
+            threads=threads,
+        )
+    ]
+    tokenizer = _tokenizer(name)
+    texts = ["a photo of a red mug", "sofa", "thé à la menthe", "", "the small green plant on the window sill " * 5]
+    ids = tokenizer(texts, context_length=length).to(torch.int32)
+    rows.append(
+        write_graph(
+            folder / "textual" / "model.onnx",
+            Text(model),
+            {"text": ids[:2]},
+            ["embedding"],
+            free={"text": {0: "batch"}, "embedding": {0: "batch"}},
+            other={"text": ids},
+            threads=threads,
+        )
+    )
+    preprocessing = {"size": [size, size], "mode": "RGB", "interpolation": "bicubic", "resize_mode": "shortest"}
+    preprocessing |= {"mean": list(model.visual.image_mean), "std": list(model.visual.image_std)}
+    write_text(folder / "visual" / "preprocess_cfg.json", json.dumps(preprocessing, indent=2) + "\n")
+    merges = [list(pair) for pair, _ in sorted(tokenizer.bpe_ranks.items(), key=lambda item: item[1])]
+    vocabulary = {"model": {"type": "BPE", "vocab": tokenizer.encoder, "merges": merges}}
+    write_text(folder / "textual" / "tokenizer.json", json.dumps(vocabulary, ensure_ascii=False) + "\n")
+    return [dataclasses.replace(row, graph=f"{half}/model.onnx") for row, half in zip(rows, ("visual", "textual"))]
+
+
+def _tokenizer(name: str):
+    import open_clip
+
+    return open_clip.get_tokenizer(name)
+
+
+class Image(torch.nn.Module):
+    """Images to unit embeddings."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, image):
+        return self.model.encode_image(image, normalize=True)
+
+
+class Text(torch.nn.Module):
+    """Token ids to unit embeddings."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, text):
+        return self.model.encode_text(text.long(), normalize=True)

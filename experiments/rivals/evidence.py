@@ -1,0 +1,91 @@
+"""What every rival learns from: one set of Gaussians, the masks of each frame, and how a tracker joined them."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jsecon.errors import require
+from jsecon.splat.plan import ViewPlan, plan_views
+from jsecon.types import Array, Camera, Gaussians
+
+_SLOTS = 8
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """A scene as the rivals see it; a pytree."""
+
+    gaussians: Gaussians
+    cameras: Camera
+    """batch of T: the views that may be learnt from."""
+    masks: Array
+    """(T, H, W) int32 rows of `embeddings`, -1 = none; a row belongs to one frame."""
+    embeddings: Array
+    """(M, E) float32 unit, one per mask."""
+    frame: Array
+    """(M,) int32 the frame of each mask."""
+    tracks: Array
+    """(T, H, W) int32 the same regions under a tracker's ids, alike in all frames; -1 = none."""
+
+
+def evidence_of_tracks(
+    gaussians: Gaussians,
+    cameras: Camera,
+    tracks: Int[Array, "t h w"],
+    embeddings: Float[Array, "t r e"],
+) -> Evidence:
+    """Evidence whose masks are those of the tracks, taken apart by frame: embeddings (T, R, E) of region r in frame t.
+
+    Raises ValueError where a track has no embedding row.
+    """
+    tracks, embeddings = np.asarray(tracks), np.asarray(embeddings, np.float32)
+    require(
+        len(tracks) == len(embeddings) and int(tracks.max(initial=-1)) < embeddings.shape[1],
+        "evidence_of_tracks",
+        got=f"tracks {tracks.shape} up to {int(tracks.max(initial=-1))}, embeddings {embeddings.shape}",
+        expected="an embedding for each region and frame",
+        remedy="Embed each region in each frame that shows it.",
+    )
+    masks, rows, frame = np.full(tracks.shape, -1, np.int32), [], []
+    for t, image in enumerate(tracks):
+        for region in np.unique(image[image >= 0]):
+            masks[t][image == region] = len(rows)
+            rows.append(embeddings[t, region])
+            frame.append(t)
+    table = np.stack(rows) if rows else np.zeros((0, embeddings.shape[2]), np.float32)
+    return Evidence(gaussians, cameras, masks, table, np.array(frame, np.int32), tracks.astype(np.int32))
+
+
+def local_masks(evidence: Evidence) -> tuple[Int[np.ndarray, "t h w"], Int[np.ndarray, "t k"]]:
+    """The masks counted from 0 in each frame (T, H, W), -1 = none; and the rows (T, K) that the counts stand for, -1
+    past a frame's last. K is a multiple of 8: scenes share their compiled programs."""
+    masks, frame = np.asarray(evidence.masks), np.asarray(evidence.frame)
+    rows = [np.flatnonzero(frame == t) for t in range(len(masks))]
+    names = np.full((len(masks), _SLOTS * -(-max(1, max(map(len, rows), default=1)) // _SLOTS)), -1, np.int32)
+    local = np.full(masks.shape, -1, np.int32)
+    for t, here in enumerate(rows):
+        names[t, : len(here)] = here
+        place = np.full(len(frame) + 1, -1, np.int32)
+        place[here] = np.arange(len(here))
+        local[t] = place[masks[t]]
+    return local, names
+
+
+def view_plans(evidence: Evidence) -> ViewPlan:
+    """The plans of all views, stacked on a leading axis: the geometry is frozen, so each is made once."""
+    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    plans = plan_views(gaussians, cameras, most_bytes=sys.maxsize)
+    assert plans is not None
+    return plans
+
+
+def only(plan: ViewPlan, mask: Array) -> ViewPlan:
+    """The plan of the same view with the Gaussians of `mask` (N,) alone: the others' opacity is zero."""
+    return dataclasses.replace(plan, splats=plan.splats.at[:, 5].multiply(mask.astype(plan.splats.dtype)))

@@ -1,0 +1,1 @@
+"""Vision simulated from true instance labels: for experiments and tests."""

@@ -1,0 +1,1 @@
+"""Stiff and extreme scenes, a row each."""

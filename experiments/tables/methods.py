@@ -1,0 +1,101 @@
+"""The rows of Tables 1 to 3: the other methods, trained on a setting and asked as their papers ask them, and ours."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
+from experiments.rivals import lifting
+from experiments.rivals.evidence import Evidence
+from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
+from experiments.rivals.langsplat import LangSplat, train_langsplat
+from experiments.rivals.opengaussian import Schedule, train_opengaussian
+from experiments.tables.answers import Answers, Method, Steps, by_selection
+from experiments.tables.ours import asked, paper
+from experiments.tables.setting import Setting
+from jsecon.types import Array, Selection
+
+
+def by_features(setting: Setting, features: Float[Array, "n e"], *, relevancy: bool) -> Answers:
+    """Selections by VALA's readout of the relevancy, or by the scene's most similar text; classes by the latter."""
+    texts, features = jnp.asarray(setting.texts), jnp.asarray(features)
+    labels, cosines = most_similar_text(features, texts)
+    by_text = lambda k: select_text(labels, cosines, k)
+    means = setting.evidence.gaussians.means
+    read = lambda k: lifting.query_relevancy(features, means, texts[k], jnp.asarray(setting.canonical))
+    return Answers(read if relevancy else by_text, lambda: np.asarray(labels))
+
+
+def langsplat(setting: Setting, steps: Steps) -> Answers:
+    """Each frame's own masks; asked by the most similar text, as OpenGaussian asks it at the points."""
+    return by_features(setting, langsplat_of(setting, setting.evidence, steps).features(), relevancy=False)
+
+
+def langsplat_of(setting: Setting, evidence: Evidence, steps: Steps) -> LangSplat:
+    """LangSplat trained on the masks of one level."""
+    key = jax.random.key(setting.seed)
+    return train_langsplat(evidence, key=key, steps=steps.langsplat, init="random", epochs=steps.epochs)
+
+
+def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
+    """Tracked ids; a text is found in the first view or not at all."""
+    rates = dict(zip(("identity_rate", "classifier_rate"), steps.grouping_rates))
+    # A classifier's outputs in multiples of 32, and one for no id: settings share their compiled programs.
+    key, classes = jax.random.key(setting.seed), 1 + 32 * -(-(int(setting.evidence.tracks.max()) + 1) // 32)
+    model, _ = train_gaussian_grouping(setting.evidence, key=key, steps=steps.grouping, classes=classes, **rates)
+    canonical = jnp.asarray(setting.canonical)
+    ask = lambda k: query_gaussian_grouping(model, setting.evidence, jnp.asarray(setting.texts[k]), canonical)
+    return by_selection(setting, ask)
+
+
+def opengaussian(setting: Setting, steps: Steps) -> Answers:
+    """Instance features and a codebook; the most similar leaf."""
+    views = len(setting.names)
+    schedule = Schedule(
+        steps.instance,
+        steps.coarse,
+        steps.fine,
+        steps.roots,
+        steps.leaves,
+        min_views=max(2, min(5, views // 4)),
+        rate=steps.opengaussian_rate,
+        coarse_rate=steps.opengaussian_rate / 10,
+    )
+    model, _ = train_opengaussian(setting.evidence, key=jax.random.key(setting.seed), schedule=schedule)
+    gaussians = setting.evidence.gaussians
+
+    def ask(k: int) -> Selection:
+        text = jnp.asarray(setting.texts[k])
+        found = select_leaf(model.leaf_features, model.leaf_codes, model.leaf_of, text, siblings=model.siblings)
+        kept = without_stragglers(gaussians.means, gaussians.log_scales, found.mask)
+        return dataclasses.replace(found, mask=jnp.asarray(kept))
+
+    def classes() -> np.ndarray:
+        labels, _ = most_similar_text(model.leaf_features, jnp.asarray(setting.texts))
+        return np.asarray(labels)[np.asarray(model.leaf_of)]
+
+    return Answers(ask, classes)
+
+
+def _lifted(train: Callable) -> Callable[[Setting, Steps], Answers]:
+    return lambda setting, steps: by_features(setting, train(setting.evidence).features, relevancy=True)
+
+
+METHODS: dict[str, Method] = {
+    "LangSplat-m": langsplat,
+    "Gaussian Grouping-m": gaussian_grouping,
+    "OpenGaussian": opengaussian,
+    "Occam's LGS": _lifted(lifting.train_occam),
+    "weighted back-projection": _lifted(lifting.train_backprojection),
+    "VALA": _lifted(lifting.train_vala),
+    "the paper's path": paper,
+    "ours, tracks": asked("votes", pieces=True),
+    "ours, consensus": asked("votes", by="consensus", pieces=True),
+}
+"""the rows of Tables 1 to 3"""
+RECOMMENDED = "ours, consensus"
+"""what jsecon does by default with masks of single frames: the row to hold against the others"""

@@ -1,0 +1,150 @@
+"""jsecon's own rows: the field of a setting, and the ways to ask it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.tables.answers import Answers, Method, Steps, by_selection
+from experiments.tables.association import Association, associated, by_consensus
+from experiments.tables.memberships import by_lead, of_all_views
+from experiments.tables.setting import Setting
+from jsecon.language.autoencoder import train_autoencoder
+from jsecon.language.codes import encode, region_codes
+from jsecon.language.distill import distill_l1, distill_votes
+from jsecon.language.shares import finish_votes, membership_probability
+from jsecon.language.votes import region_votes
+from jsecon.query.anchored import query_anchored
+from jsecon.query.classes import query_classes
+from jsecon.query.direct import query_canonical, query_one_step
+from jsecon.query.outliers import remove_outliers
+from jsecon.query.retrieval import PIECE_NEARNESS
+from jsecon.types import LanguageField, Regions, Selection, Votes
+
+BY_COSINE = {"retrieval": "cosine"}
+"""the region of the largest cosine, as the paper finds it"""
+
+
+def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:
+    """The regions of a setting: by "tracks", by "consensus", or any other name with its `labels`."""
+    evidence = setting.evidence
+    if by == "tracks":
+        return setting.tracked
+    if labels is not None:
+        return setting.shared.get(by, lambda: associated(evidence, labels))
+    return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed))
+
+
+def field_of(
+    setting: Setting,
+    *,
+    by: str = "tracks",
+    labels: np.ndarray | None = None,
+    latent: int | str = "auto",
+    uniform: bool = False,
+    steps: Steps | None = None,
+) -> LanguageField:
+    """jsecon's field of a setting, its regions those of `association`. latent=3: LangSplat's autoencoder; with `steps`
+    the paper's own path, Adam on the rendered L1 from random codes, else the votes' mode."""
+    evidence, shared = setting.evidence, setting.shared
+    regions = association(setting, by, labels=labels)
+    embeddings = jnp.asarray(regions.uniform_embeddings if uniform else regions.embeddings)
+    found, key = jnp.asarray(regions.labels), jax.random.key(setting.seed)
+    known = Regions(np.asarray(embeddings), regions.pixels)
+
+    def cast() -> Votes:
+        given = evidence.gaussians, evidence.cameras, found, len(embeddings)
+        return finish_votes(region_votes(*given, by_view=True), known)
+
+    votes = shared.get(("votes", by, uniform), cast)
+    if latent == "auto":
+        table, coder, _ = shared.get(("codes", by, uniform), lambda: region_codes(embeddings, latent=latent, key=key))
+    else:
+        epochs = None if steps is None else steps.epochs
+        coder = train_autoencoder(embeddings, latent=latent, key=key, epochs=epochs)
+        table = coder.encode(embeddings)
+    if steps is None:
+        codes = distill_votes(votes, table)
+    else:
+        codes, _ = distill_l1(
+            evidence.gaussians,
+            evidence.cameras,
+            found,
+            table,
+            steps=steps.paper,
+            key=key,
+            init="random",
+        )
+    return LanguageField(
+        evidence.gaussians,
+        codes,
+        votes,
+        known,
+        table,
+        coder,
+        evidence.cameras,
+        setting.canonical,
+        np.eye(4),
+        setting.names,
+    )
+
+
+def ask_field(
+    setting: Setting,
+    field: LanguageField,
+    way: str,
+    *,
+    retrieval: str = "contrast",
+    clean: bool = True,
+    threshold: float | None = None,
+    pieces: bool = False,
+) -> Answers:
+    """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code,
+    probability (of the votes; all anchored, by `retrieval`), one_step or canonical; `clean` drops outliers, `pieces`
+    joins the regions that are pieces of what the text found (not by lead)."""
+    means = np.asarray(setting.evidence.gaussians.means)
+    field = of_all_views(field) if way == "all_views" else field
+    phrases = jnp.asarray(field.canonical)
+    nearness = PIECE_NEARNESS if pieces else None
+
+    def ask(k: int) -> Selection:
+        text = jnp.asarray(setting.texts[k])
+        if way == "one_step":
+            found = query_one_step(
+                field.codes, encode(field.autoencoder, text), 0.9 if threshold is None else threshold
+            )
+        elif way == "canonical":
+            code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
+            found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
+        elif way == "probability":
+            found = query_anchored(field, text, retrieval=retrieval, piece_nearness=nearness)
+            probability = membership_probability(found.similarity, field.votes)
+            inside = (found.region >= 0) & (probability >= (0.5 if threshold is None else threshold))
+            found = dataclasses.replace(found, mask=inside)
+        elif way == "lead":
+            found = by_lead(field, query_anchored(field, text, retrieval=retrieval), threshold=threshold)
+        else:
+            by = "votes" if way == "all_views" else way
+            options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_nearness": nearness}
+            found = query_anchored(field, text, by=by, **options)
+        mask = np.asarray(found.mask)
+        return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
+
+    if way != "votes":
+        return by_selection(setting, ask)
+    texts = jnp.asarray(setting.texts)
+    return Answers(ask, lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, every=True)[0]))
+
+
+def asked(way: str, *, retrieval: str = "contrast", clean: bool = True, pieces: bool = False, **options) -> Method:
+    """The row that asks `field_of(setting, **options)` as `ask_field` describes."""
+    return lambda setting, steps: ask_field(
+        setting, field_of(setting, **options), way, retrieval=retrieval, clean=clean, pieces=pieces
+    )
+
+
+def paper(setting: Setting, steps: Steps) -> Answers:
+    """The paper's own path: tracks, phi_bar, 3-d codes trained on the rendered L1, the region of the largest cosine,
+    anchored by code, DBSCAN."""
+    return ask_field(setting, field_of(setting, latent=3, steps=steps), "code", retrieval="cosine")

@@ -1,0 +1,133 @@
+"""Twin datasets on disk with the results of simulated vision: masks, tracks, embeddings and texts in true form.
+
+ROOT/<scene>/masks: the tracker's ids, one PNG per frame (0 = none). ROOT/<scene>/language_features: LangSplat's files.
+ROOT/<scene>/text_features.json: the queries' and canonical phrases' vectors. Held-out frames get none: nothing may be
+learnt from them.
+"""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from experiments import results
+from experiments.cells import alone
+from experiments.datasets import twins
+from experiments.datasets.benchmark import Benchmark
+from experiments.datasets.feature_files import write_features, write_text_features
+from experiments.datasets.lerf_ovs import load_lerf_ovs
+from experiments.datasets.ovs3d import load_ovs3d
+from experiments.datasets.replica import load_replica
+from experiments.datasets.scannet import load_scannet
+from experiments.simulated_vision.embeddings import SimulatedEmbedder, made_text_space
+from experiments.simulated_vision.masks import LEVELS, Faults, simulated_masks
+from jsecon.files import write_text
+from jsecon.vision.protocols import CANONICAL
+
+PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)
+"""true masks that agree in all views, each object embedded alike in all; texts and images lie apart, as in CLIP"""
+KIND = 2
+"""of twin: raised where what the writers write changes, so that nothing measured on another kind is taken for it"""
+WRITERS = {
+    "lerf": twins.write_lerf_twin,
+    "ovs3d": twins.write_ovs3d_twin,
+    "replica": twins.write_replica_twin,
+    "scannet": twins.write_scannet_twin,
+}
+
+
+def faults_of(level: str) -> Faults:
+    """Of a named level of noise: perfect, low, medium or high."""
+    return PERFECT if level == "perfect" else LEVELS[level]
+
+
+def load(dataset: str, root: Path, scene: str, *, every: int = 1, downscale: float | None = None) -> Benchmark:
+    """A scene of any of the four datasets, real or twin; `every` and `downscale` are for long, large captures."""
+    if dataset == "lerf":
+        return load_lerf_ovs(root, scene, downscale=downscale)
+    if dataset == "ovs3d":
+        return load_ovs3d(root, scene, downscale=downscale)
+    if dataset == "replica":
+        return load_replica(root, scene, every=every, downscale=downscale)
+    return load_scannet(root, scene, every=every, downscale=downscale)
+
+
+def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict) -> Path:
+    """A twin of `scene` under `root` with simulated vision of `level`, made where it is not there yet; its root.
+
+    Each (seed, level, size) has a root of its own: a scene's vision lies beside its frames, and twins of another size
+    have other labelled frames. One process at a time writes to a root.
+    """
+    kind = json.dumps({"size": size, "kind": KIND}, sort_keys=True)
+    place = root / f"{dataset}-seed{seed}-{level}-{hashlib.sha1(kind.encode()).hexdigest()[:8]}"
+    marker = place / scene / "made.json"
+    if marker.exists():
+        return place
+    with alone(place / "twin.lock", wait=True):
+        if not marker.exists():
+            number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
+            WRITERS[dataset](place, scene, 1000 * seed + number, **size)
+            look(load(dataset, place, scene), place, level, seed)
+            write_text(marker, kind)
+    return place
+
+
+def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
+    """Writes simulated masks, tracks and embeddings, with the faults of `level`, of the frames that may be learnt
+    from."""
+    told = json.loads((root / "twin.json").read_text())["scenes"][bench.name]
+    shown = np.flatnonzero(~np.asarray(bench.capture.held_out))
+    names = [bench.capture.names[t] for t in shown]
+    images = [cv2.imread(str(root / "truth" / bench.name / f"{name}.png"), cv2.IMREAD_UNCHANGED) for name in names]
+    truth, frames = np.stack(images).astype(np.int16) - 1, np.asarray(bench.capture.frames)[shown]
+    words = sorted({*told["objects"], *bench.queries})
+    space = made_text_space(words, seed=seed)
+    faults = faults_of(level)
+    masks = simulated_masks(truth, faults, seed=seed)
+    embedder = SimulatedEmbedder(frames, truth, told["objects"], space, faults, seed=seed)
+    folder = root / bench.name
+    for name, frame, image in zip(names, frames, masks.labels, strict=True):
+        here = np.unique(image[image >= 0])
+        rows = embedder.embed_regions(frame, image[None] == here[:, None, None])
+        local = np.searchsorted(here, image)
+        write_features(folder / "language_features", name, np.where(image >= 0, local, -1), rows)
+        twins.write_ids(folder / "masks" / f"{name}.png", (image + 1).astype(np.uint16))
+    vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical])
+    write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
+
+
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """Which scenes an experiment runs on: a real dataset's root, or twins made under the results' folder."""
+
+    dataset: str
+    root: str = ""
+    """of the real dataset; empty: twins."""
+    twins: str = "twins"
+    """folder of the twins, from the checkout on."""
+    scenes: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """of the twins and their vision; a real dataset has the first alone, for the training."""
+    size: tuple[tuple[str, int | float], ...] = ()
+    """of the twins: options of their writer."""
+    every: int = 10
+    """frames of a real scan of which one is taken (Replica and ScanNet have thousands)."""
+    downscale: float | None = None
+    """of real frames."""
+
+    def load(self, root: Path, scene: str) -> Benchmark:
+        """The scene under the root that `place` gave."""
+        return load(self.dataset, root, scene, every=self.every if self.root else 1, downscale=self.downscale)
+
+    def place(self, scene: str, seed: int, level: str) -> Path:
+        """The root that holds the scene."""
+        if self.root:
+            return Path(self.root)
+        return make(self.dataset, results.HOME.parent / self.twins, scene, seed, level, dict(self.size))
+
+    def kept(self, root: Path, scene: str) -> Path:
+        """Where Gaussians fitted to the scene are kept: twins of all levels of noise share them."""
+        return root / scene if self.root else root.parent / "fitted"

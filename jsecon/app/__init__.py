@@ -1,0 +1,1 @@
+"""The command line and a run: options, stages, pipeline, answers, reports."""

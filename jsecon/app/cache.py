@@ -1,0 +1,264 @@
+"""What a run has already computed: one file per stage, named by a digest of all that its content depends on.
+
+    OUT/cache/<stage>-<key>.npz
+
+The key covers the stage's options, its input files, the source that computes it, and the keys of the
+stages it reads. So a stopped run goes on where it stopped, a changed option reruns only what depends on it, and no
+stale result can be taken for a fresh one. A file holds arrays and a JSON description of their tree: no pickle.
+"""
+
+import ast
+import dataclasses
+import functools
+import hashlib
+import importlib
+import json
+import os
+import sys
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jsecon
+from jsecon.files import write_text, written_whole
+
+_TREE = "__tree__"
+STALE_SECONDS = 600.0
+"""a half-written file that has not grown for this long has no writer any more"""
+_UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, ImportError, zipfile.BadZipFile)
+
+
+class CorruptCacheError(Exception):
+    """A cache file that cannot be read back; the stage must be computed again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """A stage's result, with how it came about."""
+
+    value: Any
+    """The result, every array a NumPy array."""
+    seconds: float
+    """Wall time of the computation, also where it happened in an earlier run."""
+    fresh: bool
+    """Computed now, rather than read from the cache."""
+
+
+def key_of(stage: str, parts: Mapping[str, Any]) -> str:
+    """16 hex digits that name a stage's result; `parts` holds plain values: numbers, texts, None, lists, dicts."""
+    text = json.dumps([stage, parts], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
+    """Digest of files, and of all files beneath folders, by name, size and time of change.
+
+    Hidden files don't count, nor does `leave_out`, the run's own output, where it lies inside of such a folder.
+    """
+    entries = []
+    for root in paths:
+        own = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out.resolve()
+        if own is not None and not own.is_relative_to(root.resolve()):
+            own = None
+        for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
+            inside = path.relative_to(root) if path != root else Path(path.name)
+            if any(part.startswith(".") for part in inside.parts) or not path.is_file():
+                continue
+            if own is not None and path.resolve().is_relative_to(own):
+                continue
+            stat = path.stat()
+            entries.append(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}")
+    return hashlib.blake2b("\n".join(entries).encode(), digest_size=8).hexdigest()
+
+
+def source_digest(*entries: Callable) -> str:
+    """Digest of the source that functions and classes of jsecon stand on, as the imports tell.
+
+    Of the file of each entry, the definitions that it uses, one by way of the other, count; of the modules that these
+    import, and of all that those import in turn, inside functions too, the whole files.
+    """
+    digest, modules = hashlib.blake2b(digest_size=8), set()
+    for entry in entries:
+        home = sys.modules[entry.__module__]
+        tree = ast.parse(Path(str(home.__file__)).read_text())
+        defined = {name: node for node in tree.body for name in _names_of(node)}
+        wanted, used = [entry.__qualname__.partition(".")[0]], set()
+        while wanted:
+            name = wanted.pop()
+            if name in used:
+                continue
+            used.add(name)
+            node = defined[name]
+            modules |= _imports(node)
+            if not isinstance(node, (ast.Import, ast.ImportFrom)):
+                digest.update(ast.dump(node).encode())
+                wanted += [n.id for n in ast.walk(node) if isinstance(n, ast.Name) and n.id in defined]
+    for name in sorted(modules_beneath(modules)):
+        digest.update(name.encode())
+        digest.update(_file_of(name).read_bytes())
+    return digest.hexdigest()
+
+
+def modules_beneath(names: Iterable[str]) -> set[str]:
+    """The named modules of jsecon and all of its modules that they import, one by way of the other."""
+    found, wanted = set(), list(names)
+    while wanted:
+        name = wanted.pop()
+        if name not in found:
+            found.add(name)
+            wanted += _imports_of_module(name)
+    return found
+
+
+@functools.cache
+def _imports_of_module(name: str) -> frozenset[str]:
+    return frozenset(_imports(ast.parse(_file_of(name).read_text())))
+
+
+def _imports(tree: ast.AST) -> set[str]:
+    """The modules of jsecon that are imported within a tree. The package itself is a table of contents: no module
+    draws from it more than its version."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jsecon."):
+            inner = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name for name in inner if _file_of(name).exists()} or {str(node.module)}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names if alias.name.startswith("jsecon.")}
+    return found
+
+
+def _file_of(module: str) -> Path:
+    place = Path(jsecon.__file__).parent.joinpath(*module.split(".")[1:])
+    return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+
+
+def _names_of(node: ast.stmt) -> set[str]:
+    """The names that a statement at the top of a module binds."""
+    if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+        return {node.name}
+    if isinstance(node, (ast.Import, ast.ImportFrom)):
+        return {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
+    return {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+
+
+def path_of(folder: Path, stage: str, key: str) -> Path:
+    """Where a stage's result lies."""
+    return folder / f"{stage}-{key}.npz"
+
+
+def record_path_of(path: Path) -> Path:
+    """Where the stage whose result lies at `path` keeps, while it runs, how far it has come."""
+    return path.with_suffix(".checkpoint.npz")
+
+
+def prepare(folder: Path) -> None:
+    """Makes the folder, marks it as a cache for backup programs, and removes what killed writers left behind."""
+    tag = folder / "CACHEDIR.TAG"
+    if not tag.exists():
+        write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
+    for partial in folder.glob(".*.partial.npz"):
+        if time.time() - partial.stat().st_mtime > STALE_SECONDS:
+            partial.unlink(missing_ok=True)
+
+
+def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None) -> Kept:
+    """A stage's result: read where `path` holds it, else computed and kept there.
+
+    A file that cannot be read is said through `note` and computed again. A fresh result is passed through the same
+    packing as a stored one, so that what follows sees the same arrays whether the run was stopped here or not.
+    """
+    if path.exists():
+        try:
+            value, seconds = _read(path)
+            return Kept(value, seconds, fresh=False)
+        except CorruptCacheError as error:
+            if note is not None:
+                stage = path.stem.partition("-")[0]
+                note(f"{path.name} cannot be read ({error}); {stage} is computed again")
+    started = time.monotonic()
+    value = compute()
+    jax.block_until_ready(value)
+    seconds = time.monotonic() - started
+    tree, arrays = pack(value)
+    _write(path, tree, arrays, seconds)
+    return Kept(unpack(tree, arrays), seconds, fresh=True)
+
+
+def save(path: Path, value: Any) -> None:
+    """Keeps `value` (a tree of plain values, arrays and jsecon's records) at `path`, whole or not at all."""
+    _write(path, *pack(value), seconds=0.0)
+
+
+def load(path: Path) -> Any:
+    """What `save` kept. Raises CorruptCacheError where the file cannot be read."""
+    return _read(path)[0]
+
+
+def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float) -> None:
+    description = np.frombuffer(json.dumps({"tree": tree, "seconds": seconds}).encode(), np.uint8)
+    with written_whole(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, allow_pickle=False, **{_TREE: description}, **arrays)
+        file.flush()
+        os.fsync(file.fileno())  # a rename may reach the disk before the content does
+
+
+def _read(path: Path) -> tuple[Any, float]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        description = json.loads(arrays.pop(_TREE).tobytes())
+        return unpack(description["tree"], arrays), description["seconds"]
+    except _UNREADABLE as error:
+        raise CorruptCacheError(f"{type(error).__name__}: {error}") from error
+
+
+def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """A JSON description of the tree, and its arrays by path. Raises TypeError on what is neither plain nor a record of
+    jsecon's."""
+    arrays: dict[str, np.ndarray] = {}
+
+    def describe(node: Any, path: str) -> Any:
+        if node is None or isinstance(node, (bool, int, float, str)):
+            return {"value": node}
+        if isinstance(node, (np.ndarray, np.generic, jax.Array)):
+            arrays[path] = np.asarray(node)
+            return {"array": path}
+        if isinstance(node, (list, tuple)) and type(node) in (list, tuple):
+            return {type(node).__name__: [describe(item, f"{path}.{i}") for i, item in enumerate(node)]}
+        if isinstance(node, Mapping) and all(isinstance(name, str) for name in node):
+            return {"dict": {name: describe(item, f"{path}.{name}") for name, item in node.items()}}
+        kind = type(node)
+        if dataclasses.is_dataclass(node) and kind.__module__.startswith("jsecon."):
+            fields = {f.name: describe(getattr(node, f.name), f"{path}.{f.name}") for f in dataclasses.fields(node)}
+            return {"record": f"{kind.__module__}:{kind.__qualname__}", "fields": fields}
+        raise TypeError(f"{path}: {kind.__module__}.{kind.__qualname__} cannot be kept in the cache")
+
+    return describe(value, "root"), arrays
+
+
+def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The value that `pack` took apart; arrays are NumPy arrays. Raises KeyError, TypeError or ValueError on a tree
+    that `pack` did not write."""
+    if "value" in tree:
+        return tree["value"]
+    if "array" in tree:
+        return arrays[tree["array"]]
+    if "list" in tree:
+        return [unpack(item, arrays) for item in tree["list"]]
+    if "tuple" in tree:
+        return tuple(unpack(item, arrays) for item in tree["tuple"])
+    if "dict" in tree:
+        return {name: unpack(item, arrays) for name, item in tree["dict"].items()}
+    module, _, name = tree["record"].partition(":")
+    if not module.startswith("jsecon."):
+        raise ValueError(f"{tree['record']} is no record of jsecon's")
+    kind = getattr(importlib.import_module(module), name)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise ValueError(f"{tree['record']} is no record of jsecon's")
+    return kind(**{field: unpack(item, arrays) for field, item in tree["fields"].items()})

@@ -1,0 +1,252 @@
+"""The command line: demo, run, query, eval, models. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
+
+import argparse
+import dataclasses
+import inspect
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jsecon
+from jsecon.app.arguments import add_arguments, parsed
+from jsecon.app.options import Folder, Options, require_writable
+from jsecon.errors import InputError
+
+EPILOG = """
+examples
+  jsecon demo                                           a made-up room, from frames to answers and a report
+  jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.npz
+  jsecon run my_capture --out my_field --gaussians point_cloud.ply
+                                                        the same on a scene that is already splatted
+  jsecon query my_field/field.npz "red mug" "dark green bottle" --out answers
+  jsecon query my_field/field.npz --at frame_00012 310 145 --out answers
+  jsecon eval my_field/field.npz --labels my_capture/label --out evaluation
+  jsecon run my_capture --out my_field --segmenter sam --embedder clip
+                                                        with SAM and CLIP from model folders
+  jsecon models check clip                              what a model folder holds and lacks
+
+A run that is stopped goes on where it stopped when the same command is given again.
+"""
+RUN_GROUPS = {"gaussians": "frames and scene", "masks": "masks", "segmenter": "models", "weighting": "field"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """make a room, build its field, query it and write a report
+
+    Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on it
+    what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is used.
+    Ends with report.html, metrics.json, field.npz and a .ply for each query. One to two minutes on two cores.
+    """
+
+    seed: int = 0
+    """which room"""
+    out: Path = Path("jsecon-demo")
+    """folder for all of it"""
+    steps: int = 700
+    """of the photometric fit"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(Options):
+    """build the language field of a capture
+
+    From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found in the frames and
+    brought together, or given as masks), one embedding per region, codes distilled into the Gaussians. Prints its
+    stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
+    """
+
+    out: Path
+    """folder for the field, the report and the cache"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Asking:
+    """What `jsecon query` and `jsecon eval` take."""
+
+    field: Annotated[Path, {"positional": True}]
+    """field.npz of a run"""
+    embedder: Folder = None
+    """the CLIP model folder that the field was made with (default: where the run had it)"""
+    template: Annotated[list[str] | None, {"action": "append", "metavar": "PHRASE"}] = None
+    """CLIP: a phrase for the text, such as "a photo of a {}."; several are averaged (default: the bare text)"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Query(Asking):
+    """the Gaussians that a text names, or that lie under a pixel
+
+    For each text, or for a pixel, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's own
+    world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames that
+    show it best, and answers.html with the pictures.
+    """
+
+    texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
+    """what to find: "red mug" "dark green bottle" "mug or bowl but not handle" ..."""
+    at: Annotated[list[list[str]] | None, {"action": "append", "nargs": 3, "metavar": ("FRAME", "X", "Y")}] = None
+    """what lies under pixel (column X, row Y) of a frame, by its name or number, in the frames as the run used them;
+    needs no text"""
+    out: Path
+    """folder for the answers"""
+    by: Literal["votes", "code", "one_step", "canonical"] = "votes"
+    """votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; one_step,
+    canonical: each Gaussian's code against the text"""
+    threshold: float | None = None
+    """on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, 0.5 canonical)"""
+    all: bool = False
+    """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.8
+    of the way from the middle region's to the best one's (by votes)"""
+    keep_outliers: bool = False
+    """leave out the last step, DBSCAN"""
+    views: Annotated[int, {"metavar": "N"}] = 3
+    """masks to write per query"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eval(Asking):
+    """measure a field against labels
+
+    Point-level rendered protocol on LERF-style labels (one .json per frame): the selected Gaussians alone are rendered,
+    alpha > 0.7, against each labelled mask; a missing prediction counts as 0. Prints mIoU, mAcc@0.25 and localisation
+    accuracy of each kind of query, and writes OUT/evaluation.json with every pair.
+    """
+
+    labels: Annotated[Path, {"metavar": "DIR"}]
+    """folder of LERF label files (frame.json)"""
+    out: Path | None = None
+    """folder for evaluation.json (default: the field's)"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Models:
+    """look into a folder of models
+
+    check DIR: what models a folder holds, each graph's inputs and outputs, what it can be used for, what is missing,
+    and where such exports are published. Exit code 2 where nothing in it can be used.
+    """
+
+    action: Annotated[str, {"positional": True, "choices": ("check",), "metavar": "check"}]
+    """tell what a model folder holds"""
+    folder: Annotated[Path, {"positional": True, "metavar": "DIR"}]
+    """folder with .onnx files"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code."""
+    try:
+        arguments = parser().parse_args(argv)
+    except SystemExit as stop:  # argparse has said why
+        return int(stop.code or 0)
+    act, kind = _VERBS[arguments.verb]
+    try:
+        act(parsed(kind, arguments))
+    except InputError as error:
+        print(f"jsecon: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\njsecon: stopped. Give the same command again and it goes on where it stopped.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    raw = argparse.RawDescriptionHelpFormatter
+    about = "Find things in 3D Gaussian scenes by text, at the level of points, on a plain CPU."
+    top = argparse.ArgumentParser(prog="jsecon", formatter_class=raw, epilog=EPILOG, description=about)
+    top.add_argument("--version", action="version", version=f"jsecon {jsecon.__version__}")
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for name, (_, kind) in _VERBS.items():
+        short, _, long = (inspect.getdoc(kind) or "").partition("\n\n")
+        verb = verbs.add_parser(name, help=short, description=long, formatter_class=raw)
+        add_arguments(verb, kind, RUN_GROUPS if kind is Run else None)
+    return top
+
+
+def _demo(asked: Demo) -> None:
+    from jsecon.app.demo import demo
+    from jsecon.app.progress import Console
+
+    demo(asked.out, seed=asked.seed, steps=asked.steps, listener=Console())
+
+
+def _run(asked: Run) -> None:
+    from jsecon.app import pipeline
+    from jsecon.app.progress import Console
+    from jsecon.app.summary import write_run
+
+    console = Console()
+    options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(Options)})
+    write_run(pipeline.run(options, asked.out, listener=console), asked.out, console)
+
+
+def _query(asked: Query) -> None:
+    from jsecon.app import question
+    from jsecon.app.progress import Console
+    from jsecon.app.summary import write_answers
+    from jsecon.language.field import load_field
+
+    if not asked.texts and not asked.at:
+        raise InputError(
+            "query",
+            found="nothing to find",
+            expected="a TEXT, or --at FRAME X Y",
+            remedy='For example: jsecon query field.npz "red mug" --out answers',
+        )
+    pixels = [(frame, _whole("X", x), _whole("Y", y)) for frame, x, y in asked.at or ()]
+    require_writable(asked.out)
+    field = load_field(asked.field)
+    embedder = _embedder(field, asked) if asked.texts else None
+    how = {"by": asked.by, "threshold": asked.threshold, "outliers": not asked.keep_outliers}
+    answers = [question.ask_text(field, embedder, text, several=asked.all, **how) for text in asked.texts]
+    answers += [question.ask_pixel(field, frame, x, y, **how) for frame, x, y in pixels]
+    write_answers(field, answers, asked.out, Console(), views=asked.views)
+
+
+def _eval(asked: Eval) -> None:
+    from jsecon.app.progress import Console
+    from jsecon.app.summary import write_evaluation
+    from jsecon.language.field import load_field
+
+    out = asked.out or asked.field.parent
+    require_writable(out)
+    field = load_field(asked.field)
+    write_evaluation(field, _embedder(field, asked), asked.labels, out, Console())
+
+
+def _models(asked: Models) -> None:
+    from jsecon.app.models import examine, report_lines, require_usable
+    from jsecon.app.progress import Console
+
+    findings = examine(asked.folder)
+    console = Console()
+    for line in report_lines(findings):
+        console.say(line)
+    require_usable(findings)
+
+
+def _embedder(field: Any, asked: Asking) -> Any:
+    from jsecon.app import networks
+
+    return networks.embedder_of_field(field, asked.embedder, templates=asked.template or ("{}",))
+
+
+def _whole(name: str, text: str) -> int:
+    if not text.isdecimal():
+        raise InputError(
+            f"--at {name}",
+            found=text,
+            expected="a whole number of pixels",
+            remedy="For example: --at frame_00012 310 145",
+        )
+    return int(text)
+
+
+_VERBS: dict[str, tuple[Any, type]] = {
+    "demo": (_demo, Demo),
+    "run": (_run, Run),
+    "query": (_query, Query),
+    "eval": (_eval, Eval),
+    "models": (_models, Models),
+}

@@ -1,0 +1,145 @@
+"""The stages about what the regions are: embeddings, codes, votes, distilled codes; and the field made of them.
+
+Frames that are held out are read by none of them.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsecon.app.progress import Progress
+from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.errors import InputError
+from jsecon.types import LanguageField, Regions
+
+
+def regions(work: Work) -> Stage:
+    """One embedding for each region: by the embedder, or from files."""
+    options, embedder = work.options, work.networks.embedder
+
+    def embedded(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.language.regions import region_embeddings
+
+        capture = results["load"]
+        frames = np.asarray(capture.frames)[training_frames(capture)]
+        found = region_embeddings(
+            frames, results["masklets"], embedder.embed_regions, weighting=options.weighting, progress=progress
+        )
+        work.networks.close()
+        return Outcome(found)
+
+    def read(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.data.langsplat_files import load_features
+        from jsecon.language.regions import given_embeddings
+
+        capture, labels = results["load"], results["masklets"]
+        assert options.features is not None
+        names = [capture.names[t] for t in training_frames(capture)]
+        given = load_features(options.features, names, labels.shape[1:], level=options.level)
+        if not len(given.embeddings):
+            raise InputError(
+                options.features,
+                found=f"no mask of level {options.level} in any frame",
+                expected="masks with their embeddings",
+                remedy="Take another --level, or write the files again.",
+            )
+        found = given_embeddings(labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress)
+        bare = int((~found.embeddings.any(1)).sum())
+        notes = (f"{len(given.embeddings)} embeddings in the files",)
+        return Outcome(found, notes=(*notes, f"{bare} regions lie on no mask with one") if bare else notes)
+
+    how, given, left = f"embedded by {embedder.name!r}", {"embedder": embedder.name}, {}
+    if options.features is not None:
+        how, given = f"embeddings read from {options.features.name}, level {options.level}", work.given("level")
+        left = {"embedder": f"embeddings are given ({options.features.name})"}
+    return Stage(
+        "regions",
+        f"{how}, views weighted by {options.weighting}",
+        embedded if options.features is None else read,
+        after=("load", "masklets"),
+        given=work.given("weighting") | given,
+        files=options.features,
+        uses=(embedder,),
+        left_out=left,
+    )
+
+
+def codes(work: Work) -> Stage:
+    """(codes (R, d), coder): the regions' embeddings, compressed only where they don't fit as they are."""
+    options = work.options
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.language.autoencoder import Autoencoder
+        from jsecon.language.codes import region_codes
+
+        table, coder, why = region_codes(
+            results["regions"].embeddings, latent=options.latent, key=jax.random.key(options.seed), progress=progress
+        )
+        trained, why = isinstance(coder, Autoencoder), why.partition(": ")[2] or why
+        notes = (f"autoencoder: {why}",) if trained else ()
+        return Outcome((table, coder), {} if trained else {"autoencoder": why}, notes)
+
+    auto = options.latent == "auto"
+    how = "as few numbers per region as keep them apart" if auto else f"at most {options.latent} numbers per region"
+    return Stage("codes", how, compute, after=("regions",), given=work.given("latent", "seed"))
+
+
+def votes(work: Work) -> Stage:
+    """The weight that each region casts on each Gaussian over the training frames, with each frame's total."""
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.language.votes import region_votes
+
+        capture, scene, labels = results["load"], results["gaussians"], results["masklets"]
+        cameras = capture.cameras[training_frames(capture)]
+        count, top = int(labels.max()) + 1, work.options.top
+        cast = region_votes(scene, cameras, labels, count, top=top, by_view=True, progress=progress)
+        unseen = int((np.asarray(cast.views) == 0).sum())
+        left = {"unseen Gaussians": f"{unseen} of {scene.count} that no frame sees get no code"} if unseen else {}
+        return Outcome(cast, left)
+
+    return Stage(
+        "votes",
+        f"the {work.options.top} strongest regions of each Gaussian",
+        compute,
+        after=("load", "gaussians", "masklets"),
+        given=work.given("top"),
+    )
+
+
+def distil(work: Work) -> Stage:
+    """codes (N, d) of the Gaussians, from their votes."""
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.language.distill import distill_votes
+
+        table = results["codes"][0]
+        return Outcome(distill_votes(results["votes"], table, reduce=work.options.reduce))
+
+    how = f"a Gaussian's code is its votes' {work.options.reduce}"
+    return Stage("distil", how, compute, after=("votes", "codes"), given=work.given("reduce"))
+
+
+def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:
+    """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
+    from jsecon.language.shares import finish_votes
+
+    capture, found = results["load"], results["regions"]
+    pixels = np.zeros((found.count, len(capture.names)), np.int32)
+    pixels[:, training_frames(capture)] = found.pixels
+    table, coder = results["codes"]
+    return LanguageField(
+        gaussians=results["gaussians"],
+        codes=results["distil"],
+        votes=finish_votes(results["votes"], found),
+        regions=Regions(found.embeddings, pixels),
+        region_codes=table,
+        autoencoder=coder,
+        cameras=capture.cameras,
+        canonical=np.asarray(embedder.canonical, np.float32),
+        to_source=np.asarray(capture.to_source),
+        names=capture.names,
+        embedder=embedder.name,
+        provenance=provenance,
+    )

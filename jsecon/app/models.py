@@ -1,0 +1,116 @@
+"""What a folder of models holds: every graph's signature, and what jsecon can use it for."""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from jsecon.errors import InputError
+from jsecon.networks.clip import ClipEmbedder
+from jsecon.networks.onnx_graph import Graph, describe
+from jsecon.networks.sam import graphs as sam_graphs
+from jsecon.networks.sam2.graphs import open_sam2
+
+SAM2_PUBLISHED = "The same split of SAM 2 into graphs is that of axinc-ai/segment-anything-2 on github.com."
+
+
+@dataclasses.dataclass(frozen=True)
+class Use:
+    """One thing that a folder could be used for."""
+
+    model: str
+    """CLIP, SAM, SAM 2."""
+    usable: bool
+    told: str
+    """how to use it, or what was found instead of what."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Findings:
+    """What lies in a folder."""
+
+    folder: Path
+    graphs: dict[str, str]
+    """path of each .onnx file within the folder -> its inputs and outputs, or why it cannot be opened."""
+    uses: tuple[Use, ...]
+
+
+def examine(folder: str | Path) -> Findings:
+    """Opens every graph of a folder, and puts each kind of model in it to the test.
+
+    Raises InputError where there is no such folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, found="no such folder", expected="a folder of models", remedy="Check the path.")
+    graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
+    return Findings(folder, graphs, tuple(_tried(model, use, folder) for model, use in _KINDS.items()))
+
+
+def report_lines(findings: Findings) -> Iterable[str]:
+    """The findings as lines of text."""
+    yield f"{findings.folder}: {len(findings.graphs)} graphs"
+    for path, signature in findings.graphs.items():
+        yield f"  {path}"
+        yield from (f"    {line}" for line in signature.splitlines())
+    for use in findings.uses:
+        yield f"{use.model}: {'usable' if use.usable else 'not usable'}"
+        yield f"  {use.told}"
+
+
+def require_usable(findings: Findings) -> None:
+    """Raises InputError where the folder can be used for nothing."""
+    if not any(use.usable for use in findings.uses):
+        raise InputError(
+            findings.folder,
+            found="nothing that can be used",
+            expected=" or ".join(use.model for use in findings.uses) + " as ONNX graphs",
+            remedy="See above for what is missing and where such exports are published.",
+        )
+
+
+def _signature(path: Path) -> str:
+    try:
+        graph = Graph(path, threads=1, optimise=False)
+    except InputError as error:
+        return f"cannot be opened: found {error.found}; expected {error.expected}"
+    return f"in   {describe(graph.inputs.values())}\nout  {describe(graph.outputs.values())}"
+
+
+def _tried(model: str, use: Callable[[Path], str], folder: Path) -> Use:
+    try:
+        return Use(model, True, use(folder))
+    except InputError as error:
+        return Use(model, False, str(error))
+
+
+def _clip(folder: Path) -> str:
+    embedder = ClipEmbedder(folder)
+    embedder.check()
+    size, files = embedder.size, embedder.files
+    told = (
+        f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}, "
+        f"tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
+    )
+    embedder.close()
+    return told
+
+
+def _sam(folder: Path) -> str:
+    graphs = sam_graphs.SamGraphs(sam_graphs.find_sam(folder))
+    many = "one prompt per call" if graphs.batch == 1 else f"{graphs.batch} prompts per call"
+    return (
+        f"masks of every frame; decoder of {graphs.dialect.name}, {many}, images of {graphs.side} px: "
+        f"jsecon run --segmenter {folder}"
+    )
+
+
+def _sam2(folder: Path) -> str:
+    try:
+        graphs = open_sam2(folder)
+    except InputError as error:
+        remedy = f"{error.remedy} {SAM2_PUBLISHED}"
+        raise InputError(error.where, found=error.found, expected=error.expected, remedy=remedy) from error
+    return f"SAM {graphs.version}: objects followed through the frames: jsecon run --tracker {folder}"
+
+
+_KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam, "SAM 2": _sam2}

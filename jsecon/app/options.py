@@ -1,0 +1,129 @@
+"""What a run is asked to do, and whether that can be done at all: checked before any work.
+
+The command line is made from this class: an option's docstring is its help, its type what it takes (app/arguments).
+"""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Annotated, Literal
+
+from jsecon.app.arguments import arguments_of
+from jsecon.errors import InputError
+
+Folder = Annotated[Path | None, {"metavar": "DIR"}]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """All that the result of a run depends on, but for the files themselves."""
+
+    capture: Annotated[Path, {"positional": True}]
+    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)"""
+    gaussians: Annotated[Path | None, {"metavar": "PLY"}] = None
+    """a scene of 3D Gaussians (.ply, INRIA layout) in the capture's world; without it, Gaussians are fitted to the
+    frames"""
+    downscale: Annotated[float | None, {"metavar": "K", "least": 1}] = None
+    """make frames K times smaller (default: so that the longer side is at most --long-side)"""
+    long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400
+    """of the frames, where --downscale is not given"""
+    frames: Annotated[int | None, {"metavar": "N", "least": 2}] = None
+    """use at most N frames, evenly spaced (default: all)"""
+    holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
+    """keep every K-th frame for measuring only; 0 = none"""
+    steps: Annotated[int, {"least": 1}] = 1500
+    """of the photometric fit"""
+    sh_degree: Annotated[int, {"choices": range(4)}] = 1
+    """of the fitted colours"""
+    masks: Folder = None
+    """instance masks, one integer PNG per frame under the frame's name (0 = none), <id>/<frame>.png, or LangSplat's
+    _s.npy; without it, they are found in the frames"""
+    proposals: Folder = None
+    """masks of single frames, to be brought together: <frame>.json of SAM's own generator, LangSplat's _s.npy, or
+    PNGs"""
+    granularity: Literal["fine", "medium", "coarse"] = "medium"
+    """of the proposals, without masks: fine parts things; coarse joins the colours of one thing, and tells things apart
+    by the depth that the Gaussians render"""
+    association: Literal["consensus", "tracking"] = "consensus"
+    """of the frames' proposals: what most views agree on, or Algorithm 1 of the paper with a tracker through the
+    Gaussians"""
+    agreement: Annotated[float, {"metavar": "SHARE"}] = 0.4
+    """consensus: share of the views that must put two things into one proposal; less joins more"""
+    iou_threshold: Annotated[float, {"metavar": "KAPPA"}] = 0.5
+    """tracking: a proposal that overlaps a masklet by more is not new"""
+    segmenter: Folder = None
+    """a SAM model folder (.onnx) to find proposals with, instead of colour and texture"""
+    level: Literal["default", "s", "m", "l"] = "l"
+    """of SAM's proposals and of LangSplat's files: subparts, parts, wholes, or all"""
+    points_per_side: Annotated[int, {"metavar": "N", "least": 1}] = 32
+    """SAM: asked on a grid of NxN points"""
+    crop_layers: Annotated[int, {"metavar": "N", "least": 0}] = 0
+    """SAM: asked on 4^k crops too, for each layer k; 1 is LangSplat's setting and takes five times longer"""
+    tracker: Folder = None
+    """a SAM 2 model folder (.onnx) that follows the proposals (the paper's Algorithm 1), instead of consensus"""
+    embedder: Folder = None
+    """a CLIP model folder (.onnx, tokenizer.json) for regions and texts, instead of colours"""
+    features: Folder = None
+    """LangSplat's language_features: regions take their embeddings from <frame>_s.npy and _f.npy; texts then need the
+    CLIP that made them (--embedder, here or of query)"""
+    weighting: Literal["pixels", "uniform"] = "pixels"
+    """of the views in a region's embedding"""
+    latent: Annotated[int | Literal["auto"], {"metavar": "D", "least": 1}] = 16
+    """most numbers a code may have; 3 as in the paper; auto for as few as keep the regions apart"""
+    reduce: Literal["mode", "median", "mean"] = "mode"
+    """from a Gaussian's votes to its code"""
+    top: Annotated[int, {"metavar": "N", "least": 1}] = 8
+    """regions whose votes a Gaussian keeps"""
+    seed: int = 0
+    """of whatever is drawn at random"""
+
+    @property
+    def associated_by(self) -> Literal["consensus", "tracking"]:
+        """`association`; where a tracker is given, tracking."""
+        return self.association if self.tracker is None else "tracking"
+
+
+def require_inputs(options: Options) -> None:
+    """Raises InputError where a file or folder that the options name is not there, or a number is out of its range."""
+    for argument in arguments_of(Options):
+        value = getattr(options, argument.name)
+        if isinstance(value, Path) and not value.exists():
+            raise InputError(
+                value,
+                found="nothing there",
+                expected=argument.help.partition(";")[0],
+                remedy=f"Mend the path{'' if argument.positional else f', or leave out {argument.flag}'}.",
+            )
+        if argument.least is not None and isinstance(value, int | float) and not value >= argument.least:
+            raise InputError(
+                argument.flag, found=str(value), expected=f"at least {argument.least}", remedy="Mend the option."
+            )
+    sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
+    if len(sources) > 1:
+        raise InputError(
+            " ".join(sources),
+            found="more than one source of masks",
+            expected="one: tracked masks, masks of single frames, or a model that finds them",
+            remedy="Leave out the others.",
+        )
+    if not 0 < options.agreement <= 1:
+        raise InputError(
+            "--agreement",
+            found=str(options.agreement),
+            expected="a share above 0 and at most 1",
+            remedy="Leave it out, or use 0.3 to 0.6.",
+        )
+
+
+def require_writable(folder: Path) -> None:
+    """Raises InputError where no file can be made in `folder`; makes the folder itself."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(
+            folder,
+            found=error.strerror or type(error).__name__,
+            expected="a folder that can be written",
+            remedy="Choose another output folder, or mend its permissions.",
+        ) from error

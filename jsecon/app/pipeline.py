@@ -1,0 +1,155 @@
+"""A run: from a capture to a language field, stage by stage, each kept as it is finished.
+
+    load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field, then the held-out frames measured
+
+The keys of all stages are known before any runs, so all of it is told first: what will run, what is cached, what is
+left out and why.
+"""
+
+import dataclasses
+import functools
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jsecon
+from jsecon.app import cache, networks
+from jsecon.app.language_stages import codes, distil, field_of, regions, votes
+from jsecon.app.masklet_stages import masklets
+from jsecon.app.options import Options, require_inputs, require_writable
+from jsecon.app.progress import Listener, Step
+from jsecon.app.scene_stages import gaussians, held_out, load
+from jsecon.app.stages import Outcome, Record, Stage, Work
+from jsecon.errors import InputError
+from jsecon.process import programs_built
+from jsecon.types import Capture, LanguageField
+
+FIELD_FILE = "field.npz"
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A finished run."""
+
+    field: LanguageField
+    capture: Capture
+    labels: np.ndarray
+    """(T, H, W) int16 masklets of the field's views."""
+    psnr: np.ndarray
+    """(frames held out,) dB."""
+    seconds: dict[str, float]
+    """of each stage, also where it was computed in an earlier run."""
+    steps: tuple[Step, ...]
+    """the stages and what was left out of them, with what only the data could settle."""
+    notes: tuple[str, ...]
+    options: Options
+    programs: dict[str, int]
+    """that jax built for it: "all" of them, and those that it read "from_disk"."""
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """part -> why it was not needed."""
+        return {step.name: step.why for step in self.steps if step.status == "left out"}
+
+
+def stages_of(work: Work) -> list[Stage]:
+    """The stages of a run in order. Mask files come before the long fit: what is wrong with them is said at once."""
+    first = (masklets, gaussians) if work.options.masks is not None else (gaussians, masklets)
+    return [stage(work) for stage in (load, *first, regions, codes, votes, distil, held_out)]
+
+
+def peak_memory_mib() -> float:
+    """Largest resident memory of this process so far, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def run(
+    options: Options,
+    out: Path,
+    *,
+    listener: Listener | None = None,
+    load: Callable[[], Capture] | None = None,
+    cache_folder: Path | None = None,
+) -> Run:
+    """Builds the field of a capture, keeps each stage under `cache_folder` (default OUT/cache), writes OUT/field.npz.
+
+    A run that was stopped goes on where it stopped, to the same result. `load` takes the loader's place for data whose
+    layout is one of a kind (the files beneath `options.capture` must still be all that it reads). Raises InputError for
+    bad input; what was computed before stays.
+    """
+    listener, before = listener or Listener(), programs_built()
+    folder = cache_folder or out / "cache"
+    if out.resolve() == options.capture.resolve():
+        raise InputError(
+            out,
+            found="the capture's own folder as the output folder",
+            expected="a folder of its own",
+            remedy=f"For example {out / 'field'}, or one elsewhere.",
+        )
+    require_inputs(options)
+    require_writable(out)
+    work = Work(options, networks.networks_of(options, folder), out, load)
+    cache.prepare(folder)
+    stages, keys = stages_of(work), {}
+    for stage in stages:
+        keys[stage.name] = stage.key(work, keys)
+    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
+    steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
+    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
+    listener.steps(f"{options.capture} -> {out}", steps)
+    work.networks.require_ready([step.name for step in steps if step.status == "run"])
+    results: dict[str, Any] = {}
+    seconds: dict[str, float] = {}
+    notes: list[str] = []
+    for stage in stages:
+        record = Record(cache.record_path_of(place[stage.name]))
+        with listener.progress(stage.name) as progress:
+            compute = functools.partial(stage.compute, results, progress, record)
+            kept = cache.fetch(place[stage.name], compute, note=listener.note)
+        outcome: Outcome = kept.value
+        results[stage.name], seconds[stage.name] = outcome.value, kept.seconds
+        record.remove()
+        listener.done(stage.name, kept.seconds, kept.fresh)
+        for part, why in outcome.left_out.items():
+            steps.append(Step(part, "left out", why))
+            listener.step(steps[-1])
+        for note in outcome.notes:
+            notes.append(note)
+            listener.note(note)
+    started = time.monotonic()
+    field = field_of(results, work.networks.embedder, _provenance(options, keys))
+    from jsecon.language.field import save_field
+
+    save_field(out / FIELD_FILE, field)
+    seconds["field"] = time.monotonic() - started
+    listener.done("field", seconds["field"], True)
+    return Run(
+        field,
+        results["load"],
+        results["masklets"],
+        results["held_out"],
+        seconds,
+        tuple(steps),
+        tuple(notes),
+        options,
+        {name: count - before[name] for name, count in programs_built().items()},
+    )
+
+
+def _provenance(options: Options, keys: dict[str, str]) -> str:
+    chosen = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
+    return json.dumps(
+        {
+            "jsecon": jsecon.__version__,
+            "options": {k: str(v) if isinstance(v, Path) else v for k, v in chosen.items()},
+            "keys": keys,
+        },
+        sort_keys=True,
+    )

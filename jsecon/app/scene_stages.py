@@ -1,0 +1,146 @@
+"""The stages about the scene: the capture is loaded, its Gaussians are read or fitted, held-out frames are measured."""
+
+import jax
+import jax.numpy as jnp
+
+from jsecon.app.progress import Progress
+from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.errors import InputError
+from jsecon.types import Camera, Capture, Gaussians
+
+
+def load(work: Work) -> Stage:
+    """The capture, at the size that the options ask for."""
+    options = work.options
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        if work.load is not None:
+            return _checked(work.load(), "by its adapter")
+        from jsecon.data.capture import load_capture
+
+        capture = load_capture(
+            options.capture,
+            downscale=options.downscale,
+            long_side=options.long_side,
+            frames=options.frames,
+            holdout=options.holdout,
+            progress=progress,
+        )
+        return _checked(capture, size)
+
+    if options.downscale is None:
+        size = f"long side at most {options.long_side} px"
+    else:
+        size = "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
+    count = "all frames" if options.frames is None else f"at most {options.frames} frames"
+    return Stage(
+        "load",
+        f"{count}, {size}, " + (f"1 in {options.holdout} held out" if options.holdout else "none held out"),
+        compute,
+        given=work.given("downscale", "long_side", "frames", "holdout")
+        | {"loader": getattr(work.load, "__qualname__", None)},
+        files=options.capture,
+    )
+
+
+def _checked(capture: Capture, size: str) -> Outcome:
+    """The capture as an Outcome that says what it is. Raises InputError where its views cannot be used together."""
+    from jsecon.data.capture import check_views_overlap
+
+    train = training_frames(capture)
+    check_views_overlap(capture)
+    count, height, width = capture.frames.shape[:3]
+    told = (
+        f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out, "
+        f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
+    )
+    return Outcome(capture, notes=(told, *capture.notes))
+
+
+def gaussians(work: Work) -> Stage:
+    """The scene's Gaussians: of a .ply in the capture's world, or fitted to the training frames."""
+    return _fitted(work) if work.options.gaussians is None else _read(work)
+
+
+def _read(work: Work) -> Stage:
+    path = work.options.gaussians
+    assert path is not None
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.data.ply import load_ply
+
+        capture, found = results["load"], load_ply(path)
+        check_overlap(found, capture.cameras[training_frames(capture)], str(path))
+        return Outcome(found)
+
+    return Stage(
+        "gaussians",
+        f"read from {path.name}",
+        compute,
+        after=("load",),
+        files=path,
+        left_out={"photometric fit": f"the scene's Gaussians are given ({path.name})"},
+    )
+
+
+def _fitted(work: Work) -> Stage:
+    options = work.options
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.fit.optimise import fit_gaussians
+        from jsecon.fit.start import starting_gaussians
+
+        capture, state = results["load"], record.read()
+        start, notes = None, ()
+        if state is None:
+            start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
+            check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
+            notes = (f"start of the fit: {whence}",)
+        found, _ = fit_gaussians(
+            capture,
+            steps=options.steps,
+            key=jax.random.key(options.seed),
+            start=start,
+            state=state,
+            on_checkpoint=lambda current: record.keep(lambda: current),
+            progress=progress,
+        )
+        return Outcome(found, notes=notes)
+
+    left = {"densification": "the fit keeps the points that it starts from"}
+    if options.sh_degree == 0:
+        left["view-dependent colour"] = "SH degree 0"
+    return Stage(
+        "gaussians",
+        f"fitted to the frames in {options.steps} steps, SH degree {options.sh_degree}",
+        compute,
+        after=("load",),
+        given=work.given("steps", "sh_degree", "seed"),
+        left_out=left,
+    )
+
+
+def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: float = 0.01) -> None:
+    """Raises InputError where fewer than `least` of the Gaussians lie in the view of at least two cameras."""
+    from jsecon.splat.project import project
+
+    seen = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
+    share = float(jnp.mean(seen.sum(0) >= 2)) if gaussians.count else 0.0
+    if share < least:
+        raise InputError(
+            where,
+            found=f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames",
+            expected="views that overlap, and a scene in the world of their poses",
+            remedy="Check that the poses belong to these frames, and the .ply to this capture.",
+        )
+
+
+def held_out(work: Work) -> Stage:
+    """(frames held out,) PSNR in dB of the rendered colours against the photographs."""
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.fit.optimise import evaluate_psnr
+
+        return Outcome(evaluate_psnr(results["gaussians"], results["load"], progress=progress))
+
+    return Stage("held_out", "PSNR of the rendered colours", compute, after=("load", "gaussians"))

@@ -1,0 +1,127 @@
+"""What a stage of a run is: its name, what its result depends on, what it leaves out and why, and its function.
+
+The stages themselves stand in `scene_stages` (load, gaussians, held_out) and `language_stages` (masklets, regions,
+codes, votes, distil), each made whole by one function of the run's `Work`.
+"""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from jsecon.app import cache
+from jsecon.app.options import Options
+from jsecon.app.progress import Progress
+from jsecon.errors import InputError
+from jsecon.types import Capture
+from jsecon.vision.protocols import Networks
+
+CHECKPOINT_SECONDS = 20.0
+"""between two records of a stage in progress: a stop loses at most this and one chunk of steps, or one tracked frame"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a stage made."""
+
+    value: Any
+    """the result, a tree of arrays and records."""
+    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    """part that was not needed -> why."""
+    notes: tuple[str, ...] = ()
+    """what the user should know, a sentence each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What the stages of one run share."""
+
+    options: Options
+    networks: Networks
+    out: Path
+    """the run's output folder, which does not count as input where it lies inside of an input folder."""
+    load: Callable[[], Capture] | None = None
+    """takes the loader's place for data whose layout is one of a kind."""
+
+    def given(self, *names: str) -> dict[str, Any]:
+        """The named options, as a part of a stage's key."""
+        return {name: getattr(self.options, name) for name in names}
+
+
+class Record:
+    """How far a stage in progress has come, on disk, so that it goes on there after a stop."""
+
+    def __init__(self, path: Path):
+        self._path, self._last = path, time.monotonic()
+
+    def read(self) -> Any | None:
+        """What was last kept, or None. A file that cannot be read loses time and nothing else: the stage starts again,
+        to the same result."""
+        with contextlib.suppress(cache.CorruptCacheError):
+            return cache.load(self._path) if self._path.exists() else None
+        return None
+
+    def keep(self, state: Callable[[], Any]) -> None:
+        """Keeps `state()`, at most every CHECKPOINT_SECONDS."""
+        if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
+            cache.save(self._path, state())
+            self._last = time.monotonic()
+
+    def remove(self) -> None:
+        """Called when the stage's result is kept."""
+        self._path.unlink(missing_ok=True)
+
+
+Results: TypeAlias = Mapping[str, Any]
+"""of the stages that are done, by name"""
+Compute: TypeAlias = Callable[[Results, Progress, Record], Outcome]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One stage of a run. Its key covers all that its result depends on: see `key`."""
+
+    name: str
+    how: str
+    """what it will do, for the lines that a run prints first."""
+    compute: Compute
+    after: tuple[str, ...] = ()
+    """the stages whose results it reads."""
+    given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """options and models that its result depends on; models by their content, not by the place of their files."""
+    files: Path | None = None
+    """input file or folder."""
+    uses: tuple[Any, ...] = ()
+    """what it calls beside what it imports: a segmenter, a tracker, an embedder; None where there is none."""
+    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """what the options alone make needless: part -> why."""
+
+    def key(self, work: Work, keys: Mapping[str, str]) -> str:
+        """Digest of the source that computes it (`cache.source_digest`), of the keys of the stages that it reads, of
+        what it is given and of its files."""
+        return cache.key_of(
+            self.name,
+            {
+                "source": cache.source_digest(self.compute, *(type(used) for used in self.uses if used is not None)),
+                "after": [keys[other] for other in self.after],
+                "given": dict(self.given),
+                "files": None if self.files is None else cache.files_digest([self.files], leave_out=work.out),
+            },
+        )
+
+
+def training_frames(capture: Capture) -> np.ndarray:
+    """Indices of the frames that may be fitted to. Raises InputError where there are fewer than two."""
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    if len(train) < 2:
+        raise InputError(
+            "frames",
+            found=f"{len(train)} of {len(capture.names)} frames to work with",
+            expected="at least 2",
+            remedy="Hold out fewer frames (--holdout), or use more (--frames).",
+        )
+    return train

@@ -1,0 +1,241 @@
+"""What is written at the end of a verb: metrics.json, and a page of pictures to look at."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jsecon.app import pictures, question, report
+from jsecon.app.pipeline import Run, peak_memory_mib
+from jsecon.app.progress import Listener
+from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
+from jsecon.errors import InputError
+from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
+from jsecon.files import write_text
+from jsecon.types import LanguageField, Selection
+
+KINDS = {"anchored": "votes", "anchored_code": "code", "one_step": "one_step", "canonical": "canonical"}
+"""kind of query in metrics.json -> the method of jsecon.app.question"""
+FRAMES_SHOWN = 6
+
+
+def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
+    """OUT/metrics.json and OUT/report.html of a run without ground truth; says the figures. Returns the metrics."""
+    metrics = run_metrics(run)
+    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    with listener.progress("report"):
+        parts = [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
+        write_text(
+            out / "report.html",
+            report.page(
+                f"Language field of {run.options.capture.resolve().name}", "Made by jsecon from posed frames.", parts
+            ),
+        )
+    if len(run.psnr):
+        listener.say(f"held-out PSNR {metrics['held_out_psnr']:.2f} dB over {len(run.psnr)} frames")
+    listener.say(
+        f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
+        f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
+        f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
+    )
+    listener.say(
+        f"field   {out / 'field.npz'}\nreport  {out / 'report.html'}\nask it  jsecon query {out / 'field.npz'} "
+        f'"dark green bottle" --out {out / "answers"}'
+    )
+    return metrics
+
+
+def run_metrics(run: Run) -> dict[str, Any]:
+    """The figures of a run, for metrics.json."""
+    return {
+        "gaussians": run.field.gaussians.count,
+        "regions": run.field.regions.count,
+        "code_size": int(run.field.region_codes.shape[1]),
+        "frames": len(run.capture.names),
+        "size": [run.capture.cameras.width, run.capture.cameras.height],
+        "held_out_psnr": round(float(np.mean(run.psnr)), 3) if len(run.psnr) else None,
+        "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
+        "left_out": run.left_out,
+        "programs_compiled": run.programs,
+        "peak_memory_mib": round(peak_memory_mib(), 1),
+    }
+
+
+def write_answers(
+    field: LanguageField, answers: Sequence[question.Answer], out: Path, listener: Listener, *, views: int
+) -> None:
+    """The files of each answer, OUT/answers.html, and a line each."""
+    renderer, parts = pictures.Renderer(field.gaussians, field.cameras), []
+    for n, item in enumerate(answers):
+        shown = question.masks_of(field, item, max(views, 1))
+        told = question.write_answer(field, item, out, {t: shown[t] for t in list(shown)[:views]})
+        if told["place"]:
+            place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
+        elif told["region"] is None and item.by in ("votes", "code"):
+            place = "nothing selected: no region answers it"
+        else:
+            place = "nothing selected"
+        listener.say(
+            f"{item.question!r}: {told['count']} of {told['of']} Gaussians, score {told['score']:.3f}, "
+            f"region {told['region']}, {place}"
+        )
+        parts.append(
+            report.section(
+                item.question,
+                f"{told['count']} of {told['of']} Gaussians by {item.by}; score {told['score']:.3f}; region "
+                f"{told['region']}; {told['outliers_dropped']} outliers dropped; {place}.",
+                report.grid(
+                    [
+                        report.figure(pictures.selection_overlay(renderer.photo(t), mask), field.names[t])
+                        for t, mask in shown.items()
+                    ],
+                    3,
+                ),
+            )
+        )
+        with listener.progress("answers") as progress:
+            progress(n + 1, len(answers))
+    write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
+    listener.say(f"pictures  {out / 'answers.html'}")
+
+
+def evaluate(
+    field: LanguageField,
+    embedder: Any,
+    labels: Sequence[LabelledFrame],
+    listener: Listener,
+    kinds: Sequence[str] = tuple(KINDS),
+) -> dict[str, tuple[list[Row], dict[str, Any]]]:
+    """Rows and summary of each kind of query under the point-level rendered protocol."""
+    cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
+    found = {}
+    for kind in kinds:
+
+        def select(text: str, by: str = KINDS[kind]) -> Selection | None:
+            try:
+                asked = question.ask_text(field, embedder, text, by=by)
+            except InputError:  # no words for it: no answer, which counts as 0
+                return None
+            return dataclasses.replace(asked.selection, mask=asked.mask)
+
+        with listener.progress(f"evaluate {kind}") as progress:
+            found[kind] = evaluate_point_level_rendered(field.gaussians, cameras, labels, select, progress=progress)
+    return found
+
+
+def write_evaluation(field: LanguageField, embedder: Any, folder: Path, out: Path, listener: Listener) -> None:
+    """Prints the table and writes OUT/evaluation.json, with every pair."""
+    found = evaluate(field, embedder, load_lerf_labels(folder), listener)
+    say_table(found, listener)
+    told = {kind: summary | {"rows": [pair(row) for row in rows]} for kind, (rows, summary) in found.items()}
+    write_text(out / "evaluation.json", json.dumps(told, indent=2) + "\n")
+    listener.say(f"all pairs  {out / 'evaluation.json'}")
+
+
+def pair(row: Row) -> dict[str, Any]:
+    """A row without its mask, as plain values."""
+    return {
+        "frame": row.frame,
+        "query": row.query,
+        "iou": round(row.iou, 4),
+        "located": row.located,
+        "selected": row.selected,
+        "region": row.region,
+        "score": round(row.score, 4),
+    }
+
+
+def say_table(found: dict[str, tuple[list[Row], dict[str, Any]]], listener: Listener) -> None:
+    """mIoU, mAcc@0.25 and localisation of each kind, with the protocol they were measured under."""
+    first = next(iter(found.values()))[1]
+    listener.say(
+        f"{first['protocol']}\n{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
+    )
+    listener.say(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
+    for kind, (_, told) in found.items():
+        listener.say(
+            f"  {kind:<14} {told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f} {told['missing']:>8}"
+        )
+
+
+def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
+    psnr = metrics["held_out_psnr"]
+    return {
+        "Gaussians": f"{metrics['gaussians']:,}",
+        "regions": str(metrics["regions"]),
+        "numbers a code": str(metrics["code_size"]),
+        "held-out PSNR": "none held out" if psnr is None else f"{psnr:.2f} dB",
+        "in all": f"{sum(metrics['seconds'].values()):.0f} s",
+        "peak memory": f"{metrics['peak_memory_mib']:,.0f} MiB",
+    }
+
+
+def scene_parts(run: Run) -> list[str]:
+    """Frames, masklets, codes and the rendered scene, row by row."""
+    train = np.flatnonzero(~np.asarray(run.capture.held_out))
+    shown = train[np.unique(np.linspace(0, len(train) - 1, FRAMES_SHOWN).round().astype(int))]
+    renderer, colours = pictures.Renderer(run.field.gaussians, run.field.cameras), pictures.code_colours(run.field)
+    place = {int(t): n for n, t in enumerate(train)}
+    cells = []
+    for t in (int(t) for t in shown):
+        frame = np.asarray(run.capture.frames[t])
+        cells += [
+            report.figure(frame, run.capture.names[t]),
+            report.figure(pictures.label_overlay(frame, run.labels[place[t]]), "masklets", sharp=True),
+            report.figure(renderer.colours(t, colours), "codes"),
+            report.figure(renderer.photo(t), "the Gaussians' own colours"),
+        ]
+    parts = [
+        report.section(
+            "Frames, masklets, codes",
+            "One colour is one region in every view. Codes are shown by their first three principal "
+            "components, as the Gaussians render them; grey is unknown.",
+            report.grid(cells, 4),
+        )
+    ]
+    if len(run.psnr):
+        out = np.flatnonzero(run.capture.held_out)
+        order = out[np.unique(np.linspace(0, len(out) - 1, 4).round().astype(int))]
+        values = dict(zip(out.tolist(), run.psnr.tolist()))
+        parts.append(
+            report.section(
+                "Held-out frames",
+                "Never seen by any step; photograph and rendering.",
+                report.grid(
+                    [
+                        cell
+                        for t in order.tolist()
+                        for cell in (
+                            report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]),
+                            report.figure(renderer.photo(t), "rendered", strong=f"{values[t]:.2f} dB"),
+                        )
+                    ],
+                    4,
+                ),
+            )
+        )
+    return parts
+
+
+def work_parts(run: Run) -> list[str]:
+    """Seconds, stages, notes and where it all came from."""
+    notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
+    return [
+        report.section(
+            "Seconds of each stage",
+            "Wall time of the computation, also where it happened in an earlier run.",
+            report.bars(run.seconds),
+        ),
+        report.section(
+            "Stages",
+            "What ran, and what was left out because this scene does not need it.",
+            report.steps(run.steps),
+            notes,
+        ),
+        report.section(
+            "Where it came from", "", report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
+        ),
+    ]

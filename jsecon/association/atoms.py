@@ -1,0 +1,121 @@
+"""Atoms: small regions of one frame, cut along its edges and its proposals, and the weight cast on each of them."""
+
+import functools
+from typing import Any, TypeAlias
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Bool, Float32, Int32, UInt8
+from scipy import sparse
+
+from jsecon.language.votes import distinct_labels
+from jsecon.splat.fusion import stored
+from jsecon.splat.plan import ViewPlan, plan_view
+from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
+from jsecon.types import Array, Camera, Gaussians
+from jsecon.vision.region_graph import renumbered
+from jsecon.vision.surfaces import filled
+
+Sparse: TypeAlias = Any
+"""scipy.sparse.csr_matrix, of which type checkers know too little"""
+SMALLEST = 12
+"""px: smaller pieces are taken for slivers along an edge"""
+_SLOTS = 8
+"""labels of a tile that one walk counts; few tiles of 8x8 pixels show more, and then the view is walked again"""
+
+
+def image_atoms(
+    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int, smallest: int = SMALLEST
+) -> Int32[np.ndarray, "h w"]:
+    """About `count` superpixels (SLICO, Achanta et al. 2012) of a frame, cut by the masks' outlines.
+
+    frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under `smallest` pixels go to
+    the nearest other piece.
+    """
+    lab = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2LAB)
+    size = max(round(float(np.sqrt(frame.shape[0] * frame.shape[1] / count))), 4)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLICO, size)
+    slic.iterate(6)
+    pieces = np.asarray(slic.getLabels(), np.int64)
+    for eight in np.packbits(masks, axis=0):
+        pieces = renumbered(pieces * 256 + eight)
+    large = np.bincount(pieces.reshape(-1))[pieces] >= smallest
+    if large.any() and not large.all():
+        pieces = filled(pieces, large)
+    return renumbered(pieces).astype(np.int32)
+
+
+def coverage(
+    atoms: Int32[np.ndarray, "h w"], masks: Bool[np.ndarray, "m h w"], count: int
+) -> Float32[np.ndarray, "m a"]:
+    """(M, A) float32 share of each atom's pixels that lie in each mask."""
+    area = np.bincount(atoms.reshape(-1), minlength=count)
+    inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
+    return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
+
+
+def label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
+    """(A, R) float32 share of each atom's pixels that carry each label."""
+    inside = labels >= 0
+    weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
+    return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
+
+
+def cast_on_atoms(
+    gaussians: Gaussians, camera: Camera, atoms: Int32[np.ndarray, "h w"], *, negligible: float = 0.005
+) -> Sparse:
+    """(N, A) sum of alpha T of each Gaussian over each atom's pixels, without what is a `negligible` share of its row.
+
+    `region_votes` of one view, where regions are many and a Gaussian sees few of them: every pair of a tile and a
+    Gaussian keeps its own sums over the tile's atoms, and a dense (N, A) never exists. One program for any number of
+    atoms.
+    """
+    plan = plan_view(gaussians, camera)
+    lists = plan.lists
+    starts, lengths, ids = (np.asarray(a) for a in (lists.starts, lists.lengths, lists.gaussians))
+    tile_of_pair = np.repeat(np.arange(len(lengths)), lengths)
+    places = np.arange(len(tile_of_pair)) + np.repeat(starts - (np.cumsum(lengths) - lengths), lengths)
+    distinct = np.asarray(_distinct_atoms(atoms, lists.tile))
+    entries = []
+    for first in range(0, max(int((distinct >= 0).sum(1).max()), 1), _SLOTS):
+        cast = np.asarray(_cast_by_pair(plan, atoms, first))[places]
+        pair, slot = np.nonzero(cast)
+        entries.append((cast[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
+    values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
+    cast = sparse.csr_matrix((values, (rows, columns)), shape=(gaussians.count, int(atoms.max()) + 1))
+    total = np.repeat(np.asarray(cast.sum(1)).ravel(), np.diff(cast.indptr))
+    cast.data[cast.data <= negligible * total] = 0.0
+    cast.eliminate_zeros()
+    return cast
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _distinct_atoms(atoms: Array, tile: int) -> Array:
+    return distinct_labels(to_tiles(atoms + 1, tile) - 1, _SLOTS)
+
+
+@jax.jit
+def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int) -> Array:
+    """(pairs, _SLOTS) what each pair of the tiles' lists, in their order, casts on its tile's distinct atoms `first`,
+    `first` + 1, ..."""
+    splats, lists = plan.splats, plan.lists
+    batches = make_batches(lists, plan.width)
+    tiles = to_tiles(atoms + 1, lists.tile) - 1
+    slots = lax.dynamic_slice_in_dim(distinct_labels(tiles, _SLOTS), first, _SLOTS, axis=1)
+    table = make_table(splats)
+
+    def one_batch(cast, ids_of_tiles):
+        is_slot = tiles[ids_of_tiles][:, :, None] == slots[ids_of_tiles][:, None, :]
+
+        def body(transmittance, cast, chunk):
+            weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            own = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype))
+            return transmittance, cast.at[chunk.places].set(own, mode="drop")
+
+        return walk(table, lists, batches, ids_of_tiles, body, cast)[0], None
+
+    empty = jnp.zeros((lists.gaussians.shape[0], _SLOTS), splats.dtype)
+    return lax.scan(one_batch, empty, batches.tiles)[0]

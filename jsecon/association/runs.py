@@ -1,0 +1,80 @@
+"""Masks in little memory: the runs of pixels that they are made of, some hundred numbers per mask and not an image."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool
+from scipy import sparse
+
+from jsecon.association.atoms import Sparse
+
+
+@dataclasses.dataclass(frozen=True)
+class Runs:
+    """R masks over P pixels, free to overlap. Arrays only."""
+
+    starts: np.ndarray
+    """(K,) int32 first pixel of each run, ascending within a mask."""
+    stops: np.ndarray
+    """(K,) int32 the pixel behind its last."""
+    counts: np.ndarray
+    """(R,) int32 runs of each mask."""
+    pixels: int
+    """P."""
+
+    def rows(self) -> Sparse:
+        """(R, P) float32 ones."""
+        lengths = (self.stops - self.starts).astype(np.int64)
+        ends = np.concatenate([[0], np.cumsum(lengths)])
+        columns = np.arange(ends[-1]) + np.repeat(self.starts - ends[:-1], lengths)
+        ends = ends[np.concatenate([[0], np.cumsum(self.counts)])]
+        shape = (len(self.counts), self.pixels)
+        return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
+
+    def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
+        """(R, H, W) bool, where P = H W."""
+        rows = self.rows()
+        masks = np.zeros((len(self.counts), self.pixels), bool)
+        masks[np.repeat(np.arange(len(masks)), np.diff(rows.indptr)), rows.indices] = True
+        return masks.reshape(len(masks), height, width)
+
+    def followed_by(self, others: "Runs") -> "Runs":
+        """These masks and then the others, over the same pixels."""
+        starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
+        return Runs(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
+
+
+def runs_of_rows(rows: Sparse) -> Runs:
+    """Runs of the nonzeros of a csr_matrix (R, P) with sorted indices."""
+    new = np.ones(rows.nnz, bool)
+    new[1:] = np.diff(rows.indices) != 1
+    new[rows.indptr[:-1][np.diff(rows.indptr) > 0]] = True
+    first = np.flatnonzero(new)
+    last = np.append(first[1:], rows.nnz) - 1 if len(first) else first
+    counts = np.diff(np.searchsorted(first, rows.indptr))
+    starts, stops = rows.indices[first], rows.indices[last] + 1
+    return Runs(starts.astype(np.int32), stops.astype(np.int32), counts.astype(np.int32), rows.shape[1])
+
+
+def runs_of_masks(masks: Bool[np.ndarray, "r h w"]) -> Runs:
+    """Runs of masks (R, H, W), P = H W."""
+    return runs_of_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
+
+
+def remembered(
+    propose: Callable[[int], Bool[np.ndarray, "m h w"]],
+) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
+    """`propose`, a function of a frame's index, asked once a frame: its masks are kept as runs."""
+
+    @functools.cache
+    def kept(index: int) -> tuple[Runs, tuple[int, int]]:
+        masks = propose(index)
+        return runs_of_masks(masks), masks.shape[1:]
+
+    def masks_of(index: int) -> Bool[np.ndarray, "m h w"]:
+        runs, size = kept(index)
+        return runs.masks(*size)
+
+    return masks_of

@@ -1,1 +1,0 @@
-"""Rivals, on the same Gaussians and masks as jsecon's own field and on the same engine: one file a method."""

@@ -1,0 +1,1 @@
+"""ONNX graphs: SAM, SAM 2 and CLIP from model folders."""

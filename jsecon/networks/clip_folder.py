@@ -1,0 +1,149 @@
+"""Where the parts of a CLIP model lie in a folder, and how it wants its images: read from its own files.
+
+Three layouts are known:
+    immich            visual/model.onnx, textual/model.onnx, visual/preprocess_cfg.json, textual/tokenizer.json
+    transformers.js   onnx/vision_model.onnx, onnx/text_model.onnx, preprocessor_config.json, tokenizer.json
+    flat              two .onnx files, told apart by their inputs, with those JSON files beside them
+"""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from jsecon.errors import InputError
+from jsecon.networks.onnx_graph import Graph, content_digest, describe, graph_files
+
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+"""of RGB in 0..1, where a folder does not say"""
+LAYOUTS = {
+    "immich": ("visual/model.onnx", "textual/model.onnx"),
+    "transformers.js": ("onnx/vision_model.onnx", "onnx/text_model.onnx"),
+}
+"""layout -> its graphs of images and of texts"""
+CONFIGS = ("visual/preprocess_cfg.json", "preprocess_cfg.json", "preprocessor_config.json", "open_clip_config.json")
+TOKENIZERS = ("textual/tokenizer.json", "tokenizer.json", "textual/vocab.json", "vocab.json")
+PUBLISHED = (
+    "CLIP folders are published on huggingface.co: immich-app/ViT-B-32__laion2b-s34b-b79k and others of immich-app, "
+    "Xenova/clip-vit-base-patch16 and others of Xenova."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipFiles:
+    """The parts of a CLIP model."""
+
+    visual: Path
+    """graph: images (B, 3, S, S) -> embeddings (B, E)."""
+    textual: Path
+    """graph: ids (B, 77) -> embeddings (B, E)."""
+    tokenizer: Path
+    """tokenizer.json, or vocab.json with merges.txt beside it."""
+    mean: tuple[float, ...] = CLIP_MEAN
+    """of RGB in 0..1."""
+    std: tuple[float, ...] = CLIP_STD
+    """of RGB in 0..1."""
+    size: int | None = None
+    """S in px; None: as the graph fixes it, else 224."""
+    layout: str = "given"
+    """immich, transformers.js, flat, or given: the files were named one by one."""
+
+    def digest(self) -> str:
+        """Hex digits of all that the embeddings depend on: the files' contents, and the three numbers."""
+        files = [*graph_files(self.visual), *graph_files(self.textual), self.tokenizer]
+        if self.tokenizer.name == "vocab.json":
+            files.append(self.tokenizer.with_name("merges.txt"))
+        return content_digest(files, extra=repr((self.mean, self.std, self.size)))
+
+
+def find_clip(folder: str | Path) -> ClipFiles:
+    """The parts of the CLIP model in a folder. Raises InputError naming what is missing or cannot be read."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, found="no such folder", expected="a folder with a CLIP model", remedy=PUBLISHED)
+    layout, (visual, textual) = _graphs(folder)
+    tokenizer = next((folder / name for name in TOKENIZERS if (folder / name).is_file()), None)
+    if tokenizer is None:
+        raise InputError(
+            folder, found=f"graphs in the layout of {layout}, no tokenizer", expected=TOKENIZERS[1], remedy=PUBLISHED
+        )
+    config = next((folder / name for name in CONFIGS if (folder / name).is_file()), None)
+    numbers = (CLIP_MEAN, CLIP_STD, None) if config is None else read_preprocessing(config)
+    return ClipFiles(visual, textual, tokenizer, *numbers, layout)
+
+
+def _graphs(folder: Path) -> tuple[str, tuple[Path, Path]]:
+    """The layout, and the graphs of images and of texts."""
+    for layout, names in LAYOUTS.items():
+        present = [name for name in names if (folder / name).is_file()]
+        if len(present) == 1:
+            raise InputError(
+                folder,
+                found=f"{present[0]} without its other half",
+                expected=f"{names[0]} and {names[1]}, the layout of {layout}",
+                remedy="Fetch the missing file. " + PUBLISHED,
+            )
+        if present:
+            return layout, (folder / names[0], folder / names[1])
+    graphs = {path: Graph(path, threads=1, optimise=False) for path in sorted(folder.glob("*.onnx"))}
+    visual = [path for path, graph in graphs.items() if is_visual(graph)]
+    textual = [path for path, graph in graphs.items() if is_textual(graph)]
+    if len(visual) != 1 or len(textual) != 1:
+        seen = "; ".join(f"{path.name} takes {describe(graph.inputs.values())}" for path, graph in graphs.items())
+        raise InputError(
+            folder,
+            found=seen or "no .onnx file in a place known",
+            expected="one graph of images and one of texts: "
+            + ", or ".join(" and ".join(names) for names in LAYOUTS.values())
+            + ", or two .onnx files",
+            remedy=PUBLISHED,
+        )
+    return "flat", (visual[0], textual[0])
+
+
+def is_visual(graph: Graph) -> bool:
+    """Whether a graph could embed images: its one input is (B, 3, S, S), and an output is (B, E)."""
+    images = [t for t in graph.inputs.values() if t.fits((None, 3, None, None)) and t.dtype.startswith("float")]
+    vectors = [t for t in graph.outputs.values() if t.shape is not None and len(t.shape) == 2]
+    return len(graph.inputs) == len(images) == 1 and bool(vectors)
+
+
+def is_textual(graph: Graph) -> bool:
+    """Whether a graph could embed texts: it takes ids (B, L), perhaps with a mask of them, and an output is (B, E)."""
+    ids = [t for t in graph.inputs.values() if t.fits((None, None)) and t.dtype in ("int32", "int64")]
+    vectors = [t for t in graph.outputs.values() if t.shape is not None and len(t.shape) == 2]
+    return 1 <= len(ids) == len(graph.inputs) <= 2 and bool(vectors)
+
+
+def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
+    """(mean, std, size) of a preprocess_cfg.json, preprocessor_config.json or open_clip_config.json; what a file leaves
+    out is CLIP's own, or None for the size. Raises InputError where it cannot be read."""
+    expected = "mean and std of three channels, and a size in px"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        content = content.get("preprocess_cfg", content)
+        mean = content.get("mean", content.get("image_mean", CLIP_MEAN))
+        std = content.get("std", content.get("image_std", CLIP_STD))
+        size = _side(content.get("crop_size", content.get("size")))
+        mean, std = tuple(map(float, mean)), tuple(map(float, std))
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+        raise InputError(
+            path, found=f"what cannot be read ({error!r})", expected=expected, remedy="Fetch the file again."
+        ) from error
+    if len(mean) != 3 or len(std) != 3 or min(std) <= 0 or (size is not None and size < 1):
+        raise InputError(
+            path, found=f"mean {mean}, std {std}, size {size}", expected=expected, remedy="Fetch the file again."
+        )
+    return mean, std, size
+
+
+def _side(size: object) -> int | None:
+    """The side of a square image, which files write as 224, [224, 224] or {"height": 224, "width": 224}."""
+    if isinstance(size, dict):
+        size = list(size.values())
+    if isinstance(size, Sequence):
+        sides = set(map(int, size))
+        if len(sides) != 1:
+            raise ValueError(f"a size of {sorted(sides)}, not of a square")
+        return sides.pop()
+    return None if size is None else int(str(size))

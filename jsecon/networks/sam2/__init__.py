@@ -1,0 +1,1 @@
+"""SAM 2: masks followed through the frames."""

@@ -1,0 +1,163 @@
+"""Compositing as jax sees it: its own gradient rule, and its own way under vmap.
+
+Gradient: symbolic zeros tell whether anybody asked for the geometry's, so that a field distilled into frozen Gaussians
+never pays for it.
+
+vmap: a loop with an early exit runs in lockstep when it is batched, as long as its slowest member. So several feature
+sets of one view become more channels of one walk over its tiles, and several views are walked one after another.
+
+Compositing that keeps a feature which is not finite to the pixels that its Gaussian touches.
+
+Zero times NaN is NaN, so a bad row left in the tables would spread: to its whole tile, and by the padding of lists to
+others. Bad numbers are therefore composited as zeros, and the pixels they touch are found by a second walk, which is
+taken only where there is a bad number at all.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap, sequential_vmap
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from jsecon.splat.composite import composite, composite_features_vjp
+from jsecon.splat.gradient import composite_vjp
+from jsecon.splat.project import Projection
+from jsecon.splat.strips import over_strips
+from jsecon.splat.tiles import TILE, TileLists, tile_lists
+from jsecon.types import Array
+
+
+def view_lists(
+    projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, mesh: Mesh | None = None
+) -> TileLists:
+    """`tile_lists` of all strips, `capacity` shared among them, one view after another under vmap; no gradient
+    passes."""
+    each = capacity if mesh is None else -(-capacity // mesh.size)
+
+    def local(strip, dealt, projection):
+        del dealt
+        return tile_lists(projection, width, height, capacity=each, tile=tile, strip=strip)
+
+    lists = sequential_vmap(lambda p: over_strips(local, (), p, mesh))
+    return lists(jax.tree.map(lax.stop_gradient, projection))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
+def splat(
+    splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
+) -> tuple[Array, Array]:
+    """Image (H, W, D) and final transmittance (H, W) of `splats` (N, 6) with `features` (N, D); see composite.py."""
+    return _forward(splats, features, lists, width, height, mesh)[:2]
+
+
+def _splat_forward(splats, features, lists, width, height, mesh):
+    wants_geometry = splats.perturbed
+    splats, features = splats.value, features.value
+    lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
+    image, transmittance, seen = _forward(splats, features, lists, width, height, mesh)
+    lists = dataclasses.replace(lists, lengths=seen)
+    saved = (image, transmittance) if wants_geometry else None
+    return (image, transmittance), (splats, features, lists, saved)
+
+
+def _splat_backward(width, height, mesh, residual, cotangents):
+    splats, features, lists, saved = residual
+    symbolic = jax.custom_derivatives.SymbolicZero
+    bars = [jnp.zeros(bar.shape, splats.dtype) if isinstance(bar, symbolic) else bar for bar in cotangents]
+    if saved is None:
+        gradient = _features_backward(splats, bars[0], lists, mesh)
+        return jnp.zeros_like(splats), gradient.astype(features.dtype), None
+    vjp = sequential_vmap(functools.partial(composite_vjp, mesh=mesh))
+    by_splat, gradient = vjp(splats, features.astype(splats.dtype), lists, *saved, *bars)
+    return by_splat, gradient.astype(features.dtype), None
+
+
+splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
+
+
+def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
+    def one(splats, features, lists):
+        return composite(splats, features, lists, width, height, mesh)
+
+    def split(out, sets):
+        return (_unmerge(out[0], sets), *out[1:]), (True, False, False)
+
+    return _merging_channels(one, split)(splats, features, lists)
+
+
+def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: Mesh | None) -> Array:
+    def one(splats, cotangent, lists):
+        return composite_features_vjp(splats, lists, cotangent, mesh)
+
+    return _merging_channels(one, lambda out, sets: (_unmerge(out, sets), True))(splats, cotangent, lists)
+
+
+def _merging_channels(one: Callable, split: Callable) -> Callable:
+    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call;
+    `split(result, S)` takes it apart and says what of it is batched. Anything else runs one after another."""
+    function = custom_vmap(one)
+
+    @function.def_vmap
+    def rule(size, batched, splats, channels, lists):
+        if any(jax.tree.leaves((batched[0], batched[2]))):
+            out = _in_sequence(function, size, tuple(batched), splats, channels, lists)
+            return out, jax.tree.map(lambda _: True, out)
+        merged = jnp.moveaxis(channels, 0, -2)
+        return split(function(splats, merged.reshape(*merged.shape[:-2], -1), lists), size)
+
+    return function
+
+
+def _in_sequence(function: Callable, size: int, batched: tuple, *arguments):
+    def pick(index):
+        take = lambda argument, is_batched: (
+            lax.dynamic_index_in_dim(argument, index, 0, keepdims=False) if is_batched else argument
+        )
+        return jax.tree.map(take, arguments, batched)
+
+    return lax.map(lambda index: function(*pick(index)), jnp.arange(size))
+
+
+def _unmerge(array: Array, sets: int) -> Array:
+    """(..., S D) -> (S, ..., D)."""
+    return jnp.moveaxis(array.reshape(*array.shape[:-1], sets, -1), -2, 0)
+
+
+def splat_contained(
+    splats: Float[Array, "n 6"],
+    features: Float[Array, "n d"],
+    lists: TileLists,
+    width: int,
+    height: int,
+    mesh: Mesh | None = None,
+) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
+    """`differentiate.splat`, with NaN in every channel of the pixels that a Gaussian with a NaN or infinite feature
+    touches, and in no other. Those pixels and those numbers have gradient zero."""
+    sound = jnp.isfinite(features)
+    image, transmittance = splat(splats, jnp.where(sound, features, 0.0), lists, width, height, mesh)
+    bad = lax.stop_gradient(1.0 - sound.all(1, keepdims=True).astype(splats.dtype))
+
+    def walk(bad) -> Array:
+        image, _ = cast(tuple[Array, Array], splat(lax.stop_gradient(splats), bad, lists, width, height, mesh))
+        return image[..., 0] > 0
+
+    touched = lax.cond(_any(bad), walk, lambda bad: jnp.zeros((height, width), bool), bad)
+    return jnp.where(touched[..., None], jnp.nan, image), transmittance
+
+
+@custom_vmap
+def _any(bad: Array) -> Array:
+    """() bool: one is bad. Under vmap: one in the whole batch, so that the choice stays one branch."""
+    return jnp.any(bad > 0)
+
+
+@_any.def_vmap
+def _(size: int, batched: list, bad: Array):
+    del size, batched
+    return _any(bad), False

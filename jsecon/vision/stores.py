@@ -1,0 +1,118 @@
+"""Embeddings kept on disk by content: the same mask of the same frame is embedded once by the same model.
+
+    FOLDER/<digest of model and frame>.npz      keys (M, 16) uint8 of its masks, vectors (M, E) float32
+
+So a run that was stopped embeds only what is missing, and so does one whose masks have changed in part.
+
+A segmenter whose masks are kept on disk by content: a frame is cut once by the same model with the same settings.
+
+    FOLDER/<digest of model, settings and frame>.npz      bits (M, ceil(H W / 8)) uint8, shape (3,)
+
+SAM takes minutes per frame on a CPU; a run that is stopped in the middle of its frames goes on where it stopped.
+"""
+
+import dataclasses
+import hashlib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from jsecon.files import written_whole
+from jsecon.vision.protocols import NamedSegmenter
+
+_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile)
+
+
+@dataclasses.dataclass(frozen=True)
+class EmbeddingStore:
+    """What one model has embedded."""
+
+    folder: Path
+    model: str
+    """names the model by its content."""
+
+    def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
+        """Mask key -> vector (E,) float32 of a frame. A file that cannot be read holds nothing: it only saves time."""
+        try:
+            with np.load(self._path(frame), allow_pickle=False) as file:
+                keys, vectors = file["keys"], file["vectors"]
+        except _UNREADABLE:
+            return {}
+        return {key.tobytes(): vector for key, vector in zip(keys, vectors)}
+
+    def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
+        """Keeps the vectors of a frame, in place of those kept before. Raises InputError where it cannot write."""
+        if not vectors:
+            return
+        keys = np.stack([np.frombuffer(key, np.uint8) for key in vectors])
+        with written_whole(self._path(frame)) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, keys=keys, vectors=np.stack(list(vectors.values())))
+
+    def _path(self, frame: np.ndarray) -> Path:
+        return self.folder / f"{frame_digest(self.model, frame)}.npz"
+
+
+def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
+    """32 hex digits that name a frame as one model sees it."""
+    digest = hashlib.blake2b(f"{model} {frame.shape}".encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(frame).data)
+    return digest.hexdigest()
+
+
+def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
+    """16 bytes that name a mask."""
+    return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
+
+
+def known_vectors(
+    known: dict[bytes, np.ndarray], keys: list[bytes], dim: int
+) -> tuple[Float32[np.ndarray, "m e"], list[int]]:
+    """Rows (M, E) of the keys that are known, zero for the others, and the indices of those others."""
+    rows = np.zeros((len(keys), dim), np.float32)
+    missing = []
+    for index, key in enumerate(keys):
+        if key in known and known[key].shape == (dim,):
+            rows[index] = known[key]
+        else:
+            missing.append(index)
+    return rows, missing
+
+
+_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile)
+
+
+class StoredSegmenter:
+    """Segmenter (jsecon.vision.protocols) that asks `segmenter` for what `folder` does not hold.
+
+    The segmenter's `name` must tell it from others, and from itself with other settings. A file that cannot be read is
+    computed again. Raises InputError where the folder cannot be written.
+    """
+
+    def __init__(self, segmenter: NamedSegmenter, folder: str | Path):
+        self.name = segmenter.name
+        self._segmenter, self._folder = segmenter, Path(folder)
+
+    def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
+        """frame (H, W, 3) uint8 -> masks (M, H, W) bool, as the segmenter gave them."""
+        path = self._folder / f"{frame_digest(self.name, frame)}.npz"
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                count, height, width = file["shape"].tolist()
+                pixels = np.unpackbits(file["bits"], axis=1, count=height * width)
+            return pixels.reshape(count, height, width).astype(bool)
+        except _UNREADABLE:
+            masks = np.asarray(self._segmenter(frame, index), bool)
+        bits = np.packbits(masks.reshape(len(masks), frame.shape[0] * frame.shape[1]), axis=1)
+        with written_whole(path) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, bits=bits, shape=np.asarray(masks.shape))
+        return masks
+
+    def check(self) -> None:
+        """Raises InputError where the segmenter cannot work."""
+        self._segmenter.check()
+
+    def close(self) -> None:
+        """Drops what the segmenter holds in memory."""
+        self._segmenter.close()

@@ -1,0 +1,56 @@
+"""How XLA compiles the tests' programs: fast, and as in a user's process in files marked `as_shipped`.
+
+Most of a test run's time is XLA's. What these options leave out is the speed of the programs, and nothing of what they
+compute beyond rounding. It matters to few tests: those whose claim is about the code that is shipped.
+"""
+
+import functools
+
+FAST = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
+"""for most programs: a fifth of the CPU time that XLA takes as shipped. In XLA_FLAGS, so that the processes which tests
+start find on disk what is compiled already."""
+SHIPPED = {
+    "xla_cpu_use_fusion_emitters": True,
+    "xla_backend_optimization_level": 3,
+    "xla_cpu_parallel_codegen_split_count": 32,
+}
+"""XLA's own defaults"""
+LOOPS = {"xla_backend_optimization_level": 1}
+"""for programs that are run hundreds of times: three times faster than FAST, for twice the compilation"""
+RUN_OFTEN = frozenset({"jit__step", "jit__epochs", "jit__descend", "jit__run"})
+"""their names: the training loops"""
+
+ENVIRONMENT = " ".join(f"--{name}={str(value).lower()}" for name, value in FAST.items())
+"""the part of XLA_FLAGS that makes all processes of a run compile fast"""
+
+_state = {"shipped": False}
+
+
+@functools.cache
+def install() -> None:
+    """From now on jax compiles each program of this process by what is chosen below."""
+    import jax._src.compiler as compiler
+
+    compile_or_read = compiler.compile_or_get_cached
+
+    def chosen(backend, computation, devices, options, *rest):
+        name = str(computation.operation.attributes["sym_name"]).strip('"')
+        mine = SHIPPED if _state["shipped"] else LOOPS if name in RUN_OFTEN else {}
+        options.env_option_overrides = list((mine | dict(options.env_option_overrides)).items())
+        return compile_or_read(backend, computation, devices, options, *rest)
+
+    compiler.compile_or_get_cached = chosen
+
+
+def choose(*, shipped: bool) -> None:
+    """Programs compiled from now on are those of a process without our flags, or fast ones. What was compiled otherwise
+    is forgotten; on disk, jax's own keys tell the two apart."""
+    import jax
+
+    if _state["shipped"] != shipped:
+        _state["shipped"] = shipped
+        jax.clear_caches()

@@ -1,0 +1,70 @@
+"""Regions from labels: who holds which pixels of which mask, what that makes of the embeddings; and shared work."""
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+from balls import ring_of_balls
+
+from experiments.rivals.evidence import Evidence, evidence_of_tracks
+from experiments.tables.association import ROWS, Shared, associated, by_consensus, overlaps, unit
+from jsecon.types import Camera
+
+
+def test_overlaps_count_every_pixel():
+    rng = np.random.default_rng(0)
+    tracks, masks = rng.integers(-1, 3, (2, 5, 6)), rng.integers(-1, 4, (2, 5, 6))
+    found = overlaps(tracks, masks, 4)
+    for r in range(3):
+        for m in range(4):
+            assert found[r, m] == ((tracks == r) & (masks == m)).sum()
+
+
+def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
+    masks = np.full((2, 2, 5), -1, np.int32)
+    masks[0, 0], masks[0, 1, :2], masks[1, 0, :3], masks[1, 1, :2] = 0, 1, 2, 2
+    labels = np.full(masks.shape, -1, np.int32)
+    labels[0, 0], labels[1, 0] = 0, 0  # five pixels of mask 0; three of mask 2 and two of none
+    labels[0, 1], labels[1, 1] = 1, 2  # two of five pixels in a mask: hardly seen, twice
+    embeddings = np.eye(3, 4, dtype=np.float32)
+    one = np.ones(2, np.float32)
+    cameras = Camera(np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)), one, one, one, one, 5, 2)
+    found = associated(Evidence(scene, cameras, masks, embeddings, np.array([0, 0, 1]), labels), labels)
+    assert found.embeddings.shape == (ROWS, 4)
+    np.testing.assert_array_equal(found.pixels[:3], [[5, 5], [5, 0], [0, 5]])
+    np.testing.assert_allclose(found.embeddings[0], unit(np.array([5.0, 0, 3, 0])), atol=1e-6)
+    np.testing.assert_allclose(found.uniform_embeddings[0], unit(np.array([1.0, 0, 1, 0])), atol=1e-6)
+    assert not found.embeddings[1:].any()
+    assert not found.uniform_embeddings[1:].any()
+    assert not found.pixels[3:].any()
+
+
+def test_consensus_finds_the_balls_that_no_tracker_followed():
+    gaussians, cameras, frames, truth, _ = ring_of_balls()
+    views = np.arange(0, 24, 3)
+    units = np.eye(4, 8, dtype=np.float32)
+    evidence = evidence_of_tracks(gaussians, cameras[views], truth[views], np.tile(units, (len(views), 1, 1)))
+    shuffled = dataclasses.replace(evidence, tracks=np.full_like(evidence.tracks, -1))
+    found = by_consensus(shuffled, frames[views], seed=0)
+    for ball in (1, 2, 3):
+        region = int((found.embeddings @ units[ball]).argmax())
+        own, true = found.labels == region, truth[views] == ball
+        assert (own & true).sum() > 0.8 * (own | true).sum()
+
+
+def test_shared_work_is_done_once_and_charged_to_each_that_asks():
+    shared, calls = Shared(), []
+
+    def work():
+        calls.append(1)
+        time.sleep(0.05)
+        return np.ones(2)
+
+    assert shared.get("a", work) is shared.get("a", work)
+    assert shared.settle() == 0  # who did it has spent the time already
+    shared.get("a", work)
+    shared.get("a", work)
+    assert shared.settle() == pytest.approx(0.05, abs=0.04)
+    assert shared.settle() == 0
+    assert len(calls) == 1

@@ -1,0 +1,25 @@
+"""experiments/README.md has short table cells, and names each experiment and no other."""
+
+import re
+from pathlib import Path
+
+EXPERIMENTS = Path(__file__).parent.parent.parent / "experiments"
+TEXT = (EXPERIMENTS / "README.md").read_text()
+SHARED = {"cells", "results"}
+"""modules at the root that are no experiments"""
+
+
+def test_no_table_cell_has_more_than_thirty_words():
+    rows = [line for line in TEXT.splitlines() if line.startswith("|")]
+    assert len(rows) > 100
+    for row in rows:
+        for cell in row.strip("|").split("|"):
+            assert len(cell.split()) <= 30, cell
+
+
+def test_it_names_every_experiment_and_no_other():
+    runnable = {path.stem for path in EXPERIMENTS.glob("*.py")} - SHARED
+    runnable |= {path.parent.name for path in EXPERIMENTS.glob("*/__main__.py")}
+    questions = TEXT.split("\n## Questions\n")[1].split("\n### ")[0]
+    named = re.findall(r"python -m experiments\.(\w+)", TEXT) + re.findall(r"^\| `(\w+)` ", questions, re.M)
+    assert set(named) == runnable

@@ -1,0 +1,185 @@
+"""Each rival does what its own idea promises: trained on perfect masks that agree, it finds each ball by its text."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from balls import HEIGHT, WIDTH, ring_of_balls
+
+from experiments.datasets.ovs3d import box_of
+from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text
+from experiments.rivals import lifting
+from experiments.rivals.evidence import evidence_of_tracks, local_masks
+from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
+from experiments.rivals.langsplat import train_langsplat
+from experiments.rivals.opengaussian import Schedule, train_opengaussian
+from experiments.simulated_vision.embeddings import made_text_space
+from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.errors import InputError
+from jsecon.evaluate.lerf import evaluate_point_level_rendered
+from jsecon.splat.plan import plan_view
+from jsecon.splat.project import project
+from jsecon.vision.protocols import CANONICAL
+
+# Hundreds of steps of training: as shipped they take less time than fast-compiled programs save.
+pytestmark = pytest.mark.as_shipped
+
+QUERIES = ("floor", "red ball", "blue ball", "green ball")
+TRAINED, SHOWN = np.arange(0, 24, 4), np.array([1, 10])
+
+
+@pytest.fixture(scope="module")
+def world():
+    """(evidence, labelled views nothing learnt from, texts (4, E), canonical (4, E))"""
+    gaussians, cameras, _, truth, _ = ring_of_balls()
+    gaussians, cameras = jax.tree.map(jnp.asarray, (gaussians, cameras))
+    space = made_text_space([*QUERIES, *CANONICAL], dim=128).vectors
+    texts, canonical = space[:4], space[4:]
+    embeddings = np.broadcast_to(texts, (len(TRAINED), *texts.shape))
+    evidence = evidence_of_tracks(gaussians, cameras[TRAINED], truth[TRAINED], embeddings)
+    frames = []
+    for t in SHOWN:
+        masks = {name: truth[t] == k for k, name in enumerate(QUERIES) if k and (truth[t] == k).sum() >= 40}
+        boxed = {name: (mask, box_of(mask)) for name, mask in masks.items()}
+        frames.append(LabelledFrame(f"view {t}", WIDTH, HEIGHT, boxed))
+    views = {f"view {t}": cameras[int(t)] for t in SHOWN}
+    return evidence, frames, views, jnp.asarray(texts), jnp.asarray(canonical)
+
+
+def miou(world, select):
+    evidence, frames, views, *_ = world
+    _, told = evaluate_point_level_rendered(
+        evidence.gaussians, views, frames, lambda query: select(QUERIES.index(query))
+    )
+    assert told["pairs"] == sum(len(frame.objects) for frame in frames) >= 4
+    return told["miou"]
+
+
+def by_most_similar_text(world, features):
+    labels, cosines = most_similar_text(jnp.asarray(features), world[3])
+    return miou(world, lambda query: select_text(labels, cosines, query))
+
+
+def test_langsplat(world):
+    model = train_langsplat(world[0], key=jax.random.key(0), steps=100, init="random", epochs=300)
+    assert np.isfinite(model.history).all()
+    assert model.history[-20:].mean() < 0.7 * model.history[:3].mean()
+    assert by_most_similar_text(world, model.features()) >= 0.6
+
+
+def test_gaussian_grouping(world):
+    evidence, _, _, texts, canonical = world
+    model, history = train_gaussian_grouping(
+        evidence, key=jax.random.key(0), steps=100, identity_rate=0.05, classifier_rate=0.02, classes=32
+    )
+    assert history[-20:].mean() < 0.7 * history[:5].mean()
+    ask = lambda query: query_gaussian_grouping(model, evidence, texts[query], canonical)
+    assert miou(world, ask) >= 0.6
+    # A text that means two things finds both, or the better one where one alone is asked for.
+    first = np.flatnonzero(np.asarray(evidence.frame) == 0)
+    shown = [k for k in (1, 2, 3) if (np.asarray(evidence.masks[0]) == first[k]).sum() >= 40][:2]
+    alike = np.array(evidence.embeddings)
+    alike[first[shown[1]]] = 0.95 * alike[first[shown[0]]] + 0.3 * alike[first[shown[1]]]
+    alike = dataclasses.replace(evidence, embeddings=alike)
+    both = query_gaussian_grouping(model, alike, texts[shown[0]], canonical)
+    one = query_gaussian_grouping(model, alike, texts[shown[0]], canonical, nearly=1.0)
+    each = [np.asarray(ask(k).mask) for k in shown]
+    assert each[1].any()
+    assert (np.asarray(both.mask) >= each[0] | each[1]).all()
+    np.testing.assert_array_equal(one.mask, each[0])
+    # What the first view does not show can't be found.
+    hidden = np.asarray(evidence.frame) == 0
+    blind = dataclasses.replace(evidence, embeddings=np.where(hidden[:, None], canonical[0], evidence.embeddings))
+    nothing = query_gaussian_grouping(model, blind, texts[1], canonical)
+    assert not np.asarray(nothing.mask).any()
+    assert int(nothing.region) == -1
+
+
+def test_gaussian_grouping_has_eight_bits_for_ids(world):
+    many = dataclasses.replace(world[0], tracks=np.asarray(world[0].tracks) + 260)
+    with pytest.raises(InputError, match="at most 255"):
+        train_gaussian_grouping(many, key=jax.random.key(0), steps=1)
+
+
+def test_opengaussian(world):
+    schedule = Schedule(instance_steps=100, coarse_steps=20, fine_steps=20, roots=8, leaves=3, min_views=3, rate=0.05)
+    model, history = train_opengaussian(world[0], key=jax.random.key(0), schedule=schedule)
+    assert np.isfinite(history).all()
+    assert history[-20:].mean() < history[:5].mean()
+    ask = lambda query: select_leaf(
+        model.leaf_features, model.leaf_codes, model.leaf_of, world[3][query], siblings=model.siblings
+    )
+    assert miou(world, ask) >= 0.6
+    leaf_of = np.asarray(model.leaf_of)
+    assert leaf_of.max() < 24
+    unmatched = np.asarray(model.matches) < 3
+    assert not np.asarray(model.leaf_features)[unmatched].any()
+
+
+@pytest.mark.parametrize("train", [lifting.train_occam, lifting.train_backprojection, lifting.train_vala])
+def test_lifting(world, train):
+    lifted = train(world[0])
+    length = np.linalg.norm(lifted.features, axis=1)
+    assert (np.isclose(length, 1, atol=1e-5) | (length == 0)).all()
+    assert by_most_similar_text(world, lifted.features) >= 0.6
+    evidence, _, _, texts, canonical = world
+    ask = lambda query: lifting.query_relevancy(lifted.features, evidence.gaussians.means, texts[query], canonical)
+    assert miou(world, ask) >= 0.6
+
+
+def test_backprojection_is_the_sum_over_all_pixels(world):
+    """Against the votes' own total: every labelled pixel's weight is in it, once."""
+    from jsecon.language.votes import region_votes
+
+    evidence = world[0]
+    lifted = lifting.train_backprojection(evidence)
+    votes = region_votes(evidence.gaussians, evidence.cameras, jnp.asarray(evidence.tracks), 4)
+    np.testing.assert_allclose(np.asarray(lifted.weights.sum(1)).ravel(), votes.labelled, rtol=1e-4, atol=1e-4)
+
+
+def test_centre_weights_are_the_renderers(world):
+    """Each against its definition: all nearer Gaussians' alphas at the pixel that holds the centre."""
+    gaussians, camera = world[0].gaussians, world[0].cameras[0]
+    weight, pixel = (np.asarray(a) for a in lifting.centre_weights(plan_view(gaussians, camera)))
+    splats = jax.jit(project)(gaussians, camera)
+    centre, visible = np.asarray(splats.means_px, np.float64), np.asarray(splats.visible)
+    whitening, opacity = np.asarray(splats.whitening, np.float64), np.asarray(splats.opacities, np.float64)
+    order = np.argsort(np.asarray(splats.depths), kind="stable")
+    checked = 0
+    for n in np.random.default_rng(0).permutation(gaussians.count)[:300]:
+        x, y = np.floor(centre[n])
+        if not (visible[n] and 0 <= x < WIDTH and 0 <= y < HEIGHT):
+            assert pixel[n] == -1
+            assert weight[n] == 0
+            continue
+        assert pixel[n] == y * WIDTH + x
+        dx, dy = x + 0.5 - centre[:, 0], y + 0.5 - centre[:, 1]
+        u, v = whitening[:, 0] * dx + whitening[:, 1] * dy, whitening[:, 2] * dy
+        alpha = opacity * np.exp(-0.5 * (u * u + v * v))
+        alpha = np.where(visible & (alpha >= 1 / 255), np.minimum(alpha, 0.99), 0)
+        before = np.prod(1 - alpha[order[: np.flatnonzero(order == n)[0]]])
+        expected = alpha[n] * before if before * (1 - alpha[n]) > 1e-4 else 0
+        assert weight[n] == pytest.approx(expected, abs=2e-4)
+        checked += expected > 0.01
+    assert checked > 30
+
+
+def test_the_gate_keeps_the_heaviest():
+    weight = np.concatenate([np.linspace(0.2, 0.9, 30), np.linspace(0, 0.12, 50)])
+    kept = lifting.gate(weight)
+    assert not kept[weight < 0.13].any()
+    assert kept.any()
+    assert weight[kept].min() >= weight[~kept].max()
+    assert weight[kept].sum() <= 0.75 * weight.sum() + 0.9
+    assert not lifting.gate(np.zeros(5)).any()
+
+
+def test_masks_are_counted_afresh_in_each_frame(world):
+    local, names = local_masks(world[0])
+    masks = np.asarray(world[0].masks)
+    for t in range(len(masks)):
+        shown = masks[t] >= 0
+        np.testing.assert_array_equal(names[t][local[t]][shown], masks[t][shown])
+        assert (local[t] >= 0).sum() == shown.sum()

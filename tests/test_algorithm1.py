@@ -1,0 +1,258 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from jsecon.app import cache
+from jsecon.association.algorithm1 import clean_masklets, iou_matrix, masklets
+
+
+def squares(frames=5, size=40, *, step=3):
+    """A moving 12x12 square (object 0), a still one (object 1), and everything else (object 2), as true labels."""
+    truth = np.full((frames, size, size), 2, np.int16)
+    for t in range(frames):
+        truth[t, 24:36, 6:18] = 1
+        truth[t, 4:16, 4 + step * t : 16 + step * t] = 0
+    return truth
+
+
+def frames_of(truth):
+    return np.zeros((*truth.shape, 3), np.uint8)
+
+
+def segmenter(truth, order=None):
+    """Proposes the true objects, in a given order."""
+
+    def segment(frame, index):
+        ids = np.unique(truth[index])
+        return truth[index][None] == (ids if order is None else order(ids))[:, None, None]
+
+    return segment
+
+
+def tracker(truth):
+    """Follows a prompt to the true object under most of it; counts its calls."""
+    calls = []
+
+    def track(frames, index, prompts):
+        calls.append((index, len(prompts)))
+        labels = np.full(truth.shape, -1, np.int16)
+        for b, prompt in enumerate(prompts):
+            labels[truth == np.bincount(truth[index][prompt]).argmax()] = b
+        return labels
+
+    track.calls = calls
+    return track
+
+
+def canonical(labels):
+    """Labels renumbered by first appearance, so that partitions can be compared."""
+    ids, first = np.unique(labels, return_index=True)
+    name = {i: n for n, i in enumerate(ids[np.argsort(first)])}
+    return np.vectorize(name.get)(labels)
+
+
+def test_finds_each_object_once():
+    truth = squares()
+    track = tracker(truth)
+    labels = masklets(frames_of(truth), segmenter(truth), track)
+    assert labels.dtype == np.int16
+    np.testing.assert_array_equal(canonical(labels), canonical(truth))
+    assert track.calls == [(0, 3)]  # what is tracked is not prompted again
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1))
+def test_the_order_of_proposals_only_renames(seed):
+    truth = squares()
+    rng = np.random.default_rng(seed)
+    labels = masklets(frames_of(truth), segmenter(truth, rng.permutation), tracker(truth))
+    np.testing.assert_array_equal(canonical(labels), canonical(truth))
+
+
+def test_running_again_on_its_own_result_changes_nothing():
+    truth = squares()
+    first = masklets(frames_of(truth), segmenter(truth), tracker(truth))
+    again = masklets(frames_of(truth), segmenter(first), tracker(first))
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(clean_masklets(first), first)
+
+
+def test_an_object_that_enters_late_is_prompted_where_it_enters():
+    truth = squares()
+    truth[:2][truth[:2] == 0] = 2
+    track = tracker(truth)
+    labels = masklets(frames_of(truth), segmenter(truth), track)
+    assert track.calls == [(0, 2), (2, 1)]
+    np.testing.assert_array_equal(canonical(labels), canonical(truth))
+
+
+def test_the_iou_threshold_decides_what_is_new():
+    truth = squares(frames=3, step=0)
+    shifted = np.roll(truth, 3, axis=2)  # IoU of the squares with themselves: 9 / 15 = 0.6
+
+    def segment(frame, index):
+        return (truth if index == 0 else shifted)[index][None] == np.arange(2)[:, None, None]
+
+    for threshold, calls in ((0.5, [(0, 2)]), (0.59, [(0, 2)]), (0.61, [(0, 2), (1, 2), (2, 2)])):
+        track = tracker(truth)
+        masklets(frames_of(truth), segment, track, iou_threshold=threshold)
+        assert track.calls == calls
+
+
+def test_a_fragment_found_once_gives_way_and_a_part_found_always_stays():
+    truth = squares(frames=6, step=0)
+    square = truth == 1
+    half = square.copy()
+    half[:, :, 12:] = False
+    for frames_with_half, regions in (({2}, 3), (set(range(6)), 4)):
+
+        def segment(frame, index, split=frames_with_half):
+            parts = [half[index], square[index] & ~half[index]] if index in split else [square[index]]
+            return np.stack([truth[index] == 0, truth[index] == 2, *parts])
+
+        def track(frames, index, prompts):
+            labels = np.full(truth.shape, -1, np.int16)
+            for b, prompt in enumerate(prompts):
+                labels[:, prompt] = b  # nothing moves
+            return labels
+
+        labels = masklets(frames_of(truth), segment, track)
+        assert len(np.unique(labels[labels >= 0])) == regions
+        np.testing.assert_array_equal(labels[2] == labels[2, 30, 8], (square if regions == 3 else half)[2])
+
+
+def test_parts_that_most_frames_hold_together_are_joined():
+    """The square comes in halves in the first two of six frames, and whole later: one object; always in halves: two."""
+    truth = squares(frames=6, step=0)
+    square = truth[0] == 1
+    half = square.copy()
+    half[:, 12:] = False
+
+    def track(frames, index, prompts):
+        labels = np.full(truth.shape, -1, np.int16)
+        for b, prompt in enumerate(prompts):
+            labels[:, prompt] = b
+        return labels
+
+    for split, rate, regions in ((2, 0.5, 2), (6, 0.5, 3), (2, 1.0, 3)):
+
+        def segment(frame, index, split=split):
+            return np.stack([truth[index] == 0, *([half, square & ~half] if index < split else [square])])
+
+        labels = masklets(frames_of(truth), segment, track, join_rate=rate, min_support=0.0)
+        assert len(np.unique(labels[labels >= 0])) == regions, (split, rate)
+
+
+def test_specks_and_glimpses_are_dropped():
+    truth = squares()
+    truth[2, 0, 0] = 3  # a speck
+    truth[3, 38:, 20:] = 4  # a glimpse: one frame
+    labels = masklets(frames_of(truth), segmenter(truth), tracker(truth), min_area=0.005)
+    assert labels.max() == 2
+    assert labels[2, 0, 0] == -1
+    assert (labels[3, 38:, 20:] == -1).all()
+
+
+def test_at_most_so_many():
+    truth = squares()
+    assert masklets(frames_of(truth), segmenter(truth), tracker(truth), max_masklets=2).max() == 1
+
+
+def test_nothing_proposed_is_nothing_found():
+    truth = squares()
+    labels = masklets(frames_of(truth), lambda frame, index: np.zeros((0, 40, 40), bool), tracker(truth))
+    assert (labels == -1).all()
+
+
+def test_progress_counts_frames():
+    truth, told = squares(frames=3), []
+    masklets(frames_of(truth), segmenter(truth), tracker(truth), progress=lambda *c: told.append(c))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_bad_shapes_are_refused():
+    truth = squares()
+    with pytest.raises(ValueError, match="frames"):
+        masklets(frames_of(truth)[0], segmenter(truth), tracker(truth))
+    with pytest.raises(ValueError, match="segment"):
+        masklets(frames_of(truth), lambda f, i: np.ones((1, 3, 3), bool), tracker(truth))
+    with pytest.raises(ValueError, match="track"):
+        masklets(frames_of(truth), segmenter(truth), lambda f, i, p: np.zeros((1, 40, 40), np.int16))
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**32 - 1))
+def test_iou_matrix_equals_the_definition(seed):
+    rng = np.random.default_rng(seed)
+    a, b = rng.random((4, 60)) < rng.random(), rng.random((3, 60)) < rng.random()
+    expected = [[(x & y).sum() / (x | y).sum() if (x | y).any() else 0.0 for y in b] for x in a]
+    np.testing.assert_allclose(iou_matrix(a, b), expected, atol=1e-6)
+    np.testing.assert_allclose(iou_matrix(b, a), iou_matrix(a, b).T)
+    assert iou_matrix(a, b[:0]).shape == (4, 0)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**32 - 1))
+def test_clean_masklets(seed):
+    rng = np.random.default_rng(seed)
+    labels = rng.choice([-1, -1, 0, 1, 2, 5], (4, 6, 6), p=[0.2, 0.2, 0.3, 0.2, 0.08, 0.02]).astype(np.int16)
+    clean = clean_masklets(labels, min_area=0.06, min_views=2)
+    np.testing.assert_array_equal(clean_masklets(clean, min_area=0.06, min_views=2), clean)
+    ids = np.unique(clean[clean >= 0])
+    np.testing.assert_array_equal(ids, np.arange(len(ids)))  # numbered without gaps, in order of appearance
+    assert list(np.argsort([np.flatnonzero((clean == i).any((1, 2)))[0] for i in ids], kind="stable")) == list(ids)
+    for old in (0, 1, 2, 5):
+        areas = (labels == old).sum((1, 2))
+        enough = areas >= 0.06 * 36
+        new = clean[labels == old]
+        assert (new >= 0).sum() == (areas[enough].sum() if enough.sum() >= 2 else 0)
+        assert len(np.unique(new[new >= 0])) <= 1
+
+
+class Stopped(Exception):
+    """In place of a process that ends."""
+
+
+@pytest.mark.parametrize("stop", [1, 2, 4])
+def test_goes_on_in_the_middle_of_the_sequence_to_the_same_result(stop):
+    truth = squares(6)
+    truth[3:, 30:38, 30:38] = 3  # comes into view later
+    whole = tracker(truth)
+    wanted = masklets(frames_of(truth), segmenter(truth), whole)
+    assert len(whole.calls) > 1
+    kept = []
+
+    def keep(state):
+        kept.append(state())
+        if kept[-1].done == stop:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=keep)
+    tree, arrays = cache.pack(kept[-1])
+    seen, track, told = [], tracker(truth), []
+
+    def segment(frame, index):
+        seen.append(index)
+        return segmenter(truth)(frame, index)
+
+    found = masklets(
+        frames_of(truth),
+        segment,
+        track,
+        state=cache.unpack(tree, arrays),
+        progress=lambda done, total: told.append((done, total)),
+    )
+    np.testing.assert_array_equal(found, wanted)
+    assert seen == list(range(stop, 6))  # what was done is not done again
+    assert track.calls == [call for call in whole.calls if call[0] >= stop]
+    assert told[0] == (stop + 1, 6)
+
+
+def test_the_state_of_another_sequence_is_refused():
+    truth = squares(4)
+    kept = []
+    masklets(frames_of(truth), segmenter(truth), tracker(truth), on_checkpoint=lambda state: kept.append(state()))
+    assert [state.done for state in kept] == [1, 2, 3, 4]
+    with pytest.raises(ValueError, match="a state of 5 frames"):
+        masklets(frames_of(squares(5)), segmenter(truth), tracker(truth), state=kept[0])

@@ -1,0 +1,158 @@
+"""The room that tile lists have by default: enough for what is ordinary, told where it is not, one for all views."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.language.distill import distill_l1
+from jsecon.language.votes import region_votes
+from jsecon.parallel import host_mesh
+from jsecon.process import programs_built
+from jsecon.query.masks import selection_mask
+from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
+from jsecon.splat.plan import plan_view, plan_views, render_plan
+from jsecon.splat.reference import render_reference
+from jsecon.splat.render import render, render_depth
+from jsecon.types import Gaussians
+
+COVERING = 2100
+"""Gaussians of `covering`: with four blocks in the image, 8,400 pairs"""
+
+
+@pytest.fixture(scope="module")
+def covering() -> Gaussians:
+    """Faint Gaussians, each of which covers the whole image of any camera of the ring, all at other depths."""
+    rng = np.random.default_rng(4)
+    return Gaussians(
+        means=rng.uniform(-0.3, 0.3, (COVERING, 3)).astype(np.float32),
+        log_scales=np.full((COVERING, 3), 1.5, np.float32),
+        quaternions=rng.normal(size=(COVERING, 4)).astype(np.float32),
+        opacity_logits=rng.uniform(-4.8, -4.0, COVERING).astype(np.float32),
+        sh=np.zeros((COVERING, 1, 3), np.float32),
+    )
+
+
+def features_of(count, channels=3):
+    return np.random.default_rng(1).normal(size=(count, channels)).astype(np.float32)
+
+
+def test_jit_without_a_capacity_is_exact(scene, camera):
+    features = features_of(scene.count)
+    rendering = jax.jit(lambda g: render(g, camera, features))(scene)
+    expected, alpha = render_reference(scene, camera, features)
+    assert int(rendering.overflow) == 0
+    assert np.median(np.abs(np.asarray(rendering.features) - expected)) < 1e-6
+    assert np.abs(np.asarray(rendering.alpha) - alpha).max() < 1 / 255
+    # also where the scene is a constant to jit
+    inside = jax.jit(lambda f: render(scene, camera, f))(features)
+    np.testing.assert_allclose(inside.features, rendering.features, atol=5e-6)
+
+
+def test_vmap_and_grad_without_a_capacity(scene, cameras):
+    features, planned = features_of(scene.count), plan_capacity(scene, cameras)
+
+    def both(make):
+        def loss(gaussians, camera, features):
+            rendering = make(gaussians, camera, features)
+            return (rendering.features**2).sum(), rendering.overflow
+
+        return jax.jit(jax.vmap(jax.grad(loss, argnums=(0, 2), has_aux=True), in_axes=(None, 0, None)))
+
+    by_default, overflow = both(render)(scene, cameras, features)
+    by_plan, _ = both(functools.partial(render, capacity=planned))(scene, cameras, features)
+    assert np.asarray(overflow).tolist() == [0] * 4
+    for got, expected in zip(jax.tree.leaves(by_default), jax.tree.leaves(by_plan), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("mesh", [None, host_mesh()])
+def test_what_exceeds_it_is_rendered_with_enough_outside_a_trace_and_counted_inside(covering, camera, mesh):
+    features = features_of(COVERING)
+    pairs, room = 4 * COVERING, default_capacity(COVERING, 48, 40, strips=1 if mesh is None else 2)
+    assert room < pairs
+    rendering = render(covering, camera, features, mesh=mesh)
+    expected, alpha = render_reference(covering, camera, features)
+    assert int(rendering.overflow) == 0
+    np.testing.assert_allclose(rendering.features, expected, atol=2e-4)
+    np.testing.assert_allclose(rendering.alpha, alpha, atol=2e-4)
+    inside = jax.jit(lambda g: render(g, camera, features, mesh=mesh).overflow)(covering)
+    assert int(inside) == pairs - room
+
+
+def test_depth_that_lacks_something_is_no_number(covering, camera):
+    depth, alpha = render_depth(covering, camera)
+    assert np.isfinite(depth).all()
+    assert np.isfinite(alpha).all()
+    depth, alpha = jax.jit(lambda g: render_depth(g, camera))(covering)
+    assert np.isnan(depth).all()
+    assert np.isnan(alpha).all()
+
+
+def test_plans_votes_and_codes_hold_what_exceeds_it(covering, cameras):
+    pair = jax.tree.map(lambda a: a[:2], cameras)
+    plans = plan_views(covering, pair)
+    assert np.asarray(plans.overflow).tolist() == [0, 0]
+    features = features_of(COVERING)
+    for t in range(2):
+        one = render_plan(jax.tree.map(lambda a, t=t: a[t], plans), features)
+        np.testing.assert_allclose(one.features, render_reference(covering, pair[t], features)[0], atol=2e-4)
+    assert plan_views(covering, pair, most_bytes=1000) is None
+
+    labels = np.zeros((2, 40, 48), np.int32)
+    votes = region_votes(covering, pair, labels, 1)
+    assert int(votes.overflow) == 0
+    weight = np.asarray(render_plan(plan_view(covering, pair[0]), np.ones((COVERING, 1), np.float32)).alpha).sum()
+    weight += np.asarray(render_plan(plan_view(covering, pair[1]), np.ones((COVERING, 1), np.float32)).alpha).sum()
+    np.testing.assert_allclose(np.asarray(votes.total).sum(), weight, rtol=1e-4)
+    inside = jax.jit(lambda seen: region_votes(covering, pair, seen, 1))(labels)
+    assert int(inside.overflow) == 2 * (4 * COVERING - default_capacity(COVERING, 48, 40))
+
+    codes = np.eye(1, 3, dtype=np.float32)
+    found, history = distill_l1(covering, pair, jnp.asarray(labels), codes, steps=2, key=jax.random.key(0))
+    assert np.isfinite(history).all()
+    assert found.shape == (COVERING, 3)
+
+
+def test_one_program_serves_all_views_and_selections_of_a_size(scene, cameras):
+    some = jax.tree.map(lambda a: a[:61], scene)  # a count that no other test has
+
+    def look(t):
+        render(some, cameras[t], features_of(some.count))
+        selection_mask(some, cameras[t], np.arange(some.count) % (t + 2) == 0)
+        region_votes(some, cameras[t : t + 1], np.full((1, 40, 48), t % 2, np.int32), 2)
+
+    programs_built()
+    look(0)
+    before = programs_built()["all"]
+    assert before > 0
+    for t in range(1, 4):
+        look(t)
+    assert programs_built()["all"] == before
+
+
+def test_it_follows_the_sizes_alone():
+    assert default_capacity(64, 48, 40) == default_capacity(1, 8, 8) == 4096
+    # Up to 256 Gaussians there is room for all of them everywhere.
+    for count, width, height in ((200, 400, 300), (256, 1600, 1200), (100, 5000, 3000)):
+        blocks = -(-width // 32) * -(-height // 32)
+        assert default_capacity(count, width, height) >= count * blocks
+    sizes = [default_capacity(n, 640, 480) for n in (10, 1000, 10_000, 100_000, 1_000_000)]
+    assert sizes == sorted(sizes)
+    assert default_capacity(100_000, 640, 480) == default_capacity(101_000, 640, 480)
+    # A million Gaussians at 1600x1200: 110 bytes for each pair stay far below what their gradients take.
+    assert 2_000_000 <= default_capacity(1_000_000, 1600, 1200) <= 3_000_000
+    for strips in (2, 5):
+        assert default_capacity(100_000, 640, 480, strips=strips) >= default_capacity(100_000, 640, 480)
+
+
+@pytest.mark.parametrize("strips", [1, 2, 3])
+def test_enough_is_enough(strips):
+    rng = np.random.default_rng(strips)
+    for capacity in (4096, 9000, 100):
+        room = 32 * int(np.ceil(np.ceil(capacity / strips) / 32))  # of a strip, in whole words
+        needs = room + rng.integers(-50, 20_000, strips)
+        overflow = np.maximum(needs - room, 0)
+        assert enough_capacity(capacity, overflow) // strips >= needs.max()

@@ -1,0 +1,127 @@
+"""query_one_step at the ends of the floats (in test_window.py where jax was silently wrong);
+query_canonical against LERF's definition, written as the softmax it is, in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jsecon.query.direct import query_canonical, query_one_step, unit_codes
+
+
+def exact_cosines(codes, code):
+    codes, code = np.asarray(codes, np.float64), np.asarray(code, np.float64)
+    return codes @ code / np.linalg.norm(codes, axis=1) / np.linalg.norm(code)
+
+
+def test_wide_features_equal_float64():
+    rng = np.random.default_rng(0)
+    features, text = rng.normal(size=(2_000, 512)).astype(np.float32), rng.normal(size=512).astype(np.float32)
+    np.testing.assert_allclose(query_one_step(features, text, 0.1).similarity, exact_cosines(features, text), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30, 3e38])
+def test_only_directions_count(scale):
+    codes = jnp.asarray(np.array([[1, 0, 0], [0.6, 0.8, 0], [-1, 0, 0]]) * scale, jnp.float32)
+    got = query_one_step(codes, jnp.asarray([1.0, 0, 0]), 0.5)
+    np.testing.assert_allclose(got.similarity, [1, 0.6, -1], rtol=1e-6)
+    assert got.mask.tolist() == [True, True, False]
+    scale = min(scale, 1e37)
+    assert query_one_step(jnp.eye(3), jnp.asarray([scale, 0, 0], jnp.float32), 0.5).mask.tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+@pytest.mark.parametrize("threshold", [-1.0, 0.0, 0.5])
+def test_what_is_unknown_is_never_selected(threshold):
+    inf, nan = np.inf, np.nan
+    codes = jnp.asarray([[0, 0, 0], [nan, 1, 0], [inf, 1, 0], [1, 0, 0]], jnp.float32)
+    got = query_one_step(codes, jnp.asarray([1.0, 0, 0]), threshold)
+    assert got.mask.tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(got.similarity[:3], 0)
+    assert float(got.score) == 1
+    assert int(got.region) == -1
+    for text in ([0, 0, 0], [nan, 0, 0], [inf, 0, 0]):
+        nothing = query_one_step(codes, jnp.asarray(text, jnp.float32), threshold)
+        assert not nothing.mask.any()
+        assert float(nothing.score) == 0
+
+
+def test_nan_threshold_and_no_gaussians_select_nothing():
+    assert not query_one_step(jnp.eye(3), jnp.ones(3), np.nan).mask.any()
+    empty = query_one_step(jnp.zeros((0, 3)), jnp.ones(3), 0.5)
+    assert empty.mask.shape == (0,)
+    assert float(empty.score) == 0
+
+
+def test_sizes_that_disagree_are_told():
+    with pytest.raises(ValueError, match=r"got \(4,\), expected \(3,\)"):
+        query_one_step(jnp.eye(3), jnp.ones(4), 0.5)
+
+
+@pytest.mark.parametrize("size", [3, 40])
+def test_unit_codes_answer_as_codes_do_under_jit_and_vmap(size):
+    rng = np.random.default_rng(size)
+    codes, texts = (rng.normal(size=(n, size)).astype(np.float32) for n in (300, 2))
+    codes[:3] = [[0] * size, [np.nan] * size, [1e30] * size]
+    units = unit_codes(codes)
+    many = jax.jit(jax.vmap(lambda text: query_one_step(units, text, 0.1)))(texts)
+    for index, text in enumerate(texts):
+        alone, plain = query_one_step(units, text, 0.1), query_one_step(codes, text, 0.1)
+        expected = exact_cosines(codes[2:], text)
+        for got in (alone, plain, jax.tree.map(lambda a, index=index: a[index], many)):
+            np.testing.assert_allclose(got.similarity[2:], expected, atol=1e-6)
+            assert not np.asarray(got.mask)[:2].any()
+    assert float(query_one_step(units, texts[0], -1.0).mask[:2].sum()) == 0
+    relevancy = query_canonical(units, texts[0], texts, 0.5).similarity
+    np.testing.assert_allclose(relevancy, query_canonical(codes, texts[0], texts, 0.5).similarity, atol=1e-6)
+
+
+def exact_relevancy(features, text, canonical):
+    unit = [np.asarray(a, np.float64) for a in (features, text, canonical)]
+    features, text, canonical = (a / np.linalg.norm(a, axis=-1, keepdims=True) for a in unit)
+    shares = []
+    for phrase in canonical:
+        logits = 10 * np.stack([features @ text, features @ phrase])
+        powers = np.exp(logits - logits.max(axis=0))
+        shares.append(powers[0] / powers.sum(axis=0))
+    return np.min(shares, axis=0)
+
+
+def test_relevancy_equals_the_softmax_in_float64():
+    rng = np.random.default_rng(0)
+    features, texts, canonical = (rng.normal(size=s).astype(np.float32) for s in ((300, 8), (2, 8), (4, 8)))
+    got = jax.jit(jax.vmap(lambda text: query_canonical(jnp.asarray(features), text, jnp.asarray(canonical), 0.5)))(
+        texts
+    )
+    for row, text in enumerate(texts):
+        expected = exact_relevancy(features, text, canonical)
+        np.testing.assert_allclose(got.similarity[row], expected, atol=3e-6)
+        clear = np.abs(expected - 0.5) > 1e-5
+        assert (np.asarray(got.mask[row]) == (expected >= 0.5))[clear].all()
+    alone = query_canonical(features, texts[1], canonical, 0.5)
+    np.testing.assert_allclose(alone.similarity, got.similarity[1], atol=1e-6)
+
+
+def test_above_a_half_means_closer_than_every_phrase():
+    features = jnp.asarray([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    got = query_canonical(features, jnp.asarray([1.0, 0.2, 0]), jnp.asarray([[0, 1.0, 0], [0, 0, 1.0]]), 0.5)
+    assert got.mask.tolist() == [True, False, False]
+
+
+def test_unknown_features_are_never_selected_and_broken_phrases_select_nothing():
+    features = jnp.asarray([[0, 0, 0], [jnp.nan, 1, 0], [1e30, 0, 0], [1e-30, 0, 0]], jnp.float32)
+    text, phrases = jnp.asarray([1.0, 0, 0]), jnp.asarray([[0, 1.0, 0]])
+    assert query_canonical(features, text, phrases, 0.0).mask.tolist() == [False, False, True, True]
+    for broken in (jnp.zeros((1, 3)), jnp.full((1, 3), jnp.nan)):
+        assert not query_canonical(features, text, broken, 0.0).mask.any()
+    assert not query_canonical(features, jnp.zeros(3), phrases, 0.0).mask.any()
+
+
+def test_no_phrases_or_other_sizes_are_told():
+    with pytest.raises(ValueError, match="C >= 1"):
+        query_canonical(jnp.eye(3), jnp.ones(3), jnp.zeros((0, 3)), 0.5)
+    with pytest.raises(ValueError, match="text"):
+        query_canonical(jnp.eye(3), jnp.ones(2), jnp.ones((1, 3)), 0.5)

@@ -1,0 +1,52 @@
+"""The renderer as it ships: its images and gradients against the brute-force float64 twin, on one device and on two;
+votes against the twin's weights."""
+
+import numpy as np
+import pytest
+
+from experiments.stability.case import GRADIENT, VALUE, ordinary
+from experiments.stability.measure import evaluate
+from jsecon.language.votes import region_votes
+from jsecon.parallel import host_mesh
+from jsecon.splat.reference import render_reference, weights_reference
+from jsecon.splat.render import render
+
+pytestmark = pytest.mark.as_shipped
+
+
+@pytest.mark.parametrize("channels", [1, 3, 16])
+def test_images_are_the_brute_force_sum(scene, cameras, channels):
+    features = np.random.default_rng(1).normal(size=(scene.count, channels)).astype(np.float32)
+    for t in range(4):
+        rendering = render(scene, cameras[t], features)
+        expected, alpha = render_reference(scene, cameras[t], features)
+        assert int(rendering.overflow) == 0
+        error = np.abs(np.asarray(rendering.features) - expected).max(-1)
+        # An alpha at the 1/255 cut may fall on the other side in float32: 1/255 of a feature, on few pixels.
+        assert np.median(error) < 1e-6
+        assert np.mean(error > 1e-5) < 0.01
+        assert error.max() < np.abs(features).max() * 2 / 255
+        assert np.abs(np.asarray(rendering.alpha) - alpha).max() < 1 / 255
+
+
+def test_gradients_are_the_twins():
+    row = evaluate(ordinary(), ulp=False)
+    assert row.value_error <= VALUE
+    assert max(row.gradient_errors.values()) <= GRADIENT
+
+
+def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera):
+    features = np.random.default_rng(1).normal(size=(scene.count, 3)).astype(np.float32)
+    one, two = (render(scene, camera, features, mesh=mesh) for mesh in (None, host_mesh()))
+    np.testing.assert_array_equal(one.features, two.features)
+    np.testing.assert_array_equal(one.alpha, two.alpha)
+
+
+def test_votes_are_the_twins_weights(scene, cameras):
+    labels = np.random.default_rng(5).integers(-1, 11, (4, 5, 6)).repeat(8, 1).repeat(8, 2).astype(np.int32)
+    votes = region_votes(scene, cameras, labels, 11, top=11)
+    expected = np.zeros((scene.count, 11))
+    for t in range(4):
+        weights = weights_reference(scene, cameras[t])
+        expected += np.stack([weights[labels[t] == r].sum(0) for r in range(11)], 1)
+    assert np.linalg.norm(votes.dense() - expected) <= 1e-4 * np.linalg.norm(expected)

@@ -1,0 +1,242 @@
+"""A run with SAM and CLIP from model folders, end to end: their content is in the keys, a stopped run keeps what they
+found, and a field finds its model again or says what is missing."""
+
+import dataclasses
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from clip_files import COLOURS, write_clip, write_visual
+from sam2_files import write_sam2
+from sam_files import write_sam
+from test_pipeline import Recorder
+
+from experiments.datasets.feature_files import write_features
+from jsecon.app import command_line, networks, pipeline, stages
+from jsecon.app.language_stages import regions
+from jsecon.app.masklet_stages import masklets
+from jsecon.app.networks import GivenSpace
+from jsecon.app.options import Options
+from jsecon.app.scene_stages import gaussians, load
+from jsecon.data.capture import load_capture
+from jsecon.data.ply import save_ply
+from jsecon.errors import InputError
+from jsecon.fit.start import starting_gaussians
+from jsecon.language.field import load_field, save_field
+from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
+from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.vision.protocols import NamedSegmenter
+from jsecon.vision.stores import StoredSegmenter
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    base = tmp_path_factory.mktemp("models")
+    return write_sam(base / "sam", "transformers.js"), write_clip(base / "clip", "transformers.js")
+
+
+@pytest.fixture(scope="module")
+def splat(room, tmp_path_factory):
+    """The room's sparse points as Gaussians: a scene that is given, so that nothing is fitted."""
+    start, _ = starting_gaussians(load_capture(room, holdout=4), sh_degree=1)
+    path = tmp_path_factory.mktemp("splat") / "scene.ply"
+    save_ply(path, start)
+    return path
+
+
+@pytest.fixture(scope="module")
+def seen(room, splat, models, tmp_path_factory):
+    """A run with both: the run, its folder, and what it told."""
+    folder, listener = tmp_path_factory.mktemp("seen"), Recorder()
+    options = Options(
+        room, gaussians=splat, holdout=4, segmenter=models[0], embedder=models[1], points_per_side=10, level="m"
+    )
+    return pipeline.run(options, folder, listener=listener), folder, listener
+
+
+def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
+    run, folder, listener = seen
+    assert "proposals of level m by sam, asked at 10x10 points" in listener.planned["masklets"].why
+    field = load_field(folder / "field.npz")
+    assert field.embedder.startswith("clip-")
+    assert field.regions.embeddings.shape[1] == 3
+    assert field.regions.count >= 4
+    texts = networks.embedder_of_field(field).embed_text([f"a {name} thing" for name in COLOURS])
+    frames = np.asarray(run.capture.frames)[~run.capture.held_out]
+    for text, (name, colour) in zip(texts, COLOURS.items()):
+        best = int((np.asarray(field.regions.embeddings) @ text).argmax())
+        means = [frames[run.labels == r].mean(0) for r in range(field.regions.count)]
+        cosines = [mean @ colour / np.linalg.norm(mean) / np.linalg.norm(colour) for mean in means]
+        assert cosines[best] > np.max(cosines) - 0.03, name
+
+
+def test_the_same_models_elsewhere_are_cached_and_others_are_not(seen, models, tmp_path):
+    run, folder, _ = seen
+    shutil.copytree(folder, tmp_path / "out")
+    moved = [shutil.copytree(model, tmp_path / f"moved{n}") for n, model in enumerate(models)]
+    options = dataclasses.replace(run.options, segmenter=moved[0], embedder=moved[1])
+    listener = Recorder()
+    pipeline.run(options, tmp_path / "out", listener=listener)
+    assert not any(fresh for name, fresh in listener.fresh.items() if name != "field")
+
+    write_visual(moved[1] / "onnx" / "vision_model.onnx", ("pixel_values", "image_embeds"), "batch", std=(0.1, 1, 1))
+    listener = Recorder()
+    pipeline.run(options, tmp_path / "out", listener=listener)
+    fresh = {name for name, value in listener.fresh.items() if value}
+    assert {"regions", "codes"} <= fresh
+    assert not fresh & {"load", "gaussians", "masklets", "votes"}
+
+
+def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
+    run, _, _ = seen
+    folder = shutil.copytree(models[0], tmp_path / "sam")
+    decoder = folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
+    decoder.write_bytes(decoder.read_bytes()[:400])
+    listener = Recorder()
+    with pytest.raises(InputError, match=r"prompt_encoder_mask_decoder\.onnx: found what ONNX Runtime"):
+        pipeline.run(dataclasses.replace(run.options, segmenter=folder), tmp_path / "out", listener=listener)
+    assert listener.fresh == {}
+
+
+def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
+    """Random weights track nothing in earnest; the run, its plan and its key are what is tested."""
+    run, folder, _ = seen
+    shutil.copytree(folder / "cache", tmp_path / "out" / "cache")
+    listener = Recorder()
+    options = dataclasses.replace(run.options, tracker=write_sam2(tmp_path / "sam2"))
+    followed = pipeline.run(options, tmp_path / "out", listener=listener)
+    assert listener.planned["masklets"].why.endswith("followed by the SAM 2 of sam2")
+    assert listener.fresh["masklets"]
+    assert not listener.fresh["gaussians"]
+    assert not np.array_equal(followed.labels, run.labels)
+
+
+def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, splat, tmp_path, monkeypatch):
+    options = Options(room, gaussians=splat, holdout=4, tracker=write_sam2(tmp_path / "sam2"), granularity="coarse")
+    monkeypatch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
+    own, called, stop = Sam2Tracker.__call__, [], []
+
+    def counted(self, frames, index, prompts):
+        called.append(index)
+        if index in stop:
+            raise KeyboardInterrupt
+        return own(self, frames, index, prompts)
+
+    def tracked(folder):
+        called.clear()
+        work, results = stages.Work(options, networks.networks_of(options, folder), folder), {}
+        for stage in (load(work), gaussians(work), masklets(work)):
+            record = stages.Record(folder / f"{stage.name}.npz")
+            results[stage.name] = stage.compute(results, lambda done, total: None, record).value
+        return results["masklets"]
+
+    monkeypatch.setattr(Sam2Tracker, "__call__", counted)
+    whole, everywhere = tracked(tmp_path / "whole"), called.copy()
+    assert len(everywhere) > 2  # frames that showed something new
+    stop.append(everywhere[1])
+    with pytest.raises(KeyboardInterrupt):
+        tracked(tmp_path / "out")
+    stop.clear()
+    np.testing.assert_array_equal(tracked(tmp_path / "out"), whole)
+    assert called == everywhere[1:]
+
+
+def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):
+    _, folder, _ = seen
+    field = folder / "field.npz"
+    assert (
+        command_line.main(
+            ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
+        )
+        == 0
+    )
+    answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
+    text = networks.embedder_of_field(found, templates=("a {} thing",)).embed_text(["red"])[0]
+    assert answer["region"] == int((np.asarray(found.regions.embeddings) @ text).argmax())
+    assert answer["score"] > 0.9
+    other = write_clip(tmp_path / "other", "immich")
+    assert command_line.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--embedder", str(other)]) == 2
+    assert "model that the field was made with" in capsys.readouterr().err
+    assert command_line.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--template", "a thing"]) == 2
+    assert "a phrase that holds {}" in capsys.readouterr().err
+    lost = dataclasses.replace(load_field(field), provenance=json.dumps({"options": {"embedder": "/nowhere"}}))
+    with pytest.raises(InputError, match=r"--embedder DIR"):
+        networks.embedder_of_field(lost)
+    assert networks.embedder_of_field(lost, models[1]).name == lost.embedder
+
+
+def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, models, tmp_path):
+    capture, folder, rows = load_capture(room, holdout=4), tmp_path / "language_features", []
+    for t, name in enumerate(capture.names):
+        ids = cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED).astype(int)
+        labels = np.unique(ids, return_inverse=True)[1].reshape(ids.shape) - (0 in ids)
+        vectors = np.random.default_rng(t).normal(size=(labels.max() + 1, 3))
+        write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+        rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
+    options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
+    work = stages.Work(options, networks.networks_of(options, tmp_path), tmp_path)
+    assert work.networks.embedder.name == "given-3"
+    stage, none = regions(work), (lambda done, total: None, stages.Record(tmp_path / "none.npz"))
+    assert "read from language_features, level l" in stage.how
+    assert "embedder" in stage.left_out
+    results = {"load": capture}
+    results["masklets"] = masklets(work).compute(results, *none).value
+    found = stage.compute(results, *none)
+    np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
+    assert found.notes == (f"{len(rows)} embeddings in the files",)
+    for name in capture.names:
+        write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
+    with pytest.raises(InputError, match="no mask of level l"):
+        stage.compute(results, *none)
+    with_clip = networks.networks_of(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
+    assert with_clip.name.startswith("clip-")
+
+
+def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, capsys):
+    known = load_field(seen[1] / "field.npz")
+    given = dataclasses.replace(known, embedder="given-3", canonical=np.zeros((0, 3), np.float32), provenance="{}")
+    save_field(tmp_path / "field.npz", given)
+    ask = ["query", str(tmp_path / "field.npz"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
+    assert command_line.main(ask) == 2
+    assert "came from files, 3 numbers each" in capsys.readouterr().err
+    with pytest.raises(InputError, match="--embedder DIR"):
+        GivenSpace(3).embed_text(["red"])
+    assert (
+        command_line.main([*ask, "--embedder", str(models[1]), "--by", "canonical"]) == 0
+    )  # the phrases, too, are the model's
+    assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
+    with pytest.raises(InputError, match="5, as those from files have"):
+        networks.embedder_named("given-5", folder=models[1])
+
+
+def test_templates_are_for_clip():
+    with pytest.raises(InputError, match="--template"):
+        networks.embedder_named(templates=("a photo of a {}.",))
+
+
+def test_two_sources_of_masks_are_refused(room, models, tmp_path):
+    with pytest.raises(InputError, match="--masks --segmenter"):
+        pipeline.run(Options(room, masks=room / "masks", segmenter=models[0]), tmp_path)
+    with pytest.raises(InputError, match="SAM model"):
+        pipeline.run(Options(room, segmenter=tmp_path / "nowhere"), tmp_path)
+
+
+def test_proposals_are_kept_by_content(models, tmp_path):
+    frame = np.zeros((60, 80, 3), np.uint8)
+    frame[10:40, 10:50] = (200, 30, 30)
+    stored = StoredSegmenter(SamSegmenter(models[0], SamSettings(points_per_side=4, crop_layers=0)), tmp_path)
+    assert isinstance(stored, NamedSegmenter)
+    masks = stored(frame, 0)
+    assert len(masks) >= 1
+    failing = StoredSegmenter(SamSegmenter(models[0], SamSettings(points_per_side=4, crop_layers=0)), tmp_path)
+    failing._segmenter = None  # whatever is asked of it now must come from disk
+    np.testing.assert_array_equal(failing(frame, 5), masks)
+    with pytest.raises(TypeError):
+        failing(255 - frame, 0)
+    path = next(tmp_path.glob("*.npz"))
+    path.write_bytes(path.read_bytes()[:60])
+    np.testing.assert_array_equal(stored(frame, 0), masks)
+    finer = SamSegmenter(models[0], SamSettings(points_per_side=5, crop_layers=0))
+    assert finer.name != stored.name

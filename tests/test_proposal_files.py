@@ -1,0 +1,150 @@
+"""Masks of single frames from disk: SAM's own JSON, LangSplat's files, PNGs, whichever a frame has."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from jsecon.data.proposal_files import decode_rle, proposals_from_disk
+from jsecon.errors import InputError
+
+SIZE = (20, 30)
+
+
+@pytest.fixture
+def masks():
+    """Three masks, the second inside of the first."""
+    found = np.zeros((3, *SIZE), bool)
+    found[0, 2:12, 3:20] = found[1, 4:8, 5:9] = found[2, 14:19, 10:28] = True
+    return found
+
+
+def records(masks, scores=None):
+    """As scripts/amg.py of segment-anything writes them."""
+    found = [
+        {"segmentation": {"size": list(mask.shape), "counts": text_of(runs_of(mask))}, "area": int(mask.sum())}
+        for mask in masks
+    ]
+    for record, score in zip(found, scores or []):
+        record |= {"predicted_iou": score, "stability_score": 0.9}
+    return found
+
+
+def test_json_of_sams_generator_may_overlap_and_is_ordered_by_score(tmp_path, masks):
+    (tmp_path / "a.json").write_text(json.dumps(records(masks, [0.8, 0.95, 0.9])))
+    (tmp_path / "b.json").write_text(json.dumps({"image": {"image_id": 1}, "annotations": records(masks)}))
+    read, notes = proposals_from_disk(tmp_path, ("a", "b", "c"), SIZE)
+    np.testing.assert_array_equal(read(0), masks[[1, 2, 0]])
+    np.testing.assert_array_equal(read(1), masks)
+    assert read(2).shape == (0, *SIZE)
+    assert notes == ("1 of 3 frames have no masks (the first: c).",)
+
+
+def test_png_and_langsplat_files_hold_one_layer(tmp_path, masks):
+    ids = np.zeros(SIZE, np.uint8)
+    ids[masks[0]], ids[masks[2]] = 7, 200
+    cv2.imwrite(str(tmp_path / "a.png"), ids)
+    levels = np.full((4, *SIZE), -1, np.float32)
+    levels[3][masks[2]], levels[1][masks[1]] = 4, 0
+    np.save(tmp_path / "b_s.npy", levels)
+    read, notes = proposals_from_disk(tmp_path, ("a", "b.extra"), SIZE)
+    np.testing.assert_array_equal(read(0), masks[[0, 2]])
+    np.testing.assert_array_equal(read(1), masks[[2]])
+    assert notes == ()
+    read, _ = proposals_from_disk(tmp_path, ("a", "b"), SIZE, level="s")
+    np.testing.assert_array_equal(read(1), masks[[1]])
+
+
+def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):
+    large = masks.repeat(2, 1).repeat(2, 2)
+    (tmp_path / "a.json").write_text(json.dumps(records(large)))
+    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    np.testing.assert_array_equal(read(0), masks)
+    read, _ = proposals_from_disk(tmp_path, ("a",), (20, 20))
+    with pytest.raises(InputError, match="60x40"):
+        read(0)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[{", "no list of masks"),
+        ('[{"bbox": [1, 2, 3, 4]}]', "KeyError"),
+        ('{"info": 1}', "KeyError"),
+        ('[{"segmentation": [[1, 2, 3, 4]]}]', "mask 0"),
+        ('[{"segmentation": {"size": [20, 30], "counts": [5]}}]', "5 of 20x30"),
+    ],
+)
+def test_damaged_json_is_named(tmp_path, content, words):
+    (tmp_path / "a.json").write_text(content)
+    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    with pytest.raises(InputError, match=words) as caught:
+        read(0)
+    assert caught.value.where.startswith(str(tmp_path / "a.json"))
+
+
+def test_folders_without_masks_are_refused(tmp_path):
+    with pytest.raises(InputError, match="called like a frame"):
+        proposals_from_disk(tmp_path, ("a",), SIZE)
+    with pytest.raises(InputError, match="no such folder"):
+        proposals_from_disk(tmp_path / "nowhere", ("a",), SIZE)
+
+
+def runs_of(mask) -> list[int]:
+    """Lengths of runs down the columns, of 0 first."""
+    flat = np.concatenate([[False], mask.T.ravel()])
+    edges = np.flatnonzero(np.diff(flat)) + 0
+    return np.diff([0, *edges, mask.size]).tolist()
+
+
+def text_of(runs) -> str:
+    """The 6-bit digits of runs, written the other way round from how they are read: by twos' complement."""
+    text = ""
+    for n, run in enumerate(runs):
+        value = run - runs[n - 2] if n > 2 else run
+        while True:
+            digit, value = value & 31, value >> 5
+            more = value != (-1 if digit & 16 else 0)
+            text += chr(48 + (digit | 32 if more else digit))
+            if not more:
+                break
+    return text
+
+
+def test_the_example_of_cocos_own_tests():
+    counts = [6, 1, 40, 4, 5, 4, 5, 4, 21]
+    mask = decode_rle({"size": [9, 10], "counts": "61X13mN000`0"}, "here")
+    np.testing.assert_array_equal(mask, decode_rle({"size": [9, 10], "counts": counts}, "here"))
+    assert mask.sum() == 1 + 4 + 4 + 4
+    assert np.argwhere(mask.T.ravel())[0] == 6
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 70), st.floats(0, 1))
+def test_every_mask_comes_back(seed, height, width, density):
+    rng = np.random.default_rng(seed)
+    mask = np.kron(rng.random((height, width)) < density, np.ones((1, rng.integers(1, 9)), bool)) > 0
+    size = list(mask.shape)
+    for counts in (runs_of(mask), text_of(runs_of(mask))):
+        np.testing.assert_array_equal(decode_rle({"size": size, "counts": counts}, "here"), mask)
+
+
+@pytest.mark.parametrize(
+    ("rle", "words"),
+    [
+        ({"size": [9, 10], "counts": "61X13mN000"}, "69 of 9x10"),
+        ({"size": [9, 10], "counts": "61X13mN000`"}, "breaks off"),
+        ({"size": [9, 10], "counts": "61 X"}, "is no digit"),
+        ({"size": [9, 10], "counts": [-10, 100]}, "90 of 9x10"),
+        ({"size": [0, 10], "counts": []}, "0 of 0x10"),
+        ({"size": [9, 10]}, "KeyError"),
+        ([[10, 10, 20, 20, 10, 20]], "TypeError"),
+        ({"size": [2, 2], "counts": "abc\u00e9"}, "is no digit"),
+    ],
+)
+def test_what_is_no_mask_is_refused_where_it_lies(rle, words):
+    with pytest.raises(InputError, match=words) as caught:
+        decode_rle(rle, "frame_0001.json, mask 3")
+    assert caught.value.where == "frame_0001.json, mask 3"

@@ -1,0 +1,154 @@
+"""Starts from points and from depth, against brute force and against a scene whose answer is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from experiments.datasets.depth_points import labels_of_points
+from jsecon.errors import InputError
+from jsecon.fit.depth import points_from_depth, voxel_for
+from jsecon.fit.start import gaussians_from_points, neighbour_distances
+from jsecon.splat.sh import C0
+from jsecon.types import Camera, Capture
+
+
+def brute_distances(points, neighbours=3):
+    distance = np.linalg.norm(points[:, None].astype(np.float64) - points[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    nearest = np.sort(distance, axis=1)[:, : min(neighbours, len(points) - 1)]
+    return np.sqrt(np.maximum((nearest**2).mean(axis=1), 1e-7))
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(2, 40), st.integers(0, 1000))
+def test_neighbour_distances_equal_brute_force(count, seed):
+    points = np.random.default_rng(seed).standard_normal((count, 3))
+    points[: count // 3] = points[0]  # duplicates
+    np.testing.assert_allclose(neighbour_distances(points), brute_distances(points), rtol=1e-9)
+
+
+def test_neighbour_distances_of_many_points_and_of_one():
+    points = np.random.default_rng(0).standard_normal((40_000, 3))
+    found = neighbour_distances(points)
+    assert found.shape == (40_000,)
+    some = slice(0, 3)
+    distance = np.linalg.norm(points[some, None] - points[None], axis=-1)
+    np.testing.assert_allclose(found[some], np.sqrt((np.sort(distance, axis=1)[:, 1:4] ** 2).mean(axis=1)), rtol=1e-9)
+    assert neighbour_distances(points[:1])[0] == pytest.approx(np.sqrt(1e-7))
+
+
+def test_gaussians_from_points_hold_the_colour_opacity_and_scale():
+    rng = np.random.default_rng(0)
+    points, colors = rng.standard_normal((30, 3)), rng.integers(0, 256, (30, 3)).astype(np.uint8)
+    gaussians = gaussians_from_points(points, colors, opacity=0.3, sh_degree=2)
+    assert gaussians.sh.shape == (30, 9, 3)
+    np.testing.assert_allclose(0.5 + C0 * gaussians.sh[:, 0], colors / 255, atol=1e-6)
+    assert not gaussians.sh[:, 1:].any()
+    np.testing.assert_allclose(1 / (1 + np.exp(-gaussians.opacity_logits)), 0.3, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.exp(gaussians.log_scales), np.repeat(brute_distances(points)[:, None], 3, 1), rtol=1e-5
+    )
+    np.testing.assert_array_equal(gaussians.quaternions, np.tile([1, 0, 0, 0], (30, 1)))
+    capped = gaussians_from_points(points, colors, max_scale=0.2, scale=0.5)
+    np.testing.assert_allclose(
+        np.exp(capped.log_scales[:, 0]), np.minimum(0.5 * brute_distances(points), 0.2), rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("wrong", [
+    {"points": np.zeros((0, 3)), "colors": np.zeros((0, 3), np.uint8)},
+    {"points": np.full((1, 3), np.nan), "colors": np.zeros((1, 3), np.uint8)},
+    {"opacity": 1.0}, {"opacity": 0.0}, {"scale": 0.0}, {"sh_degree": 4},
+])  # fmt: skip
+def test_wrong_starts_are_refused(wrong):
+    options = {"points": np.eye(3), "colors": np.zeros((3, 3), np.uint8), **wrong}
+    with pytest.raises(ValueError, match="expected"):
+        gaussians_from_points(options.pop("points"), options.pop("colors"), **options)
+
+
+def wall_capture(height=24, width=32, views=3):
+    """Cameras that look along z at the plane z = 2 from different places; each third of the wall has its own colour."""
+    focal = 30.0
+    frames, depths, poses = [], [], []
+    for t in range(views):
+        centre = np.array([0.3 * t - 0.3, 0.1 * t, -0.2 * t])
+        pose = np.eye(4)
+        pose[:3, 3] = -centre
+        depth = np.full((height, width), 2.0 - centre[2], np.float32)
+        x = (np.arange(width) + 0.5 - width / 2) / focal * depth[0, 0] + centre[0]
+        third = np.clip(np.floor((x + 1.2) / 0.8), 0, 2).astype(int)
+        frames.append(np.broadcast_to(np.eye(3)[third] * 200, (height, width, 3)).astype(np.uint8))
+        depths.append(depth)
+        poses.append(pose)
+    depths[0][:4] = 0  # unknown
+    camera = Camera(np.array(poses), *(np.full(views, v) for v in (focal, focal, width / 2, height / 2)), width, height)
+    return Capture(
+        np.array(frames),
+        camera,
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        np.array([False] * (views - 1) + [True]),
+        np.array(depths),
+        np.eye(4),
+        tuple(f"{t}" for t in range(views)),
+    )
+
+
+def test_points_from_depth_lie_on_the_wall_and_agree_between_views():
+    capture = wall_capture()
+    found = points_from_depth(capture, voxel=0.2)
+    np.testing.assert_allclose(found.points[:, 2], 2.0, atol=1e-5)
+    pixels = capture.frames.shape[1] * capture.frames.shape[2]
+    assert found.counts.sum() == len(found.sample_points) == 2 * pixels - 4 * 32  # neither unknown nor held out
+    assert set(np.unique(found.sample_pixels[:, 0])) == {0, 1}
+    # The view from another place puts the same colours on the same part of the wall.
+    inside = (np.abs((found.points[:, 0] + 1.2) % 0.8 - 0.4) < 0.25) & (np.abs(found.points[:, 0]) < 1)
+    third = np.clip(np.floor((found.points[:, 0] + 1.2) / 0.8), 0, 2).astype(int)
+    assert inside.sum() > 10
+    np.testing.assert_array_equal(found.colors[inside].argmax(axis=1), third[inside])
+    assert (found.colors[inside].max(axis=1) == 200).all()
+
+
+def test_points_from_depth_project_back_onto_their_pixels():
+    capture = wall_capture()
+    found = points_from_depth(capture, voxel=1e-4, stride=3, frames=np.array([2]))
+    assert (found.counts == 1).all()
+    frame, row, column = found.sample_pixels.T
+    assert set(frame) == {2}
+    pose = capture.cameras.world_to_camera[2]
+    seen = found.points[found.sample_points] @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(30 * seen[:, 0] / seen[:, 2] + 16, column + 0.5, atol=1e-3)
+    np.testing.assert_allclose(30 * seen[:, 1] / seen[:, 2] + 12, row + 0.5, atol=1e-3)
+
+
+def test_max_points_is_kept_and_nearly_reached():
+    points = np.random.default_rng(0).random((5000, 3))
+    voxel = voxel_for(points, 400)
+    occupied = len(np.unique(np.floor((points - points.min(0)) / voxel), axis=0))
+    assert 300 < occupied <= 400
+    assert len(points_from_depth(wall_capture(), max_points=50).points) <= 50
+
+
+def test_labels_of_points_take_the_majority():
+    capture = wall_capture()
+    labels = np.where(capture.frames.sum(-1) > 0, capture.frames.argmax(-1), -1).astype(np.int16)
+    labels[0, :, ::5] = -1
+    found = points_from_depth(capture, voxel=0.15)
+    result = labels_of_points(found, labels, 3)
+    for n in range(len(found.points)):
+        own = found.sample_pixels[found.sample_points == n]
+        values = [v for v in labels[own[:, 0], own[:, 1], own[:, 2]] if v >= 0]
+        expected = np.bincount(values).argmax() if values else -1
+        assert result[n] == expected
+
+
+def test_depth_points_need_depth():
+    capture = wall_capture()
+    with pytest.raises(InputError, match="no depth"):
+        points_from_depth(dataclasses.replace(capture, depths=None), voxel=0.1)
+    with pytest.raises(InputError, match="no pixel"):
+        points_from_depth(dataclasses.replace(capture, depths=np.zeros_like(capture.depths)), voxel=0.1)
+    with pytest.raises(ValueError, match="exactly one"):
+        points_from_depth(capture)

@@ -1,0 +1,252 @@
+"""What computes on many rows, as it ships, under jit and vmap, against NumPy in float64 at the numbers of rows at which
+jax was silently wrong (its issue 39103: about 32,769 to 43,000 in float32, from 16,385 on in float64).
+
+The definitions that results are compared with are those of the files that test each function itself.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import test_autoencoder as of_autoencoder
+import test_classes as of_classes
+import test_distill as of_distill
+import test_retrieval as of_retrieval
+import test_shares as of_shares
+from conftest import look_at
+from small_field import unit_rows
+from test_direct import exact_cosines, exact_relevancy
+
+from jsecon.fit.photometric import l1, psnr
+from jsecon.language.codes import Rotation, Spread
+from jsecon.language.distill import distill_votes
+from jsecon.language.shares import share_of, with_overlap, with_shown
+from jsecon.query.anchored import query_anchored
+from jsecon.query.classes import query_classes
+from jsecon.query.direct import query_canonical, query_one_step, similarities, unit_codes
+from jsecon.query.retrieval import contrasts
+from jsecon.query.several import query_several
+from jsecon.splat.project import project
+from jsecon.splat.sh import colours_from_sh
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Camera, Gaussians
+
+pytestmark = pytest.mark.as_shipped
+
+REGIONS = of_classes.REGIONS
+
+
+@pytest.fixture(params=[16_385, 32_769, 40_000, 100_000])
+def count(request) -> int:
+    return request.param
+
+
+def normal(*shape):
+    return np.random.default_rng(shape).normal(size=shape).astype(np.float32)
+
+
+def compiled(function, batch, *given):
+    """function(one of the batch, *given) for all of a batch, in one program."""
+    return jax.jit(jax.vmap(function, in_axes=(0, *(None for _ in given))))(batch, *given)
+
+
+def test_one_step(count):
+    codes, texts = normal(count, 3), normal(2, 3)
+    expected = np.stack([exact_cosines(codes, text) for text in texts])
+    np.testing.assert_allclose(query_one_step(codes, texts[0], 0.5).similarity, expected[0], atol=1e-6)
+    found = compiled(lambda text, codes: query_one_step(codes, text, 0.5), texts, codes)
+    np.testing.assert_allclose(found.similarity, expected, atol=1e-6)
+    np.testing.assert_allclose(found.score, expected.max(axis=1), atol=1e-6)
+    clear = np.abs(expected - 0.5) > 1e-5
+    assert (np.asarray(found.mask) == (expected >= 0.5))[clear].all()
+    by_row = compiled(lambda code, text: similarities(code[None], text)[0][0], codes, texts[0])
+    np.testing.assert_allclose(by_row, expected[0], atol=1e-6)
+
+
+def test_canonical(count):
+    features, texts, phrases = normal(count, 8), normal(2, 8), normal(4, 8)
+    expected = np.stack([exact_relevancy(features, text, phrases) for text in texts])
+    ask = lambda text, features, phrases: query_canonical(features, text, phrases, 0.5)
+    found = compiled(ask, texts, features, phrases)
+    np.testing.assert_allclose(found.similarity, expected, atol=3e-6)
+    clear = np.abs(expected - 0.5) > 1e-5
+    assert (np.asarray(found.mask) == (expected >= 0.5))[clear].all()
+    np.testing.assert_allclose(query_canonical(features, texts[1], phrases, 0.5).similarity, expected[1], atol=3e-6)
+
+
+def test_unit_codes(count):
+    codes, texts = normal(count, 40), normal(2, 40)
+    codes[:3] = [[0] * 40, [np.nan] * 40, [1e30] * 40]
+    units = unit_codes(codes)
+    found = compiled(lambda text, units: query_one_step(units, text, 0.1), texts, units)
+    for text, similarity, mask in zip(texts, found.similarity, found.mask):
+        np.testing.assert_allclose(similarity[2:], exact_cosines(codes[2:], text), atol=1e-6)
+        assert not mask[:2].any()
+    relevancy = query_canonical(units, texts[0], texts, 0.5).similarity
+    np.testing.assert_allclose(relevancy[2:], exact_relevancy(codes[2:], texts[0], texts), atol=3e-6)
+
+
+@pytest.fixture
+def field(count):
+    """Random votes and codes for six regions."""
+    made = of_classes.made_field(count)
+    return dataclasses.replace(made, codes=unit_rows(np.random.default_rng(1), count, 4))
+
+
+def share(field, regions):
+    """(N,) float64: the regions' votes as a part of what the views show that show them."""
+    chosen = np.isin(field.votes.regions, regions)
+    weight, seen = (np.where(chosen, a, 0).astype(np.float64) for a in (field.votes.weights, field.votes.shown))
+    return np.divide(weight.sum(1), seen.max(1), out=np.zeros(len(weight)), where=chosen.any(1)).clip(max=1)
+
+
+def test_anchored(field):
+    asked = np.array([0, 3])
+    texts = field.regions.embeddings[asked]
+    ask = {"retrieval": "cosine", "alike_threshold": None, "piece_nearness": None}
+    by_votes = compiled(lambda text, field: query_anchored(field, text, **ask).similarity, texts, field)
+    by_code = compiled(lambda text, field: query_anchored(field, text, by="code", **ask).similarity, texts, field)
+    for n, region in enumerate(asked):
+        np.testing.assert_allclose(by_votes[n], share(field, [region]), atol=1e-6)
+        np.testing.assert_allclose(by_code[n], exact_cosines(field.codes, field.region_codes[region]), atol=1e-6)
+
+
+def test_several(field):
+    sets = field.regions.embeddings[np.array([[0, 3], [1, 2]])]
+    ask = {"retrieval": "cosine", "several": False, "nearness": 2.0}
+    found = compiled(lambda texts, field: query_several(field, texts, **ask).similarity, sets, field)
+    for n, regions in enumerate(([0, 3], [1, 2])):
+        np.testing.assert_allclose(found[n], share(field, regions), atol=1e-6)
+
+
+def test_classes_of_all(field, count):
+    sets = unit_rows(np.random.default_rng(2), 10, of_classes.SIZE).reshape(2, 5, -1)
+    ask = {"retrieval": "cosine", "retrieval_threshold": -1.0, "every": True}
+    labels, found = compiled(lambda texts, field: query_classes(field, texts, **ask), sets, field)
+    rows = np.unique(np.linspace(0, count - 1, 2_000).astype(int))
+    few = dataclasses.replace(
+        field, votes=jax.tree.map(lambda a: np.asarray(a)[rows] if np.ndim(a) else a, field.votes)
+    )
+    for n, texts in enumerate(sets):
+        similarity = np.asarray(field.regions.embeddings, np.float64) @ texts.T
+        expected, _ = of_classes.exact(few, similarity, -1.0, np.ones(REGIONS))
+        np.testing.assert_allclose(found[n][rows], expected, atol=2e-6)
+        ordered = np.sort(expected, axis=1)
+        clear = ordered[:, -1] - ordered[:, -2] > 1e-5
+        np.testing.assert_array_equal(np.asarray(labels)[n][rows][clear], expected.argmax(1)[clear])
+
+
+def test_contrasts_of_many_regions(count):
+    rng = np.random.default_rng(3)
+    embeddings, texts, phrases = (unit_rows(rng, n, of_retrieval.SIZE) for n in (count, 3, 4))
+    pixels = rng.integers(0, 900, (count, 2))
+    ask = lambda text, *given: contrasts(given[0], text, *given[1:])
+    found, known = compiled(ask, texts, embeddings, phrases, pixels)
+    assert np.asarray(known).all()
+    for n, text in enumerate(texts):
+        np.testing.assert_allclose(found[n], of_retrieval.exact(embeddings, text, phrases, pixels), atol=5e-6)
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_shares(count, shown):
+    votes = jax.tree.map(jnp.asarray, of_shares.known_votes(count, shown=shown))
+    chosen = np.random.default_rng(1).random((3, of_shares.REGIONS)) < 0.5
+    found = compiled(lambda one, votes: share_of(votes, one), chosen, votes)
+    rows = np.unique(np.linspace(0, count - 1, 2_000).astype(int))
+    few = jax.tree.map(lambda a: a if a.ndim == 0 else np.asarray(a)[rows], votes)
+    for n, one in enumerate(chosen):
+        np.testing.assert_allclose(found.share[n][rows], of_shares.exact_share(few, one), atol=1e-6)
+
+
+def test_shown_and_overlap(count):
+    votes, regions = of_shares.cast(count)
+    found = with_shown(votes, regions)
+    np.testing.assert_allclose(found.shown, of_shares.exact_shown(votes, regions), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(with_overlap(found).overlap, of_shares.exact_overlap(found), rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("reduce", ["mean", "median", "mode"])
+def test_reductions_of_votes(count, reduce):
+    rng = np.random.default_rng(0)
+    small, tables = of_distill.random_votes(rng, 100, 4, 8), np.stack([unit_rows(rng, 8, 3) for _ in range(2)])
+    rows = np.arange(count) % 100
+    votes = jax.tree.map(lambda a: a[rows] if np.ndim(a) else a, small)
+    found = compiled(lambda table, votes: distill_votes(votes, table, reduce), tables, votes)
+    for n, table in enumerate(tables):
+        np.testing.assert_allclose(found[n], of_distill.exact(small, table, reduce)[rows], atol=3e-5)
+
+
+def test_coders(count):
+    units, many = unit_rows(np.random.default_rng(0), 5, 12), unit_rows(np.random.default_rng(1), count, 12)
+    basis = np.linalg.qr(normal(12, 4))[0]
+    expected = many.astype(np.float64) @ basis
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(compiled(Rotation(jnp.asarray(basis)).encode, many), expected, atol=2e-6)
+    table = unit_rows(np.random.default_rng(2), 5, 3)
+    weights = np.exp(40 * (many.astype(np.float64) @ units.T - 1))
+    expected = weights @ table
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    found = compiled(Spread(jnp.asarray(units), jnp.asarray(table)).encode, many)
+    np.testing.assert_allclose(found, expected, atol=3e-5)
+    rng = np.random.default_rng(3)
+    drawn = lambda leaf: rng.uniform(0.1, 0.2, leaf.shape).astype(np.float32) * rng.choice([-1, 1], leaf.shape)
+    coder = jax.tree.map(drawn, of_autoencoder.shapes_of(12, 3))
+    variances = jax.tree.map(np.abs, coder.encoder["batch_stats"])
+    coder = dataclasses.replace(coder, encoder=coder.encoder | {"batch_stats": variances})
+    expected = of_autoencoder.encoded(coder, many)
+    np.testing.assert_allclose(compiled(lambda row, coder: coder.encode(row), many, coder), expected, atol=1e-3)
+
+
+@pytest.fixture
+def cloud(count):
+    """Gaussians in a cube, and a camera before it."""
+    rng = np.random.default_rng(count)
+    gaussians = Gaussians(
+        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        rng.uniform(-5, -2, (count, 3)).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(size=count).astype(np.float32),
+        rng.normal(size=(count, 4, 3)).astype(np.float32),
+    )
+    lens = (np.float32(number) for number in (300, 310, 160, 120))
+    return gaussians, Camera(look_at((0.3, -0.5, -3.0)), *lens, 320, 240)
+
+
+def test_projection(cloud):
+    gaussians, camera = cloud
+    pose = np.asarray(camera.world_to_camera, np.float64)
+    inside = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    expected = inside[:, :2] / inside[:, 2:] * [300, 310] + [160, 120]
+    views = jax.tree.map(lambda a: np.asarray(a)[None], camera)
+    found = compiled(lambda view, gaussians: project(gaussians, view), views, gaussians)
+    np.testing.assert_allclose(found.means_px[0], expected, rtol=1e-4, atol=2e-3)
+    np.testing.assert_allclose(found.depths[0], inside[:, 2], rtol=1e-5)
+
+
+def test_colours(cloud):
+    gaussians, camera = cloud
+    x, y, z = (away := gaussians.means - np.asarray(camera.centres, np.float64)).T / np.linalg.norm(away, axis=1)
+    basis = 0.28209479177387814 * np.ones_like(x), *(0.4886025119029199 * np.stack([-y, z, -x]))
+    expected = np.maximum(np.einsum("kn,nkc->nc", np.stack(basis), gaussians.sh) + 0.5, 0)
+    np.testing.assert_allclose(jax.jit(colours_from_sh)(gaussians, camera), expected, atol=2e-6)
+
+
+def test_another_world(cloud):
+    gaussians, _ = cloud
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    similarity = np.eye(4)
+    similarity[:3, :3], similarity[:3, 3] = 2.0 * turn * np.sign(np.linalg.det(turn)), (1, -2, 3)
+    moved = transform_gaussians(gaussians, similarity)  # takes no tracers
+    expected = gaussians.means @ similarity[:3, :3].T + similarity[:3, 3]
+    np.testing.assert_allclose(moved.means, expected, atol=2e-6)
+
+
+def test_losses_of_many_pixels(count):
+    image, target = np.random.default_rng(0).random((2, count, 1, 3)).astype(np.float32)
+    error = np.float64(image) - target
+    stacked = np.stack([image, target])
+    np.testing.assert_allclose(compiled(l1, stacked, target)[0], np.abs(error).mean(), rtol=1e-5)
+    expected = -10 * np.log10((error**2).mean())
+    np.testing.assert_allclose(compiled(psnr, stacked, target)[0], expected, rtol=1e-5)
