@@ -55,6 +55,7 @@ def test_a_plan_says_what_it_lacks(scene, camera):
     assert int(plan_view(scene, camera, capacity=32).overflow) > 0
 
 
+@pytest.mark.as_shipped  # equal bits are a claim about the machine code
 @pytest.mark.parametrize("channels", [3, 16])
 def test_several_devices_give_what_one_gives(scene, camera, channels):
     mesh = host_mesh()
