@@ -82,9 +82,9 @@ def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
     ):
         raise InputError(
             "cam.info.txt",
-            found=f"the matrices {sorted(blocks)}",
-            expected="a 3x3 colour intrinsic matrix and a 4x4 camera-to-world matrix a frame",
-            remedy="Give the file as the APC toolbox writes it.",
+            f"the matrices {sorted(blocks)}",
+            "a 3x3 colour intrinsic matrix and a 4x4 camera-to-world matrix a frame",
+            "Give the file as the APC toolbox writes it.",
         )
     return np.array(intrinsics), np.array([poses[k] for k in sorted(poses)])
 
@@ -97,7 +97,7 @@ def decode_depth(raw: np.ndarray) -> np.ndarray:
 def _image(path: Path, flags: int) -> np.ndarray:
     image = cv2.imread(str(path), flags)
     if image is None:
-        raise InputError(path, found="no readable image", expected="a PNG", remedy="Fetch the capture again.")
+        raise InputError(path, "no readable image", "a PNG", "Fetch the capture again.")
     return image
 
 
@@ -108,10 +108,7 @@ def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tu
         intrinsics, poses = parse_cameras((folder / "cam.info.txt").read_text())
     except OSError as error:
         raise InputError(
-            folder / "cam.info.txt",
-            found=str(error.strerror),
-            expected="the cameras",
-            remedy="Give the folder scene-0000 of apc_bin.",
+            folder / "cam.info.txt", str(error.strerror), "the cameras", "Give the folder scene-0000 of apc_bin."
         ) from error
     names = tuple(f"frame-{t:06d}" for t in range(len(poses)))
     frames = np.stack([_image(folder / f"{n}.color.png", cv2.IMREAD_COLOR)[..., ::-1] for n in names])

@@ -46,9 +46,9 @@ def read_cells(file: Path) -> dict[str, Any]:
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(
                 file,
-                found=f"line {number} is no cell: {line[:60]!r}",
-                expected='{"key": ..., "value": ...} in every line',
-                remedy="Remove the line: if it was a cell, it will be computed again.",
+                f"line {number} is no cell: {line[:60]!r}",
+                '{"key": ..., "value": ...} in every line',
+                "Remove the line: if it was a cell, it will be computed again.",
             ) from error
     return found
 

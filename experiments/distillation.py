@@ -72,9 +72,9 @@ def main(options: Options = Options()) -> dict:
     if not made:
         raise InputError(
             options.replica,
-            found="no capture there, and no demo seeds",
-            expected="a scene to measure on",
-            remedy="Give a folder of demos, or put replica_apartment_0 beside the checkout.",
+            "no capture there, and no demo seeds",
+            "a scene to measure on",
+            "Give a folder of demos, or put replica_apartment_0 beside the checkout.",
         )
     paths = [(name, path) for name in made for path in ("votes", "Adam from zero")]
     paths += [(n, path) for n in made if n in options.all_starts for path in ("Adam from random", "Adam from votes")]

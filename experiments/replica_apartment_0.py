@@ -74,9 +74,9 @@ def ids_of_colors(image: np.ndarray, where: object) -> np.ndarray:
     if foreign.any():
         raise InputError(
             where,
-            found=f"colour #{key[foreign][0]:06x}",
-            expected="the 40 colours of the d3-40 palette",
-            remedy="Give the label images as they were drawn, without compression or resizing.",
+            f"colour #{key[foreign][0]:06x}",
+            "the 40 colours of the d3-40 palette",
+            "Give the label images as they were drawn, without compression or resizing.",
         )
     return ids
 
@@ -98,10 +98,7 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
         poses = np.load(folder / "GT_pose.npy")
     except (OSError, ValueError) as error:
         raise InputError(
-            folder / "GT_pose.npy",
-            found=str(error),
-            expected="the poses (T, 7)",
-            remedy="Give the folder replica_apartment_0.",
+            folder / "GT_pose.npy", str(error), "the poses (T, 7)", "Give the folder replica_apartment_0."
         ) from error
 
     def read(kind: str) -> list[np.ndarray]:
@@ -109,10 +106,7 @@ def load_replica(folder: str | Path, *, voting_every: int) -> tuple[Capture, np.
         for t, image in enumerate(images):
             if image is None:
                 raise InputError(
-                    folder / kind / f"{t + 1}.png",
-                    found="no readable image",
-                    expected="a PNG a pose",
-                    remedy="Fetch the capture again.",
+                    folder / kind / f"{t + 1}.png", "no readable image", "a PNG a pose", "Fetch the capture again."
                 )
         return images
 

@@ -10,12 +10,12 @@ class InputError(ValueError):
     `where` is the file or argument, `found` what is there, `expected` what should be, `remedy` what to do about it.
     """
 
-    def __init__(self, where: object, *, found: str, expected: str, remedy: str):
+    def __init__(self, where: object, found: str, expected: str, remedy: str):
         self.where, self.found, self.expected, self.remedy = str(where), found, expected, remedy
         super().__init__(f"{where}: found {found}; expected {expected}. {remedy}")
 
 
-def require(condition: bool, name: str, *, got: object, expected: str, remedy: str) -> None:
+def require(condition: bool, name: str, got: object, expected: str, remedy: str) -> None:
     """Raise ValueError(got, expected, remedy) unless `condition`: for what is known at trace time (shapes, dtypes,
     options)."""
     if not condition:
@@ -28,10 +28,10 @@ def require_shape(name: str, array: Any, expected: tuple[Any, ...], remedy: str)
     wanted = (*got[: len(got) - len(expected) + 1], *expected[1:]) if expected[0] is ... else expected
     fits = len(got) == len(wanted) and all(isinstance(size, str) or size == own for own, size in zip(got, wanted))
     told = ", ".join("..." if size is ... else str(size) for size in expected)
-    require(fits, name, got=got, expected=f"({told}{',' * (len(expected) == 1)})", remedy=remedy)
+    require(fits, name, got, f"({told}{',' * (len(expected) == 1)})", remedy)
 
 
 def require_one_of(name: str, got: object, choices: Iterable[str], remedy: str) -> None:
     """Raise ValueError unless an option is one of its choices."""
     choices = tuple(choices)
-    require(got in choices, name, got=repr(got), expected=" or ".join(map(repr, choices)), remedy=remedy)
+    require(got in choices, name, repr(got), " or ".join(map(repr, choices)), remedy)

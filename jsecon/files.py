@@ -24,9 +24,9 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     except OSError as error:
         raise InputError(
             path,
-            found=f"{error.strerror} on writing to {path.parent}",
-            expected="a folder that can be written",
-            remedy="Choose another output folder, or mend its permissions.",
+            f"{error.strerror} on writing to {path.parent}",
+            "a folder that can be written",
+            "Choose another output folder, or mend its permissions.",
         ) from error
     try:
         yield temporary

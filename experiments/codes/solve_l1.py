@@ -93,23 +93,23 @@ def solve_l1(
     require(
         cameras.world_to_camera.shape[:-2] == (views,) and labels.shape[1:] == (cameras.height, cameras.width),
         "solve_l1",
-        got=f"labels {labels.shape}",
-        expected=f"one (H, W) = ({cameras.height}, {cameras.width}) image per camera",
-        remedy="Pass the labels and the cameras of the same views at the same size.",
+        f"labels {labels.shape}",
+        f"one (H, W) = ({cameras.height}, {cameras.width}) image per camera",
+        "Pass the labels and the cameras of the same views at the same size.",
     )
     require(
         start.shape == (count, region_codes.shape[1]) and views > 0 and region_codes.shape[0] > 0,
         "solve_l1",
-        got=f"start {start.shape}, region codes {region_codes.shape}, {views} views",
-        expected=f"a start of {count} rows of the regions' code size, a region, a view",
-        remedy="Start from distill_votes(votes, region_codes).",
+        f"start {start.shape}, region codes {region_codes.shape}, {views} views",
+        f"a start of {count} rows of the regions' code size, a region, a view",
+        "Start from distill_votes(votes, region_codes).",
     )
     require(
         loyalty > 0 and sweeps >= 1,
         "solve_l1",
-        got=f"loyalty={loyalty}, sweeps={sweeps}",
-        expected="loyalty > 0 and sweeps >= 1",
-        remedy="A small loyalty, such as 0.01, follows the images almost alone.",
+        f"loyalty={loyalty}, sweeps={sweeps}",
+        "loyalty > 0 and sweeps >= 1",
+        "A small loyalty, such as 0.01, follows the images almost alone.",
     )
     arrays: Any = jax.tree.map(jnp.asarray, (gaussians, cameras, labels, region_codes, start))
     rounds = -(-sweeps // CHECK)
@@ -121,9 +121,9 @@ def solve_l1(
         require(
             not bool(jnp.isnan(found.gap)),
             "solve_l1",
-            got=f"capacity={capacity}, too small for a view, or NaN",
-            expected="every view within the capacity, finite Gaussians and codes",
-            remedy="Leave capacity out, and check the Gaussians with jsecon.numerics.finite.",
+            f"capacity={capacity}, too small for a view, or NaN",
+            "every view within the capacity, finite Gaussians and codes",
+            "Leave capacity out, and check the Gaussians with jsecon.numerics.finite.",
         )
     return found
 

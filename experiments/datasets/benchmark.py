@@ -74,9 +74,9 @@ def twin_of(root: str | Path, scene: str) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             file,
-            found=f"nothing readable about {scene!r} ({error})",
-            expected="what the generator wrote of each scene",
-            remedy="Make the twin again, or remove the file if these are real data.",
+            f"nothing readable about {scene!r} ({error})",
+            "what the generator wrote of each scene",
+            "Make the twin again, or remove the file if these are real data.",
         ) from error
 
 
@@ -88,9 +88,9 @@ def hold_out(capture: Capture, frames: Sequence[LabelledFrame], where: Path) -> 
         if frame.name not in index:
             raise InputError(
                 where,
-                found=f"labels of {frame.name}, which is not among the {len(index)} frames of the capture",
-                expected=f"frames of the capture, such as {capture.names[0]}",
-                remedy="Keep images, poses and labels of one scene together; take none of its labelled frames away.",
+                f"labels of {frame.name}, which is not among the {len(index)} frames of the capture",
+                f"frames of the capture, such as {capture.names[0]}",
+                "Keep images, poses and labels of one scene together; take none of its labelled frames away.",
             )
     out = np.zeros(len(capture.names), bool)
     out[[index[frame.name] for frame in frames]] = True
@@ -103,7 +103,7 @@ def require_count(where: Path, found: int, expected: int, what: str) -> None:
     if found != expected:
         raise InputError(
             where,
-            found=f"{found} {what}",
-            expected=f"{expected}, the protocol's denominator",
-            remedy="Use the dataset's own label files, all of them.",
+            f"{found} {what}",
+            f"{expected}, the protocol's denominator",
+            "Use the dataset's own label files, all of them.",
         )

@@ -32,15 +32,13 @@ def load_text_features(file: Path, queries: Sequence[str]) -> tuple[Float[np.nda
         if missing:
             raise InputError(
                 file,
-                found=f"no vector of {', '.join(missing)}",
-                expected="every query and the four canonical phrases",
-                remedy="Embed them with the text encoder of the embedder that made the masks' features.",
+                f"no vector of {', '.join(missing)}",
+                "every query and the four canonical phrases",
+                "Embed them with the text encoder of the embedder that made the masks' features.",
             )
         found = [np.array([table[text] for text in texts], np.float32) for texts in (queries, CANONICAL)]
     except (OSError, json.JSONDecodeError, TypeError, AttributeError) as error:
-        raise InputError(
-            file, found=str(error), expected="a JSON of text -> vector", remedy="Write it again."
-        ) from error
+        raise InputError(file, str(error), "a JSON of text -> vector", "Write it again.") from error
     return found[0].reshape(len(queries), -1), found[1]
 
 

@@ -39,9 +39,9 @@ def load_lerf_ovs(root: str | Path, scene: str, *, downscale: float | int | None
     if missing:
         raise InputError(
             folder,
-            found=f"no label of {', '.join(missing)}",
-            expected=f"{len(names)} annotated frames",
-            remedy="Copy the scene's label files, all of them.",
+            f"no label of {', '.join(missing)}",
+            f"{len(names)} annotated frames",
+            "Copy the scene's label files, all of them.",
         )
     pairs = sum(len(frame.objects) for frame in frames)
     expected = LERF_PAIRS.get(scene, pairs) if told is None else told["pairs"]

@@ -63,7 +63,7 @@ def image_files(folder: Path) -> list[Path]:
     """The images of a scene in the order that the numbers of `segmentations` count. Raises InputError for none."""
     files = sorted(file for file in folder.glob("*") if file.suffix in IMAGE_ENDINGS)
     if not files:
-        raise InputError(folder, found="no image", expected="the scene's frames", remedy="Check the path.")
+        raise InputError(folder, "no image", "the scene's frames", "Check the path.")
     return files
 
 
@@ -77,31 +77,29 @@ def load_segmentations(folder: Path, names: Sequence[str]) -> tuple[list[Labelle
     try:
         classes = tuple(sorted(line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()))
     except OSError as error:
-        raise InputError(
-            file, found=error.strerror or "an error", expected="one class per line", remedy="Check the path."
-        ) from error
+        raise InputError(file, error.strerror or "an error", "one class per line", "Check the path.") from error
     if not classes or len(set(classes)) < len(classes):
         raise InputError(
             file,
-            found=f"{len(classes)} classes, {len(set(classes))} distinct",
-            expected="one class per line, each once",
-            remedy="Use the dataset's own file.",
+            f"{len(classes)} classes, {len(set(classes))} distinct",
+            "one class per line, each once",
+            "Use the dataset's own file.",
         )
     frames = []
     for place in sorted((entry for entry in folder.iterdir() if entry.is_dir()), key=lambda entry: entry.name):
         if not place.name.isdigit() or int(place.name) >= len(names):
             raise InputError(
                 place,
-                found=f"a folder called {place.name}",
-                expected=f"the number of one of the {len(names)} images, 00 to {len(names) - 1:02d}",
-                remedy="Folders count the sorted list of images from 0.",
+                f"a folder called {place.name}",
+                f"the number of one of the {len(names)} images, 00 to {len(names) - 1:02d}",
+                "Folders count the sorted list of images from 0.",
             )
         found = {mask.stem for mask in place.glob("*.png")}
         missing, unknown = sorted(set(classes) - found), sorted(found - set(classes))
         if missing or unknown:
             raise InputError(
                 place,
-                found="; ".join(
+                "; ".join(
                     text
                     for text, which in (
                         (f"no mask of {', '.join(missing)}", missing),
@@ -109,15 +107,13 @@ def load_segmentations(folder: Path, names: Sequence[str]) -> tuple[list[Labelle
                     )
                     if which
                 ),
-                expected=f"one .png for each of {', '.join(classes)}",
-                remedy="Name each mask like its class; a class that a frame does not show has an all-black one.",
+                f"one .png for each of {', '.join(classes)}",
+                "Name each mask like its class; a class that a frame does not show has an all-black one.",
             )
         objects = {name: _mask(place / f"{name}.png") for name in classes}
         shapes = {mask.shape for mask in objects.values()}
         if len(shapes) > 1:
-            raise InputError(
-                place, found=f"masks of {len(shapes)} sizes", expected="one size", remedy="Export the masks again."
-            )
+            raise InputError(place, f"masks of {len(shapes)} sizes", "one size", "Export the masks again.")
         height, width = shapes.pop()
         boxed = {name: (mask, box_of(mask)) for name, mask in objects.items()}
         frames.append(LabelledFrame(names[int(place.name)], width, height, boxed))
@@ -160,9 +156,9 @@ def read_poses_bounds(
     try:
         table = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(path, found=str(error), expected="an (N, 17) array", remedy="Copy the file again.") from error
+        raise InputError(path, str(error), "an (N, 17) array", "Copy the file again.") from error
     if table.ndim != 2 or table.shape[1] != 17:
-        raise InputError(path, found=f"shape {table.shape}", expected="(N, 17)", remedy="Use LLFF's poses_bounds.npy.")
+        raise InputError(path, f"shape {table.shape}", "(N, 17)", "Use LLFF's poses_bounds.npy.")
     matrices = table[:, :15].astype(np.float64).reshape(-1, 3, 5)
     down, right, back, centre, sizes = (matrices[..., k] for k in range(5))
     rotation = np.stack([right, down, -back], axis=1)  # rows: the camera's axes in the world

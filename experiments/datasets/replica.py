@@ -55,9 +55,9 @@ def load_replica(
     if unknown:
         raise InputError(
             root / scene,
-            found=f"classes {', '.join(unknown)} asked for",
-            expected=f"names of the scene's own table, such as {', '.join(sorted(names.values())[:5])}",
-            remedy="Spell them as the table does.",
+            f"classes {', '.join(unknown)} asked for",
+            f"names of the scene's own table, such as {', '.join(sorted(names.values())[:5])}",
+            "Spell them as the table does.",
         )
     index = {number: queries.index(name) for number, name in names.items() if name in queries}
     numbers, place = np.unique(ids, return_inverse=True)
@@ -86,16 +86,16 @@ def load_frames(root: Path, scene: str, *, every: int, downscale: float | int | 
     camera = _json(file).get("camera", {})
     keys = ("w", "h", "fx", "fy", "cx", "cy", "scale")
     if not all(isinstance(camera.get(key), int | float) for key in keys):
-        raise InputError(file, found=f"camera {camera}", expected=f"numbers {', '.join(keys)}", remedy="Copy it again.")
+        raise InputError(file, f"camera {camera}", f"numbers {', '.join(keys)}", "Copy it again.")
     # The principal point counts pixel centres from 0.
     lens = Lens(*(int(camera[k]) for k in "wh"), camera["fx"], camera["fy"], camera["cx"] + 0.5, camera["cy"] + 0.5)
     file = root / scene / "traj.txt"
     try:
         rows = np.loadtxt(file, ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(file, found=str(error), expected="16 numbers per line", remedy="Copy it again.") from error
+        raise InputError(file, str(error), "16 numbers per line", "Copy it again.") from error
     if rows.shape[1:] != (16,) or not np.isfinite(rows).all():
-        raise InputError(file, found=f"{rows.shape}", expected="16 finite numbers per line", remedy="Copy it again.")
+        raise InputError(file, f"{rows.shape}", "16 finite numbers per line", "Copy it again.")
     poses = np.linalg.inv(rows.reshape(-1, 4, 4))
     images = sorted((root / scene / "results").glob("frame*.jpg"))
     require_count(root / scene / "results", len(images), len(poses), "frames beside the poses")
@@ -106,9 +106,9 @@ def load_frames(root: Path, scene: str, *, every: int, downscale: float | int | 
         if not number.isdigit() or int(number) >= len(poses) or not depth.is_file():
             raise InputError(
                 image,
-                found=f"no {depth.name} beside it, or no pose",
-                expected="frame, depth and pose of one number",
-                remedy="Copy the rendering again.",
+                f"no {depth.name} beside it, or no pose",
+                "frame, depth and pose of one number",
+                "Copy the rendering again.",
             )
         shots.append(Shot(image.name, image, lens, poses[int(number)], depth, 1.0 / camera["scale"]))
     return assemble(Posed(shots, root / scene), downscale=downscale, holdout=0)
@@ -124,9 +124,7 @@ def load_semantics(
         try:
             ids = np.loadtxt(ready, dtype=np.int64, ndmin=1)
         except ValueError as error:
-            raise InputError(
-                ready, found=str(error), expected="a class id per line", remedy="Copy it again."
-            ) from error
+            raise InputError(ready, str(error), "a class id per line", "Copy it again.") from error
         require_count(ready, len(ids), len(points), "labels for the vertices of the mesh")
         return points, colors, ids, _names(root / "replica_class_id_to_names.txt")
     habitat = root / re.sub(r"(\D)(\d+)$", r"\1_\2", scene) / "habitat"
@@ -134,7 +132,7 @@ def load_semantics(
     points, colors = load_points_ply(mesh)
     faces, properties = read_faces(mesh)
     if "object_id" not in properties:
-        raise InputError(mesh, found="faces without object_id", expected="Replica's habitat mesh", remedy="Use that.")
+        raise InputError(mesh, "faces without object_id", "Replica's habitat mesh", "Use that.")
     info = _json(habitat / "info_semantic.json")
     try:
         names = {int(entry["id"]): str(entry["name"]) for entry in info["classes"]}
@@ -142,9 +140,9 @@ def load_semantics(
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             habitat / "info_semantic.json",
-            found=f"no usable {error}",
-            expected="classes (id, name) and objects (id, class_id)",
-            remedy="Copy it again.",
+            f"no usable {error}",
+            "classes (id, name) and objects (id, class_id)",
+            "Copy it again.",
         ) from error
     return points, colors, vertex_classes(len(points), faces, properties["object_id"], of_object), names
 
@@ -167,16 +165,14 @@ def _names(file: Path) -> dict[int, str]:
         lines = file.read_text(encoding="utf-8").split("\n")
         return {int(number): name for number, name in (line.split(maxsplit=1) for line in lines if line.strip())}
     except (OSError, ValueError) as error:
-        raise InputError(
-            file, found=str(error), expected="a class id and its name per line", remedy="Copy it again."
-        ) from error
+        raise InputError(file, str(error), "a class id and its name per line", "Copy it again.") from error
 
 
 def _json(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(file, found=str(error), expected="a JSON file", remedy="Copy it again.") from error
+        raise InputError(file, str(error), "a JSON file", "Copy it again.") from error
     if not isinstance(content, dict):
-        raise InputError(file, found="no JSON object", expected="one", remedy="Copy it again.")
+        raise InputError(file, "no JSON object", "one", "Copy it again.")
     return content

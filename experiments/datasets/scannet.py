@@ -65,16 +65,14 @@ def load_scannet(
     number of vertices than the mesh, and where files are missing or damaged.
     """
     if classes not in CLASS_SETS:
-        raise InputError(
-            "classes", found=str(classes), expected="19, 15 or 10", remedy="These are OpenGaussian's three sets."
-        )
+        raise InputError("classes", str(classes), "19, 15 or 10", "These are OpenGaussian's three sets.")
     root, told = Path(root), twin_of(root, scene)
     folder = root / scene
     points, colors = load_points_ply(folder / f"{scene}_vh_clean_2.ply")
     file = folder / f"{scene}_vh_clean_2.labels.ply"
     labelled = read_vertices(file)
     if "label" not in (labelled.dtype.names or ()):
-        raise InputError(file, found="vertices without label", expected="ScanNet's .labels.ply", remedy="Use that.")
+        raise InputError(file, "vertices without label", "ScanNet's .labels.ply", "Use that.")
     require_count(file, len(labelled), len(points), "labels for the vertices of the mesh")
     ids = np.asarray(labelled["label"], np.int64)
     table = np.full(max(int(ids.max(initial=0)), max(NYU40)) + 1, -1, np.int32)
@@ -116,7 +114,7 @@ def _matrix(file: Path) -> np.ndarray:
     try:
         matrix = np.loadtxt(file)
     except (OSError, ValueError) as error:
-        raise InputError(file, found=str(error), expected="a 4x4 matrix", remedy="Export the scan again.") from error
+        raise InputError(file, str(error), "a 4x4 matrix", "Export the scan again.") from error
     if matrix.shape != (4, 4):
-        raise InputError(file, found=f"{matrix.shape}", expected="a 4x4 matrix", remedy="Export the scan again.")
+        raise InputError(file, f"{matrix.shape}", "a 4x4 matrix", "Export the scan again.")
     return matrix

@@ -81,9 +81,9 @@ def decide(maps: Float[np.ndarray, "l h w"], *, threshold: float = THRESHOLD) ->
     require(
         maps.shape[0] > 0 and min(maps.shape[1:]) > 1,
         "decide",
-        got=maps.shape,
-        expected="(L > 0, H > 1, W > 1)",
-        remedy="Render the maps at the labels' size.",
+        maps.shape,
+        "(L > 0, H > 1, W > 1)",
+        "Render the maps at the labels' size.",
     )
     mean = np.stack([_mean(image) for image in maps.astype(np.float64)])
     mixed = 0.5 * (maps + mean)

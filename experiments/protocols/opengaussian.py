@@ -36,9 +36,9 @@ def most_similar_text(
     require(
         features.shape[1] == texts.shape[1] and texts.shape[0] > 0,
         "most_similar_text",
-        got=f"features {features.shape}, texts {texts.shape}",
-        expected="one space, at least one text",
-        remedy="Decode the features to the texts' space.",
+        f"features {features.shape}, texts {texts.shape}",
+        "one space, at least one text",
+        "Decode the features to the texts' space.",
     )
     return _most_similar_text(features, texts)
 

@@ -50,9 +50,9 @@ def evaluate_points(
     require(
         highest < len(queries),
         "evaluate_points",
-        got=f"classes up to {highest}",
-        expected=f"below {len(queries)}",
-        remedy="Count classes by the queries.",
+        f"classes up to {highest}",
+        f"below {len(queries)}",
+        "Count classes by the queries.",
     )
     counted = true >= 0
     faint = 0
@@ -67,9 +67,9 @@ def evaluate_points(
     if not rows or (expected_classes is not None and len(rows) != expected_classes):
         raise InputError(
             "labelled points",
-            found=f"{len(rows)} classes among {len(true)} counted points ({faint} left out as faint)",
-            expected=f"{expected_classes or 'at least one'}",
-            remedy="Evaluate on all labelled points of the scene, with the protocol's class set.",
+            f"{len(rows)} classes among {len(true)} counted points ({faint} left out as faint)",
+            f"{expected_classes or 'at least one'}",
+            "Evaluate on all labelled points of the scene, with the protocol's class set.",
         )
     return rows, {
         "protocol": "points: most similar class; means over the classes that occur of IoU and of recall",

@@ -49,9 +49,9 @@ def evidence_of_tracks(
     require(
         len(tracks) == len(embeddings) and int(tracks.max(initial=-1)) < embeddings.shape[1],
         "evidence_of_tracks",
-        got=f"tracks {tracks.shape} up to {int(tracks.max(initial=-1))}, embeddings {embeddings.shape}",
-        expected="an embedding for each region and frame",
-        remedy="Embed each region in each frame that shows it.",
+        f"tracks {tracks.shape} up to {int(tracks.max(initial=-1))}, embeddings {embeddings.shape}",
+        "an embedding for each region and frame",
+        "Embed each region in each frame that shows it.",
     )
     masks, rows, frame = np.full(tracks.shape, -1, np.int32), [], []
     for t, image in enumerate(tracks):

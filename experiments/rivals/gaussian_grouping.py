@@ -84,9 +84,7 @@ def train_gaussian_grouping(
     """
     most = int(np.asarray(evidence.tracks).max(initial=-1)) + 1
     if most >= classes:
-        raise InputError(
-            "tracks", found=f"{most} ids", expected=f"at most {classes - 1}", remedy="Leave small regions out."
-        )
+        raise InputError("tracks", f"{most} ids", f"at most {classes - 1}", "Leave small regions out.")
     count = evidence.gaussians.count
     init_key, kernel_key, bias_key, key = jax.random.split(key, 4)
     bound = 1 / math.sqrt(SIZE)

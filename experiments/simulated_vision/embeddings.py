@@ -39,15 +39,13 @@ def load_text_space(vectors: str | Path, names: str | Path) -> TextSpace:
     try:
         rows, texts = np.load(vectors).astype(np.float32), json.loads(Path(names).read_text())
     except (OSError, ValueError) as error:
-        raise InputError(
-            vectors, found=str(error), expected="text vectors and their names", remedy="Use made_text_space instead."
-        ) from error
+        raise InputError(vectors, str(error), "text vectors and their names", "Use made_text_space instead.") from error
     if rows.ndim != 2 or len(rows) != len(texts):
         raise InputError(
             vectors,
-            found=f"vectors {rows.shape} beside {len(texts)} names",
-            expected="a row per name",
-            remedy="Give the two files of one space.",
+            f"vectors {rows.shape} beside {len(texts)} names",
+            "a row per name",
+            "Give the two files of one space.",
         )
     return TextSpace(tuple(texts), _unit(rows))
 
@@ -88,9 +86,9 @@ class SimulatedEmbedder:
         require(
             labels.shape == frames.shape[:3] and int(labels.max(initial=-1)) < len(classes),
             "SimulatedEmbedder",
-            got=f"labels {labels.shape} up to {labels.max(initial=-1)}, {len(classes)} classes",
-            expected=f"labels {frames.shape[:3]} below the number of classes",
-            remedy="Give the true labels of these frames and a class per object.",
+            f"labels {labels.shape} up to {labels.max(initial=-1)}, {len(classes)} classes",
+            f"labels {frames.shape[:3]} below the number of classes",
+            "Give the true labels of these frames and a class per object.",
         )
         self.name, self.dim = f"simulated (seed {seed})", space.vectors.shape[1]
         self._labels, self._faults, self._seed, self._classes = labels, faults, seed, len(classes)
@@ -116,9 +114,9 @@ class SimulatedEmbedder:
         if t is None:
             raise InputError(
                 "SimulatedEmbedder",
-                found="a frame without true labels",
-                expected=f"one of the {len(self._frames)} frames it was made with",
-                remedy="Simulated vision sees only what it was told.",
+                "a frame without true labels",
+                f"one of the {len(self._frames)} frames it was made with",
+                "Simulated vision sees only what it was told.",
             )
         found = np.zeros((len(masks), self.dim))
         for m, mask in enumerate(masks):
@@ -135,9 +133,7 @@ class SimulatedEmbedder:
         """(Q, E) vectors of names of the space. Raises InputError for any other text."""
         for text in texts:
             if text not in self._words:
-                raise InputError(
-                    text, found="no such name", expected=f"one of {len(self._words)}", remedy="Use a name of the space."
-                )
+                raise InputError(text, "no such name", f"one of {len(self._words)}", "Use a name of the space.")
         return np.array([self._words[text] for text in texts], np.float32).reshape(len(texts), self.dim)
 
 

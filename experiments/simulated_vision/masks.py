@@ -87,13 +87,13 @@ def simulated_masks(labels: Int[np.ndarray, "t h w"], faults: Faults, *, seed: i
 def _check(faults: Faults) -> None:
     for name in ("split", "merge", "miss", "lose", "gone", "swap"):
         share = getattr(faults, name)
-        require(0 <= share <= 1, f"Faults.{name}", got=share, expected="a share in [0, 1]", remedy="See LEVELS.")
+        require(0 <= share <= 1, f"Faults.{name}", share, "a share in [0, 1]", "See LEVELS.")
     require(
         faults.parts >= 2 and faults.jitter_px >= 0,
         "Faults",
-        got=f"parts={faults.parts}, jitter_px={faults.jitter_px}",
-        expected="parts >= 2, jitter_px >= 0",
-        remedy="split=0 cuts nothing.",
+        f"parts={faults.parts}, jitter_px={faults.jitter_px}",
+        "parts >= 2, jitter_px >= 0",
+        "split=0 cuts nothing.",
     )
 
 

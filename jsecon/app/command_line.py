@@ -190,9 +190,9 @@ def _query(asked: Query) -> None:
     if not asked.texts and not asked.at:
         raise InputError(
             "query",
-            found="nothing to find",
-            expected="a TEXT, or --at FRAME X Y",
-            remedy='For example: jsecon query field.npz "red mug" --out answers',
+            "nothing to find",
+            "a TEXT, or --at FRAME X Y",
+            'For example: jsecon query field.npz "red mug" --out answers',
         )
     pixels = [(frame, _whole("X", x), _whole("Y", y)) for frame, x, y in asked.at or ()]
     require_writable(asked.out)
@@ -234,12 +234,7 @@ def _embedder(field: Any, asked: Asking) -> Any:
 
 def _whole(name: str, text: str) -> int:
     if not text.isdecimal():
-        raise InputError(
-            f"--at {name}",
-            found=text,
-            expected="a whole number of pixels",
-            remedy="For example: --at frame_00012 310 145",
-        )
+        raise InputError(f"--at {name}", text, "a whole number of pixels", "For example: --at frame_00012 310 145")
     return int(text)
 
 

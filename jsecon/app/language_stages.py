@@ -40,9 +40,9 @@ def regions(work: Work) -> Stage:
         if not len(given.embeddings):
             raise InputError(
                 options.features,
-                found=f"no mask of level {options.level} in any frame",
-                expected="masks with their embeddings",
-                remedy="Take another --level, or write the files again.",
+                f"no mask of level {options.level} in any frame",
+                "masks with their embeddings",
+                "Take another --level, or write the files again.",
             )
         found = given_embeddings(labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress)
         bare = int((~found.embeddings.any(1)).sum())

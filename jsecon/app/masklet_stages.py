@@ -186,8 +186,5 @@ def associated(
 def _require_regions(labels: np.ndarray, where: str) -> None:
     if labels.max(initial=-1) < 0:
         raise InputError(
-            where,
-            found="no region in any frame",
-            expected="at least one",
-            remedy="Give masks (--masks DIR), or frames with more contrast.",
+            where, "no region in any frame", "at least one", "Give masks (--masks DIR), or frames with more contrast."
         )

@@ -41,7 +41,7 @@ def examine(folder: str | Path) -> Findings:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, found="no such folder", expected="a folder of models", remedy="Check the path.")
+        raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
     graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
     return Findings(folder, graphs, tuple(_tried(model, use, folder) for model, use in _KINDS.items()))
 
@@ -62,9 +62,9 @@ def require_usable(findings: Findings) -> None:
     if not any(use.usable for use in findings.uses):
         raise InputError(
             findings.folder,
-            found="nothing that can be used",
-            expected=" or ".join(use.model for use in findings.uses) + " as ONNX graphs",
-            remedy="See above for what is missing and where such exports are published.",
+            "nothing that can be used",
+            " or ".join(use.model for use in findings.uses) + " as ONNX graphs",
+            "See above for what is missing and where such exports are published.",
         )
 
 
@@ -109,7 +109,7 @@ def _sam2(folder: Path) -> str:
         graphs = open_sam2(folder)
     except InputError as error:
         remedy = f"{error.remedy} {SAM2_PUBLISHED}"
-        raise InputError(error.where, found=error.found, expected=error.expected, remedy=remedy) from error
+        raise InputError(error.where, error.found, error.expected, remedy) from error
     return f"SAM {graphs.version}: objects followed through the frames: jsecon run --tracker {folder}"
 
 

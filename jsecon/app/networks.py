@@ -47,9 +47,9 @@ def missing_model(dim: int) -> InputError:
     """That the model of a given space is needed."""
     return InputError(
         "field",
-        found=f"regions whose embeddings came from files, {dim} numbers each",
-        expected="the CLIP model that made them",
-        remedy="Give its folder: --embedder DIR. Without it, ask by a pixel (--at).",
+        f"regions whose embeddings came from files, {dim} numbers each",
+        "the CLIP model that made them",
+        "Give its folder: --embedder DIR. Without it, ask by a pixel (--at).",
     )
 
 
@@ -112,20 +112,17 @@ def embedder_named(
             remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
         elif tuple(templates) != ("{}",):
             raise InputError(
-                "--template",
-                found="a field whose texts are colours",
-                expected="one made with CLIP",
-                remedy="Leave out --template.",
+                "--template", "a field whose texts are colours", "one made with CLIP", "Leave out --template."
             )
     if dim is not None and found.dim != dim:
         raise InputError(
             "--embedder",
-            found=f"a model whose embeddings have {found.dim} numbers",
-            expected=f"{dim}, as those from files have",
-            remedy="Give the CLIP model that made the files.",
+            f"a model whose embeddings have {found.dim} numbers",
+            f"{dim}, as those from files have",
+            "Give the CLIP model that made the files.",
         )
     if dim is None and name not in (None, found.name):
-        raise InputError("field", found=f"regions embedded by {name!r}", expected=f"{found.name!r}", remedy=remedy)
+        raise InputError("field", f"regions embedded by {name!r}", f"{found.name!r}", remedy)
     return found
 
 

@@ -90,28 +90,23 @@ def require_inputs(options: Options) -> None:
         if isinstance(value, Path) and not value.exists():
             raise InputError(
                 value,
-                found="nothing there",
-                expected=argument.help.partition(";")[0],
-                remedy=f"Mend the path{'' if argument.positional else f', or leave out {argument.flag}'}.",
+                "nothing there",
+                argument.help.partition(";")[0],
+                f"Mend the path{'' if argument.positional else f', or leave out {argument.flag}'}.",
             )
         if argument.least is not None and isinstance(value, int | float) and not value >= argument.least:
-            raise InputError(
-                argument.flag, found=str(value), expected=f"at least {argument.least}", remedy="Mend the option."
-            )
+            raise InputError(argument.flag, str(value), f"at least {argument.least}", "Mend the option.")
     sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
     if len(sources) > 1:
         raise InputError(
             " ".join(sources),
-            found="more than one source of masks",
-            expected="one: tracked masks, masks of single frames, or a model that finds them",
-            remedy="Leave out the others.",
+            "more than one source of masks",
+            "one: tracked masks, masks of single frames, or a model that finds them",
+            "Leave out the others.",
         )
     if not 0 < options.agreement <= 1:
         raise InputError(
-            "--agreement",
-            found=str(options.agreement),
-            expected="a share above 0 and at most 1",
-            remedy="Leave it out, or use 0.3 to 0.6.",
+            "--agreement", str(options.agreement), "a share above 0 and at most 1", "Leave it out, or use 0.3 to 0.6."
         )
 
 
@@ -123,7 +118,7 @@ def require_writable(folder: Path) -> None:
     except OSError as error:
         raise InputError(
             folder,
-            found=error.strerror or type(error).__name__,
-            expected="a folder that can be written",
-            remedy="Choose another output folder, or mend its permissions.",
+            error.strerror or type(error).__name__,
+            "a folder that can be written",
+            "Choose another output folder, or mend its permissions.",
         ) from error

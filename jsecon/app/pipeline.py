@@ -89,9 +89,9 @@ def run(
     if out.resolve() == options.capture.resolve():
         raise InputError(
             out,
-            found="the capture's own folder as the output folder",
-            expected="a folder of its own",
-            remedy=f"For example {out / 'field'}, or one elsewhere.",
+            "the capture's own folder as the output folder",
+            "a folder of its own",
+            f"For example {out / 'field'}, or one elsewhere.",
         )
     require_inputs(options)
     require_writable(out)

@@ -69,18 +69,13 @@ def ask_text(
     A text may be composite: `"red mug" or "bowl" but not "handle"`. Raises InputError where the embedder has no words
     for a part, and for several regions or a composite text by anything but votes.
     """
-    require(by in METHODS, "by", got=by, expected=f"one of {METHODS}", remedy="votes is the default.")
+    require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
     if not len(field.canonical):  # its embeddings came from files, without phrases: those of who reads the text
         field = dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
     wanted, unwanted = parts_of_question(text)
     if several or unwanted or len(wanted) > 1:
         if by != "votes":
-            raise InputError(
-                text,
-                found=f"several regions by {by}",
-                expected="by votes",
-                remedy="Leave out --by, or ask for one thing.",
-            )
+            raise InputError(text, f"several regions by {by}", "by votes", "Leave out --by, or ask for one thing.")
         given: dict[str, Any] = {} if threshold is None else {"similarity_threshold": threshold}
         embedded = jax.device_put(embedder.embed_text(wanted + unwanted))
         selection = query_several(field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given)
@@ -122,9 +117,9 @@ def ask_pixel(
     if region < 0:
         raise InputError(
             f"--at {name} {x} {y}",
-            found="no region under that pixel",
-            expected="a pixel of an object",
-            remedy="Choose another pixel or frame: report.html of the run shows the regions.",
+            "no region under that pixel",
+            "a pixel of an object",
+            "Choose another pixel or frame: report.html of the run shows the regions.",
         )
     membership = "code" if by == "code" else "votes"
     selection = query_region(field, region, by=membership, similarity_threshold=threshold)
@@ -149,9 +144,9 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
         return int(frame)
     raise InputError(
         f"frame {frame}",
-        found="no such frame in the field",
-        expected=f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})",
-        remedy="Held-out frames are not in the field.",
+        "no such frame in the field",
+        f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})",
+        "Held-out frames are not in the field.",
     )
 
 

@@ -129,9 +129,9 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
     if share < least:
         raise InputError(
             where,
-            found=f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames",
-            expected="views that overlap, and a scene in the world of their poses",
-            remedy="Check that the poses belong to these frames, and the .ply to this capture.",
+            f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames",
+            "views that overlap, and a scene in the world of their poses",
+            "Check that the poses belong to these frames, and the .ply to this capture.",
         )
 
 

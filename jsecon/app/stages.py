@@ -120,8 +120,8 @@ def training_frames(capture: Capture) -> np.ndarray:
     if len(train) < 2:
         raise InputError(
             "frames",
-            found=f"{len(train)} of {len(capture.names)} frames to work with",
-            expected="at least 2",
-            remedy="Hold out fewer frames (--holdout), or use more (--frames).",
+            f"{len(train)} of {len(capture.names)} frames to work with",
+            "at least 2",
+            "Hold out fewer frames (--holdout), or use more (--frames).",
         )
     return train

@@ -63,9 +63,9 @@ def masklets(
     require(
         frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8,
         "frames",
-        got=(frames.shape, frames.dtype),
-        expected="(T, H, W, 3) uint8",
-        remedy="Stack RGB frames of one size.",
+        (frames.shape, frames.dtype),
+        "(T, H, W, 3) uint8",
+        "Stack RGB frames of one size.",
     )
     count, height, width = frames.shape[:3]
     proposals = _Layers(count, height, width)
@@ -74,9 +74,9 @@ def masklets(
         require(
             len(state.layers["rows"]) == count and 0 <= state.done <= count,
             "state",
-            got=f"{state.done} of {len(state.layers['rows'])} frames",
-            expected=f"a state of {count} frames",
-            remedy="Give the state of this sequence, or none.",
+            f"{state.done} of {len(state.layers['rows'])} frames",
+            f"a state of {count} frames",
+            "Give the state of this sequence, or none.",
         )
         proposals.restore(state.proposals)
         layers.restore(state.layers)

@@ -50,9 +50,9 @@ def group_by_consensus(
     require(
         membership.shape[0] == visible.shape[0] == len(weights) == len(means),
         "membership, visible, weights, means",
-        got=(membership.shape, visible.shape, weights.shape, means.shape),
-        expected="N rows each",
-        remedy="Give one row per Gaussian.",
+        (membership.shape, visible.shape, weights.shape, means.shape),
+        "N rows each",
+        "Give one row per Gaussian.",
     )
     piece = scene_pieces(membership, visible, weights, means, pieces=pieces, seed=seed)
     live = np.flatnonzero(piece >= 0)

@@ -68,11 +68,7 @@ class SceneViews:
         atoms_per_frame: int = 256,
     ):
         require(
-            atoms_per_frame > 0,
-            "atoms_per_frame",
-            got=atoms_per_frame,
-            expected="at least 1",
-            remedy="Use about 200 for small frames.",
+            atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use about 200 for small frames."
         )
         self.gaussians, self.cameras = gaussians, cameras
         self.atoms_per_frame = atoms_per_frame
@@ -100,9 +96,9 @@ class SceneViews:
         require(
             frames.shape[:3] == expected,
             "frames",
-            got=frames.shape,
-            expected=f"{(*expected, 3)}",
-            remedy="Give the frames of the scene's own cameras, the same at every call.",
+            frames.shape,
+            f"{(*expected, 3)}",
+            "Give the frames of the scene's own cameras, the same at every call.",
         )
         if not self._views:
             # While one frame's votes are cast, others are segmented and cut, on all cores.

@@ -48,9 +48,9 @@ def _posed(path: Path) -> Posed:
     found = "nothing there" if not path.exists() else "a file" if path.is_file() else "neither of them"
     raise InputError(
         path,
-        found=found,
-        expected="a folder with sparse/0 (COLMAP) and images, or with transforms.json",
-        remedy="Give the capture's own folder; a transforms file of another name can be given itself.",
+        found,
+        "a folder with sparse/0 (COLMAP) and images, or with transforms.json",
+        "Give the capture's own folder; a transforms file of another name can be given itself.",
     )
 
 
@@ -78,9 +78,9 @@ def check_views_overlap(capture: Capture) -> None:
         found = f"{count} views that look apart from each other"
     raise InputError(
         f"capture of {capture.names[0]} ...",
-        found=found,
-        expected="at least two views of the same things",
-        remedy="Check the poses and their axes (world-to-camera, OpenCV), and take views that overlap.",
+        found,
+        "at least two views of the same things",
+        "Check the poses and their axes (world-to-camera, OpenCV), and take views that overlap.",
     )
 
 

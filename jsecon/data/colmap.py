@@ -39,18 +39,18 @@ def read_colmap(path: Path, model: Path) -> Posed:
     if missing:
         raise InputError(
             path / "images",
-            found=f"{len(missing)} of {len(images)} images of the model missing (the first: {missing[0]})",
-            expected="every image that the model names",
-            remedy="Copy them there, or take them out of the model (colmap image_deleter).",
+            f"{len(missing)} of {len(images)} images of the model missing (the first: {missing[0]})",
+            "every image that the model names",
+            "Copy them there, or take them out of the model (colmap image_deleter).",
         )
     shots = []
     for name, camera, pose in images:
         if camera not in lenses:
             raise InputError(
                 model,
-                found=f"image {name} of camera {camera}, which is not in the cameras file",
-                expected="cameras and images of one model",
-                remedy=REMEDY,
+                f"image {name} of camera {camera}, which is not in the cameras file",
+                "cameras and images of one model",
+                REMEDY,
             )
         shots.append(Shot(name, path / "images" / name, lenses[camera], pose))
     if model_file(model, "points3D") is None:

@@ -38,7 +38,7 @@ REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 
 def bad_model(file: Path, found: str, expected: str, remedy: str = REMEDY) -> InputError:
     """What is wrong with a file of a model."""
-    return InputError(file, found=found, expected=expected, remedy=remedy)
+    return InputError(file, found, expected, remedy)
 
 
 def model_file(model: Path, kind: str) -> Path | None:

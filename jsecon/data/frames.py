@@ -59,18 +59,16 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     pose = np.asarray(pose, np.float64)
     remedy = "Estimate the poses again, or take this frame out of the capture."
     if not np.isfinite(pose).all():
-        raise InputError(
-            where, found=f"a pose of {name} with NaN or infinite numbers", expected="finite poses", remedy=remedy
-        )
+        raise InputError(where, f"a pose of {name} with NaN or infinite numbers", "finite poses", remedy)
     rotation = pose[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         raise InputError(
             where,
-            found=f"a pose of {name} that is not rigid (R R^T is off by {error:.2g}, "
+            f"a pose of {name} that is not rigid (R R^T is off by {error:.2g}, "
             f"determinant {np.linalg.det(rotation):.3g})",
-            expected="a rotation and a translation, without scale, shear or mirror",
-            remedy=remedy,
+            "a rotation and a translation, without scale, shear or mirror",
+            remedy,
         )
     left, _, right = np.linalg.svd(rotation)
     result = pose.copy()
@@ -83,19 +81,17 @@ def check_options(
 ) -> None:
     """Raises InputError on options that no capture can be loaded with."""
     if downscale is not None and not (np.isfinite(downscale) and downscale >= 1):
-        raise InputError(
-            "downscale", found=str(downscale), expected="a number of at least 1", remedy="2 halves width and height."
-        )
+        raise InputError("downscale", str(downscale), "a number of at least 1", "2 halves width and height.")
     if long_side is not None and long_side < 1:
-        raise InputError("long_side", found=str(long_side), expected="at least 1 px", remedy="400 is the default.")
+        raise InputError("long_side", str(long_side), "at least 1 px", "400 is the default.")
     if frames is not None and frames < 1:
-        raise InputError("frames", found=str(frames), expected="at least 1", remedy="Leave it out to take every frame.")
+        raise InputError("frames", str(frames), "at least 1", "Leave it out to take every frame.")
     if holdout is not None and (holdout < 0 or holdout == 1):
         raise InputError(
             "holdout",
-            found=str(holdout),
-            expected="0 (none), or 2 and more (every second, ...)",
-            remedy="8 is the custom; at 1 no frame would be left to fit to.",
+            str(holdout),
+            "0 (none), or 2 and more (every second, ...)",
+            "8 is the custom; at 1 no frame would be left to fit to.",
         )
 
 
@@ -120,9 +116,9 @@ def _short_names(shots: Sequence[Shot], where: object) -> tuple[str, ...]:
     twice = collections.Counter(names).most_common(1)[0][0]
     raise InputError(
         where,
-        found=f"two frames called {twice!r}",
-        expected="names that differ in more than their endings",
-        remedy="Rename the images, or take one of the two out.",
+        f"two frames called {twice!r}",
+        "names that differ in more than their endings",
+        "Rename the images, or take one of the two out.",
     )
 
 
@@ -135,9 +131,9 @@ def _true_lens(shot: Shot) -> Lens:
     if min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) > 1:
         raise InputError(
             shot.image,
-            found=f"an image of {width}x{height}",
-            expected=f"{lens.width}x{lens.height}, or that aspect",
-            remedy="Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them.",
+            f"an image of {width}x{height}",
+            f"{lens.width}x{lens.height}, or that aspect",
+            "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them.",
         )
     return lens.resized(width, height)
 
@@ -168,9 +164,7 @@ def assemble(
     check_options(downscale, frames, holdout, long_side)
     where = posed.where
     if not posed.shots:
-        raise InputError(
-            where, found="no frame", expected="at least one posed image", remedy="Estimate the poses again."
-        )
+        raise InputError(where, "no frame", "at least one posed image", "Estimate the poses again.")
     shots = sorted(posed.shots, key=lambda shot: shot.name)
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
@@ -218,9 +212,9 @@ def assemble(
             if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
                 raise InputError(
                     shot.depth,
-                    found=f"a depth map of {depth.shape[1]}x{depth.shape[0]}",
-                    expected=f"the aspect of its image, {lens.width}x{lens.height}",
-                    remedy="Register it to the image.",
+                    f"a depth map of {depth.shape[1]}x{depth.shape[0]}",
+                    f"the aspect of its image, {lens.width}x{lens.height}",
+                    "Register it to the image.",
                 )
             # Nearest throughout: the mean of two depths lies on neither surface.
             if lens.distorted:

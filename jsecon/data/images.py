@@ -24,9 +24,7 @@ _READ_AGAIN = "Copy or export the file again."
 
 
 def _unreadable(path: Path, found: str) -> InputError:
-    return InputError(
-        path, found=found, expected="a whole PNG, JPEG or other image that OpenCV reads", remedy=_READ_AGAIN
-    )
+    return InputError(path, found, "a whole PNG, JPEG or other image that OpenCV reads", _READ_AGAIN)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -127,10 +125,7 @@ def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
         image = ((image.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
     if image.dtype != np.uint8:
         raise InputError(
-            path,
-            found=f"pixels of type {image.dtype}",
-            expected="8 or 16 bits per channel",
-            remedy="Convert the image to PNG or JPEG.",
+            path, f"pixels of type {image.dtype}", "8 or 16 bits per channel", "Convert the image to PNG or JPEG."
         )
     if image.ndim == 2:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), False
@@ -153,9 +148,7 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"], *, jpeg_qua
     except cv2.error:
         done = False
     if not done:
-        raise InputError(
-            path, found=f"ending {path.suffix!r}", expected="one of .png .jpg", remedy="Choose another format."
-        )
+        raise InputError(path, f"ending {path.suffix!r}", "one of .png .jpg", "Choose another format.")
     with written_whole(path) as temporary:
         temporary.write_bytes(data.tobytes())
 
@@ -171,7 +164,7 @@ def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
     expected = "a PNG of integers: grey (1 to 16 bits), palette, or RGB of 8 bits per channel"
     remedy = "Write one id per pixel as an 8 or 16 bit grey PNG (lossless, no transparency)."
     if not data.startswith(_PNG):
-        raise InputError(path, found="a file that is no PNG", expected=expected, remedy=remedy)
+        raise InputError(path, "a file that is no PNG", expected, remedy)
     (_, header), *_ = _png_chunks(path, data)
     bits, colour_type = header[8], header[9]
     if colour_type == 3:  # OpenCV would look up the colours; Pillow leaves the indices as they are
@@ -184,12 +177,7 @@ def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
         blue, green, red = (image[..., channel].astype(np.int32) for channel in range(3))
         return red * 65536 + green * 256 + blue, True
     channels = 1 if image.ndim == 2 else image.shape[2]
-    raise InputError(
-        path,
-        found=f"a PNG of {channels} channels, {bits} bits, colour type {colour_type}",
-        expected=expected,
-        remedy=remedy,
-    )
+    raise InputError(path, f"a PNG of {channels} channels, {bits} bits, colour type {colour_type}", expected, remedy)
 
 
 def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
@@ -206,13 +194,13 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         try:
             depth = np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(path, found=str(error), expected=expected, remedy=remedy) from error
+            raise InputError(path, str(error), expected, remedy) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         if depth.ndim != 2:
-            raise InputError(path, found=f"shape {depth.shape}", expected=expected, remedy=remedy)
+            raise InputError(path, f"shape {depth.shape}", expected, remedy)
     else:
         depth = _decode(path, _checked_bytes(path))
         if depth.dtype != np.uint16 or depth.ndim != 2:
-            raise InputError(path, found=f"shape {depth.shape} of {depth.dtype}", expected=expected, remedy=remedy)
+            raise InputError(path, f"shape {depth.shape} of {depth.dtype}", expected, remedy)
     depth = depth.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

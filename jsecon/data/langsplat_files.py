@@ -43,17 +43,17 @@ def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, 
         if rows and table.shape[-1] != len(rows[0]):
             raise InputError(
                 file,
-                found=f"rows of {table.shape[-1]} numbers",
-                expected=f"{len(rows[0])}, as in the frames before",
-                remedy="Write all frames' files with the same model.",
+                f"rows of {table.shape[-1]} numbers",
+                f"{len(rows[0])}, as in the frames before",
+                "Write all frames' files with the same model.",
             )
         found = load_labels(folder, [name], size, level=level)
         if table.ndim != 2 or not np.isfinite(table).all() or max(found.ids, default=-1) >= len(table):
             raise InputError(
                 file,
-                found=f"an array {table.shape} for ids up to {max(found.ids, default=-1)}",
-                expected="a finite row for each id of the _s.npy beside it",
-                remedy="Write both files of the frame again.",
+                f"an array {table.shape} for ids up to {max(found.ids, default=-1)}",
+                "a finite row for each id of the _s.npy beside it",
+                "Write both files of the frame again.",
             )
         kept = [k for k in range(len(found.ids)) if (found.labels[0] == k).any()]
         place = np.full(len(found.ids) + 1, -1, np.int32)
@@ -72,9 +72,9 @@ def feature_size(folder: Path) -> int:
     if not files:
         raise InputError(
             folder,
-            found="no _f.npy",
-            expected="<frame>_f.npy beside <frame>_s.npy",
-            remedy="Give the language_features folder that LangSplat's preprocess.py wrote.",
+            "no _f.npy",
+            "<frame>_f.npy beside <frame>_s.npy",
+            "Give the language_features folder that LangSplat's preprocess.py wrote.",
         )
     return int(_read_table(files[0]).shape[-1])
 
@@ -87,8 +87,8 @@ def _read_table(file: Path) -> np.ndarray:
     except (OSError, ValueError, EOFError) as error:
         raise InputError(
             file,
-            found=f"nothing readable ({error})",
-            expected="a (M, E) array, one row per mask",
-            remedy="Run LangSplat's preprocess.py on every frame.",
+            f"nothing readable ({error})",
+            "a (M, E) array, one row per mask",
+            "Run LangSplat's preprocess.py on every frame.",
         ) from error
     return table

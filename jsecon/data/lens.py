@@ -105,9 +105,9 @@ def undistorted(lens: Lens, where: object) -> Lens:
     if not _covered(lens, high):
         raise InputError(
             where,
-            found=f"distortion {lens.distortion} that leaves no undistorted image",
-            expected="coefficients under which the image is one to one around its principal point",
-            remedy="Calibrate again, or undistort the images first (colmap image_undistorter).",
+            f"distortion {lens.distortion} that leaves no undistorted image",
+            "coefficients under which the image is one to one around its principal point",
+            "Calibrate again, or undistort the images first (colmap image_undistorter).",
         )
     if _covered(lens, low):
         high = low

@@ -47,12 +47,12 @@ def load_lerf_labels(folder: str | Path) -> list[LabelledFrame]:
     folder = Path(folder)
     files = sorted(folder.glob("*.json"))
     if not files:
-        raise InputError(folder, found="no .json file", expected="frame_XXXXX.json labels", remedy="Check the path.")
+        raise InputError(folder, "no .json file", "frame_XXXXX.json labels", "Check the path.")
     return [_read(file) for file in files]
 
 
 def _bad(file: Path, found: str, expected: str) -> InputError:
-    return InputError(file, found=found, expected=expected, remedy=_REMEDY)
+    return InputError(file, found, expected, _REMEDY)
 
 
 def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
@@ -123,9 +123,9 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
             require(
                 mask.shape == (frame.height, frame.width) and bool(mask.any()) and len(boxes) > 0,
                 f"{frame.name}: {category}",
-                got=f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes",
-                expected=f"({frame.height}, {frame.width}), with pixels and a box",
-                remedy="Leave out what the frame does not show.",
+                f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes",
+                f"({frame.height}, {frame.width}), with pixels and a box",
+                "Leave out what the frame does not show.",
             )
             for polygon, box in _with_boxes(mask_polygons(mask), np.asarray(boxes, np.float64)):
                 objects.append(

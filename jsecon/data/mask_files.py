@@ -41,9 +41,9 @@ def read_objects(folders: Sequence[Path], name: str) -> Int64[np.ndarray, "h w"]
             if mask.shape != image.shape:
                 raise InputError(
                     folder / name,
-                    found=f"a mask of {mask.shape[1]}x{mask.shape[0]}",
-                    expected=f"{image.shape[1]}x{image.shape[0]}, like those of other objects",
-                    remedy="Write all masks of a frame at one size.",
+                    f"a mask of {mask.shape[1]}x{mask.shape[0]}",
+                    f"{image.shape[1]}x{image.shape[0]}, like those of other objects",
+                    "Write all masks of a frame at one size.",
                 )
             image[mask > 0] = int(folder.name)
     assert image is not None, f"{name} lies in none of the folders"
@@ -123,9 +123,9 @@ def load_labels(
     if 0 < colours < len(files):
         raise InputError(
             folder,
-            found=f"{colours} colour images among {len(files)} masks",
-            expected="ids in all, or colours in all",
-            remedy="Write every mask the same way, best as 16 bit grey PNGs.",
+            f"{colours} colour images among {len(files)} masks",
+            "ids in all, or colours in all",
+            "Write every mask the same way, best as 16 bit grey PNGs.",
         )
 
     if per_frame:
@@ -138,9 +138,9 @@ def load_labels(
     if len(ids) > MOST_REGIONS:
         raise InputError(
             folder,
-            found=f"{len(ids)} regions",
-            expected=f"at most {MOST_REGIONS}",
-            remedy="Take a coarser level, fewer frames, or say shared=True if the ids are tracked.",
+            f"{len(ids)} regions",
+            f"at most {MOST_REGIONS}",
+            "Take a coarser level, fewer frames, or say shared=True if the ids are tracked.",
         )
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
@@ -172,7 +172,7 @@ def _find(
 ) -> tuple[dict[str, Path], str]:
     """Mask files by frame name, and their common ending; where objects have folders of their own, one of each frame."""
     if not folder.is_dir():
-        raise InputError(folder, found="no such folder", expected="a folder of masks", remedy="Check the path.")
+        raise InputError(folder, "no such folder", "a folder of masks", "Check the path.")
     found: dict[str, dict[str, Path]] = {".png": {}, _SUFFIX: {}}
     for file in sorted(file for place in objects or (folder,) for file in place.iterdir()):
         for ending, files in found.items():
@@ -195,17 +195,17 @@ def _find(
         inside = len(set(found[".png"].values())) + len(found[_SUFFIX])
         raise InputError(
             folder,
-            found=f"{inside} masks, none of which is called like a frame",
-            expected=f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png"
+            f"{inside} masks, none of which is called like a frame",
+            f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png"
             + ("" if order is None else f"; or a PNG for each number from 0 to {len(order) - 1}"),
-            remedy="Name each mask like its frame.",
+            "Name each mask like its frame.",
         )
     if matched[".png"] and matched[_SUFFIX]:
         raise InputError(
             folder,
-            found=f"both .png and {_SUFFIX} masks of these frames",
-            expected="one kind",
-            remedy="Keep each kind in a folder of its own.",
+            f"both .png and {_SUFFIX} masks of these frames",
+            "one kind",
+            "Keep each kind in a folder of its own.",
         )
     kind = ".png" if matched[".png"] else _SUFFIX
     return matched[kind], kind
@@ -214,30 +214,23 @@ def _find(
 def read_level(path: Path, level: str | int) -> np.ndarray:
     """ids (H, W) of one level of a `_s.npy`, -1 = none. Raises InputError where it is no such file."""
     if level not in (*LEVELS, 0, 1, 2, 3):
-        raise InputError(
-            "level", found=repr(level), expected=f"one of {', '.join(LEVELS)}", remedy="l is the coarsest."
-        )
+        raise InputError("level", repr(level), f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     try:
         image = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, ValueError, EOFError) as error:
         raise InputError(
-            path,
-            found=f"no whole array ({error})",
-            expected=f"a .npy of shape ({len(LEVELS)}, H, W)",
-            remedy="Write the masks again.",
+            path, f"no whole array ({error})", f"a .npy of shape ({len(LEVELS)}, H, W)", "Write the masks again."
         ) from error
     if image.ndim != 3 or len(image) != len(LEVELS):
         raise InputError(
             path,
-            found=f"an array of shape {image.shape}",
-            expected=f"({len(LEVELS)}, H, W): LangSplat's levels {', '.join(LEVELS)}",
-            remedy="Give the _s.npy files, not the _f.npy ones.",
+            f"an array of shape {image.shape}",
+            f"({len(LEVELS)}, H, W): LangSplat's levels {', '.join(LEVELS)}",
+            "Give the _s.npy files, not the _f.npy ones.",
         )
     image = np.array(image[LEVELS.index(level) if isinstance(level, str) else level])
     if image.dtype.kind == "f" and not (np.isfinite(image).all() and (image == image.round()).all()):
-        raise InputError(
-            path, found="numbers that are no integers", expected="ids, -1 = none", remedy="Write the masks again."
-        )
+        raise InputError(path, "numbers that are no integers", "ids, -1 = none", "Write the masks again.")
     return image.astype(np.int64)
 
 
@@ -250,9 +243,9 @@ def fitted_to_frame(path: Path, image: np.ndarray, width: int, height: int) -> n
     if min(abs(columns * height / rows - width), abs(width * rows / height - columns)) > 1:
         raise InputError(
             path,
-            found=f"a mask of {columns}x{rows}",
-            expected=f"{width}x{height} like its frame, or that aspect",
-            remedy="Make the masks from the frames as they are loaded (undistorted, unrotated), at any scale.",
+            f"a mask of {columns}x{rows}",
+            f"{width}x{height} like its frame, or that aspect",
+            "Make the masks from the frames as they are loaded (undistorted, unrotated), at any scale.",
         )
     # Integers below 2^24 pass through float32 unchanged; OpenCV has no int64.
     return cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST_EXACT).astype(np.int64)
@@ -272,10 +265,7 @@ def _compact(path: Path, image: np.ndarray, none: int | None) -> tuple[np.ndarra
         ids = ids[ids != none]
     if len(ids) > MOST_REGIONS:
         raise InputError(
-            path,
-            found=f"{len(ids)} ids in one mask",
-            expected=f"at most {MOST_REGIONS}",
-            remedy="Give label images, not photographs.",
+            path, f"{len(ids)} ids in one mask", f"at most {MOST_REGIONS}", "Give label images, not photographs."
         )
     if not len(ids):
         return ids, np.full(image.shape, -1, np.int16)

@@ -85,7 +85,7 @@ def read_nerfstudio(file: Path) -> Posed:
 
 
 def _bad(file: Path, found: str, expected: str, remedy: str = _REMEDY) -> InputError:
-    return InputError(file, found=found, expected=expected, remedy=remedy)
+    return InputError(file, found, expected, remedy)
 
 
 def _parse(file: Path) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class _Element:
 def bad_ply(
     path: Path, found: str, expected: str = "a whole .ply file", remedy: str = "Export the file again."
 ) -> InputError:
-    return InputError(path, found=found, expected=expected, remedy=remedy)
+    return InputError(path, found, expected, remedy)
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:

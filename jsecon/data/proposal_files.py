@@ -62,9 +62,9 @@ def _numbers(text: str) -> list[int]:
 def _no_mask(where: str | Path, found: str) -> InputError:
     return InputError(
         where,
-        found=found,
-        expected='run-length encoded masks: {"size": [H, W], "counts": a text or a list}',
-        remedy="Write them with SAM's scripts/amg.py --convert-to-rle.",
+        found,
+        'run-length encoded masks: {"size": [H, W], "counts": a text or a list}',
+        "Write them with SAM's scripts/amg.py --convert-to-rle.",
     )
 
 
@@ -86,9 +86,9 @@ def proposals_from_disk(
     if len(missing) == len(names):
         raise InputError(
             folder,
-            found="no masks called like a frame" if folder.is_dir() else "no such folder",
-            expected=", ".join(f"{names[0]}{ending}" for ending in ENDINGS) + " or the like",
-            remedy="Name each file like its frame.",
+            "no masks called like a frame" if folder.is_dir() else "no such folder",
+            ", ".join(f"{names[0]}{ending}" for ending in ENDINGS) + " or the like",
+            "Name each file like its frame.",
         )
     notes = (f"{len(missing)} of {len(names)} frames have no masks (the first: {missing[0]}).",) if missing else ()
 
@@ -123,8 +123,8 @@ def _read_json(file: Path) -> list[np.ndarray]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             file,
-            found=f"what is no list of masks ({error!r})",
-            expected='a list of {"segmentation": {"size", "counts"}, ...}',
-            remedy="Write it with SAM's scripts/amg.py --convert-to-rle.",
+            f"what is no list of masks ({error!r})",
+            'a list of {"segmentation": {"size", "counts"}, ...}',
+            "Write it with SAM's scripts/amg.py --convert-to-rle.",
         ) from error
     return [decode_rle(coded[i], f"{file}, mask {i}") for i in np.argsort(-np.asarray(scores), kind="stable")]

@@ -130,9 +130,9 @@ def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> lis
     if not pairs or (expected is not None and len(pairs) != expected):
         raise InputError(
             "labels",
-            found=f"{len(pairs)} (frame, query) pairs",
-            expected=f"{expected or 'at least one'}",
-            remedy="Evaluate on the very label files of the protocol, all of them.",
+            f"{len(pairs)} (frame, query) pairs",
+            f"{expected or 'at least one'}",
+            "Evaluate on the very label files of the protocol, all of them.",
         )
     return pairs
 
@@ -202,15 +202,15 @@ def _check(frame: LabelledFrame, cameras: Mapping[str, Camera]) -> None:
         some = ", ".join(sorted(cameras)[:3])
         raise InputError(
             f"labels of {frame.name}",
-            found="no frame of that name in the capture",
-            expected=f"one of {some}, ...",
-            remedy="Evaluate with the capture that was labelled, and leave none of its labelled frames out.",
+            "no frame of that name in the capture",
+            f"one of {some}, ...",
+            "Evaluate with the capture that was labelled, and leave none of its labelled frames out.",
         )
     camera = cameras[frame.name]
     if abs(frame.width / camera.width - frame.height / camera.height) > 0.02 * frame.width / camera.width:
         raise InputError(
             f"labels of {frame.name}",
-            found=f"{frame.width}x{frame.height}",
-            expected=f"the aspect of the frame, {camera.width}x{camera.height}",
-            remedy="Label the undistorted frames, or scale the labels to them.",
+            f"{frame.width}x{frame.height}",
+            f"the aspect of the frame, {camera.width}x{camera.height}",
+            "Label the undistorted frames, or scale the labels to them.",
         )

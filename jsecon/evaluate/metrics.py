@@ -18,9 +18,9 @@ def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array,
     require(
         predicted.shape == true.shape,
         "iou",
-        got=f"{predicted.shape} and {true.shape}",
-        expected="one shape",
-        remedy="Render the prediction at the size of the truth.",
+        f"{predicted.shape} and {true.shape}",
+        "one shape",
+        "Render the prediction at the size of the truth.",
     )
     both, either = jnp.sum(predicted & true), jnp.sum(predicted | true)
     return jnp.where(either > 0, both / jnp.maximum(either, 1), 1.0)

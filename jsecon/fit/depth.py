@@ -31,9 +31,9 @@ def require_depths(capture: Capture) -> None:
     if capture.depths is None:
         raise InputError(
             "capture",
-            found="no depth frames",
-            expected="RGB-D frames",
-            remedy="Start from sparse points (gaussians_from_points) or triangulate them.",
+            "no depth frames",
+            "RGB-D frames",
+            "Start from sparse points (gaussians_from_points) or triangulate them.",
         )
 
 
@@ -59,9 +59,9 @@ def _voxel_ids(points: np.ndarray, voxel: float) -> tuple[np.ndarray, int]:
     require(
         float(size[0]) * float(size[1]) * float(size[2]) < 2**62,
         "voxel",
-        got=voxel,
-        expected=f"large enough for the extent {np.ptp(points, axis=0)}",
-        remedy="Choose a larger voxel.",
+        voxel,
+        f"large enough for the extent {np.ptp(points, axis=0)}",
+        "Choose a larger voxel.",
     )
     keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
     unique, ids = np.unique(keys, return_inverse=True)
@@ -99,9 +99,9 @@ def points_from_depth(
     require(
         (voxel is None) != (max_points is None),
         "voxel, max_points",
-        got=(voxel, max_points),
-        expected="exactly one of the two",
-        remedy="Give voxel in world units, or max_points.",
+        (voxel, max_points),
+        "exactly one of the two",
+        "Give voxel in world units, or max_points.",
     )
     require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
@@ -109,10 +109,7 @@ def points_from_depth(
     points = np.concatenate([p for p, _, _ in parts]) if parts else np.zeros((0, 3))
     if not len(points):
         raise InputError(
-            "capture",
-            found="no pixel with a known depth",
-            expected="depths above 0",
-            remedy="Check the depth frames' encoding and unit.",
+            "capture", "no pixel with a known depth", "depths above 0", "Check the depth frames' encoding and unit."
         )
     colors = np.concatenate([c for _, c, _ in parts])
     pixels = np.concatenate(

@@ -204,24 +204,22 @@ def fit_gaussians(
     require(
         (start is None) != (state is None),
         "start, state",
-        got=(start is not None, state is not None),
-        expected="exactly one of the two",
-        remedy="Give start for a new fit, state to go on with one.",
+        (start is not None, state is not None),
+        "exactly one of the two",
+        "Give start for a new fit, state to go on with one.",
     )
     used = np.flatnonzero(~np.asarray(capture.held_out))
     if not len(used):
-        raise InputError(
-            "capture", found="every frame held out", expected="frames to fit to", remedy="Hold out fewer frames."
-        )
+        raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
     begun = start_state(start, steps) if start is not None else state
     assert begun is not None
-    require(0 <= coarse <= 1, "coarse", got=coarse, expected="between 0 and 1", remedy="0 keeps the frames' size.")
+    require(0 <= coarse <= 1, "coarse", coarse, "between 0 and 1", "0 keeps the frames' size.")
     require(
         begun.losses.shape == (steps,),
         "state",
-        got=f"a fit of {begun.losses.shape[0]} steps",
-        expected=f"{steps} steps",
-        remedy="Go on with the options that the fit was started with.",
+        f"a fit of {begun.losses.shape[0]} steps",
+        f"{steps} steps",
+        "Go on with the options that the fit was started with.",
     )
     current: FitState = jax.device_put(begun)
     cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[used])  # whose items compile nothing
@@ -247,9 +245,9 @@ def fit_gaussians(
         if not (np.isfinite(current.losses[last - 1]) and bool(_all_finite(current.gaussians))):
             raise InputError(
                 "fit",
-                found=f"numbers that are not finite after step {last}",
-                expected="a fit that converges",
-                remedy="Check the start, the poses and the intrinsics, or lower the learning rates.",
+                f"numbers that are not finite after step {last}",
+                "a fit that converges",
+                "Check the start, the poses and the intrinsics, or lower the learning rates.",
             )
         if on_checkpoint:
             on_checkpoint(current)

@@ -54,9 +54,9 @@ def _same_shape(image, target) -> None:
     require(
         image.shape == target.shape,
         "image and target",
-        got=f"{image.shape} and {target.shape}",
-        expected="the same (H, W, C)",
-        remedy="Render at the size of the photograph.",
+        f"{image.shape} and {target.shape}",
+        "the same (H, W, C)",
+        "Render at the size of the photograph.",
     )
 
 

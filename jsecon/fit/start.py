@@ -103,20 +103,20 @@ def gaussians_from_points(
     require(
         len(points) > 0,
         "points",
-        got="none",
-        expected="at least one point",
-        remedy="Give points, or triangulate them from the frames (jsecon.fit.triangulate).",
+        "none",
+        "at least one point",
+        "Give points, or triangulate them from the frames (jsecon.fit.triangulate).",
     )
     require(
         bool(np.isfinite(points).all()),
         "points",
-        got="a coordinate that is not finite",
-        expected="finite coordinates",
-        remedy="Drop such points first.",
+        "a coordinate that is not finite",
+        "finite coordinates",
+        "Drop such points first.",
     )
-    require(0 < opacity < 1, "opacity", got=opacity, expected="between 0 and 1", remedy="0.1 is usual, 0.9 on depth.")
-    require(scale > 0, "scale", got=scale, expected="positive", remedy="1 is usual.")
-    require(sh_degree in (0, 1, 2, 3), "sh_degree", got=sh_degree, expected="0 to 3", remedy="0 is colour alone.")
+    require(0 < opacity < 1, "opacity", opacity, "between 0 and 1", "0.1 is usual, 0.9 on depth.")
+    require(scale > 0, "scale", scale, "positive", "1 is usual.")
+    require(sh_degree in (0, 1, 2, 3), "sh_degree", sh_degree, "0 to 3", "0 is colour alone.")
     deviations = scale * neighbour_distances(points, neighbours)
     if max_scale is not None:
         deviations = np.minimum(deviations, max_scale)

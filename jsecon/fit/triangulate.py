@@ -216,9 +216,9 @@ def triangulated_points(
     if len(points) < MIN_POINTS:
         raise InputError(
             "capture",
-            found=f"{len(points)} points from {len(used)} views by matching their features",
-            expected=f"at least {MIN_POINTS}",
-            remedy="The views need to overlap and to have texture, and the poses to belong to them; or give "
+            f"{len(points)} points from {len(used)} views by matching their features",
+            f"at least {MIN_POINTS}",
+            "The views need to overlap and to have texture, and the poses to belong to them; or give "
             "Gaussians (--gaussians PLY) or a capture with points.",
         )
     return points.astype(np.float32), np.rint(colors).astype(np.uint8)

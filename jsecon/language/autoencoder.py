@@ -82,29 +82,29 @@ def train_autoencoder(
     The parameters returned are the best, by the loss in evaluation mode, of the last twentieth of the epochs.
     Raises ValueError for no usable row, numbers that are not finite, or options out of range.
     """
-    require(latent >= 1, "train_autoencoder", got=f"latent={latent}", expected="at least 1", remedy="3 is LangSplat's.")
+    require(latent >= 1, "train_autoencoder", f"latent={latent}", "at least 1", "3 is LangSplat's.")
     require(
         batch >= 1 and (epochs is None or epochs >= 1),
         "train_autoencoder",
-        got=f"batch={batch}, epochs={epochs}",
-        expected="both at least 1",
-        remedy="Leave epochs out to have it chosen.",
+        f"batch={batch}, epochs={epochs}",
+        "both at least 1",
+        "Leave epochs out to have it chosen.",
     )
     rows = np.asarray(embeddings)
     require(
         bool(np.isfinite(rows).all()),
         "train_autoencoder",
-        got="embeddings that are not finite",
-        expected="finite numbers",
-        remedy="Find the regions whose crops gave NaN and leave them out.",
+        "embeddings that are not finite",
+        "finite numbers",
+        "Find the regions whose crops gave NaN and leave them out.",
     )
     rows = rows[np.any(rows != 0, axis=1)]
     require(
         len(rows) >= 1,
         "train_autoencoder",
-        got=f"{embeddings.shape[0]} rows, all zero or none",
-        expected="at least one embedding",
-        remedy="Embed the regions first.",
+        f"{embeddings.shape[0]} rows, all zero or none",
+        "at least one embedding",
+        "Embed the regions first.",
     )
 
     units = normalize(jnp.asarray(rows))

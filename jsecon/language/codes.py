@@ -106,16 +106,16 @@ def region_codes(
     require(
         latent == "auto" or (isinstance(latent, int) and latent >= 1),
         "region_codes",
-        got=f"latent={latent!r}",
-        expected="at least 1, or 'auto'",
-        remedy="3 is LangSplat's.",
+        f"latent={latent!r}",
+        "at least 1, or 'auto'",
+        "3 is LangSplat's.",
     )
     require(
         bool(np.isfinite(np.asarray(embeddings)).all()),
         "region_codes",
-        got="embeddings that are not finite",
-        expected="finite numbers",
-        remedy="Find the regions whose crops gave NaN and leave them out.",
+        "embeddings that are not finite",
+        "finite numbers",
+        "Find the regions whose crops gave NaN and leave them out.",
     )
     units = normalize(jnp.asarray(embeddings))
     if latent == "auto":

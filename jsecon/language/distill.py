@@ -180,9 +180,9 @@ def distill_l1(
         require(
             not bool(jnp.isnan(state.history).any()),
             "distill_l1",
-            got=f"capacity={capacity}, too small for a view, or NaN",
-            expected="every view within the capacity, finite Gaussians and codes",
-            remedy="Leave capacity out, and check the Gaussians with jsecon.numerics.finite.",
+            f"capacity={capacity}, too small for a view, or NaN",
+            "every view within the capacity, finite Gaussians and codes",
+            "Leave capacity out, and check the Gaussians with jsecon.numerics.finite.",
         )
     codes = normalize(state.features)
     if isinstance(init, str) and init == "random":
@@ -208,9 +208,9 @@ def descent(
     require(
         views > 0 and steps > 0 and region_codes.shape[0] > 0,
         "distill_l1",
-        got=f"{views} views, {steps} steps, {region_codes.shape[0]} regions",
-        expected="at least one of each",
-        remedy="There is nothing to distil.",
+        f"{views} views, {steps} steps, {region_codes.shape[0]} regions",
+        "at least one of each",
+        "There is nothing to distil.",
     )
     order_key, init_key = jax.random.split(key)
     dtype = region_codes.dtype

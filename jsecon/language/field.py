@@ -35,13 +35,7 @@ def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     be written.
     """
     problem = _disagreement(field)
-    require(
-        problem is None,
-        "save_field",
-        got=problem,
-        expected="arrays of one N, R, d, E and T",
-        remedy="Build the field from one run.",
-    )
+    require(problem is None, "save_field", problem, "arrays of one N, R, d, E and T", "Build the field from one run.")
     arrays: dict[str, np.ndarray] = {}
     header = {"format": FORMAT, "version": VERSION, "field": _pack(field, "", arrays)}
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -56,31 +50,27 @@ def load_field(path: str | os.PathLike) -> LanguageField:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(
-            path, found="a folder" if path.is_dir() else "no such file", expected="a field file", remedy=_REMEDY
-        )
+        raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
     if not zipfile.is_zipfile(path):
         raise InputError(
             path,
-            found=f"{path.stat().st_size} bytes that are no complete zip archive",
-            expected="a field file written by jsecon",
-            remedy=f"It may have been cut short in copying. {_REMEDY}",
+            f"{path.stat().st_size} bytes that are no complete zip archive",
+            "a field file written by jsecon",
+            f"It may have been cut short in copying. {_REMEDY}",
         )
     try:
         with np.load(path, allow_pickle=False) as members:
             if not isinstance(members, np.lib.npyio.NpzFile) or "header" not in members:
-                raise InputError(
-                    path, found="a zip archive without a jsecon header", expected="a field file", remedy=_REMEDY
-                )
+                raise InputError(path, "a zip archive without a jsecon header", "a field file", _REMEDY)
             header = json.loads(members["header"].tobytes().decode())
             if not isinstance(header, dict) or header.get("format") != FORMAT:
-                raise InputError(path, found="another program's header", expected=f"format {FORMAT!r}", remedy=_REMEDY)
+                raise InputError(path, "another program's header", f"format {FORMAT!r}", _REMEDY)
             if header.get("version") != VERSION:
                 raise InputError(
                     path,
-                    found=f"version {header.get('version')}",
-                    expected=f"version {VERSION}",
-                    remedy=f"Read it with the jsecon that wrote it. {_REMEDY}",
+                    f"version {header.get('version')}",
+                    f"version {VERSION}",
+                    f"Read it with the jsecon that wrote it. {_REMEDY}",
                 )
             field = _unpack(header["field"], members)
         problem = "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field)
@@ -99,12 +89,12 @@ def load_field(path: str | os.PathLike) -> LanguageField:
     ) as error:
         raise InputError(
             path,
-            found=f"a damaged field file ({type(error).__name__}: {error})",
-            expected="a whole one",
-            remedy=f"It may have been changed or cut in copying. {_REMEDY}",
+            f"a damaged field file ({type(error).__name__}: {error})",
+            "a whole one",
+            f"It may have been changed or cut in copying. {_REMEDY}",
         ) from error
     if problem is not None:
-        raise InputError(path, found=problem, expected="arrays of one N, R, d, E and T", remedy=_REMEDY)
+        raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
     return field
 
 
@@ -120,9 +110,9 @@ def _pack(node: Any, name: str, arrays: dict[str, np.ndarray]) -> dict:
     require(
         array.dtype.kind in "biuf",
         "save_field",
-        got=f"{name[:-1]} of type {array.dtype}",
-        expected="plain numbers",
-        remedy="Convert it to float32 or an integer type.",
+        f"{name[:-1]} of type {array.dtype}",
+        "plain numbers",
+        "Convert it to float32 or an integer type.",
     )
     arrays[name[:-1]] = array
     return {"array": name[:-1], "shape": list(array.shape), "dtype": array.dtype.name}

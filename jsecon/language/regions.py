@@ -84,9 +84,9 @@ def pooled(
     require(
         highest < count,
         "num_regions",
-        got=f"label {highest} with num_regions={count}",
-        expected="labels below num_regions",
-        remedy="Raise num_regions, or leave it out.",
+        f"label {highest} with num_regions={count}",
+        "labels below num_regions",
+        "Raise num_regions, or leave it out.",
     )
     pixels = np.zeros((count, len(labels)), np.int32)
     total: np.ndarray | None = None

@@ -61,16 +61,16 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     require(
         views is not None,
         "with_shown",
-        got="votes without the weight of each view",
-        expected="by_view (T, N)",
-        remedy="Cast them with region_votes(..., by_view=True).",
+        "votes without the weight of each view",
+        "by_view (T, N)",
+        "Cast them with region_votes(..., by_view=True).",
     )
     require(
         views == regions.pixels.shape[1] and votes.num_regions == regions.count,
         "with_shown",
-        got=f"{votes.num_regions} regions and {views} views voted, of {regions.pixels.shape}",
-        expected="the pixels (R, T) of the same regions in the same views",
-        remedy="Give the regions that were made from the labels that voted.",
+        f"{votes.num_regions} regions and {views} views voted, of {regions.pixels.shape}",
+        "the pixels (R, T) of the same regions in the same views",
+        "Give the regions that were made from the labels that voted.",
     )
     known = jnp.any(regions.embeddings != 0, axis=1)
     alike = cosine_matrix(regions.embeddings, regions.embeddings) >= alike_threshold

@@ -66,7 +66,7 @@ def region_votes(
     require_shape(
         "labels", labels, (views, cameras.height, cameras.width), "Give one label image per view, of the camera's size."
     )
-    require(num_regions >= 0, "num_regions", got=num_regions, expected=">= 0", remedy="Count the regions.")
+    require(num_regions >= 0, "num_regions", num_regions, ">= 0", "Count the regions.")
     traced = is_traced((gaussians, cameras, labels))
     count = gaussians.means.shape[0]
     size = default_capacity(count, cameras.width, cameras.height) if capacity is None else capacity

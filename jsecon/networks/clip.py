@@ -34,9 +34,9 @@ def masked_crop(
     require(
         mask.shape == frame.shape[:2] and bool(mask.any()),
         "mask",
-        got=f"{mask.shape}, {int(mask.sum())} pixels",
-        expected=f"{frame.shape[:2]}, at least one pixel",
-        remedy="Leave out empty masks.",
+        f"{mask.shape}, {int(mask.sum())} pixels",
+        f"{frame.shape[:2]}, at least one pixel",
+        "Leave out empty masks.",
     )
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     height, width = max(int(rows[-1] - rows[0]), 1), max(int(columns[-1] - columns[0]), 1)
@@ -78,9 +78,9 @@ class ClipEmbedder:
         if not templates or not all("{}" in template for template in templates):
             raise InputError(
                 "--template",
-                found=", ".join(map(repr, templates)) or "none",
-                expected="a phrase that holds {}",
-                remedy='For example "a photo of a {}.", or "{}", the text alone.',
+                ", ".join(map(repr, templates)) or "none",
+                "a phrase that holds {}",
+                'For example "a photo of a {}.", or "{}", the text alone.',
             )
         self.files = model if isinstance(model, ClipFiles) else find_clip(model)
         self.templates, self._batch, self._threads = tuple(templates), batch, threads
@@ -125,9 +125,7 @@ class ClipEmbedder:
         """Q texts -> (Q, E) float32 unit, the mean over the templates. Raises InputError on an empty text."""
         for text in texts:
             if not text.strip():
-                raise InputError(
-                    "text", found=repr(text), expected="a text", remedy='Say what to find, for example "red mug".'
-                )
+                raise InputError("text", repr(text), "a text", 'Say what to find, for example "red mug".')
         phrases = [template.replace("{}", text) for text in texts for template in self.templates]
         found = self._embedded(phrases).reshape(len(texts), len(self.templates), -1)
         return _unit(found.mean(1), self.files.textual)
@@ -195,9 +193,9 @@ class ClipEmbedder:
         if rows.shape[1] != self.dim:
             raise InputError(
                 self.files.textual,
-                found=f"texts of {rows.shape[1]} numbers",
-                expected=f"{self.dim}, like the images of {self.files.visual.name}",
-                remedy="Take both graphs from one model, with their projections.",
+                f"texts of {rows.shape[1]} numbers",
+                f"{self.dim}, like the images of {self.files.visual.name}",
+                "Take both graphs from one model, with their projections.",
             )
         return _unit(rows, self.files.textual)
 
@@ -215,9 +213,9 @@ def embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
     if len(flat) != 1:
         raise InputError(
             f"{graph.path}, output {names[0]!r}",
-            found=describe(graph.outputs.values()),
-            expected=f"one output of two axes, as {what} has, called {', '.join(names)} or otherwise",
-            remedy="Export the graph with its projection.",
+            describe(graph.outputs.values()),
+            f"one output of two axes, as {what} has, called {', '.join(names)} or otherwise",
+            "Export the graph with its projection.",
         )
     return flat[0]
 
@@ -246,8 +244,8 @@ def _unit(rows: np.ndarray, path: Path) -> Float32[np.ndarray, "b e"]:
     if not (np.isfinite(length).all() and (length > 0).all()):
         raise InputError(
             path,
-            found="an embedding that is zero or not finite",
-            expected="finite numbers",
-            remedy="Export the graph again, best in 32 bit floats.",
+            "an embedding that is zero or not finite",
+            "finite numbers",
+            "Export the graph again, best in 32 bit floats.",
         )
     return (rows / length).astype(np.float32)

@@ -60,13 +60,11 @@ def find_clip(folder: str | Path) -> ClipFiles:
     """The parts of the CLIP model in a folder. Raises InputError naming what is missing or cannot be read."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, found="no such folder", expected="a folder with a CLIP model", remedy=PUBLISHED)
+        raise InputError(folder, "no such folder", "a folder with a CLIP model", PUBLISHED)
     layout, (visual, textual) = _graphs(folder)
     tokenizer = next((folder / name for name in TOKENIZERS if (folder / name).is_file()), None)
     if tokenizer is None:
-        raise InputError(
-            folder, found=f"graphs in the layout of {layout}, no tokenizer", expected=TOKENIZERS[1], remedy=PUBLISHED
-        )
+        raise InputError(folder, f"graphs in the layout of {layout}, no tokenizer", TOKENIZERS[1], PUBLISHED)
     config = next((folder / name for name in CONFIGS if (folder / name).is_file()), None)
     numbers = (CLIP_MEAN, CLIP_STD, None) if config is None else read_preprocessing(config)
     return ClipFiles(visual, textual, tokenizer, *numbers, layout)
@@ -79,9 +77,9 @@ def _graphs(folder: Path) -> tuple[str, tuple[Path, Path]]:
         if len(present) == 1:
             raise InputError(
                 folder,
-                found=f"{present[0]} without its other half",
-                expected=f"{names[0]} and {names[1]}, the layout of {layout}",
-                remedy="Fetch the missing file. " + PUBLISHED,
+                f"{present[0]} without its other half",
+                f"{names[0]} and {names[1]}, the layout of {layout}",
+                "Fetch the missing file. " + PUBLISHED,
             )
         if present:
             return layout, (folder / names[0], folder / names[1])
@@ -92,11 +90,11 @@ def _graphs(folder: Path) -> tuple[str, tuple[Path, Path]]:
         seen = "; ".join(f"{path.name} takes {describe(graph.inputs.values())}" for path, graph in graphs.items())
         raise InputError(
             folder,
-            found=seen or "no .onnx file in a place known",
-            expected="one graph of images and one of texts: "
+            seen or "no .onnx file in a place known",
+            "one graph of images and one of texts: "
             + ", or ".join(" and ".join(names) for names in LAYOUTS.values())
             + ", or two .onnx files",
-            remedy=PUBLISHED,
+            PUBLISHED,
         )
     return "flat", (visual[0], textual[0])
 
@@ -127,13 +125,9 @@ def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]
         size = _side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
-        raise InputError(
-            path, found=f"what cannot be read ({error!r})", expected=expected, remedy="Fetch the file again."
-        ) from error
+        raise InputError(path, f"what cannot be read ({error!r})", expected, "Fetch the file again.") from error
     if len(mean) != 3 or len(std) != 3 or min(std) <= 0 or (size is not None and size < 1):
-        raise InputError(
-            path, found=f"mean {mean}, std {std}, size {size}", expected=expected, remedy="Fetch the file again."
-        )
+        raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, "Fetch the file again.")
     return mean, std, size
 
 

@@ -89,9 +89,9 @@ class Graph:
         except Exception as error:  # ONNX Runtime's own kinds have no common base but this
             raise InputError(
                 self.path,
-                found=f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})",
-                expected="a whole ONNX graph, with its external data files beside it",
-                remedy="Fetch or export the file again.",
+                f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})",
+                "a whole ONNX graph, with its external data files beside it",
+                "Fetch or export the file again.",
             ) from error
         self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
         self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
@@ -111,9 +111,9 @@ class Graph:
             missing = f"no such {side}; the graph has {describe(tensors.values())}"
             raise InputError(
                 f"{self.path}, {side} {name!r}",
-                found=str(tensors[name]) if name in tensors else missing,
-                expected=f"{Tensor(name, '', tuple(shape))}, as {what} has".replace(" [", "["),
-                remedy="Give the right file; `jsecon models check DIR` lists what each one is.",
+                str(tensors[name]) if name in tensors else missing,
+                f"{Tensor(name, '', tuple(shape))}, as {what} has".replace(" [", "["),
+                "Give the right file; `jsecon models check DIR` lists what each one is.",
             )
         return tensors[name]
 
@@ -129,9 +129,9 @@ class Graph:
         if unknown or missing:
             raise InputError(
                 f"{self.path}, tensor {(unknown + missing)[0]!r}",
-                found=f"inputs {describe(self.inputs.values())}; outputs {describe(self.outputs.values())}",
-                expected=f"inputs {', '.join(feeds)}; outputs {', '.join(wanted)}",
-                remedy="This graph is of another kind than the one it is used as.",
+                f"inputs {describe(self.inputs.values())}; outputs {describe(self.outputs.values())}",
+                f"inputs {', '.join(feeds)}; outputs {', '.join(wanted)}",
+                "This graph is of another kind than the one it is used as.",
             )
         ready = {name: self._converted(self.inputs[name], np.asarray(array)) for name, array in feeds.items()}
         try:
@@ -140,9 +140,9 @@ class Graph:
             given = ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in ready.items())
             raise InputError(
                 self.path,
-                found=f"a graph that fails on {given} ({_reason(error)})",
-                expected="one that runs on its declared inputs",
-                remedy="Export the graph again.",
+                f"a graph that fails on {given} ({_reason(error)})",
+                "one that runs on its declared inputs",
+                "Export the graph again.",
             ) from error
         return dict(zip(wanted, (np.asarray(array) for array in found)))
 
@@ -153,9 +153,9 @@ class Graph:
         if not same_kind or not tensor.fits(array.shape):
             raise InputError(
                 f"{self.path}, input {tensor.name!r}",
-                found=str(tensor),
-                expected=f"{array.dtype}{list(array.shape)}",
-                remedy="This graph is of another size or kind than the one it is used as.",
+                str(tensor),
+                f"{array.dtype}{list(array.shape)}",
+                "This graph is of another size or kind than the one it is used as.",
             )
         return np.ascontiguousarray(array, wanted)
 
@@ -205,7 +205,7 @@ def _check_bytes(path: Path) -> None:
 
 
 def _unreadable(path: Path, found: str, remedy: str = "Check the path, or fetch the file again.") -> InputError:
-    return InputError(path, found=found, expected="a file of a model", remedy=remedy)
+    return InputError(path, found, "a file of a model", remedy)
 
 
 def _reason(error: Exception) -> str:

@@ -79,10 +79,10 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(
             path,
-            found=f"no tokenizer of CLIP's kind ({error!r})",
-            expected="JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
+            f"no tokenizer of CLIP's kind ({error!r})",
+            "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
             f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}",
-            remedy="Fetch the file again, from a CLIP model.",
+            "Fetch the file again, from a CLIP model.",
         ) from error
 
 

@@ -46,9 +46,9 @@ def query_classes(
     require(
         texts.ndim == 2 and texts.shape[0] >= 1 and texts.shape[1] == size,
         "query_classes",
-        got=f"texts {texts.shape}",
-        expected=f"(Q >= 1, {size})",
-        remedy="Embed the names of the classes with the field's embedder.",
+        f"texts {texts.shape}",
+        f"(Q >= 1, {size})",
+        "Embed the names of the classes with the field's embedder.",
     )
     least = threshold_of(retrieval, retrieval_threshold, "query_classes")
     if field.regions.count == 0:

@@ -88,9 +88,9 @@ def query_canonical(
     require(
         text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1,
         "query_canonical",
-        got=f"text {text.shape}, canonical {canonical.shape}",
-        expected=f"({size},) and (C >= 1, {size})",
-        remedy="Embed or encode text and canonical phrases as the features are.",
+        f"text {text.shape}, canonical {canonical.shape}",
+        f"({size},) and (C >= 1, {size})",
+        "Embed or encode text and canonical phrases as the features are.",
     )
     return _canonical(as_codes(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
 

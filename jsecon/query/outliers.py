@@ -45,9 +45,9 @@ def remove_outliers(
     require(
         min_samples >= 1 and (eps is None or eps > 0),
         "remove_outliers",
-        got=f"eps={eps}, min_samples={min_samples}",
-        expected="eps > 0 and min_samples >= 1",
-        remedy="Leave eps out to have it follow the selection's spacing.",
+        f"eps={eps}, min_samples={min_samples}",
+        "eps > 0 and min_samples >= 1",
+        "Leave eps out to have it follow the selection's spacing.",
     )
     means = np.asarray(means)
     kept = np.asarray(mask) & np.isfinite(means).all(axis=1)

@@ -52,18 +52,13 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
     """
     frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
     if not 0 <= frame < frames:
-        raise InputError(
-            "frame",
-            found=str(frame),
-            expected=f"0 to {frames - 1}",
-            remedy="Frames are numbered in the order of their names.",
-        )
+        raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(
             "pixel",
-            found=f"({x}, {y})",
-            expected=f"column 0 to {width - 1}, row 0 to {height - 1}",
-            remedy=f"Give x and y in the frames as the run used them, {width}x{height}.",
+            f"({x}, {y})",
+            f"column 0 to {width - 1}, row 0 to {height - 1}",
+            f"Give x and y in the frames as the run used them, {width}x{height}.",
         )
     gaussians, camera = jax.tree.map(jnp.asarray, (field.gaussians, _view(field.cameras, frame)))
     ids, weights = pixel_weights(gaussians, camera, x, y)

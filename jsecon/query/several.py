@@ -42,9 +42,9 @@ def query_several(
     require(
         wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1,
         "query_several",
-        got=f"wanted {wanted.shape}, unwanted {unwanted.shape}",
-        expected=f"(Q >= 1, {size}) and (U, {size})",
-        remedy="Embed the texts with the field's embedder.",
+        f"wanted {wanted.shape}, unwanted {unwanted.shape}",
+        f"(Q >= 1, {size}) and (U, {size})",
+        "Embed the texts with the field's embedder.",
     )
     least = threshold_of(retrieval, retrieval_threshold, "query_several")
     if field.regions.count == 0:
@@ -90,8 +90,8 @@ def parts_of_question(question: str) -> tuple[list[str], list[str]]:
     if not all(part for side in sides for part in side) or re.fullmatch(r"but not\b.*", question.strip().lower()):
         raise InputError(
             question,
-            found="a part without words",
-            expected='texts joined by "or" and "but not"',
-            remedy='For example: "red mug" or "bowl" but not "handle"',
+            "a part without words",
+            'texts joined by "or" and "but not"',
+            'For example: "red mug" or "bowl" but not "handle"',
         )
     return sides[0], [part for side in sides[1:] for part in side]

@@ -126,9 +126,9 @@ def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
         require(
             got == expected,
             f"gaussians.{name}",
-            got=got,
-            expected=f"{expected} with N = {n}",
-            remedy="Every array of Gaussians has one row per Gaussian.",
+            got,
+            f"{expected} with N = {n}",
+            "Every array of Gaussians has one row per Gaussian.",
         )
     require_shape(
         "camera.world_to_camera",

@@ -16,7 +16,7 @@ C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.37317633259
 
 def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]:
     """The first `bands` (1, 4, 9 or 16) basis functions at unit `directions`."""
-    require(bands in (1, 4, 9, 16), "bands", got=bands, expected="1, 4, 9 or 16", remedy="Pad sh to a whole degree.")
+    require(bands in (1, 4, 9, 16), "bands", bands, "1, 4, 9 or 16", "Pad sh to a whole degree.")
     x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
     xx, yy, zz = x * x, y * y, z * z
     basis = [jnp.full_like(x, C0)]

@@ -136,9 +136,9 @@ def tile_lists(
     require(
         0 < capacity <= (2**31 - 1) // _TILES - WORD,
         "capacity",
-        got=capacity,
-        expected="a positive number of (block, Gaussian) pairs whose tiles int32 can count",
-        remedy="Render so large an image in parts.",
+        capacity,
+        "a positive number of (block, Gaussian) pairs whose tiles int32 can count",
+        "Render so large an image in parts.",
     )
     capacity = whole_words(capacity)
     chunk = min(PAIRS, capacity)

@@ -26,9 +26,9 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     require(
         bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1])),
         "similarity",
-        got=matrix.tolist(),
-        expected="a rotation, one positive scale and a shift",
-        remedy="Shear, mirrors and unequal scales cannot be carried.",
+        matrix.tolist(),
+        "a rotation, one positive scale and a shift",
+        "Shear, mirrors and unequal scales cannot be carried.",
     )
     dtype = gaussians.means.dtype
     means = jnp.asarray(gaussians.means) @ jnp.asarray(scale * rotation.T, dtype) + jnp.asarray(matrix[:3, 3], dtype)

@@ -60,9 +60,9 @@ class ClassicalSegmenter:
         require(
             frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8,
             "frame",
-            got=(frame.shape, frame.dtype),
-            expected="(H, W, 3) uint8",
-            remedy="Give RGB frames as 8-bit arrays.",
+            (frame.shape, frame.dtype),
+            "(H, W, 3) uint8",
+            "Give RGB frames as 8-bit arrays.",
         )
         features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
         minimum = self.min_area * frame.shape[0] * frame.shape[1]
@@ -78,9 +78,9 @@ class ClassicalSegmenter:
             require(
                 depth.shape == frame.shape[:2],
                 "depths",
-                got=depth.shape,
-                expected=str(frame.shape[:2]),
-                remedy="Give depth of the frame's own size.",
+                depth.shape,
+                str(frame.shape[:2]),
+                "Give depth of the frame's own size.",
             )
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
@@ -92,9 +92,9 @@ class ClassicalSegmenter:
         require(
             surface.points.shape == surface.normals.shape == colour.shape,
             "surface",
-            got=(surface.points.shape, surface.normals.shape),
-            expected=str(colour.shape),
-            remedy="Give surfaces of the frame's own size.",
+            (surface.points.shape, surface.normals.shape),
+            str(colour.shape),
+            "Give surfaces of the frame's own size.",
         )
         turned = surface.normals * np.float32(
             self.merge_distance / (2.0 * np.sin(np.radians(self.crease_degrees) / 2.0))

@@ -187,9 +187,9 @@ class ColourEmbedder:
         if _NEGATION & set(words):
             raise InputError(
                 f"query {text!r}",
-                found="a negation",
-                expected="the colours that the thing has",
-                remedy="Say what colour it is, instead of what it is not.",
+                "a negation",
+                "the colours that the thing has",
+                "Say what colour it is, instead of what it is not.",
             )
         phrases: list[list[str]] = []
         modifiers: list[str] = []
@@ -208,9 +208,9 @@ class ColourEmbedder:
         if not phrases:
             raise InputError(
                 f"query {text!r}",
-                found="no colour word",
-                expected="a text that names a colour, such as 'dark green bottle' or 'red and white box'",
-                remedy="The embedder in use knows things by their colours only ("
+                "no colour word",
+                "a text that names a colour, such as 'dark green bottle' or 'red and white box'",
+                "The embedder in use knows things by their colours only ("
                 + ", ".join(sorted({n for n in self.names if " " not in n}))
                 + "; dark, light, -ish). Name the thing's colour, "
                 "or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights.",

@@ -68,9 +68,9 @@ def room_capture(
     require(
         int((~out).sum()) >= 2,
         "views",
-        got=f"{views} with every {holdout}. held out",
-        expected="2 that are not held out",
-        remedy="Sparse points are those that two views see: take more views.",
+        f"{views} with every {holdout}. held out",
+        "2 that are not held out",
+        "Sparse points are those that two views see: take more views.",
     )
     room = make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=views, width=width, height=height)

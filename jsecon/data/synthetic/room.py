@@ -138,9 +138,9 @@ def make_room(seed: int, *, num_objects: int = 12) -> Room:
     require(
         2 <= num_objects <= len(PALETTE),
         "num_objects",
-        got=num_objects,
-        expected=f"2 to {len(PALETTE)}",
-        remedy="There is one object per colour name.",
+        num_objects,
+        f"2 to {len(PALETTE)}",
+        "There is one object per colour name.",
     )
     draw = np.random.default_rng([seed, 2])
     colours = list(PALETTE)[:num_objects]

@@ -92,10 +92,10 @@ def find_sam(folder: str | Path) -> SamFiles:
     if encoder is None or decoder is None:
         raise InputError(
             folder,
-            found=", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file",
-            expected=f"an image encoder ({' or '.join(ENCODERS)}, or one *encoder*.onnx) and a mask decoder "
+            ", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file",
+            f"an image encoder ({' or '.join(ENCODERS)}, or one *encoder*.onnx) and a mask decoder "
             f"({' or '.join(DECODERS)}, or one *decoder*.onnx)",
-            remedy=PUBLISHED,
+            PUBLISHED,
         )
     return SamFiles(encoder, decoder)
 
@@ -131,9 +131,9 @@ class SamGraphs:
             return inputs[0]
         raise InputError(
             f"{self.files.encoder}, input {inputs[0].name if inputs else 'image'!r}",
-            found=describe(inputs),
-            expected="one image, float32[1, 3, S, S] or float32[H, W, 3], as SAM's image encoder has",
-            remedy=PUBLISHED,
+            describe(inputs),
+            "one image, float32[1, 3, S, S] or float32[H, W, 3], as SAM's image encoder has",
+            PUBLISHED,
         )
 
     def _checked_decoder(self) -> Dialect:
@@ -148,9 +148,9 @@ class SamGraphs:
         if masks.fixed(-3) not in (None, 3, 4):
             raise InputError(
                 f"{self.files.decoder}, output {masks.name!r}",
-                found=str(masks),
-                expected="3 or 4 masks per prompt, from the smallest part to the whole",
-                remedy="Export the decoder without --return-single-mask.",
+                str(masks),
+                "3 or 4 masks per prompt, from the smallest part to the whole",
+                "Export the decoder without --return-single-mask.",
             )
         return dialect
 
@@ -165,10 +165,9 @@ class SamGraphs:
         for name in left:
             raise InputError(
                 f"{self.files.decoder}, input {name!r}",
-                found=f"no such output of {self.files.encoder.name}, which gives "
-                f"{describe(self._encoder.outputs.values())}",
-                expected=str(self._decoder.inputs[name]),
-                remedy="Take encoder and decoder from one export.",
+                f"no such output of {self.files.encoder.name}, which gives {describe(self._encoder.outputs.values())}",
+                str(self._decoder.inputs[name]),
+                "Take encoder and decoder from one export.",
             )
         for name, output in links.items():
             needed = self._decoder.inputs[name].shape
@@ -210,9 +209,9 @@ class SamGraphs:
             if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
                 raise InputError(
                     f"{self.files.decoder}, output {names[0]!r}",
-                    found=f"{list(masks.shape)} with scores {list(scores.shape)}",
-                    expected="3 or 4 masks per prompt, each with its score",
-                    remedy="Export the decoder without --return-single-mask.",
+                    f"{list(masks.shape)} with scores {list(scores.shape)}",
+                    "3 or 4 masks per prompt, each with its score",
+                    "Export the decoder without --return-single-mask.",
                 )
             yield (
                 masks[:, -3:].astype(np.float32),

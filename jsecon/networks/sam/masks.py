@@ -39,7 +39,7 @@ class Crop(NamedTuple):
 
 def point_grid(side: int) -> Float32[np.ndarray, "p 2"]:
     """(side^2, 2) points (x, y) in 0..1, the centres of side x side cells, x fastest."""
-    require(side >= 1, "side", got=side, expected="at least 1", remedy="SAM's own is 32.")
+    require(side >= 1, "side", side, "at least 1", "SAM's own is 32.")
     line = np.linspace(1 / (2 * side), 1 - 1 / (2 * side), side)
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2).astype(np.float32)
 
@@ -76,9 +76,7 @@ def langsplat_nms(
     suppresses. Of equal scores the earlier counts as better. Empty masks are dropped. Raises ValueError where the
     numbers of masks and scores differ.
     """
-    require(
-        len(scores) == len(masks), "scores", got=len(scores), expected=str(len(masks)), remedy="One score per mask."
-    )
+    require(len(scores) == len(masks), "scores", len(scores), str(len(masks)), "One score per mask.")
     order = np.argsort(-scores, kind="stable")
     shared = shared_areas(masks[order])
     area = np.diagonal(shared)

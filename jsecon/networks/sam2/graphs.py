@@ -93,7 +93,7 @@ ONLY_SAM2_1 = ("obj_ptr_tpos_proj", "no_obj_embed_spatial")
 
 
 def _bad(where: object, found: str, expected: str, remedy: str = _REMEDY) -> InputError:
-    return InputError(where, found=found, expected=expected, remedy=remedy)
+    return InputError(where, found, expected, remedy)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,9 +52,9 @@ class Prompt:
         require(
             given in ([True, False, False], [False, True, True]),
             "Prompt",
-            got=f"mask, points, labels given: {given}",
-            expected="a mask, or points with labels",
-            remedy="Give one of the two.",
+            f"mask, points, labels given: {given}",
+            "a mask, or points with labels",
+            "Give one of the two.",
         )
 
 

@@ -68,9 +68,9 @@ class Sam2Tracker:
         require(
             prompts.ndim == 3 and prompts.shape[1:] == (height, width) and 0 <= index < len(frames),
             "Sam2Tracker",
-            got=(prompts.shape, index),
-            expected=f"(B, {height}, {width}) and a frame below {len(frames)}",
-            remedy="Give masks of the frames' own size.",
+            (prompts.shape, index),
+            f"(B, {height}, {width}) and a frame below {len(frames)}",
+            "Give masks of the frames' own size.",
         )
         labels = np.full(frames.shape[:3], -1, np.int16)
         given = [b for b, mask in enumerate(prompts) if mask.any()]
@@ -143,9 +143,9 @@ def follow(
     require(
         bool(asked) and asked[0] >= 0 and asked[-1] < count and all(prompts),
         "follow",
-        got=f"prompts of {len(prompts)} objects at frames {asked}",
-        expected=f"at least one for each object, at frames below {count}",
-        remedy="Leave out objects without prompts.",
+        f"prompts of {len(prompts)} objects at frames {asked}",
+        f"at least one for each object, at frames below {count}",
+        "Leave out objects without prompts.",
     )
     banks, known = _prompted_banks(sam2, frames, prompts, asked, size, hole_area, encode)
     start = asked[0] if start is None else start
