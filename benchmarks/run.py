@@ -98,7 +98,9 @@ def main() -> None:
     out = arguments.out or Path(tempfile.mkdtemp(prefix="jsecon-run-"))
     capture = rgbd_room(out / "capture") if arguments.capture == "rgbd" else Path(arguments.capture)
     out = out / "run"
-    environ = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(out / "programs")}
+    # The programs of this benchmark alone, kept as `jsecon` keeps them.
+    environ = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environ["XDG_CACHE_HOME"] = str(out / "home")
     found = {} if arguments.warm else {"cold": run_apart(capture, out, arguments.steps, environ)}
     for file in (out / "cache").glob("*.npz"):
         if not file.name.startswith(KEPT):

@@ -1,5 +1,6 @@
 """A run: its plan, its cache, what it leaves out, what it never looks at, and that it survives being killed."""
 
+import ast
 import dataclasses
 import json
 import os
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from jsecon import process
-from jsecon.app import cache, networks, pipeline, stages
+from jsecon.app import cache, networks, pipeline, question, stages
 from jsecon.app.progress import Listener
 from jsecon.app.scene_stages import gaussians
 from jsecon.app.stages import Work
@@ -27,6 +28,7 @@ from jsecon.language.field import load_field
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
+HOME = Path(pipeline.__file__).parent.parent
 STAGES = ("load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out")
 
 
@@ -308,33 +310,61 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
     assert not list(out.rglob("*.checkpoint.npz"))
 
 
-def test_each_stage_executes_nothing_that_its_key_does_not_cover(room, tmp_path):
-    """The files of jsecon whose functions run in each stage lie among those whose source its key digests."""
+@pytest.fixture(scope="module")
+def watched(room, tmp_path_factory):
+    """What a process that ran each stage, and then asked, tells of the files of jsecon whose functions ran."""
+    folder = tmp_path_factory.mktemp("watched")
     done = subprocess.run(
-        [sys.executable, "-c", WATCHER, str(room), str(tmp_path)],
-        env=os.environ | {"PYTHONPATH": str(Path(pipeline.__file__).parent.parent.parent)},
+        [sys.executable, "-c", WATCHER, str(room), str(folder)],
+        env=os.environ | {"PYTHONPATH": str(HOME.parent)},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    ran = json.loads((tmp_path / "ran.json").read_text())
-    assert set(ran) == set(STAGES)
-    for stage, told in ran.items():
+    return json.loads((folder / "ran.json").read_text())
+
+
+def test_each_stage_executes_nothing_that_its_key_does_not_cover(watched):
+    """The files of jsecon whose functions run in each stage lie among those whose source its key digests."""
+    assert set(watched["stages"]) == set(STAGES)
+    for stage, told in watched["stages"].items():
         assert told["ran"], stage
         listens = {str(Path(process.__file__))}  # jax tells it of programs compiled
         assert set(told["ran"]) - listens <= set(told["covered"]), stage
 
 
+@pytest.mark.parametrize(("module", "most"), [(pipeline, 25), (question, 12)], ids=["run", "query"])
+def test_the_files_to_read_are_those_that_run(watched, module, most):
+    """Each file that a docstring lists runs on the way, and one that runs without being listed is the ground's, the
+    engine's, or imported by its own room's listed ones."""
+    listed = {HOME / f"{name}.py" for name in re.findall(r"\b[a-z]+/[a-z_0-9]+\b", module.__doc__.split(":\n\n")[1])}
+    assert len(listed) <= most
+    ran = {Path(file) for file in watched["run" if module is pipeline else "query"] if Path(file).parent != HOME}
+    assert listed <= ran
+    behind, new = set(), listed
+    while new:
+        behind |= new
+        new = {other for file in new for other in imported(file) if other.parent == file.parent} - behind
+    assert {file for file in ran - behind if file.parent.name != "splat"} == set()
+
+
+def imported(file):
+    """The files of jsecon that one of them imports."""
+    return {cache._file_of(name) for name in cache._imports(ast.parse(file.read_text()))}
+
+
 WATCHER = """
-import cProfile, inspect, json, sys
+import inspect, json, sys, threading
 from pathlib import Path
 import jsecon
-from jsecon.app import cache, pipeline
+from jsecon.app import cache, pipeline, question
 from jsecon.app.options import Options
 from jsecon.app.stages import Stage
+from jsecon.language.field import load_field
+from jsecon.vision.colours import ColourEmbedder
 
 home, ran = Path(jsecon.__file__).parent, {}
-digested = []
+digested, on_the_way, seen = [], [], set()
 file_of = cache._file_of
 cache._file_of = lambda name: digested.append(name) or file_of(name)
 key = Stage.key
@@ -350,15 +380,33 @@ def key_and_cover(stage, work, keys):
 
 fetch = cache.fetch
 
+def listen(frame, event, _):
+    if event == "call" and frame.f_code.co_flags & inspect.CO_OPTIMIZED:  # no module's or class's body
+        seen.add(frame.f_code.co_filename)
+
+def ran_since():
+    found = sorted(file for file in seen.copy() if file.startswith(str(home)))
+    seen.clear()
+    return found
+
 def watched(path, compute, **kwargs):
-    profile = cProfile.Profile()
-    kept = fetch(path, lambda: profile.runcall(compute), **kwargs)
-    codes = [entry.code for entry in profile.getstats() if not isinstance(entry.code, str)]  # a str is a function in C
-    files = {code.co_filename for code in codes if code.co_flags & inspect.CO_OPTIMIZED}  # no module's or class's body
-    ran[path.stem.partition("-")[0]]["ran"] = sorted(file for file in files if file.startswith(str(home)))
-    return kept
+    def alone():
+        on_the_way.extend(ran_since())
+        value = compute()
+        ran[path.stem.partition("-")[0]]["ran"] = ran_since()
+        return value
+
+    return fetch(path, alone, **kwargs)
 
 Stage.key, cache.fetch = key_and_cover, watched
+threading.setprofile(listen)
+sys.setprofile(listen)
 pipeline.run(Options(Path(sys.argv[1]), holdout=4, steps=20), Path(sys.argv[2]) / "out")
-(Path(sys.argv[2]) / "ran.json").write_text(json.dumps(ran))
+on_the_way += ran_since() + [file for told in ran.values() for file in told["ran"]]
+field = load_field(Path(sys.argv[2]) / "out/field.npz")
+answer = question.ask_text(field, ColourEmbedder(), "red")
+assert answer.mask.any()
+question.write_answer(field, answer, Path(sys.argv[2]), question.masks_of(field, answer, 1))
+told = {"stages": ran, "run": on_the_way, "query": ran_since()}
+(Path(sys.argv[2]) / "ran.json").write_text(json.dumps(told))
 """

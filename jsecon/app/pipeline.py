@@ -3,7 +3,19 @@
     load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field, then the held-out frames measured
 
 The keys of all stages are known before any runs, so all of it is told first: what will run, what is cached, what is
-left out and why.
+left out and why. Read on the way, by default, without the ground (the root's modules); behind each file lies more of
+its own room, behind splat/render the engine:
+
+    all stages  app/pipeline, app/stages
+    load        app/scene_stages, data/capture, data/colmap
+    gaussians   fit/start, fit/optimise
+    masklets    app/masklet_stages, vision/protocols, vision/classical, vision/region_graph, association/atoms,
+                association/views, association/consensus, association/algorithm1
+    regions     app/language_stages, vision/colours, language/regions
+    codes       language/codes
+    votes       language/votes, splat/plan, splat/render
+    distil      language/distill
+    field       language/shares, language/field
 """
 
 import dataclasses
