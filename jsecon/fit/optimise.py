@@ -4,7 +4,6 @@ The number of Gaussians stays what it was at the start. The state between chunks
 fit can be stopped after any chunk and gone on with, to the same result.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any, cast
@@ -20,11 +19,10 @@ from jsecon.fit.photometric import photometric_loss, psnr
 from jsecon.numerics import finite
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.render import render_rgb
-from jsecon.types import Array, Camera, Capture, Gaussians
+from jsecon.types import Array, Camera, Capture, Gaussians, record
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class LearningRates:
     """Step sizes of Adam per group, for fits of hundreds to a few thousand steps.
 
@@ -44,8 +42,7 @@ class LearningRates:
     """what the other rates have decayed to at the last step, log-linearly too, as a share of their first"""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class FitState:
     """All that a fit needs to go on."""
 
@@ -86,7 +83,7 @@ def start_state(gaussians: Gaussians, steps: int) -> FitState:
     return FitState(gaussians, zeros, zeros, np.zeros((), np.int32), np.full(steps, np.nan, np.float32))
 
 
-_ADAM = optax.scale_by_adam(eps=1e-15)
+_ADAM, _RATES = optax.scale_by_adam(eps=1e-15), LearningRates()
 
 
 def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, step, band_every: Array) -> Gaussians:
@@ -174,7 +171,7 @@ def fit_gaussians(
     key: PRNGKeyArray,
     start: Gaussians | None = None,
     state: FitState | None = None,
-    rates: LearningRates = LearningRates(),
+    rates: LearningRates = _RATES,
     band_every: int | None = None,
     coarse: float = 0.5,
     chunk: int = 50,
