@@ -42,28 +42,23 @@ def check_backend(*, strict: bool = False) -> BackendReport:
     """
     rng = np.random.default_rng(0)
     texts, rows = rng.normal(size=(2, 3)), rng.normal(size=(_ROWS, 3))
-    expected = (rows / np.linalg.norm(rows, axis=1, keepdims=True)) @ (
-        texts / np.linalg.norm(texts, axis=1, keepdims=True)
-    ).T
+    unit_rows, unit_texts = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in (rows, texts))
+    expected = (unit_rows @ unit_texts.T).max(1)
+    error = lambda found: float(np.abs(np.asarray(found, np.float64) - expected).max())
     f, t = jnp.asarray(rows, jnp.float32), jnp.asarray(texts, jnp.float32)
     ours = [
         jax.jit(lambda f, t: cosine_matrix(f, t).max(1))(f, t),
         jax.jit(jax.vmap(lambda f, t: cosine(f[None], t).max(), in_axes=(0, None)))(f, t),
         jax.jit(lambda f, t: cosine(f[:, None], t[None]).max(1))(f, t),
     ]
-    cosine_error = max(float(np.abs(np.asarray(o, np.float64) - expected.max(1)).max()) for o in ours)
     unit = normalize(t)
     broken = jax.jit(jax.vmap(lambda f: jnp.max(unit @ (f / jnp.linalg.norm(f)))))(f)
-    matvec_error = float(np.abs(np.asarray(broken, np.float64) - expected.max(1)).max())
-    report = BackendReport(jax.default_backend(), jax.__version__, cosine_error, matvec_error)
-    if not cosine_error < 1e-5:
-        raise RuntimeError(
-            f"check_backend: cosines are off by {cosine_error:.2g} on {report.platform} with jax {jax.__version__}, "
-            f"expected at most 1e-5. {REMEDY}"
-        )
+    report = BackendReport(jax.default_backend(), jax.__version__, max(map(error, ours)), error(broken))
+    off, where = "check_backend: {} are off by {:.2g}", f"on {report.platform} with jax {jax.__version__}"
+    if not report.cosine_error < 1e-5:
+        told = off.format("cosines", report.cosine_error)
+        raise RuntimeError(f"{told} {where}, expected at most 1e-5. {REMEDY}")
     if strict and report.has_jax_39103:
-        raise RuntimeError(
-            f"check_backend: vmapped matrix-vector products are off by {matvec_error:.2g} with jax {jax.__version__} "
-            f"(jax issue 39103), expected at most 1e-3. {REMEDY}"
-        )
+        told = off.format("vmapped matrix-vector products (jax issue 39103)", report.matvec_error)
+        raise RuntimeError(f"{told} {where}, expected at most 1e-3. {REMEDY}")
     return report

@@ -22,12 +22,8 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
     except OSError as error:
-        raise InputError(
-            path,
-            f"{error.strerror} on writing to {path.parent}",
-            "a folder that can be written",
-            "Choose another output folder, or mend its permissions.",
-        ) from error
+        found, remedy = f"{error.strerror} on writing to {path.parent}", "Choose another, or mend its permissions."
+        raise InputError(path, found, "a folder that can be written", remedy) from error
     try:
         yield temporary
         os.replace(temporary, path)

@@ -35,8 +35,7 @@ def into_range(size: Array) -> Array:
 
 
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
-    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike), with zero gradient at
-    zero."""
+    """Euclidean length over `axis`, right over the whole float range (1e-30 and 1e30 alike); gradient zero at zero."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)

@@ -35,14 +35,10 @@ def over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total:
         out = local(jax.lax.axis_index(AXIS), dealt, common)
         return jax.lax.psum(out, AXIS) if total else out
 
+    part, whole = PartitionSpec(AXIS), PartitionSpec()
     # The carries of a walk start as constants, which the check of varying axes would have to be told of one by one.
-    return jax.shard_map(
-        run,
-        mesh=mesh,
-        in_specs=(PartitionSpec(AXIS), PartitionSpec()),
-        out_specs=PartitionSpec() if total else PartitionSpec(AXIS),
-        check_vma=False,
-    )(dealt, common)
+    spread = jax.shard_map(run, mesh=mesh, in_specs=(part, whole), out_specs=whole if total else part, check_vma=False)
+    return spread(dealt, common)
 
 
 def over_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:

@@ -21,8 +21,6 @@ from pathlib import Path
 # mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
 # kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
-
-
 _built: dict[str, int] = {}
 
 
@@ -121,7 +119,5 @@ def _cpu_features() -> frozenset[str]:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return frozenset()
-    return next(
-        (frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith(("flags", "Features"))),
-        frozenset(),
-    )
+    told = (line.split(":", 1)[1].split() for line in lines if line.startswith(("flags", "Features")))
+    return frozenset(next(told, ()))

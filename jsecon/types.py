@@ -21,16 +21,18 @@ Leaf: TypeAlias = Any
 """an array field of a pytree defined elsewhere: while jax transforms it, it may hold a tracer, an axis or a sentinel"""
 
 
-def _static(**kwargs) -> Any:
+def static(**kwargs) -> Any:
+    """A field that jax holds to be part of the type: jit compiles anew for each value."""
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
 @dataclass_transform(frozen_default=True)
-def _record(cls):
+def record(cls):
+    """A frozen dataclass that is a pytree."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
 
 
-@_record
+@record
 class Gaussians:
     """A scene of N anisotropic 3D Gaussians (Kerbl et al. 2023), stored before their activations."""
 
@@ -50,7 +52,7 @@ class Gaussians:
         return self.means.shape[0]
 
 
-@_record
+@record
 class Camera:
     """A pinhole camera; leading axes batch every array alike. Width and height are static."""
 
@@ -64,9 +66,9 @@ class Camera:
     """(...,) principal point, px, measured from the left edge of the first pixel."""
     cy: Array
     """(...,) principal point, px, measured from the upper edge of the first pixel."""
-    width: int = _static()
+    width: int = static()
     """px."""
-    height: int = _static()
+    height: int = static()
     """px."""
 
     def __getitem__(self, index) -> Camera:
@@ -80,7 +82,7 @@ class Camera:
         return -(rotation * translation[..., :, None]).sum(-2)
 
 
-@_record
+@record
 class Capture:
     """A posed set of frames, as every loader returns it. Arrays are NumPy on the host."""
 
@@ -98,13 +100,13 @@ class Capture:
     """(T, H, W) float32 z-depth in world units, 0 = unknown; or None."""
     to_source: Array
     """(4, 4) similarity from this world to the files' own world (identity where nothing was normalised)."""
-    names: tuple[str, ...] = _static()
+    names: tuple[str, ...] = static()
     """T file names without folder or ending, in frame order."""
-    notes: tuple[str, ...] = _static(default=())
+    notes: tuple[str, ...] = static(default=())
     """What the loader left out or changed, a sentence each."""
 
 
-@_record
+@record
 class Rendering:
     """One rendered view."""
 
@@ -118,7 +120,7 @@ class Rendering:
     """(H, W) expected z-depth, world units, 0 where nothing is covered; or None where it was not asked for."""
 
 
-@_record
+@record
 class Votes:
     """The weight that each region casts on each Gaussian: the K strongest regions of W^T onto one-hot labels."""
 
@@ -136,7 +138,7 @@ class Votes:
     """(N,) int32 views in which the Gaussian has any weight; 0 = never seen: unknown."""
     overflow: Array
     """() int32 (block, Gaussian) pairs left out for want of capacity, all views; 0 means exact."""
-    num_regions: int = _static()
+    num_regions: int = static()
     """R."""
     by_view: Array | None = None
     """(T, N) sum of alpha T over the pixels of each view, or None where it was not kept."""
@@ -158,7 +160,7 @@ class Votes:
         return jnp.zeros((n, self.num_regions), self.weights.dtype).at[rows, columns].add(self.weights, mode="drop")
 
 
-@_record
+@record
 class Regions:
     """What the masklets are: one row per region."""
 
@@ -172,7 +174,7 @@ class Regions:
         return self.embeddings.shape[0]
 
 
-@_record
+@record
 class LanguageField:
     """Everything a query needs, in one file: the scene, its codes and votes, its regions, and where they came from."""
 
@@ -191,15 +193,15 @@ class LanguageField:
     """(C, E) embeddings of the canonical phrases (LERF: object, things, stuff, texture) in the embedder's space."""
     to_source: Array
     """(4, 4) from the field's world to the capture files' world; undone on export."""
-    names: tuple[str, ...] = _static()
+    names: tuple[str, ...] = static()
     """T frame names."""
-    embedder: str = _static(default="")
+    embedder: str = static(default="")
     """name of the embedder whose space the regions live in; texts must be embedded by the same."""
-    provenance: str = _static(default="{}")
+    provenance: str = static(default="{}")
     """JSON: version, options, inputs' digests."""
 
 
-@_record
+@record
 class Selection:
     """The answer to one query."""
 

@@ -102,7 +102,6 @@ def test_fit_brings_the_held_out_view_closer(capture, start, truth, fitted):
     assert np.isfinite(losses).all()
     assert losses[-8:].mean() < 0.5 * losses[:8].mean()
     assert evaluate_psnr(truth, capture)[0] > 50  # the photographs are 8-bit copies of it
-    assert evaluate_psnr(gaussians, capture, frames=np.array([0, 1])).shape == (2,)
 
 
 def test_held_out_frames_are_never_fitted_to(capture, start, fitted):

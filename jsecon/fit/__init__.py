@@ -1,2 +1,1 @@
-"""Gaussians from images: where they start (initialise, triangulate), what they are fitted to (photometric), how
-(optimise)."""
+"""Gaussians from images: their start (start, depth, triangulate), the loss (photometric), and the fit (optimise)."""

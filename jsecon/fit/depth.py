@@ -29,12 +29,7 @@ class DepthPoints(NamedTuple):
 
 def require_depths(capture: Capture) -> None:
     if capture.depths is None:
-        raise InputError(
-            "capture",
-            "no depth frames",
-            "RGB-D frames",
-            "Start from sparse points (gaussians_from_points) or triangulate them.",
-        )
+        raise InputError("capture", "no depth frames", "RGB-D frames", "Start from sparse points, or triangulate them.")
 
 
 def back_projected(capture: Capture, frame: int, stride: int):
@@ -52,20 +47,12 @@ def back_projected(capture: Capture, frame: int, stride: int):
     return world, np.asarray(capture.frames[frame])[rows, columns], np.stack([rows, columns], axis=1)
 
 
-def _voxel_ids(points: np.ndarray, voxel: float) -> tuple[np.ndarray, int]:
-    """(S,) id of each point's voxel in 0..P-1, and P."""
+def _voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
+    """(S,) id of each point's voxel, in 0..P-1 and all of them in use."""
     cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
-    size = cells.max(axis=0) + 1
-    require(
-        float(size[0]) * float(size[1]) * float(size[2]) < 2**62,
-        "voxel",
-        voxel,
-        f"large enough for the extent {np.ptp(points, axis=0)}",
-        "Choose a larger voxel.",
-    )
-    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-    unique, ids = np.unique(keys, return_inverse=True)
-    return ids.reshape(-1), len(unique)
+    size, enough = cells.max(axis=0) + 1, f"large enough for the extent {np.ptp(points, axis=0)}"
+    require(math.prod(map(float, size)) < 2**62, "voxel", voxel, enough, "Choose a larger voxel.")
+    return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)), return_inverse=True)[1]
 
 
 def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
@@ -75,10 +62,7 @@ def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
     low = high / 2**20
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        if _voxel_ids(points, middle)[1] > max_points:
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if _voxel_ids(points, middle).max() >= max_points else (low, middle)
     return high
 
 
@@ -92,41 +76,30 @@ def points_from_depth(
 ) -> DepthPoints:
     """Back-projects the known depths and keeps the mean of each occupied voxel.
 
-    Give the voxel's edge in world units, or `max_points` and the edge is found. Held-out
-    frames are left out unless `frames` names them. `stride` takes every so many pixels in each direction. Raises
-    InputError where the capture has no depth, ValueError where neither or both of `voxel` and `max_points` are given.
+    Give the voxel's edge in world units, or `max_points` and the edge is found. Held-out frames are left out unless
+    `frames` names them. `stride` takes every so many pixels in each direction. Raises InputError where the capture has
+    no depth, ValueError where neither or both of `voxel` and `max_points` are given.
     """
-    require(
-        (voxel is None) != (max_points is None),
-        "voxel, max_points",
-        (voxel, max_points),
-        "exactly one of the two",
-        "Give voxel in world units, or max_points.",
-    )
+    given, exclusive = (voxel, max_points), (voxel is None) != (max_points is None)
+    require(exclusive, "voxel, max_points", given, "exactly one of the two", "voxel is in world units.")
     require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
     parts = [back_projected(capture, int(t), stride) for t in chosen]
-    points = np.concatenate([p for p, _, _ in parts]) if parts else np.zeros((0, 3))
-    if not len(points):
-        raise InputError(
-            "capture", "no pixel with a known depth", "depths above 0", "Check the depth frames' encoding and unit."
-        )
-    colors = np.concatenate([c for _, c, _ in parts])
-    pixels = np.concatenate(
-        [np.concatenate([np.full((len(p), 1), t), p], axis=1) for t, (_, _, p) in zip(chosen, parts, strict=True)]
-    )
+    if not any(len(world) for world, _, _ in parts):
+        raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
+    points, colors, pixels = (np.concatenate(own) for own in zip(*parts))
+    frame = np.repeat(chosen, [len(world) for world, _, _ in parts])
     if voxel is None:
         assert max_points is not None
         voxel = voxel_for(points, max_points)
-    ids, count = _voxel_ids(points, voxel)
-    counts = np.bincount(ids, minlength=count)
-    mean = np.stack([np.bincount(ids, points[:, a], minlength=count) for a in range(3)], axis=1) / counts[:, None]
-    color = np.stack([np.bincount(ids, colors[:, a], minlength=count) for a in range(3)], axis=1) / counts[:, None]
+    ids = _voxel_ids(points, voxel)
+    counts = np.bincount(ids)
+    mean, color = (np.stack([np.bincount(ids, a) for a in v.T], axis=1) / counts[:, None] for v in (points, colors))
     return DepthPoints(
         mean.astype(np.float32),
         np.rint(color).astype(np.uint8),
         counts.astype(np.int32),
         float(voxel),
-        pixels.astype(np.int32),
+        np.column_stack([frame, pixels]).astype(np.int32),
         ids.astype(np.int32),
     )

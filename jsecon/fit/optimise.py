@@ -4,10 +4,9 @@ The number of Gaussians stays what it was at the start. The state between chunks
 fit can be stopped after any chunk and gone on with, to the same result.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +19,10 @@ from jsecon.fit.photometric import photometric_loss, psnr
 from jsecon.numerics import finite
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.render import render_rgb
-from jsecon.types import Array, Camera, Capture, Gaussians
+from jsecon.types import Array, Camera, Capture, Gaussians, record
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class LearningRates:
     """Step sizes of Adam per group, for fits of hundreds to a few thousand steps.
 
@@ -44,8 +42,7 @@ class LearningRates:
     """what the other rates have decayed to at the last step, log-linearly too, as a share of their first"""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class FitState:
     """All that a fit needs to go on."""
 
@@ -63,19 +60,15 @@ class FitState:
 
 def cameras_extent(cameras: Camera) -> float:
     """1.1 times the largest distance of a camera's centre from their mean, world units (INRIA's `spatial_lr_scale`)."""
-    pose = np.asarray(cameras.world_to_camera, np.float64)
-    centres = -np.einsum("tji,tj->ti", pose[:, :3, :3], pose[:, :3, 3])
+    centres = jax.tree.map(lambda a: np.asarray(a, np.float64), cameras).centres
     return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
 def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
-    """The views of steps first..last-1: each round of `views` steps takes every view once, in an order drawn by
-    `key`."""
-    rounds = range(first // views, -(-last // views))
-    order = [np.asarray(_round(key, r, views)) for r in rounds]
-    start = first - (first // views) * views
-    joined = np.concatenate(order) if order else np.zeros(0, np.int64)
-    return joined[start : start + last - first].astype(np.int64)
+    """The views of steps first..last-1: each round of `views` steps takes all of them once, in an order of `key`'s."""
+    rounds = [np.asarray(_round(key, r, views)) for r in range(first // views, -(-last // views))]
+    start = first % views
+    return np.concatenate([np.zeros(0, np.int64), *rounds])[start : start + last - first]
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -90,15 +83,14 @@ def start_state(gaussians: Gaussians, steps: int) -> FitState:
     return FitState(gaussians, zeros, zeros, np.zeros((), np.int32), np.full(steps, np.nan, np.float32))
 
 
-_ADAM = optax.scale_by_adam(eps=1e-15)
+_ADAM, _RATES = optax.scale_by_adam(eps=1e-15), LearningRates()
 
 
 def _rates(gaussians: Gaussians, rates: LearningRates, extent: Array, progress, step, band_every: Array) -> Gaussians:
     """One rate per array (one per band for sh), in the shape of Gaussians."""
     bands = gaussians.sh.shape[1]
     degree = np.floor(np.sqrt(np.arange(bands))).astype(np.int32)
-    active = degree <= step // band_every
-    sh = jnp.where(active, jnp.where(degree == 0, rates.colors, rates.colors / 20), 0.0)
+    sh = jnp.where(degree <= step // band_every, jnp.where(degree == 0, rates.colors, rates.colors / 20), 0.0)
     # Log-linear; written so that a rate of 0 (frozen positions) stays 0.
     decay = jnp.where(rates.means > 0, rates.means_last / jnp.where(rates.means > 0, rates.means, 1.0), 0.0)
     means = extent * rates.means * decay**progress
@@ -141,7 +133,7 @@ def _chunk(
 ) -> tuple[FitState, int]:
     """A step on each of `pictures`, (camera, frame) pairs; and the most pairs that overflowed in any of them."""
     steps = state.losses.shape[0]
-    moments: Any = optax.ScaleByAdamState(state.step, _tree(state.first_moment), _tree(state.second_moment))
+    moments: Any = optax.ScaleByAdamState(*cast(Any, (state.step, state.first_moment, state.second_moment)))
     gaussians, losses, overflow = state.gaussians, [], []
     for camera, frame in pictures:
         (gaussians, moments), loss, missing = _step(
@@ -153,11 +145,6 @@ def _chunk(
     taken[first : first + len(losses)] = jax.device_get(losses)
     step = np.asarray(first + len(losses), np.int32)
     return FitState(gaussians, moments.mu, moments.nu, step, taken), int(max(jax.device_get(overflow)))
-
-
-def _tree(record: Gaussians) -> Any:
-    """A record where optax's annotations ask for a tree of its own kinds."""
-    return record
 
 
 def _chunks(first: int, steps: int, chunk: int, switch: int) -> Iterator[tuple[int, int]]:
@@ -184,7 +171,7 @@ def fit_gaussians(
     key: PRNGKeyArray,
     start: Gaussians | None = None,
     state: FitState | None = None,
-    rates: LearningRates = LearningRates(),
+    rates: LearningRates = _RATES,
     band_every: int | None = None,
     coarse: float = 0.5,
     chunk: int = 50,
@@ -196,31 +183,21 @@ def fit_gaussians(
     One view a step, all views once before any comes again, in an order drawn by `key`; the first `coarse` of the steps
     on frames of half the size, which costs a quarter and moves what is large first. The degree of the spherical
     harmonics grows by one every `band_every` steps (by default 1000, in a short fit a quarter of it) up to what
-    `start.sh` holds. The background is black. After every `chunk` steps `on_checkpoint` is
-    given the state. A chunk in which a view overflowed its tile lists is taken again with more room, so the result does
-    not depend on the capacity. Raises ValueError where not exactly one of `start` and `state` is given or the state is
-    of another number of steps, InputError where every frame is held out or the numbers stop being finite.
+    `start.sh` holds. The background is black. After every `chunk` steps `on_checkpoint` is given the state. A chunk in
+    which a view overflowed its tile lists is taken again with more room, so the result does not depend on the capacity.
+    Raises ValueError where not exactly one of `start` and `state` is given or the state is of another number of steps,
+    InputError where every frame is held out or the numbers stop being finite.
     """
-    require(
-        (start is None) != (state is None),
-        "start, state",
-        (start is not None, state is not None),
-        "exactly one of the two",
-        "Give start for a new fit, state to go on with one.",
-    )
+    given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
+    require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
     used = np.flatnonzero(~np.asarray(capture.held_out))
     if not len(used):
         raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
     begun = start_state(start, steps) if start is not None else state
     assert begun is not None
     require(0 <= coarse <= 1, "coarse", coarse, "between 0 and 1", "0 keeps the frames' size.")
-    require(
-        begun.losses.shape == (steps,),
-        "state",
-        f"a fit of {begun.losses.shape[0]} steps",
-        f"{steps} steps",
-        "Go on with the options that the fit was started with.",
-    )
+    own = begun.losses.shape[0]
+    require(own == steps, "state", f"a fit of {own} steps", f"{steps} steps", "Go on with the options of its start.")
     current: FitState = jax.device_put(begun)
     cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[used])  # whose items compile nothing
     extent = np.asarray(cameras_extent(cameras), np.float32)
@@ -235,20 +212,14 @@ def fit_gaussians(
             capacity = default_capacity(current.gaussians.count, sized[0].width, sized[0].height)
         views = view_order(key, len(used), first, last)
         pictures = [(sized[0][int(v)], sized[1][int(v)]) for v in views]
-        while True:
-            after, overflow = _chunk(current, pictures, extent, rates, every, capacity)
-            if overflow == 0:
-                break
-            capacity = enough_capacity(capacity, np.array([overflow]))
-        current = after
+        while (taken := _chunk(current, pictures, extent, rates, every, capacity))[1]:
+            capacity = enough_capacity(capacity, np.array([taken[1]]))
+        current = taken[0]
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
         if not (np.isfinite(current.losses[last - 1]) and bool(_all_finite(current.gaussians))):
-            raise InputError(
-                "fit",
-                f"numbers that are not finite after step {last}",
-                "a fit that converges",
-                "Check the start, the poses and the intrinsics, or lower the learning rates.",
-            )
+            found = f"numbers that are not finite after step {last}"
+            remedy = "Check the start, the poses and the intrinsics, or lower the learning rates."
+            raise InputError("fit", found, "a fit that converges", remedy)
         if on_checkpoint:
             on_checkpoint(current)
         if progress:
@@ -256,9 +227,7 @@ def fit_gaussians(
     return current.gaussians, np.asarray(current.losses)
 
 
-@jax.jit
-def _all_finite(gaussians: Gaussians) -> Array:
-    return finite(*jax.tree.leaves(gaussians))
+_all_finite = jax.jit(lambda gaussians: finite(*jax.tree.leaves(gaussians)))
 
 
 @jax.jit
@@ -267,15 +236,10 @@ def _psnr_of_photograph(image: Array, frame: UInt8[Array, "h w 3"]) -> Array:
 
 
 def evaluate_psnr(
-    gaussians: Gaussians,
-    capture: Capture,
-    *,
-    frames: Int[np.ndarray, " f"] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    gaussians: Gaussians, capture: Capture, *, progress: Callable[[int, int], None] | None = None
 ) -> Float[np.ndarray, " f"]:
-    """PSNR (dB) of each of `frames`, by default the held-out ones, against the photographs; renderings clamped to
-    [0, 1]."""
-    chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
+    """PSNR (dB) of each held-out frame, against the photographs; renderings clamped to [0, 1]."""
+    chosen = np.flatnonzero(capture.held_out)
     gaussians, values = jax.device_put(gaussians), []
     for n, t in enumerate(chosen):
         image = render_rgb(gaussians, capture.cameras[int(t)]).features

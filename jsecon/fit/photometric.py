@@ -1,8 +1,7 @@
 """How far a rendered image is from a photograph: L1, SSIM, their mixture (the 3DGS loss), and PSNR.
 
-Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 with the constants that 3DGS training
-uses: an 11 x 11 Gaussian window of sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
-channels.
+Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 as 3DGS training uses it: an 11 x 11 Gaussian window of
+sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and channels.
 """
 
 import functools
@@ -51,13 +50,8 @@ gaussian_blur.defvjp(lambda image: (gaussian_blur(image), None), lambda _, cotan
 
 
 def _same_shape(image, target) -> None:
-    require(
-        image.shape == target.shape,
-        "image and target",
-        f"{image.shape} and {target.shape}",
-        "the same (H, W, C)",
-        "Render at the size of the photograph.",
-    )
+    got = f"{image.shape} and {target.shape}"
+    require(image.shape == target.shape, "image and target", got, "the same (H, W, C)", "Render at the photo's size.")
 
 
 def l1(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
@@ -67,17 +61,12 @@ def l1(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Arr
 
 
 def ssim_map(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, "h w c"]:
-    """Structural similarity at each pixel and channel, in [-1, 1]; 1 where the windows are equal (Wang et al. 2004, eq.
-    13)."""
+    """Structural similarity at each pixel and channel, in [-1, 1]; 1 where windows are equal (Wang 2004, eq. 13)."""
     _same_shape(image, target)
-    # Five blurs rather than one of a stack: slicing the stack's gradient apart costs XLA four times the blurs
-    # themselves.
+    # Five blurs, not one of a stack: slicing the stack's gradient apart costs XLA four times the blurs themselves.
     mean_i, mean_t = gaussian_blur(image), gaussian_blur(target)
-    square_i, square_t, product = (
-        gaussian_blur(image * image),
-        gaussian_blur(target * target),
-        gaussian_blur(image * target),
-    )
+    square_i, square_t = gaussian_blur(image * image), gaussian_blur(target * target)
+    product = gaussian_blur(image * target)
     variance_i, variance_t = square_i - mean_i * mean_i, square_t - mean_t * mean_t
     covariance = product - mean_i * mean_t
     numerator = (2 * mean_i * mean_t + C1) * (2 * covariance + C2)
@@ -89,18 +78,13 @@ def ssim(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[A
     return jnp.mean(ssim_map(image, target))
 
 
-def photometric_loss(
-    image: Float[Array, "h w c"], target: Float[Array, "_ _ _"], *, ssim_weight: float = 0.2
-) -> Float[Array, ""]:
-    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM), Kerbl et al. 2023, eq. 7."""
-    if ssim_weight == 0:
-        return l1(image, target)
-    return (1 - ssim_weight) * l1(image, target) + ssim_weight * (1 - ssim(image, target))
+def photometric_loss(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
+    """0.8 L1 + 0.2 (1 - SSIM), Kerbl et al. 2023, eq. 7."""
+    return 0.8 * l1(image, target) + 0.2 * (1 - ssim(image, target))
 
 
 def psnr(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio, dB, of images in [0, 1]; infinite where they are equal. Clamp the rendering
-    before."""
+    """Peak signal-to-noise ratio, dB, of images in [0, 1] (clamp the rendering before); infinite where equal."""
     _same_shape(image, target)
     difference = image - target
     return -10.0 * jnp.log10(jnp.mean(difference * difference))

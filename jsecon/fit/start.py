@@ -18,65 +18,43 @@ MIN_SQUARED_DISTANCE = 1e-7
 
 
 def starting_gaussians(
-    capture: Capture,
-    *,
-    sh_degree: int = 0,
-    opacity: float = 0.7,
-    scale: float = 0.6,
-    depth_opacity: float = 0.9,
-    depth_scale: float = 0.5,
-    max_depth_points: int = 100_000,
-    progress: Callable[[int, int], None] | None = None,
+    capture: Capture, *, sh_degree: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> tuple[Gaussians, str]:
     """The Gaussians that a fit of `capture` starts from, and one sentence on where they come from.
 
-    Depth frames come first (back-projected, voxel-subsampled to at most `max_depth_points`, at `depth_opacity`), then
-    the capture's own points, then points triangulated from the frames that are not held out. Raises InputError where
-    the capture has neither depth nor points and its views cannot be triangulated.
+    Depth frames come first (back-projected, voxel-subsampled to at most 100,000), then the capture's own points, then
+    points triangulated from the frames that are not held out. Raises InputError where the capture has neither depth nor
+    points and its views cannot be triangulated.
 
-    `opacity` and `scale` (in units of the distance to the neighbours) are smaller and denser than INRIA's 0.1 and 1,
+    The scale (in units of the distance to the neighbours) is smaller and the opacity larger than INRIA's 1 and 0.1,
     which are meant for a fit that adds Gaussians. Measured with the same number of steps: on the demo room (seed 0, 400
-    steps) 32.6 dB held out for 0.8 and 0.6, 31.0 dB for 0.1 and 1, with half the error of the rendered depth; on fox
-    (216x384, 500 steps) 25.8 and 25.4 dB.
+    steps) 32.6 dB held out for opacity 0.8 and scale 0.6, 31.0 dB for 0.1 and 1, with half the error of the rendered
+    depth; on fox (216x384, 500 steps) 25.8 and 25.4 dB.
     """
     if capture.depths is not None:
-        dense = points_from_depth(capture, max_points=max_depth_points, stride=2)
-        gaussians = gaussians_from_points(
-            dense.points,
-            dense.colors,
-            opacity=depth_opacity,
-            scale=depth_scale,
-            sh_degree=sh_degree,
-            max_scale=2 * dense.voxel,
-        )
-        return (
-            gaussians,
-            f"{gaussians.count} points from the depth frames, one a voxel of {dense.voxel:.3g} world units",
-        )
+        dense = points_from_depth(capture, max_points=100_000, stride=2)
+        given = {"opacity": 0.9, "scale": 0.5, "max_scale": 2 * dense.voxel}
+        gaussians = gaussians_from_points(dense.points, dense.colors, sh_degree=sh_degree, **given)
+        origin = f"{gaussians.count} points from the depth frames, one a voxel of {dense.voxel:.3g} world units"
+        return gaussians, origin
     count = len(capture.points)
     if count >= MIN_POINTS:
-        gaussians = gaussians_from_points(
-            np.asarray(capture.points),
-            np.asarray(capture.point_colors),
-            opacity=opacity,
-            scale=scale,
-            sh_degree=sh_degree,
-        )
-        return gaussians, f"{count} sparse points of the capture"
-    points, colors = triangulated_points(capture, progress=progress)
-    gaussians = gaussians_from_points(points, colors, opacity=opacity, scale=scale, sh_degree=sh_degree)
-    few = f"only {count} points" if count else "no points"
-    return gaussians, f"the capture has {few}: {len(points)} points triangulated from feature matches between its views"
+        points, colors, origin = capture.points, capture.point_colors, f"{count} sparse points of the capture"
+    else:
+        points, colors = triangulated_points(capture, progress=progress)
+        few = f"only {count} points" if count else "no points"
+        origin = f"the capture has {few}: {len(points)} points triangulated from feature matches between its views"
+    return gaussians_from_points(points, colors, opacity=0.7, scale=0.6, sh_degree=sh_degree), origin
 
 
-def neighbour_distances(points: Float[Array, "p 3"], neighbours: int = 3) -> Float[np.ndarray, " p"]:
-    """Root of the mean squared distance to the nearest other points, world units (simple-knn of graphdeco-inria).
+def neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:
+    """Root of the mean squared distance to the three nearest other points, world units (simple-knn of graphdeco-inria).
 
-    With fewer than `neighbours` other points, the mean is over those there are; a lone point gets the floor.
+    With fewer other points, the mean is over those there are; a lone point gets the floor.
     """
     points = np.asarray(points, np.float64)
     count = len(points)
-    others = min(neighbours, count - 1)
+    others = min(3, count - 1)
     if others < 1:
         return np.full(count, math.sqrt(MIN_SQUARED_DISTANCE))
     distances, _ = KDTree(points).query(points, k=others + 1, workers=-1)
@@ -91,7 +69,6 @@ def gaussians_from_points(
     scale: float = 1.0,
     max_scale: float | None = None,
     sh_degree: int = 0,
-    neighbours: int = 3,
 ) -> Gaussians:
     """One round Gaussian a point (Kerbl et al. 2023, section 5.1).
 
@@ -100,24 +77,13 @@ def gaussians_from_points(
     is not finite, or an option is outside its range.
     """
     points, colors = np.asarray(points), np.asarray(colors)
-    require(
-        len(points) > 0,
-        "points",
-        "none",
-        "at least one point",
-        "Give points, or triangulate them from the frames (jsecon.fit.triangulate).",
-    )
-    require(
-        bool(np.isfinite(points).all()),
-        "points",
-        "a coordinate that is not finite",
-        "finite coordinates",
-        "Drop such points first.",
-    )
+    require(len(points) > 0, "points", "none", "at least one", "Triangulate them from the frames (fit.triangulate).")
+    bad = int((~np.isfinite(points).all(axis=1)).sum())
+    require(not bad, "points", f"{bad} with a coordinate that is not finite", "finite coordinates", "Drop them first.")
     require(0 < opacity < 1, "opacity", opacity, "between 0 and 1", "0.1 is usual, 0.9 on depth.")
     require(scale > 0, "scale", scale, "positive", "1 is usual.")
     require(sh_degree in (0, 1, 2, 3), "sh_degree", sh_degree, "0 to 3", "0 is colour alone.")
-    deviations = scale * neighbour_distances(points, neighbours)
+    deviations = scale * neighbour_distances(points)
     if max_scale is not None:
         deviations = np.minimum(deviations, max_scale)
     count = len(points)

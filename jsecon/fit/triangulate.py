@@ -16,6 +16,14 @@ from jsecon.types import Capture
 
 MIN_POINTS = 50
 """fewer points than this are no start for a scene: the views do not overlap or have no texture"""
+NEIGHBOURS, MAX_FEATURES = 6, 6000
+"""views that each is matched with, features of a view"""
+CONTRAST = 0.015
+"""SIFT's threshold: its own default is 0.04, lower gives more points"""
+RATIO = 0.85
+"""Lowe's, of the distances to the nearest descriptor and the second"""
+ERROR_PX, MIN_ANGLE_DEG = 2.0, 2.0
+"""bounds of the distance to the epipolar line and of the reprojection error; of the parallax"""
 
 
 class _Features(NamedTuple):
@@ -24,24 +32,21 @@ class _Features(NamedTuple):
     colors: np.ndarray  # (F, 3) uint8
 
 
-def _detect(frame: np.ndarray, max_features: int, contrast: float) -> _Features:
-    sift = cv2.SIFT.create(nfeatures=max_features, contrastThreshold=contrast)  # type: ignore[attr-defined]
+def _detect(frame: np.ndarray) -> _Features:
+    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
     keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), None)
     if not keypoints:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.uint8))
     xy = np.array([k.pt for k in keypoints], np.float64)
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))  # Arandjelovic 2012
     height, width = frame.shape[:2]
-    column = np.clip(np.rint(xy[:, 0]).astype(int), 0, width - 1)
-    row = np.clip(np.rint(xy[:, 1]).astype(int), 0, height - 1)
-    return _Features(
-        xy + 0.5, descriptors.astype(np.float32), frame[row, column]
-    )  # OpenCV's pixel centres are integers
+    column, row = np.clip(np.rint(xy).astype(int), 0, [width - 1, height - 1]).T
+    # OpenCV's pixel centres are integers.
+    return _Features(xy + 0.5, descriptors.astype(np.float32), frame[row, column])
 
 
 def view_pairs(world_to_camera: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
-    """Each view with the `neighbours` that look most alike: near in place (in units of the median spacing) and
-    direction."""
+    """Each view with those that look most alike: near in place (in units of the median spacing) and direction."""
     rotation = world_to_camera[:, :3, :3]
     centres = -np.einsum("tji,tj->ti", rotation, world_to_camera[:, :3, 3])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
@@ -61,7 +66,7 @@ def _fundamental(world_to_camera, intrinsics, i: int, j: int) -> np.ndarray:
     return np.linalg.inv(intrinsics[j]).T @ cross @ relative[:3, :3] @ np.linalg.inv(intrinsics[i])
 
 
-def _match(a: _Features, b: _Features, fundamental: np.ndarray, ratio: float, epipolar_px: float) -> np.ndarray:
+def _match(a: _Features, b: _Features, fundamental: np.ndarray) -> np.ndarray:
     """(M, 2) indices of mutual nearest descriptors that pass Lowe's ratio and lie on each other's epipolar lines."""
     if len(a.pixels) < 2 or len(b.pixels) < 2:
         return np.zeros((0, 2), int)
@@ -72,54 +77,36 @@ def _match(a: _Features, b: _Features, fundamental: np.ndarray, ratio: float, ep
     similarity[rows, forward] = -1
     second = similarity.max(axis=1)
     # Unit vectors: squared distance is 2 - 2 cos, so the ratio of distances compares these.
-    keep = (backward[forward] == rows) & (1 - best < ratio**2 * (1 - second))
+    keep = (backward[forward] == rows) & (1 - best < RATIO**2 * (1 - second))
     pairs = np.stack([rows[keep], forward[keep]], axis=1)
     x_i = np.concatenate([a.pixels[pairs[:, 0]], np.ones((len(pairs), 1))], axis=1)
     x_j = np.concatenate([b.pixels[pairs[:, 1]], np.ones((len(pairs), 1))], axis=1)
     line_j, line_i = x_i @ fundamental.T, x_j @ fundamental
     off = np.abs((x_j * line_j).sum(axis=1))
     distance = np.maximum(off / np.linalg.norm(line_j[:, :2], axis=1), off / np.linalg.norm(line_i[:, :2], axis=1))
-    return pairs[distance < epipolar_px]
+    return pairs[distance < ERROR_PX]
 
 
-def _tracks(counts: list[int], matches: dict[tuple[int, int], np.ndarray]) -> list[np.ndarray]:
-    """Connected features, as arrays of (view, feature); a component with two features of one view is dropped."""
+def _tracks(edges: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
+    """Features (of `views`, one each) that `edges` (M, 2) connect; a component with two of one view is dropped."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    edges = [np.stack([offsets[i] + m[:, 0], offsets[j] + m[:, 1]]) for (i, j), m in matches.items() if len(m)]
-    if not edges:
+    if not len(edges):
         return []
-    start, end = np.concatenate(edges, axis=1)
-    total = int(offsets[-1])
-    _, component = connected_components(
-        coo_array((np.ones(len(start), bool), (start, end)), shape=(total, total)), directed=False
-    )
+    graph = coo_array((np.ones(len(edges), bool), tuple(edges.T)), shape=(len(views), len(views)))
+    component = connected_components(graph, directed=False)[1]
     order = np.argsort(component, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(component[order])) + 1)
-    tracks = []
-    for nodes in groups:
-        if len(nodes) < 2:
-            continue
-        views = np.searchsorted(offsets, nodes, side="right") - 1
-        if len(np.unique(views)) == len(views):
-            tracks.append(np.stack([views, nodes - offsets[views]], axis=1))
-    return tracks
+    return [nodes for nodes in groups if 1 < len(nodes) == len(np.unique(views[nodes]))]
 
 
 def triangulate_tracks(
-    world_to_camera: np.ndarray,
-    intrinsics: np.ndarray,
-    views: np.ndarray,
-    pixels: np.ndarray,
-    seen: np.ndarray,
-    *,
-    iterations: int = 5,
+    world_to_camera: np.ndarray, intrinsics: np.ndarray, views: np.ndarray, pixels: np.ndarray, seen: np.ndarray
 ):
     """Points from padded tracks: views (P, V), pixels (P, V, 2), seen (P, V) bool -> points (P, 3), largest error px
-    (P,), smallest depth (P,), largest angle between two rays in radians (P,). Linear start, then Gauss-Newton on the
-    reprojection.
+    (P,), smallest depth (P,), largest angle between two rays in radians (P,). Linear start, then five steps of
+    Gauss-Newton on the reprojection.
     """
     projection = intrinsics @ world_to_camera[:, :3]
     p = projection[views]
@@ -138,7 +125,7 @@ def triangulate_tracks(
         depth = np.where(np.abs(homogeneous[..., 2]) < 1e-9, 1e-9, homogeneous[..., 2])
         return homogeneous[..., :2] / depth[..., None], depth
 
-    for _ in range(iterations):
+    for _ in range(5):
         projected, depth = project(points)
         residual = (pixels - projected) * weight
         jacobian = (
@@ -158,67 +145,44 @@ def triangulate_tracks(
 
 
 def triangulated_points(
-    capture: Capture,
-    *,
-    neighbours: int = 6,
-    max_features: int = 6000,
-    contrast: float = 0.015,
-    ratio: float = 0.85,
-    error_px: float = 2.0,
-    min_angle_deg: float = 2.0,
-    progress: Callable[[int, int], None] | None = None,
+    capture: Capture, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sparse points (P, 3) float32 and their colours (P, 3) uint8 from the frames that are not held out.
+    """Sparse points (P, 3) float32 and their colours (P, 3) uint8 from the frames that are not held out. Deterministic.
 
-    `contrast` is SIFT's threshold (its own default is 0.04; lower gives more points), `ratio` Lowe's, `error_px` bounds
-    both the distance to the epipolar line and the reprojection error, `min_angle_deg` the parallax. Deterministic.
     Raises InputError where fewer than MIN_POINTS points remain: the views do not overlap, or the poses do not belong to
     them.
     """
     used = np.flatnonzero(~np.asarray(capture.held_out))
     cameras = capture.cameras[used]
     poses = np.asarray(cameras.world_to_camera, np.float64)
-    intrinsics = np.zeros((len(used), 3, 3))
-    for row, column, value in (
-        (0, 0, cameras.fx),
-        (1, 1, cameras.fy),
-        (0, 2, cameras.cx),
-        (1, 2, cameras.cy),
-        (2, 2, 1.0),
-    ):
-        intrinsics[:, row, column] = value
-    pairs = view_pairs(poses, neighbours)
+    intrinsics = np.tile(np.eye(3), (len(used), 1, 1))
+    intrinsics[:, 0, 0], intrinsics[:, 1, 1] = cameras.fx, cameras.fy
+    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = cameras.cx, cameras.cy
+    pairs = view_pairs(poses, NEIGHBOURS)
     total = len(used) + len(pairs)
-    features, matches = [], {}
+    report = progress or (lambda done, total: None)
+    features, edges = [], [np.zeros((0, 2), int)]
     for n, t in enumerate(used):
-        features.append(_detect(np.ascontiguousarray(capture.frames[t]), max_features, contrast))
-        if progress:
-            progress(n + 1, total)
+        features.append(_detect(np.ascontiguousarray(capture.frames[t])))
+        report(n + 1, total)
+    first = np.cumsum([0, *(len(f.pixels) for f in features)])
     for n, (i, j) in enumerate(pairs):
-        matches[i, j] = _match(features[i], features[j], _fundamental(poses, intrinsics, i, j), ratio, error_px)
-        if progress:
-            progress(len(used) + n + 1, total)
-    tracks = _tracks([len(f.pixels) for f in features], matches)
-    points, colors = np.zeros((0, 3)), np.zeros((0, 3))
-    if tracks:
-        longest = max(len(track) for track in tracks)
-        views = np.zeros((len(tracks), longest), int)
-        pixels = np.zeros((len(tracks), longest, 2))
-        shade = np.zeros((len(tracks), longest, 3))
-        seen = np.arange(longest) < np.array([len(track) for track in tracks])[:, None]
-        for n, track in enumerate(tracks):
-            views[n, : len(track)] = track[:, 0]
-            pixels[n, : len(track)] = [features[v].pixels[f] for v, f in track]
-            shade[n, : len(track)] = [features[v].colors[f] for v, f in track]
-        points, error, depth, angle = triangulate_tracks(poses, intrinsics, views, pixels, seen)
-        good = (error < error_px) & (depth > 0) & (angle > np.deg2rad(min_angle_deg)) & np.isfinite(points).all(axis=1)
-        points, colors = points[good], (shade.sum(axis=1) / seen.sum(axis=1, keepdims=True))[good]
-    if len(points) < MIN_POINTS:
-        raise InputError(
-            "capture",
-            f"{len(points)} points from {len(used)} views by matching their features",
-            f"at least {MIN_POINTS}",
-            "The views need to overlap and to have texture, and the poses to belong to them; or give "
-            "Gaussians (--gaussians PLY) or a capture with points.",
-        )
-    return points.astype(np.float32), np.rint(colors).astype(np.uint8)
+        edges.append(_match(features[i], features[j], _fundamental(poses, intrinsics, i, j)) + first[[i, j]])
+        report(len(used) + n + 1, total)
+    view = np.repeat(np.arange(len(used)), np.diff(first))
+    tracks = _tracks(np.concatenate(edges), view)
+    lengths = np.array([len(track) for track in tracks], int)
+    nodes = np.concatenate([np.zeros(0, int), *tracks])
+    seen = np.arange(lengths.max(initial=1)) < lengths[:, None]
+    views, pixels, shade = np.zeros(seen.shape, int), np.zeros((*seen.shape, 2)), np.zeros((*seen.shape, 3))
+    views[seen] = view[nodes]
+    pixels[seen] = np.concatenate([np.zeros((0, 2)), *(f.pixels for f in features)])[nodes]
+    shade[seen] = np.concatenate([np.zeros((0, 3)), *(f.colors for f in features)])[nodes]
+    points, error, depth, angle = triangulate_tracks(poses, intrinsics, views, pixels, seen)
+    good = (error < ERROR_PX) & (depth > 0) & (angle > np.deg2rad(MIN_ANGLE_DEG)) & np.isfinite(points).all(axis=1)
+    if good.sum() < MIN_POINTS:
+        found = f"{good.sum()} points from {len(used)} views by matching their features"
+        remedy = "The views must overlap and have texture, and the poses be theirs; or give points, or --gaussians PLY."
+        raise InputError("capture", found, f"at least {MIN_POINTS}", remedy)
+    colors = (shade.sum(axis=1) / seen.sum(axis=1, keepdims=True))[good]
+    return points[good].astype(np.float32), np.rint(colors).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Compositing as jax sees it: its own gradient rule, and its own way under vmap.
+"""Compositing as jax sees it: its own gradient rule, its own way under vmap, and bad features kept to their pixels.
 
 Gradient: symbolic zeros tell whether anybody asked for the geometry's, so that a field distilled into frozen Gaussians
 never pays for it.
@@ -6,10 +6,8 @@ never pays for it.
 vmap: a loop with an early exit runs in lockstep when it is batched, as long as its slowest member. So several feature
 sets of one view become more channels of one walk over its tiles, and several views are walked one after another.
 
-Compositing that keeps a feature which is not finite to the pixels that its Gaussian touches.
-
-Zero times NaN is NaN, so a bad row left in the tables would spread: to its whole tile, and by the padding of lists to
-others. Bad numbers are therefore composited as zeros, and the pixels they touch are found by a second walk, which is
+Zero times NaN is NaN, so a feature that is not finite would spread to its whole tile, and by the padding of lists to
+others. Such numbers are therefore composited as zeros, and the pixels they touch are found by a second walk, which is
 taken only where there is a bad number at all.
 """
 
@@ -36,8 +34,7 @@ from jsecon.types import Array
 def view_lists(
     projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, mesh: Mesh | None = None
 ) -> TileLists:
-    """`tile_lists` of all strips, `capacity` shared among them, one view after another under vmap; no gradient
-    passes."""
+    """`tile_lists` of all strips, which share `capacity`; one view after another under vmap; no gradient passes."""
     each = capacity if mesh is None else -(-capacity // mesh.size)
 
     def local(strip, dealt, projection):
@@ -106,22 +103,17 @@ def _merging_channels(one: Callable, split: Callable) -> Callable:
     @function.def_vmap
     def rule(size, batched, splats, channels, lists):
         if any(jax.tree.leaves((batched[0], batched[2]))):
-            out = _in_sequence(function, size, tuple(batched), splats, channels, lists)
+
+            def one_of(index):
+                take = lambda a, is_batched: lax.dynamic_index_in_dim(a, index, 0, False) if is_batched else a
+                return function(*jax.tree.map(take, (splats, channels, lists), tuple(batched)))
+
+            out = lax.map(one_of, jnp.arange(size))
             return out, jax.tree.map(lambda _: True, out)
         merged = jnp.moveaxis(channels, 0, -2)
         return split(function(splats, merged.reshape(*merged.shape[:-2], -1), lists), size)
 
     return function
-
-
-def _in_sequence(function: Callable, size: int, batched: tuple, *arguments):
-    def pick(index):
-        take = lambda argument, is_batched: (
-            lax.dynamic_index_in_dim(argument, index, 0, keepdims=False) if is_batched else argument
-        )
-        return jax.tree.map(take, arguments, batched)
-
-    return lax.map(lambda index: function(*pick(index)), jnp.arange(size))
 
 
 def _unmerge(array: Array, sets: int) -> Array:
@@ -137,8 +129,8 @@ def splat_contained(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
-    """`differentiate.splat`, with NaN in every channel of the pixels that a Gaussian with a NaN or infinite feature
-    touches, and in no other. Those pixels and those numbers have gradient zero."""
+    """`splat`, with NaN in every channel of the pixels that a Gaussian with a NaN or infinite feature touches, and in
+    no other. Those pixels and those numbers have gradient zero."""
     sound = jnp.isfinite(features)
     image, transmittance = splat(splats, jnp.where(sound, features, 0.0), lists, width, height, mesh)
     bad = lax.stop_gradient(1.0 - sound.all(1, keepdims=True).astype(splats.dtype))

@@ -3,8 +3,6 @@
 A batch's tiles are walked together (walk.py), batch after batch; over several devices, each walks its strip.
 """
 
-import dataclasses
-
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import Mesh
@@ -16,8 +14,6 @@ from jsecon.splat.strips import join, over_strips, split
 from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import CHUNK, make_batches, make_table, to_image, to_tiles, walk, weights
 from jsecon.types import Array
-
-# `splats` (N, 6) throughout: centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity.
 
 WIDE = 6
 """from this many channels on, a chunk's weights are computed once and kept; below, anew for each channel"""
@@ -44,7 +40,7 @@ def composite(
         def body(transmittance, total, chunk):
             if apart:
                 given = features[chunk.ids].astype(table.dtype)
-                chunk = dataclasses.replace(chunk, columns=jnp.concatenate([given, chunk.columns], axis=-1))
+                chunk = chunk._replace(columns=jnp.concatenate([given, chunk.columns], axis=-1))
             if channels <= WIDE:
                 return _summed_anew(transmittance, total, chunk)
             weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)

@@ -56,15 +56,8 @@ def composite_vjp(
             def body(transmittance, state, chunk):
                 before, gradient = state
                 weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
-                slope, before = stored(
-                    chunk.always,
-                    _slopes,
-                    weight,
-                    chunk.alpha,
-                    _along(chunk.columns, local) - along_transmittance[:, None],
-                    before,
-                    final,
-                )
+                along = _along(chunk.columns, local) - along_transmittance[:, None]
+                slope, before = stored(chunk.always, _slopes, weight, chunk.alpha, along, before, final)
                 moments = jnp.einsum("bcp,mp->bcm", slope, monomials)
                 by_attribute = _attribute_gradient(moments, chunk.attributes, corners, lists.tile / 2)
                 by_feature = jnp.einsum("bcp,bdp->bcd", weight, local)
@@ -106,11 +99,8 @@ def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array,
     # moments about the Gaussian's centre
     sx, sy = corners[0][:, None] + half - x, corners[1][:, None] + half - y
     dx, dy = mx + sx * m, my + sy * m
-    dxx, dxy, dyy = (
-        mxx + 2 * sx * mx + sx * sx * m,
-        mxy + sx * my + sy * mx + sx * sy * m,
-        myy + 2 * sy * my + sy * sy * m,
-    )
+    dxx, dxy = mxx + 2 * sx * mx + sx * sx * m, mxy + sx * my + sy * mx + sx * sy * m
+    dyy = myy + 2 * sy * my + sy * sy * m
     # alpha = o exp(-(u^2 + v^2)), u = l11 dx + l21 dy, v = l22 dy
     u = l11 * dx + l21 * dy
     return jnp.stack(

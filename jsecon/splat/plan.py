@@ -18,14 +18,13 @@ from jsecon.splat.autodiff import splat_contained, view_lists
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.tiles import TileLists
-from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering
+from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering, record, static
 
 PLAN_BYTES = 1 << 30
 """most that the plans of all views may take together to be kept"""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class ViewPlan:
     """The splats and tile lists of one view: a pytree, so it passes through jit and is stacked by vmap."""
 
@@ -37,11 +36,11 @@ class ViewPlan:
     """() bool: the camera is finite; one that is not sees NaN."""
     lists: TileLists
     """which Gaussians reach which tile, front to back."""
-    width: int = dataclasses.field(metadata={"static": True})
+    width: int = static()
     """px."""
-    height: int = dataclasses.field(metadata={"static": True})
+    height: int = static()
     """px."""
-    mesh: Mesh | None = dataclasses.field(default=None, metadata={"static": True})
+    mesh: Mesh | None = static(default=None)
     """the devices that hold its strips, or None."""
 
     @property
@@ -81,9 +80,7 @@ def plan_view(
     return plan
 
 
-def _plan(
-    gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array, mesh: Mesh | None = None
-) -> ViewPlan:
+def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array, mesh: Mesh | None) -> ViewPlan:
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
     projection = over_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
     lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
@@ -99,19 +96,14 @@ _plan_compiled = jax.jit(_plan, static_argnums=(2, 4))
 
 
 def plan_views(
-    gaussians: Gaussians,
-    cameras: Camera,
-    *,
-    capacity: int | None = None,
-    near: float | Array = NEAR,
-    most_bytes: int = PLAN_BYTES,
+    gaussians: Gaussians, cameras: Camera, *, capacity: int | None = None, most_bytes: int = PLAN_BYTES
 ) -> ViewPlan | None:
     """The plans of all views of a batch (T), stacked on a leading axis: `jax.tree.map(lambda a: a[t], plans)` is that
     of view t. None where they would take more than `most_bytes` together: then each is to be made when it is wanted.
 
     Outside a trace the lists are cut to what the views need.
     """
-    make = functools.partial(plan_view, gaussians, capacity=capacity, near=near)
+    make = functools.partial(plan_view, gaussians, capacity=capacity)
     views, first = cameras.world_to_camera.shape[0], make(cameras[0])
     if is_traced(first):
         return None if views * _bytes(first) > most_bytes else lax.map(make, cameras)
@@ -139,11 +131,7 @@ def _cut(plan: ViewPlan, length: int | None = None) -> ViewPlan:
 
 
 def render_plan(
-    plan: ViewPlan,
-    features: Float[Array, "n d"],
-    *,
-    background: Array | None = None,
-    depth: bool = False,
+    plan: ViewPlan, features: Float[Array, "n d"], *, background: Array | None = None, depth: bool = False
 ) -> Rendering:
     """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
 

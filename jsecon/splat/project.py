@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from jsecon.errors import require, require_shape
+from jsecon.errors import require_shape
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, finite, normalize, sigmoid
 from jsecon.splat.fusion import stored, surely
-from jsecon.types import Array, Camera, Gaussians, Leaf
+from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
 
 def usable(gaussians: Gaussians) -> Bool[Array, " n"]:
@@ -43,8 +43,7 @@ _FARTHEST_PX = 1e17
 _LARGEST_LOG_SCALE = 60.0
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class Projection:
     """N splats of one view."""
 
@@ -61,8 +60,7 @@ class Projection:
     extents: Leaf
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
     visible: Leaf
-    """(N,) bool: usable (see `sound.usable`), in front of the near plane, able to reach alpha 1/255, box touching the
-    image."""
+    """(N,) bool: `usable`, in front of the near plane, able to reach alpha 1/255, box touching the image."""
 
     @property
     def conics(self) -> Array:
@@ -115,27 +113,12 @@ def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
 
 def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
     """Raises ValueError where the arrays of `gaussians` disagree or `camera` is a batch."""
-    n = gaussians.means.shape[0] if gaussians.means.ndim == 2 else -1
-    for name, expected in (
-        ("means", (n, 3)),
-        ("log_scales", (n, 3)),
-        ("quaternions", (n, 4)),
-        ("opacity_logits", (n,)),
-    ):
-        got = getattr(gaussians, name).shape
-        require(
-            got == expected,
-            f"gaussians.{name}",
-            got,
-            f"{expected} with N = {n}",
-            "Every array of Gaussians has one row per Gaussian.",
-        )
-    require_shape(
-        "camera.world_to_camera",
-        camera.world_to_camera,
-        (4, 4),
-        "Give a single camera: index the batch (cameras[t]) or use jax.vmap over it.",
-    )
+    require_shape("gaussians.means", gaussians.means, ("N", 3), "Give one centre per Gaussian.")
+    for name, rest in (("log_scales", (3,)), ("quaternions", (4,)), ("opacity_logits", ())):
+        expected = gaussians.count, *rest
+        require_shape(f"gaussians.{name}", getattr(gaussians, name), expected, "Give one row for each of the means.")
+    remedy = "Give a single camera: index the batch (cameras[t]) or use jax.vmap over it."
+    require_shape("camera.world_to_camera", camera.world_to_camera, (4, 4), remedy)
 
 
 def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR) -> Projection:
@@ -185,14 +168,9 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     visible = in_front & (opacities >= MIN_ALPHA) & touching
     for number in jax.lax.stop_gradient((centre_x, centre_y, extent_x, extent_y, l11, l21, l22, z, opacities)):
         visible &= jnp.isfinite(number)
-    return Projection(
-        jnp.stack([mean_px, mean_py], axis=-1),
-        jnp.stack([l11, l21, l22], axis=-1),
-        opacities,
-        z,
-        jnp.stack([extent_x, extent_y], axis=-1),
-        visible,
-    )
+    stack = lambda *columns: jnp.stack(columns, axis=-1)
+    means_px, whitening, extents = stack(mean_px, mean_py), stack(l11, l21, l22), stack(extent_x, extent_y)
+    return Projection(means_px, whitening, opacities, z, extents, visible)
 
 
 def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
@@ -200,17 +178,9 @@ def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, A
     must be gone before the first product, or its gradient, zero times NaN, is NaN and reaches the pose."""
     sound = finite(*jax.tree.leaves(camera))
     drawn = usable(gaussians) & sound
-    keep = lambda array, other: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, other)
+    keep = lambda array: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)
     harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)
     harmless = dataclasses.replace(harmless, world_to_camera=jnp.eye(4, dtype=camera.world_to_camera.dtype))
-    return (
-        dataclasses.replace(
-            gaussians,
-            means=keep(gaussians.means, 0.0),
-            log_scales=keep(gaussians.log_scales, 0.0),
-            quaternions=keep(gaussians.quaternions, 0.0),
-            opacity_logits=keep(gaussians.opacity_logits, 0.0),
-        ),
-        jax.tree.map(lambda a, b: jnp.where(sound, a, b), camera, harmless),
-        drawn,
-    )
+    kept = {name: keep(getattr(gaussians, name)) for name in ("means", "log_scales", "quaternions", "opacity_logits")}
+    camera = jax.tree.map(lambda a, b: jnp.where(sound, a, b), camera, harmless)
+    return dataclasses.replace(gaussians, **kept), camera, drawn

@@ -6,7 +6,7 @@ from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_
 from jsecon.types import Camera, Gaussians
 
 
-def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> dict[str, np.ndarray]:
+def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
     """means_px (N, 2), covariances (N, 2, 2) px^2 and their inverses' a, b, c (N, 3), depths (N,), opacities (N,),
     in_front (N,), one Gaussian at a time."""
     means, log_scales, quaternions, logits = (
@@ -15,26 +15,18 @@ def project_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
     )
     w2c = np.asarray(camera.world_to_camera, np.float64)
     fx, fy, cx, cy = (float(a) for a in (camera.fx, camera.fy, camera.cx, camera.cy))
-    count = len(means)
-    out = {
-        "means_px": np.zeros((count, 2)),
-        "covariances": np.zeros((count, 2, 2)),
-        "conics": np.zeros((count, 3)),
-        "depths": np.zeros(count),
-        "opacities": np.zeros(count),
-        "in_front": np.zeros(count, bool),
-    }
-    for i in range(count):
+    shapes = {"means_px": (2,), "covariances": (2, 2), "conics": (3,), "depths": (), "opacities": ()}
+    out = {name: np.zeros((len(means), *shape)) for name, shape in shapes.items()}
+    out["in_front"] = np.zeros(len(means), bool)
+    for i in range(len(means)):
         x, y, z = w2c[:3, :3] @ means[i] + w2c[:3, 3]
-        out["depths"][i], out["in_front"][i] = z, z > near
+        out["depths"][i], out["in_front"][i] = z, z > NEAR
         out["opacities"][i] = 0.5 * (1 + np.tanh(0.5 * logits[i]))
-        if not z > near:
+        if not z > NEAR:
             continue
         out["means_px"][i] = fx * x / z + cx, fy * y / z + cy
-        margin_x, margin_y = (
-            (FRUSTUM_MARGIN - 1) * 0.5 * camera.width / fx,
-            (FRUSTUM_MARGIN - 1) * 0.5 * camera.height / fy,
-        )
+        margin_x = (FRUSTUM_MARGIN - 1) * 0.5 * camera.width / fx
+        margin_y = (FRUSTUM_MARGIN - 1) * 0.5 * camera.height / fy
         tx = z * np.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
         ty = z * np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
         jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
@@ -58,9 +50,9 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
     )
 
 
-def weights_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> np.ndarray:
+def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """(H, W, N) alpha T of every Gaussian at every pixel, front to back, equal depths in index order."""
-    splats = project_reference(gaussians, camera, near=near)
+    splats = project_reference(gaussians, camera)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
     transmittance = np.ones((camera.height, camera.width))
@@ -79,9 +71,7 @@ def weights_reference(gaussians: Gaussians, camera: Camera, *, near: float = NEA
     return weights
 
 
-def render_reference(
-    gaussians: Gaussians, camera: Camera, features: np.ndarray, *, near: float = NEAR
-) -> tuple[np.ndarray, np.ndarray]:
+def render_reference(gaussians: Gaussians, camera: Camera, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, D) features and (H, W) alpha in float64: W f, and the sum of W."""
-    weights = weights_reference(gaussians, camera, near=near)
+    weights = weights_reference(gaussians, camera)
     return weights @ np.asarray(features, np.float64), weights.sum(-1)

@@ -37,8 +37,8 @@ def render(
     `capacity` (`plan_capacity`), which is taken as it is, in and outside of a trace.
 
     Gaussians with NaN or infinite numbers are hidden, and a feature that is not finite makes NaN of the pixels that its
-    Gaussian touches; neither has a gradient, nor spoils another's (`sound.count_non_finite` counts them). A camera that
-    is not finite sees NaN.
+    Gaussian touches; neither has a gradient, nor spoils another's (`project.count_non_finite` counts them). A camera
+    that is not finite sees NaN.
 
     `mesh` (`jsecon.parallel.host_mesh()`) spreads the work over several devices of this process, in value and
     gradient: a program that calls `jsecon.process.prepare_process()` before jax starts has all cores of a CPU that way.
@@ -52,10 +52,8 @@ def render(
     check_shapes(gaussians, camera)
     require_shape("features", features, (gaussians.count, "D"), "Give one row of features per Gaussian.")
     if gaussians.means.shape[0] == 0:
-        image, alpha = (
-            jnp.zeros((camera.height, camera.width, *rest), gaussians.means.dtype)
-            for rest in ((features.shape[1],), ())
-        )
+        image = jnp.zeros((camera.height, camera.width, features.shape[1]), gaussians.means.dtype)
+        alpha = jnp.zeros(image.shape[:2], image.dtype)
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0), alpha if depth else None)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near, mesh=mesh)
@@ -88,12 +86,10 @@ def render_depth(
     """Expected z-depth (H, W) = sum(w z) / sum(w), world units, 0 where nothing is covered; and alpha (H, W). NaN where
     pairs overflowed the capacity, which has no other place here (see `render`)."""
     nothing = jnp.zeros((gaussians.means.shape[0], 0), jnp.asarray(gaussians.means).dtype)
-    rendering = render(gaussians, camera, nothing, capacity=capacity, near=near, depth=True)
-    return _unless_overflow(rendering)
+    return _unless_overflow(render(gaussians, camera, nothing, capacity=capacity, near=near, depth=True))
 
 
 @jax.jit
 def _unless_overflow(rendering: Rendering) -> tuple[Array, Array]:
-    return jax.tree.map(
-        lambda image: jnp.where(rendering.overflow > 0, jnp.nan, image), (rendering.depth, rendering.alpha)
-    )
+    mark = lambda image: jnp.where(rendering.overflow > 0, jnp.nan, image)
+    return jax.tree.map(mark, (rendering.depth, rendering.alpha))

@@ -6,7 +6,6 @@ that the Gaussian's ellipse reaches, and the tiles' lists are read off the bits 
 no second sort, and the ellipses leave a fifth fewer pairs than boxes (garden).
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -19,7 +18,7 @@ from jsecon.errors import require
 from jsecon.splat.bits import WORD, in_chunks, read_off, set_bits
 from jsecon.splat.project import Projection
 from jsecon.splat.strips import BLOCK, WHOLE, Strip, tile_rows
-from jsecon.types import Array, Leaf
+from jsecon.types import Array, Leaf, record, static
 
 TILE = 8
 """tile edge, px; speed only"""
@@ -30,8 +29,7 @@ PAIRS = 8192
 _SLACK_PX = 0.02
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@record
 class TileLists:
     """For each tile, row by row, the Gaussians that reach a pixel of it, by depth (equal depths in index order).
 
@@ -46,7 +44,7 @@ class TileLists:
     """(tiles,) int32 how long it is."""
     overflow: Leaf
     """(strips,) int32 (block, Gaussian) pairs that did not fit: those of the Gaussians with the highest indices."""
-    tile: int = dataclasses.field(metadata={"static": True})
+    tile: int = static()
     """tile edge, px."""
 
 
@@ -131,21 +129,15 @@ def _sorted_pairs_by_rank(blocks: Array, owner: Array, depths: Array) -> tuple[A
 def tile_lists(
     projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, strip: Strip = WHOLE
 ) -> TileLists:
-    """One strip's lists of up to `capacity` (block, Gaussian) pairs in all; what does not fit is counted in
-    `overflow`."""
-    require(
-        0 < capacity <= (2**31 - 1) // _TILES - WORD,
-        "capacity",
-        capacity,
-        "a positive number of (block, Gaussian) pairs whose tiles int32 can count",
-        "Render so large an image in parts.",
-    )
+    """One strip's lists of up to `capacity` (block, Gaussian) pairs; what does not fit is counted in `overflow`."""
+    most = (2**31 - 1) // _TILES - WORD  # whose tiles int32 can count
+    require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render so large an image in parts.")
     capacity = whole_words(capacity)
     chunk = min(PAIRS, capacity)
     room = -(-capacity // chunk) * chunk
     edge = BLOCK * tile
     rows = tile_rows(height, tile, strip.count)
-    across, down = -(-width // edge), -(-rows // BLOCK)
+    across, down = grid(width, rows * tile, edge)
     number = across * down
     x0, x1, y0, y1 = _rectangles(projection, width, height, edge, strip)
     # Pairs are laid out Gaussian after Gaussian; `owner` says whose pair the k-th is. int32 cumulative sums would wrap
@@ -194,13 +186,8 @@ def tile_lists(
         square = square.reshape(down * BLOCK, across * BLOCK)[:rows, :tiles_across]
         return jnp.where(inside, square, 0).reshape(-1)
 
-    return TileLists(
-        gaussians,
-        row_by_row(bounds[:-1]),
-        row_by_row(bounds[1:] - bounds[:-1]),
-        jnp.maximum(ends[-1:] - capacity, 0),
-        tile,
-    )
+    overflow = jnp.maximum(ends[-1:] - capacity, 0)
+    return TileLists(gaussians, row_by_row(bounds[:-1]), row_by_row(bounds[1:] - bounds[:-1]), overflow, tile)
 
 
 def _reached_tiles(
@@ -231,9 +218,8 @@ def _reached_tiles(
             v = l22 * dy
             rims.append(side * jnp.sqrt(jnp.maximum(radius2 - v * v, 0.0)) / l11 - slope * dy)
         for column in range(BLOCK):
-            beside = (left + ((column + 1) * tile - 0.5) + slack < rims[0]) | (
-                left + (column * tile + 0.5) - slack > rims[1]
-            )
+            beside = left + ((column + 1) * tile - 0.5) + slack < rims[0]
+            beside |= left + (column * tile + 0.5) - slack > rims[1]
             bits |= jnp.where(missed | beside, jnp.uint32(0), jnp.uint32(1 << (row * BLOCK + column)))
     return jnp.where(blocks < number, bits, jnp.uint32(0))
 

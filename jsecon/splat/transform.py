@@ -23,13 +23,9 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     rotation = matrix[:3, :3] / scale if scale > 0 else np.zeros((3, 3))
     rigid = scale > 0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-    require(
-        bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1])),
-        "similarity",
-        matrix.tolist(),
-        "a rotation, one positive scale and a shift",
-        "Shear, mirrors and unequal scales cannot be carried.",
-    )
+    similar = bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1]))
+    expected, remedy = "a rotation, one positive scale and a shift", "Leave out shear, mirrors and unequal scales."
+    require(similar, "similarity", matrix.tolist(), expected, remedy)
     dtype = gaussians.means.dtype
     means = jnp.asarray(gaussians.means) @ jnp.asarray(scale * rotation.T, dtype) + jnp.asarray(matrix[:3, 3], dtype)
     return Gaussians(

@@ -1,21 +1,18 @@
 """The walk down a batch of tiles' lists: Gaussians in chunks, front to back, until nothing is left to be seen.
 
-Arrays of a walk are (tiles, ..., pixels): a tile's pixels lie innermost and fill the vectors; what belongs to a
-Gaussian is a number that a whole row of pixels shares.
+A batch is of tiles with lists of like length. Arrays of a walk are (tiles, ..., pixels): a tile's pixels lie innermost
+and fill the vectors; what belongs to a Gaussian is a number that a whole row of pixels shares.
 
 What XLA's CPU backend makes of this decides the speed; all of it measured on garden (benchmarks/results.md):
 - A scan over single Gaussians starts four kernels for each and reads its slices unvectorised; a chunk at a time, the
   recurrence written out inside one kernel, took a third of that.
 - Fusion recomputes cheap arithmetic for every reader, and a chunk's exponentials written as a polynomial are cheap to
   it. Only a conditional whose outcome it can't know makes it store them once: `stored`.
-
-The tiles of a strip in batches of like list length, and strips cut to tiles and put together again.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,8 +29,7 @@ BATCH = 64
 """tiles walked side by side; speed only"""
 
 
-@dataclasses.dataclass(frozen=True)
-class Batches:
+class Batches(NamedTuple):
     """Tiles sorted by list length, in batches of BATCH; the last is filled up with empty tiles."""
 
     tiles: Array
@@ -59,15 +55,8 @@ def make_batches(lists: TileLists, width: int, strip: Strip = WHOLE) -> Batches:
     order = jnp.argsort(-lists.lengths).astype(jnp.int32)
     order = jnp.concatenate([order, jnp.full(-number % BATCH, number, jnp.int32)])
     empty = jnp.zeros(1, jnp.int32)
-    return Batches(
-        order.reshape(-1, BATCH),
-        jnp.concatenate([lists.starts, empty]),
-        jnp.concatenate([lists.lengths, empty]),
-        -(-width // lists.tile),
-        number,
-        lists.tile,
-        strip,
-    )
+    starts, lengths = (jnp.concatenate([a, empty]) for a in (lists.starts, lists.lengths))
+    return Batches(order.reshape(-1, BATCH), starts, lengths, -(-width // lists.tile), number, lists.tile, strip)
 
 
 def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> Float[Array, "h w d"]:
@@ -108,8 +97,7 @@ _EXP2 = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Chunk:
+class Chunk(NamedTuple):
     """CHUNK Gaussians of each tile of a batch."""
 
     ids: Array
