@@ -130,11 +130,7 @@ def _cell_means(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -
 
 
 def average_linkage(
-    together: Float[np.ndarray, "k k"],
-    both: Float[np.ndarray, "k k"],
-    *,
-    least_ratio: float,
-    least_shared: float = 0.0,
+    together: Float[np.ndarray, "k k"], both: Float[np.ndarray, "k k"], *, least_ratio: float, least_shared: float = 0.0
 ) -> Int[np.ndarray, " k"]:
     """Groups (K,), 0 .. R-1, of K things, of which the two most alike are joined until none are alike by `least_ratio`.
 

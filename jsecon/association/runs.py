@@ -63,9 +63,7 @@ def runs_of_masks(masks: Bool[np.ndarray, "r h w"]) -> Runs:
     return runs_of_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
-def remembered(
-    propose: Callable[[int], Bool[np.ndarray, "m h w"]],
-) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
+def remembered(propose: Callable[[int], Bool[np.ndarray, "m h w"]]) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
     """`propose`, a function of a frame's index, asked once a frame: its masks are kept as runs."""
 
     @functools.cache

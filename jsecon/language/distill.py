@@ -280,11 +280,7 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, lear
         features: Any = optax.apply_updates(state.features, updates)
         value = jnp.where(overflow > 0, jnp.nan, value)
         return Descent(
-            features,
-            moments,
-            state.order,
-            state.history.at[index].set(value),
-            jnp.asarray(index + 1, jnp.int32),
+            features, moments, state.order, state.history.at[index].set(value), jnp.asarray(index + 1, jnp.int32)
         )
 
     return jax.lax.fori_loop(state.step, until, step, state)

@@ -71,10 +71,7 @@ def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> 
 
 
 def query_canonical(
-    features: Codes,
-    text: Float[Array, " d_text"],
-    canonical: Float[Array, "c d_canonical"],
-    threshold: Number,
+    features: Codes, text: Float[Array, " d_text"], canonical: Float[Array, "c d_canonical"], threshold: Number
 ) -> Selection:
     """The Gaussians whose relevancy to the text is at least `threshold`.
 
