@@ -35,10 +35,7 @@ class Runs:
 
     def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
         """(R, H, W) bool, where P = H W."""
-        rows = self.rows()
-        masks = np.zeros((len(self.counts), self.pixels), bool)
-        masks[np.repeat(np.arange(len(masks)), np.diff(rows.indptr)), rows.indices] = True
-        return masks.reshape(len(masks), height, width)
+        return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
 
     def followed_by(self, others: "Runs") -> "Runs":
         """These masks and then the others, over the same pixels."""
