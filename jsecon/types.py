@@ -15,10 +15,13 @@ from typing import Any, TypeAlias, dataclass_transform
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray, UInt32
 
 Array: TypeAlias = jax.Array | np.ndarray
 Leaf: TypeAlias = Any
 """an array field of a pytree defined elsewhere: while jax transforms it, it may hold a tracer, an axis or a sentinel"""
+Key: TypeAlias = PRNGKeyArray | UInt32[Array, "2"]
+"""of jax.random, new style or old"""
 
 
 def static(**kwargs) -> Any:

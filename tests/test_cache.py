@@ -110,7 +110,7 @@ def test_a_failed_computation_leaves_nothing_behind(tmp_path):
 
 
 def test_pickles_are_neither_written_nor_read(tmp_path):
-    with pytest.raises(TypeError, match="cannot be kept"):
+    with pytest.raises(ValueError, match=r"root\.a: got builtins\.object .* expected plain numbers"):
         cache.save(tmp_path / "x.npz", {"a": object()})
     np.savez(tmp_path / "y.npz", a=np.array([object()], object), allow_pickle=True)
     with pytest.raises(cache.CorruptCacheError):

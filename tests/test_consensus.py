@@ -87,7 +87,7 @@ def test_nothing_proposed_anywhere_gives_one_thing_or_none(world):
 def test_claims_without_a_class_or_a_proposal(world, scene):
     view = scene.all(world[2])[0]
     atoms = view.votes.shape[1]
-    total = view.on_atoms(np.ones((len(view.seen), 1), np.float32))
+    total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
     unknown = claim_atoms(view, np.zeros((atoms, 2), np.float32), np.zeros((atoms, 1), np.float32))
     assert (unknown == -1).all()
     covered = total[:, 0] > 0.2 * np.bincount(view.atoms.ravel())

@@ -16,7 +16,6 @@ import json
 import os
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,11 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.files import write_text, written_whole
+from jsecon.files import UNREADABLE, packed, unpacked, write_text, written_whole
 
 _TREE = "__tree__"
 STALE_SECONDS = 600.0
 """a half-written file that has not grown for this long has no writer any more"""
-_UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, ImportError, zipfile.BadZipFile)
 
 
 class CorruptCacheError(Exception):
@@ -214,51 +212,29 @@ def _read(path: Path) -> tuple[Any, float]:
             arrays = {name: file[name] for name in file.files}
         description = json.loads(arrays.pop(_TREE).tobytes())
         return unpack(description["tree"], arrays), description["seconds"]
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise CorruptCacheError(f"{type(error).__name__}: {error}") from error
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """A JSON description of the tree, and its arrays by path. Raises TypeError on what is neither plain nor a record of
-    jsecon's."""
+    """`packed` of plain values, arrays and jsecon's records: the description, and the arrays by path."""
     arrays: dict[str, np.ndarray] = {}
 
-    def describe(node: Any, path: str) -> Any:
-        if node is None or isinstance(node, (bool, int, float, str)):
-            return {"value": node}
-        if isinstance(node, (np.ndarray, np.generic, jax.Array)):
-            arrays[path] = np.asarray(node)
-            return {"array": path}
-        if isinstance(node, (list, tuple)) and type(node) in (list, tuple):
-            return {type(node).__name__: [describe(item, f"{path}.{i}") for i, item in enumerate(node)]}
-        if isinstance(node, Mapping) and all(isinstance(name, str) for name in node):
-            return {"dict": {name: describe(item, f"{path}.{name}") for name, item in node.items()}}
-        kind = type(node)
-        if dataclasses.is_dataclass(node) and kind.__module__.startswith("jsecon."):
-            fields = {f.name: describe(getattr(node, f.name), f"{path}.{f.name}") for f in dataclasses.fields(node)}
-            return {"record": f"{kind.__module__}:{kind.__qualname__}", "fields": fields}
-        raise TypeError(f"{path}: {kind.__module__}.{kind.__qualname__} cannot be kept in the cache")
+    def name_of(kind: type) -> str | None:
+        ours = dataclasses.is_dataclass(kind) and kind.__module__.startswith("jsecon.")
+        return f"{kind.__module__}:{kind.__qualname__}" if ours else None
 
-    return describe(value, "root"), arrays
+    return packed(value, "root", arrays, name_of), arrays
 
 
 def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The value that `pack` took apart; arrays are NumPy arrays. Raises KeyError, TypeError or ValueError on a tree
-    that `pack` did not write."""
-    if "value" in tree:
-        return tree["value"]
-    if "array" in tree:
-        return arrays[tree["array"]]
-    if "list" in tree:
-        return [unpack(item, arrays) for item in tree["list"]]
-    if "tuple" in tree:
-        return tuple(unpack(item, arrays) for item in tree["tuple"])
-    if "dict" in tree:
-        return {name: unpack(item, arrays) for name, item in tree["dict"].items()}
-    module, _, name = tree["record"].partition(":")
-    if not module.startswith("jsecon."):
-        raise ValueError(f"{tree['record']} is no record of jsecon's")
-    kind = getattr(importlib.import_module(module), name)
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise ValueError(f"{tree['record']} is no record of jsecon's")
-    return kind(**{field: unpack(item, arrays) for field, item in tree["fields"].items()})
+    """The value that `pack` took apart. Raises one of UNREADABLE on a tree that `pack` did not write."""
+
+    def kind_of(name: str) -> type:
+        module, _, kind = name.partition(":")
+        found = getattr(importlib.import_module(module), kind) if module.startswith("jsecon.") else None
+        if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+            raise ValueError(f"{name} is no record of jsecon's")
+        return found
+
+    return unpacked(tree, arrays, kind_of)

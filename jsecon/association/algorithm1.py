@@ -1,14 +1,13 @@
 """Masklets: one identity an object through all frames (Algorithm 1 of the paper), over any segmenter and tracker."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse
+from jsecon.association.atoms import Sparse, one_hot
 from jsecon.association.runs import Runs, runs_of_masks, runs_of_rows
 from jsecon.errors import require, require_shape
 from jsecon.vision.protocols import Segmenter, Tracker
@@ -60,24 +59,14 @@ def masklets(
     `on_checkpoint` gets, after each frame, a function that makes the state (of the size of all masks: not for nothing);
     given back as `state`, with the same frames and options, the sequence goes on behind that frame to the same result.
     """
-    require(
-        frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8,
-        "frames",
-        (frames.shape, frames.dtype),
-        "(T, H, W, 3) uint8",
-        "Stack RGB frames of one size.",
-    )
+    rgb = frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8
+    require(rgb, "frames", (frames.shape, frames.dtype), "(T, H, W, 3) uint8", "Stack RGB frames of one size.")
     count, height, width = frames.shape[:3]
-    proposals = _Layers(count, height, width)
-    layers = _Layers(count, height, width)
+    proposals, layers = _Layers(count, height, width), _Layers(count, height, width)
     if state is not None:
-        require(
-            len(state.layers["rows"]) == count and 0 <= state.done <= count,
-            "state",
-            f"{state.done} of {len(state.layers['rows'])} frames",
-            f"a state of {count} frames",
-            "Give the state of this sequence, or none.",
-        )
+        done, known = state.done, len(state.layers["rows"])
+        fits, remedy = known == count and 0 <= done <= count, "Give the state of this sequence, or none."
+        require(fits, "state", f"{done} of {known} frames", f"a state of {count} frames", remedy)
         proposals.restore(state.proposals)
         layers.restore(state.layers)
     for t in range(0 if state is None else state.done, count):
@@ -92,18 +81,14 @@ def masklets(
             for other, image in enumerate(labels):
                 layers.add_labels(other, image, len(prompts))
         if on_checkpoint is not None:
-            on_checkpoint(functools.partial(_state, t + 1, proposals, layers))
+            on_checkpoint(lambda done=t + 1: MaskletState(done, proposals.record(), layers.record()))
         if progress is not None:
             progress(t + 1, count)
     if not layers.size(0):
         return np.full((count, height, width), -1, np.int16)
-    layers, area, support = joined(layers, proposals, join_rate=join_rate)
+    whole, area, support = joined(layers, proposals, join_rate=join_rate)
     order = np.lexsort((np.where(support >= min_support, area, -support), support < min_support))
-    return clean_masklets(layers.flatten(order), min_area=min_area, min_views=min_views)
-
-
-def _state(done: int, proposals: "_Layers", layers: "_Layers") -> MaskletState:
-    return MaskletState(done, proposals.record(), layers.record())
+    return clean_masklets(whole.flatten(order), min_area=min_area, min_views=min_views)
 
 
 def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
@@ -239,11 +224,11 @@ class _Layers:
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """The layers with those of one group (R,) united, in the order of the groups."""
-        number = np.unique(groups, return_inverse=True)[1]
-        unite: Sparse = sparse.csr_matrix((np.ones(len(groups), np.float32), (number, np.arange(len(groups)))))
+        names, number = np.unique(groups, return_inverse=True)
+        unite = one_hot(number, len(names)).T.tocsr()
         result = _Layers(self.count, *self.shape)
         for t in range(self.count):
-            united = (unite @ self.at(t)).tocsr()
+            united = unite @ self.at(t)
             united.sort_indices()
             result._runs[t] = runs_of_rows(united)
         return result

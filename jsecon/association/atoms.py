@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy import sparse
 
 from jsecon.language.votes import distinct_labels
@@ -28,11 +28,11 @@ _SLOTS = 8
 
 
 def image_atoms(
-    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int, smallest: int = SMALLEST
+    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int
 ) -> Int32[np.ndarray, "h w"]:
     """About `count` superpixels (SLICO, Achanta et al. 2012) of a frame, cut by the masks' outlines.
 
-    frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under `smallest` pixels go to
+    frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under SMALLEST pixels go to
     the nearest other piece.
     """
     lab = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2LAB)
@@ -42,7 +42,7 @@ def image_atoms(
     pieces = np.asarray(slic.getLabels(), np.int64)
     for eight in np.packbits(masks, axis=0):
         pieces = renumbered(pieces * 256 + eight)
-    large = np.bincount(pieces.reshape(-1))[pieces] >= smallest
+    large = np.bincount(pieces.reshape(-1))[pieces] >= SMALLEST
     if large.any() and not large.all():
         pieces = filled(pieces, large)
     return renumbered(pieces).astype(np.int32)
@@ -55,6 +55,18 @@ def coverage(
     area = np.bincount(atoms.reshape(-1), minlength=count)
     inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
+
+
+def summed(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
+    """The matrix of all entries, each (values, rows, columns); what repeats is added up."""
+    values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
+    return sparse.csr_matrix((values, (rows, columns)), shape=shape)
+
+
+def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
+    """(A, R) float32 ones where a row carries a label 0 .. R-1, R = `count`; -1 = none."""
+    rows = np.flatnonzero(labels >= 0)
+    return sparse.csr_matrix((np.ones(len(rows), np.float32), (rows, labels[rows])), shape=(len(labels), count))
 
 
 def label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
@@ -84,8 +96,7 @@ def cast_on_atoms(
         cast = np.asarray(_cast_by_pair(plan, atoms, first))[places]
         pair, slot = np.nonzero(cast)
         entries.append((cast[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
-    values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
-    cast = sparse.csr_matrix((values, (rows, columns)), shape=(gaussians.count, int(atoms.max()) + 1))
+    cast = summed(entries, (gaussians.count, int(atoms.max()) + 1))
     total = np.repeat(np.asarray(cast.sum(1)).ravel(), np.diff(cast.indptr))
     cast.data[cast.data <= negligible * total] = 0.0
     cast.eliminate_zeros()

@@ -1,12 +1,10 @@
 """Masklets without a tracker: what the views agree on, from any segmenter's masks and the scene's own Gaussians.
 
-Gaussians into objects by what the views agree on: two belong together if most views that see both put both into one
-mask.
-
-This is evidence accumulation (Fred & Jain, PAMI 2005) with the views as the ensemble and the rendering weights as the
-evidence. A mask that merges two things, or cuts one, is outvoted by the views that do not. No frame comes first and
-nothing is tracked, so no error travels; the idea is that of mask clustering by view consensus (Yan et al., CVPR 2024),
-between pieces of the scene instead of masks.
+Two Gaussians belong together if most views that see both put both into one mask. This is evidence accumulation (Fred &
+Jain, PAMI 2005) with the views as the ensemble and the rendering weights as the evidence. A mask that merges two
+things, or cuts one, is outvoted by the views that do not. No frame comes first and nothing is tracked, so no error
+travels; the idea is that of mask clustering by view consensus (Yan et al., CVPR 2024), between pieces of the scene
+instead of masks.
 """
 
 from collections.abc import Callable
@@ -15,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse
+from jsecon.association.atoms import Sparse, one_hot, summed
 from jsecon.association.views import SceneViews, View, claim_atoms
 from jsecon.errors import require
 from jsecon.vision.region_graph import renumbered
@@ -24,6 +22,10 @@ SKETCH = 24
 """numbers that stand for a Gaussian's masks while pieces are formed"""
 ROUNDS = 2
 """of k-means"""
+LEAST_SHARED = 0.02
+"""of what two groups are seen: groups that fewer views see together are left apart"""
+NEGLIGIBLE = 0.05
+"""a mask's share of a Gaussian that is left out, where masks lie in one layer"""
 
 
 def group_by_consensus(
@@ -34,7 +36,6 @@ def group_by_consensus(
     *,
     agreement: float = 0.4,
     pieces: int = 3000,
-    least_shared: float = 0.02,
     seed: int = 0,
 ) -> Int[np.ndarray, " n"]:
     """Object (N,) of each Gaussian, 0 .. R-1, -1 = never seen.
@@ -45,15 +46,11 @@ def group_by_consensus(
 
     The Gaussians are first gathered into at most `pieces` small pieces (`scene_pieces`), then the pieces are joined by
     `average_linkage` while the views that see two groups put both into one mask with a probability of at least
-    `agreement`; groups that hardly any view sees together (below `least_shared` of what each is seen) are left apart.
+    `agreement`; groups that hardly any view sees together (LEAST_SHARED) are left apart.
     """
-    require(
-        membership.shape[0] == visible.shape[0] == len(weights) == len(means),
-        "membership, visible, weights, means",
-        (membership.shape, visible.shape, weights.shape, means.shape),
-        "N rows each",
-        "Give one row per Gaussian.",
-    )
+    shapes = [rows.shape for rows in (membership, visible, weights, means)]
+    equal = len({shape[0] for shape in shapes}) == 1
+    require(equal, "membership, visible, weights, means", shapes, "N rows each", "Give one row per Gaussian.")
     piece = scene_pieces(membership, visible, weights, means, pieces=pieces, seed=seed)
     live = np.flatnonzero(piece >= 0)
     owner = np.full(len(piece), -1, np.int64)
@@ -64,7 +61,7 @@ def group_by_consensus(
     in_masks, in_view = gather @ membership, gather @ visible
     together = (in_masks @ in_masks.T).toarray()
     both = (in_view @ in_view.T).toarray()
-    owner[live] = average_linkage(together, both, least_ratio=agreement, least_shared=least_shared)[piece[live]]
+    owner[live] = average_linkage(together, both, least_ratio=agreement, least_shared=LEAST_SHARED)[piece[live]]
     return owner
 
 
@@ -130,11 +127,7 @@ def _cell_means(points: Float[np.ndarray, "n d"], cell: Int[np.ndarray, " n"]) -
 
 
 def average_linkage(
-    together: Float[np.ndarray, "k k"],
-    both: Float[np.ndarray, "k k"],
-    *,
-    least_ratio: float,
-    least_shared: float = 0.0,
+    together: Float[np.ndarray, "k k"], both: Float[np.ndarray, "k k"], *, least_ratio: float, least_shared: float = 0.0
 ) -> Int[np.ndarray, " k"]:
     """Groups (K,), 0 .. R-1, of K things, of which the two most alike are joined until none are alike by `least_ratio`.
 
@@ -149,9 +142,7 @@ def average_linkage(
     together, both = ((matrix + matrix.T) / 2.0 for matrix in (together.astype(np.float64), both.astype(np.float64)))
     count = len(together)
     parent = np.arange(count)
-    waiting = np.ones(count, bool)
-    """a chain may start here"""
-    live = np.ones(count, bool)
+    waiting, live = np.ones((2, count), bool)  # a chain may start here; not joined to another yet
 
     def ratios(a: int) -> Float[np.ndarray, " k"]:
         own = np.sqrt(np.maximum(both[a, a] * np.diagonal(both), 0.0))
@@ -195,42 +186,26 @@ def consensus_masklets(
     scene: SceneViews,
     *,
     agreement: float = 0.4,
-    pieces: int = 3000,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """labels (T, H, W) int16, -1 = none, of frames (T, H, W, 3) uint8 whose proposals `scene` holds.
 
-    The Gaussians are grouped by the views' consensus (`group_by_consensus`: `agreement`, `pieces`, `seed`), and the
-    groups claim each frame's atoms (`claim_atoms`). Independent of the order of the frames. `progress(done, total)`
-    counts frames.
+    The Gaussians are grouped by the views' consensus (`group_by_consensus`), and the groups claim each frame's atoms
+    (`claim_atoms`). Independent of the order of the frames. `progress(done, total)` counts frames.
     """
-    views = scene.all(frames, progress)
-    membership, visible, weights = mask_signatures(views, scene.count)
-    owner = group_by_consensus(
-        membership,
-        visible,
-        weights,
-        np.asarray(scene.gaussians.means, np.float32),
-        agreement=agreement,
-        pieces=pieces,
-        seed=seed,
-    )
+    views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
+    owner = group_by_consensus(*mask_signatures(views, scene.count), means, agreement=agreement, seed=seed)
     count = int(owner.max(initial=-1)) + 1
     labels = np.full(frames.shape[:3], -1, np.int16)
     for image, view in zip(labels, views):
-        known = np.flatnonzero(owner[view.seen] >= 0)
-        ones = np.ones(len(known), np.float32)
-        owned = sparse.csr_matrix((ones, (known, owner[view.seen[known]])), shape=(len(view.seen), count))
         if count:
-            mass = view.on_atoms(owned)
+            mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
             image[:] = claim_atoms(view, mass, mass.sum(1, keepdims=True))[view.atoms]
     return labels
 
 
-def mask_signatures(
-    views: list[View], count: int, *, negligible: float = 0.05
-) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
+def mask_signatures(views: list[View], count: int) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
     """(membership (N, M), visible (N, T), weights (N,)): what `group_by_consensus` asks for, of N = `count` Gaussians.
 
     A frame is heard on a Gaussian by how clearly it sees it, against the frame that sees it best: on an outline it
@@ -238,9 +213,7 @@ def mask_signatures(
     majority. Masks that lie over each other share it: a frame with many levels of masks has no more say than one with
     a single partition.
     """
-    rows, columns, shares, seen, frame, clarity = [], [], [], [], [], []
-    weights = np.zeros(count, np.float64)
-    start = 0
+    shares, looks, weights, start = [], [], np.zeros(count, np.float64), 0
     for t, view in enumerate(views):
         totals = view.totals
         weights[view.seen] += totals
@@ -251,16 +224,10 @@ def mask_signatures(
         share = cast.data / np.maximum(totals[cast.row] * layers, 1e-12)
         norm = np.bincount(cast.row, share**2, len(totals)) + outside**2 / layers
         share = share**2 / np.maximum(norm[cast.row], 1e-12)
-        keep = share >= negligible / layers
-        rows.append(view.seen[cast.row[keep]])
-        columns.append(start + cast.col[keep])
-        shares.append((share * np.sqrt(layers) * view.clarity[cast.row])[keep])
-        seen.append(view.seen)
-        frame.append(np.full(len(view.seen), t))
-        clarity.append(view.clarity)
+        keep = share >= NEGLIGIBLE / layers
+        share = (share * np.sqrt(layers) * view.clarity[cast.row])[keep].astype(np.float32)
+        shares.append((share, view.seen[cast.row[keep]], start + cast.col[keep]))
+        looks.append((view.clarity.astype(np.float32), view.seen, np.full(len(view.seen), t)))
         start += len(view.proposals)
-    where = np.concatenate(rows), np.concatenate(columns)
-    membership = sparse.csr_matrix((np.concatenate(shares).astype(np.float32), where), shape=(count, start))
-    where = np.concatenate(seen), np.concatenate(frame)
-    visible = sparse.csr_matrix((np.concatenate(clarity).astype(np.float32), where), shape=(count, len(views)))
+    membership, visible = summed(shares, (count, start)), summed(looks, (count, len(views)))
     return membership, visible, (weights / max(len(views), 1)).astype(np.float32)

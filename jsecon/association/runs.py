@@ -35,10 +35,7 @@ class Runs:
 
     def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
         """(R, H, W) bool, where P = H W."""
-        rows = self.rows()
-        masks = np.zeros((len(self.counts), self.pixels), bool)
-        masks[np.repeat(np.arange(len(masks)), np.diff(rows.indptr)), rows.indices] = True
-        return masks.reshape(len(masks), height, width)
+        return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
 
     def followed_by(self, others: "Runs") -> "Runs":
         """These masks and then the others, over the same pixels."""
@@ -63,9 +60,7 @@ def runs_of_masks(masks: Bool[np.ndarray, "r h w"]) -> Runs:
     return runs_of_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
-def remembered(
-    propose: Callable[[int], Bool[np.ndarray, "m h w"]],
-) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
+def remembered(propose: Callable[[int], Bool[np.ndarray, "m h w"]]) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
     """`propose`, a function of a frame's index, asked once a frame: its masks are kept as runs."""
 
     @functools.cache

@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
-from scipy import sparse
 
-from jsecon.association.atoms import coverage, label_shares
+from jsecon.association.atoms import coverage, label_shares, one_hot, summed
 from jsecon.association.views import SceneViews, View, claim_atoms
 from jsecon.errors import require_shape
 from jsecon.types import Camera, Gaussians
@@ -22,8 +21,8 @@ class GeometricTracker:
     frame the track goes outward, always on to the frame that shares the most with one already visited, and every frame
     adds what it shows: evidence e_ib, the weight that Gaussian i casts on the masks of b; ownership is e_ib^2 / sum_b
     e_ib^2. In the next frame the atoms are claimed (`claim_atoms`). Occlusion is that of the full scene's compositing.
-    A Gaussian counts as known in proportion to the best look that a visited frame had of it, in full from `glimpse`
-    times what the frame at hand sees.
+    A Gaussian counts as known in proportion to the best look that a visited frame had of it, in full from half of
+    what the frame at hand sees.
     """
 
     def __init__(
@@ -33,10 +32,8 @@ class GeometricTracker:
         proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
         *,
         atoms_per_frame: int = 256,
-        glimpse: float = 0.5,
     ):
         self.views = SceneViews(gaussians, cameras, proposals, atoms_per_frame=atoms_per_frame)
-        self.glimpse = glimpse
 
     def __call__(
         self, frames: UInt8[np.ndarray, "t h w 3"], index: int, prompts: Bool[np.ndarray, "b _ _"]
@@ -57,7 +54,8 @@ class GeometricTracker:
         evidence = np.zeros((self.views.count, len(classes)), np.float32)
         best = np.zeros(len(evidence), np.float32)
         start = views[index]
-        evidence[start.seen] = start.clearly(coverage(start.atoms, classes, start.votes.shape[1]).T)
+        said = start.votes @ coverage(start.atoms, classes, start.votes.shape[1]).T
+        evidence[start.seen] = start.clarity[:, None] * said  # one seen from its side, over an outline, says little
         best[start.seen] = start.clarity
         owners = {}
         order = self._outward(index)
@@ -90,11 +88,11 @@ class GeometricTracker:
         return np.stack([*classes, free])
 
     def consistent(
-        self, frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"], *, least_own: float = 0.5
+        self, frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"]
     ) -> Int[np.ndarray, "t h w"]:
         """labels (T, H, W) with every region given away whose Gaussians belong to another one in the sum of all views.
 
-        A region is kept if at least `least_own` of the weight that it casts falls on Gaussians on which no other region
+        A region is kept if at least half of the weight that it casts falls on Gaussians on which no other region
         casts more; otherwise (a part that few frames tell from the rest, a shadow) its pixels become the region's that
         owns most of it. Numbers of regions are kept, so some may end without a pixel.
         """
@@ -106,15 +104,13 @@ class GeometricTracker:
                 shares = label_shares(view.atoms, labels[t], view.votes.shape[1], count)
                 cast = (view.votes @ shares).tocoo()
                 entries.append((cast.data, view.seen[cast.row], cast.col))
-            weights, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
-            shape = (self.views.count, count)
-            votes = sparse.csr_matrix((weights, (rows, columns)), shape=shape)  # sums what repeats
+            votes = summed(entries, (self.views.count, count))
             winner = np.asarray(votes.argmax(axis=1)).reshape(-1)
-            owner = sparse.csr_matrix((np.ones(shape[0], np.float32), (np.arange(shape[0]), winner)), shape=shape)
-            cast = (votes.T @ owner).toarray()  # (R, R): row r's weight by the region that owns the Gaussian
+            # (R, R): row r's weight by the region that owns the Gaussian
+            cast = (votes.T @ one_hot(winner, count)).toarray()
             heir = cast.argmax(1)
             total = np.maximum(cast.sum(1), 1e-12)
-            lost = (heir != np.arange(count)) & (np.diagonal(cast) < least_own * total)
+            lost = (heir != np.arange(count)) & (np.diagonal(cast) < 0.5 * total)
             if not lost.any():
                 break
             table = np.append(np.where(lost, heir, np.arange(count)), -1).astype(labels.dtype)
@@ -141,7 +137,7 @@ class GeometricTracker:
         # On an outline a Gaussian leans over the neighbours and is counted with them, in view after view. So one tells
         # something only once some view has seen about as much of it as this one does, and assigned what it saw.
         assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)
-        known = np.minimum(np.minimum(best / np.maximum(view.clarity, 1e-6), assigned) / self.glimpse, 1.0)
+        known = np.minimum(np.minimum(best / np.maximum(view.clarity, 1e-6), assigned) / 0.5, 1.0)
         known = np.square(known).astype(np.float32)[:, None]
         # Of most classes a frame shows nothing, of most of what it shows the visited frames say nothing: left out.
         rows, classes = np.flatnonzero(known), np.flatnonzero(evidence.any(0))
@@ -155,8 +151,6 @@ class GeometricTracker:
 
 def _said(view: View, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a view that gives its atoms to classes (A,), -1 = none, of `count`, says of its Gaussians: row, class and
-    weight of each entry that is not 0 of `view.clearly` of the classes one-hot."""
-    owned = np.flatnonzero(owner >= 0)
-    one_hot = sparse.csr_matrix((np.ones(len(owned), np.float32), (owned, owner[owned])), shape=(len(owner), count))
-    cast = (view.votes @ one_hot).tocoo()
+    weight, by the clarity of the look, of each entry that is not 0."""
+    cast = (view.votes @ one_hot(owner, count)).tocoo()
     return cast.row, cast.col, view.clarity[cast.row] * cast.data

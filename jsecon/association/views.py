@@ -13,12 +13,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from scipy import sparse
 
 from jsecon.association.atoms import SMALLEST, Sparse, cast_on_atoms, coverage, image_atoms
 from jsecon.errors import require
 from jsecon.process import cores
 from jsecon.types import Camera, Gaussians
+
+PROPOSAL_SHARE, ATOM_SHARE, MERGER, KNOWN_SHARE, COVERED = 0.4, 0.6, 0.5, 0.5, 0.2
+"""see `claim_atoms`"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,16 +43,6 @@ class View:
         """(n,) weight that each Gaussian casts in the frame."""
         return np.asarray(self.votes.sum(1)).ravel()
 
-    def on_atoms(self, values: Float[np.ndarray, "n c"] | Sparse) -> np.ndarray:
-        """(A, C) what the atoms receive of values (n, C) of the Gaussians."""
-        mass = self.votes.T @ values
-        return mass.toarray() if sparse.issparse(mass) else mass
-
-    def clearly(self, values: Float[np.ndarray, "a c"]) -> np.ndarray:
-        """(n, C) what the Gaussians receive of values (A, C) of the atoms, by how clearly they are seen: one seen from
-        its side, over an outline, says little."""
-        return self.clarity[:, None] * (self.votes @ values)
-
 
 class SceneViews:
     """The views of one scene, each computed once.
@@ -67,19 +59,13 @@ class SceneViews:
         *,
         atoms_per_frame: int = 256,
     ):
-        require(
-            atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use about 200 for small frames."
-        )
-        self.gaussians, self.cameras = gaussians, cameras
+        require(atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use 200 for small frames.")
+        self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
         self.atoms_per_frame = atoms_per_frame
         self.propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: list[View] = []
-        self._shared = np.zeros((0, 0), np.float32)
-
-    @property
-    def count(self) -> int:
-        """Gaussians in the scene."""
-        return self.gaussians.means.shape[0]
+        self.shared = np.zeros((0, 0), np.float32)
+        """(T, T) what any two frames see in common: the cosine of how much they see of each Gaussian. After `all`."""
 
     def _cut(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple[np.ndarray, np.ndarray]:
         """(atoms (H, W), proposals (M, A) by the share of each atom that lies in them)."""
@@ -93,13 +79,8 @@ class SceneViews:
         """All views, each with how clearly it sees its Gaussians. Raises ValueError where the frames are not the
         cameras'."""
         expected = (*self.cameras.fx.shape, self.cameras.height, self.cameras.width)
-        require(
-            frames.shape[:3] == expected,
-            "frames",
-            frames.shape,
-            f"{(*expected, 3)}",
-            "Give the frames of the scene's own cameras, the same at every call.",
-        )
+        remedy = "Give the frames of the scene's own cameras, the same at every call."
+        require(frames.shape[:3] == expected, "frames", frames.shape, f"{(*expected, 3)}", remedy)
         if not self._views:
             # While one frame's votes are cast, others are segmented and cut, on all cores.
             views, pool = [], ThreadPoolExecutor(cores())
@@ -124,52 +105,39 @@ class SceneViews:
                 for view, look in zip(views, looks)
             ]
             looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-30)
-            self._shared = looks @ looks.T
+            self.shared = looks @ looks.T
         return self._views
-
-    @property
-    def shared(self) -> Float[np.ndarray, "t t"]:
-        """(T, T) what any two frames see in common: the cosine of how much they see of each Gaussian. After `all`."""
-        return self._shared
 
 
 def claim_atoms(
-    view: View,
-    mass: Float[np.ndarray, "a c"],
-    known_mass: Float[np.ndarray, "a 1"],
-    *,
-    proposal_share: float = 0.4,
-    atom_share: float = 0.6,
-    merger: float = 0.5,
-    known_share: float = 0.5,
-    covered: float = 0.2,
+    view: View, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
 ) -> Int[np.ndarray, " a"]:
     """The class (A,) that owns each atom of a view, -1 = none.
 
     `mass` (A, C) is the weight m_ac on each atom of the Gaussians of each class, `known_mass` (A, 1) that, k_a, of all
     whose class is known; t_a is the weight of all. Sums over a proposal p weigh an atom by the share of it inside of p:
 
-        share of an atom       s_ac = m_ac / k_a,  sure where k_a >= known_share t_a and t_a >= covered px(a)
-        share of a proposal    s_pc = m_pc / k_p,  sure where k_p >= known_share t_p
+        share of an atom       s_ac = m_ac / k_a,  sure where k_a >= KNOWN_SHARE t_a and t_a >= COVERED px(a)
+        share of a proposal    s_pc = m_pc / k_p,  sure where k_p >= KNOWN_SHARE t_p
 
-    1. A sure atom goes to the class of its largest share if that is at least `atom_share`.
-    2. Then each sure proposal, from the weakest to the strongest in v = max_c s_pc, if v >= proposal_share, gives the
+    1. A sure atom goes to the class of its largest share if that is at least ATOM_SHARE.
+    2. Then each sure proposal, from the weakest to the strongest in v = max_c s_pc, if v >= PROPOSAL_SHARE, gives the
        atoms that lie in it by more than half to the class w of that share. Where it is a merger of w and of the classes
-       with m_pc >= merger sum_a m_ac and m_pc >= SMALLEST, a sure atom goes to the one of them with the largest s_ac.
+       with m_pc >= MERGER sum_a m_ac and m_pc >= SMALLEST, a sure atom goes to the one of them with the largest s_ac.
     """
-    total = view.on_atoms(np.ones((len(view.seen), 1), np.float32))
+    total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
     share_of_atom = mass / np.maximum(known_mass, 1e-6)
     area = np.bincount(view.atoms.reshape(-1), minlength=len(total))
-    sure_atom = (known_mass >= known_share * total)[:, 0] & (total[:, 0] >= covered * area)
+    sure_atom = (known_mass >= KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= COVERED * area)
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
-    sure = (known_inside >= known_share * (view.proposals @ total))[:, 0]
-    merged = (inside >= merger * mass.sum(0)) & (inside >= SMALLEST)
+    sure = (known_inside >= KNOWN_SHARE * (view.proposals @ total))[:, 0]
+    merged = (inside >= MERGER * mass.sum(0)) & (inside >= SMALLEST)
 
-    owner = np.where(sure_atom & (share_of_atom.max(1) >= atom_share), share_of_atom.argmax(1), -1)
+    owner = np.where(sure_atom & (share_of_atom.max(1) >= ATOM_SHARE), share_of_atom.argmax(1), -1)
     strongest = np.where(sure, share.max(1), 0.0) if len(share) else np.zeros(0)
     for m in np.argsort(strongest, kind="stable"):
-        if strongest[m] >= proposal_share:
+        if strongest[m] >= PROPOSAL_SHARE:
             winner = share[m].argmax()
             merged[m, winner] = True
             held, rivals = np.flatnonzero(view.proposals[m] > 0.5), np.flatnonzero(merged[m])

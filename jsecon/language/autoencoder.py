@@ -8,18 +8,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray, UInt32
+from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
 from jsecon.numerics import cosine, is_traced, normalize
-from jsecon.types import Array
+from jsecon.types import Array, Key
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 """LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it."""
 MIN_STEPS = 1_000
 """LangSplat's 100 epochs run over tens of thousands of crops; a few masklets need more epochs to see as many steps."""
-Key = PRNGKeyArray | UInt32[Array, "2"]
 
 
 @jax.tree_util.register_dataclass
@@ -42,15 +41,9 @@ class Autoencoder:
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
         """(..., E) embeddings of any length -> (..., d) unit codes; a zero embedding stays a zero (unknown) code."""
-        require_shape(
-            "embeddings",
-            embeddings,
-            (..., self.dim),
-            "Encode embeddings of the embedder that the autoencoder was trained on.",
-        )
+        require_shape("embeddings", embeddings, (..., self.dim), "Embed with what the autoencoder was trained on.")
         units = normalize(jnp.asarray(embeddings))
-        rows = units.reshape(-1, self.dim)
-        codes = _encode(self.encoder, rows)
+        codes = _encode(self.encoder, units.reshape(-1, self.dim))
         return codes.reshape(*units.shape[:-1], self.latent)
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
@@ -83,41 +76,19 @@ def train_autoencoder(
     Raises ValueError for no usable row, numbers that are not finite, or options out of range.
     """
     require(latent >= 1, "train_autoencoder", f"latent={latent}", "at least 1", "3 is LangSplat's.")
-    require(
-        batch >= 1 and (epochs is None or epochs >= 1),
-        "train_autoencoder",
-        f"batch={batch}, epochs={epochs}",
-        "both at least 1",
-        "Leave epochs out to have it chosen.",
-    )
+    positive, found = batch >= 1 and (epochs is None or epochs >= 1), f"batch={batch}, epochs={epochs}"
+    require(positive, "train_autoencoder", found, "both at least 1", "Leave epochs out to have it chosen.")
     rows = np.asarray(embeddings)
-    require(
-        bool(np.isfinite(rows).all()),
-        "train_autoencoder",
-        "embeddings that are not finite",
-        "finite numbers",
-        "Find the regions whose crops gave NaN and leave them out.",
-    )
-    rows = rows[np.any(rows != 0, axis=1)]
-    require(
-        len(rows) >= 1,
-        "train_autoencoder",
-        f"{embeddings.shape[0]} rows, all zero or none",
-        "at least one embedding",
-        "Embed the regions first.",
-    )
-
+    require_finite("train_autoencoder", rows)
+    rows, found = rows[np.any(rows != 0, axis=1)], f"{len(rows)} rows, all zero or none"
+    require(len(rows) >= 1, "train_autoencoder", found, "at least one embedding", "Embed the regions first.")
     units = normalize(jnp.asarray(rows))
     count, dim = units.shape
     batches = -(-count // batch)
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
-    plan = _Plan(
-        (*(max(w, latent) for w in ENCODER_WIDTHS), latent),
-        (*(max(w, latent) for w in DECODER_WIDTHS), dim),
-        batches,
-        learning_rate,
-        cosine_weight,
-    )
+    inward = (*(max(w, latent) for w in ENCODER_WIDTHS), latent)
+    outward = (*(max(w, latent) for w in DECODER_WIDTHS), dim)
+    plan = _Plan(inward, outward, batches, learning_rate, cosine_weight)
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
     stretch = total if progress is None else max(1, -(-total // 50))
@@ -131,6 +102,12 @@ def train_autoencoder(
     vector = vector if is_traced(vector) else np.asarray(vector)  # whose slices compile nothing
     params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
     return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
+
+
+def require_finite(where: str, embeddings: np.ndarray) -> None:
+    """Raises ValueError, naming the function `where`, for embeddings that are not finite."""
+    remedy, finite = "Find the regions whose crops gave NaN and leave them out.", bool(np.isfinite(embeddings).all())
+    require(finite, where, "embeddings that are not finite", "finite numbers", remedy)
 
 
 class _Plan(NamedTuple):
@@ -234,9 +211,8 @@ def _epochs(
 
 
 def _widths(params: Any) -> tuple[int, ...]:
-    return tuple(
-        params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(sum(name.startswith("Dense_") for name in params))
-    )
+    layers = sum(name.startswith("Dense_") for name in params)
+    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(layers))
 
 
 @jax.jit

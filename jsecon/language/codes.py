@@ -6,19 +6,18 @@ A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact whe
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray, UInt32
+from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.language.autoencoder import train_autoencoder
+from jsecon.language.autoencoder import require_finite, train_autoencoder
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.numerics import cosine_matrix, normalize
-from jsecon.types import Array
+from jsecon.types import Array, Key
 
 MAX_COSINE_LOSS = 1e-4
 """a rotation counts as lossless when no cosine between two regions moves by more than this"""
@@ -29,8 +28,9 @@ LATENTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """sizes of code that "auto" tries"""
 SHARPNESS = 40.0
 """of the softmax over regions with which `Spread` places a text among their codes"""
+SPREAD_STEPS = 400
+"""of Adam, in `spread_codes`"""
 
-Key = PRNGKeyArray | UInt32[Array, "2"]
 Coder = Any
 """Autoencoder, Rotation, Spread, or None: whatever `encode` below takes"""
 
@@ -103,20 +103,9 @@ def region_codes(
     `CODE_THRESHOLD`); None where no code shorter than the embeddings does.
     Raises ValueError for numbers that are not finite.
     """
-    require(
-        latent == "auto" or (isinstance(latent, int) and latent >= 1),
-        "region_codes",
-        f"latent={latent!r}",
-        "at least 1, or 'auto'",
-        "3 is LangSplat's.",
-    )
-    require(
-        bool(np.isfinite(np.asarray(embeddings)).all()),
-        "region_codes",
-        "embeddings that are not finite",
-        "finite numbers",
-        "Find the regions whose crops gave NaN and leave them out.",
-    )
+    known = latent == "auto" or (isinstance(latent, int) and latent >= 1)
+    require(known, "region_codes", f"latent={latent!r}", "at least 1, or 'auto'", "3 is LangSplat's.")
+    require_finite("region_codes", np.asarray(embeddings))
     units = normalize(jnp.asarray(embeddings))
     if latent == "auto":
         return _smallest_codes(units)
@@ -125,17 +114,13 @@ def region_codes(
     if dim <= latent:
         return units, None, f"left out: the embeddings have {dim} numbers, no more than the {latent} of a code"
     codes, rotation = _rotated(units, latent)
-    exact = np.asarray(units, np.float64)
-    coded = np.asarray(codes, np.float64)
+    exact, coded = np.asarray(units, np.float64), np.asarray(codes, np.float64)
     loss = float(np.abs(coded @ coded.T - exact @ exact.T).max(initial=0.0))
     if loss <= MAX_COSINE_LOSS:
         return codes, rotation, f"left out: {count} regions fit in {latent} dimensions without loss"
     coder = train_autoencoder(units, latent=latent, key=key, **training)
-    return (
-        coder.encode(units),
-        coder,
-        f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}",
-    )
+    why = f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}"
+    return coder.encode(units), coder, why
 
 
 def _smallest_codes(units: Array) -> tuple[Array, Coder, str]:
@@ -167,12 +152,10 @@ def distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
     return (exact @ exact.T < ALIKE_THRESHOLD) & known[:, None] & known[None]
 
 
-def confused_pairs(
-    units: Float[Array, "r e"], codes: Float[Array, "r d"], *, separation: float = CODE_THRESHOLD
-) -> int:
-    """Pairs of distinct regions whose unit codes have a cosine of at least `separation`."""
+def confused_pairs(units: Float[Array, "r e"], codes: Float[Array, "r d"]) -> int:
+    """Pairs of distinct regions whose unit codes have a cosine of at least `CODE_THRESHOLD`."""
     exact = np.asarray(codes, np.float64)
-    return int((distinct_pairs(units) & (exact @ exact.T >= separation)).sum()) // 2
+    return int((distinct_pairs(units) & (exact @ exact.T >= CODE_THRESHOLD)).sum()) // 2
 
 
 def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
@@ -187,9 +170,7 @@ def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
     return Rotation(jnp.asarray(basis, units.dtype))
 
 
-def spread_codes(
-    units: Float[Array, "r e"], latent: int, *, separation: float = CODE_THRESHOLD, steps: int = 400
-) -> Float[Array, "r d"]:
+def spread_codes(units: Float[Array, "r e"], latent: int, *, separation: float = CODE_THRESHOLD) -> Float[Array, "r d"]:
     """Unit codes (R, d) whose cosines are those of the regions (R, E) as far as that leaves distinct ones apart.
 
     From the principal directions, by Adam on: the mean squared error of the cosines, centred (what all regions have in
@@ -208,19 +189,13 @@ def spread_codes(
     start += 1e-3 * np.random.default_rng(0).standard_normal(start.shape)
     distinct = distinct_pairs(units)
     alike = ~distinct & known[:, None] & known[None]
-    codes = _spread(
-        jnp.asarray(start, units.dtype),
-        jnp.asarray(target, units.dtype),
-        jnp.asarray(distinct),
-        jnp.asarray(alike),
-        separation,
-        steps,
-    )
+    given = jnp.asarray(start, units.dtype), jnp.asarray(target, units.dtype)
+    codes = _spread(*given, jnp.asarray(distinct), jnp.asarray(alike), separation)
     return jnp.where(jnp.asarray(known)[:, None], codes, 0.0)
 
 
-@functools.partial(jax.jit, static_argnames="steps")
-def _spread(start: Array, target: Array, distinct: Array, alike: Array, separation: Array | float, steps: int) -> Array:
+@jax.jit
+def _spread(start: Array, target: Array, distinct: Array, alike: Array, separation: Array | float) -> Array:
     pairs = jnp.maximum(jnp.sum(distinct | alike), 1)
 
     def loss(points):
@@ -234,7 +209,7 @@ def _spread(start: Array, target: Array, distinct: Array, alike: Array, separati
 
     import optax  # late: a field is read without it
 
-    optimizer = optax.adam(optax.cosine_decay_schedule(0.05, steps))
+    optimizer = optax.adam(optax.cosine_decay_schedule(0.05, SPREAD_STEPS))
 
     def step(state, _) -> tuple[Any, None]:
         points, moments = state
@@ -242,5 +217,5 @@ def _spread(start: Array, target: Array, distinct: Array, alike: Array, separati
         return (optax.apply_updates(points, updates), moments), None
 
     start = normalize(start)
-    (points, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), None, length=steps)
+    (points, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), None, length=SPREAD_STEPS)
     return normalize(points)

@@ -12,13 +12,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Float, Int
 
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, safe_norm
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import ViewPlan, plan_view, plan_views, render_plan
-from jsecon.types import Array, Camera, Gaussians, Votes
+from jsecon.types import Array, Camera, Gaussians, Key, Votes
 
 ADAM_EPS = 1e-15
 """3DGS's and LangSplat's: gradients per Gaussian are means over all pixels, far below the usual 1e-8"""
@@ -30,10 +30,6 @@ _ROWS = 8192
 """Gaussians reduced at a time: (rows, K, d) is the largest array of a reduction, 134 MB at K = 8, d = 512"""
 _TIE = 1e-5
 """relative weight below which two halves of a median count as equal: float32 sums of K weights are no surer"""
-
-Key = PRNGKeyArray | UInt32[Array, "2"]
-
-
 LEAST_LABELLED = 0.5
 """share of a Gaussian's weight: below, what no region holds has the majority. With masks of a few objects and nothing
 else, the walls around them would otherwise carry the objects' codes (demo, one-step mIoU 0.24)"""
@@ -56,9 +52,8 @@ def distill_votes(
     `least_labelled` of all weight lies on labelled pixels (0 keeps them). Raises ValueError on shapes that disagree.
     """
     require_one_of("reduce", reduce, _REDUCTIONS, "'mode' is the default.")
-    require_shape(
-        "region_codes", region_codes, (votes.num_regions, "d"), "Pass one code per region, in the regions' order."
-    )
+    expected = votes.num_regions, "d"
+    require_shape("region_codes", region_codes, expected, "Pass one code per region, in the regions' order.")
     if votes.num_regions == 0 or votes.regions.shape[1] == 0:
         return jnp.zeros((votes.regions.shape[0], region_codes.shape[1]), region_codes.dtype)
     codes = _distill_votes(votes.regions, votes.weights, jnp.asarray(region_codes), reduce)
@@ -155,35 +150,23 @@ def distill_l1(
     its capacity (as for `render`: outside a trace only a given one can). Raises ValueError on shapes that disagree and,
     outside a trace, on such a NaN.
     """
-    start = descent(gaussians, cameras, labels, region_codes, steps=steps, key=key, init=init)
+    given = gaussians, cameras, labels, region_codes
+    start = descent(*given, steps=steps, key=key, init=init)
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
     if plans is None and capacity is None and not is_traced((gaussians, cameras)):
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
-        state = descend(
-            state,
-            gaussians,
-            cameras,
-            labels,
-            region_codes,
-            until=stop,
-            learning_rate=learning_rate,
-            capacity=capacity,
-            plans=plans,
-        )
+        state = descend(state, *given, until=stop, learning_rate=learning_rate, capacity=capacity, plans=plans)
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
     if not is_traced(state.history):
-        require(
-            not bool(jnp.isnan(state.history).any()),
-            "distill_l1",
-            f"capacity={capacity}, too small for a view, or NaN",
-            "every view within the capacity, finite Gaussians and codes",
-            "Leave capacity out, and check the Gaussians with jsecon.numerics.finite.",
-        )
+        found = f"capacity={capacity}, too small for a view, or NaN"
+        expected = "every view within the capacity, finite Gaussians and codes"
+        remedy = "Leave capacity out, and check the Gaussians with jsecon.numerics.finite."
+        require(not bool(jnp.isnan(state.history).any()), "distill_l1", found, expected, remedy)
     codes = normalize(state.features)
     if isinstance(init, str) and init == "random":
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
@@ -205,26 +188,17 @@ def descent(
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
     expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
     require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
-    require(
-        views > 0 and steps > 0 and region_codes.shape[0] > 0,
-        "distill_l1",
-        f"{views} views, {steps} steps, {region_codes.shape[0]} regions",
-        "at least one of each",
-        "There is nothing to distil.",
-    )
+    some, found = min(views, steps, len(region_codes)) > 0, f"{views} views, {steps} steps, {len(region_codes)} regions"
+    require(some, "distill_l1", found, "at least one of each", "There is nothing to distil.")
     order_key, init_key = jax.random.split(key)
     dtype = region_codes.dtype
     if isinstance(init, str):
-        require_one_of(
-            "init", init, ("zero", "random"), "Start from distill_votes(...), codes (N, d), where you have votes."
-        )
+        require_one_of("init", init, ("zero", "random"), "Where you have votes, start from distill_votes(...).")
         features = jnp.zeros((count, size), dtype)
         if init == "random":
             features = RANDOM_LENGTH * normalize(jax.random.normal(init_key, (count, size), dtype))
     else:
-        require_shape(
-            "init", init, (count, size), "Codes to start from have one row per Gaussian, of the regions' code size."
-        )
+        require_shape("init", init, (count, size), "Give one row per Gaussian, of the regions' code size.")
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
@@ -278,13 +252,7 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, lear
         (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])
         updates, moments = optimizer.update(gradient, state.moments)
         features: Any = optax.apply_updates(state.features, updates)
-        value = jnp.where(overflow > 0, jnp.nan, value)
-        return Descent(
-            features,
-            moments,
-            state.order,
-            state.history.at[index].set(value),
-            jnp.asarray(index + 1, jnp.int32),
-        )
+        history = state.history.at[index].set(jnp.where(overflow > 0, jnp.nan, value))
+        return Descent(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
 
     return jax.lax.fori_loop(state.step, until, step, state)

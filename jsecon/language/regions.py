@@ -39,13 +39,8 @@ def region_embeddings(
     label beyond R, or an unknown weighting.
     """
     require_shape("labels", labels, frames.shape[:3], "Give one label image per frame, of the frame's own size.")
-    return pooled(
-        labels,
-        lambda t, masks: embed(frames[t], masks),
-        weighting=weighting,
-        num_regions=num_regions,
-        progress=progress,
-    )
+    of_frame = lambda t, masks: embed(frames[t], masks)
+    return pooled(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
 
 
 def given_embeddings(
@@ -60,8 +55,8 @@ def given_embeddings(
     require_shape("masks", masks, labels.shape, "Give one image of rows per frame, of the labels' size.")
 
     def under(t: int, regions: np.ndarray) -> np.ndarray:
-        rows, place = np.unique(masks[t][masks[t] >= 0], return_inverse=True)
         known = masks[t] >= 0
+        rows, place = np.unique(masks[t][known], return_inverse=True)
         inside = [np.bincount(place[region[known]], minlength=len(rows)) for region in regions]
         found = np.asarray(inside, np.float64).reshape(len(regions), len(rows)) @ embeddings[rows].astype(np.float64)
         return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
@@ -81,13 +76,8 @@ def pooled(
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
     highest = int(labels.max(initial=-1))
     count = highest + 1 if num_regions is None else num_regions
-    require(
-        highest < count,
-        "num_regions",
-        f"label {highest} with num_regions={count}",
-        "labels below num_regions",
-        "Raise num_regions, or leave it out.",
-    )
+    found, remedy = f"label {highest} with num_regions={count}", "Raise num_regions, or leave it out."
+    require(highest < count, "num_regions", found, "labels below num_regions", remedy)
     pixels = np.zeros((count, len(labels)), np.int32)
     total: np.ndarray | None = None
     for t, image in enumerate(labels):

@@ -58,20 +58,12 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     `regions` knows.
     """
     views = None if votes.by_view is None else votes.by_view.shape[0]
-    require(
-        views is not None,
-        "with_shown",
-        "votes without the weight of each view",
-        "by_view (T, N)",
-        "Cast them with region_votes(..., by_view=True).",
-    )
-    require(
-        views == regions.pixels.shape[1] and votes.num_regions == regions.count,
-        "with_shown",
-        f"{votes.num_regions} regions and {views} views voted, of {regions.pixels.shape}",
-        "the pixels (R, T) of the same regions in the same views",
-        "Give the regions that were made from the labels that voted.",
-    )
+    remedy = "Cast them with region_votes(..., by_view=True)."
+    require(views is not None, "with_shown", "votes without the weight of each view", "by_view (T, N)", remedy)
+    found = f"{votes.num_regions} regions and {views} views voted, of {regions.pixels.shape}"
+    expected = "the pixels (R, T) of the same regions in the same views"
+    same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
+    require(same, "with_shown", found, expected, "Give the regions that were made from the labels that voted.")
     known = jnp.any(regions.embeddings != 0, axis=1)
     alike = cosine_matrix(regions.embeddings, regions.embeddings) >= alike_threshold
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)

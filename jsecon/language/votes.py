@@ -56,16 +56,10 @@ def region_votes(
     is any, outside a trace and without a capacity given, all votes are cast again with enough. Raises ValueError on
     shapes that disagree.
     """
-    views = cameras.world_to_camera.shape[0]
-    require_shape(
-        "cameras.world_to_camera",
-        cameras.world_to_camera,
-        ("T", 4, 4),
-        "Add a leading axis to every array of a single camera.",
-    )
-    require_shape(
-        "labels", labels, (views, cameras.height, cameras.width), "Give one label image per view, of the camera's size."
-    )
+    poses = cameras.world_to_camera
+    require_shape("cameras.world_to_camera", poses, ("T", 4, 4), "Add a leading axis to all arrays of a single camera.")
+    expected = len(poses), cameras.height, cameras.width
+    require_shape("labels", labels, expected, "Give one label image per view, of the camera's size.")
     require(num_regions >= 0, "num_regions", num_regions, ">= 0", "Count the regions.")
     traced = is_traced((gaussians, cameras, labels))
     count = gaussians.means.shape[0]
@@ -84,34 +78,18 @@ def region_votes(
             state, totals = lax.scan(lambda s, view: _add_view(s, gaussians, view, *static), start, (cameras, inside))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
+            views, most = (cameras, inside), None if labels.size >= _MANY_PIXELS else 1
             state, totals = spread_over_devices(
-                _add_view,
-                start,
-                _merge,
-                gaussians,
-                (cameras, inside),
-                static=static,
-                most=None if labels.size >= _MANY_PIXELS else 1,
-                progress=report,
+                _add_view, start, _merge, gaussians, views, static=static, most=most, progress=report
             )
             if capacity is None and (missing := np.asarray(state["missing"])):
-                size = enough_capacity(size, missing[None])
-                return region_votes(
-                    gaussians,
-                    cameras,
-                    labels,
-                    num_regions,
-                    top=top,
-                    by_view=by_view,
-                    capacity=size,
-                    near=near,
-                    progress=progress,
-                )
+                again = functools.partial(region_votes, top=top, by_view=by_view, near=near, progress=progress)
+                return again(gaussians, cameras, labels, num_regions, capacity=enough_capacity(size, missing[None]))
         kept, own = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
         labelled = own if b == 0 else labelled + own
-    seen = None
-    if by_view:
-        seen = totals if traced else jnp.stack(totals)
+    if by_view and not traced:
+        totals = jnp.stack(totals)
+    seen = totals if by_view else None
     return Votes(
         kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions, seen
     )
@@ -162,7 +140,6 @@ def _add_plan(
     distinct = distinct_labels(tiles, _SLOTS)
     dtype = splats.dtype
     in_image = to_tiles(jnp.ones(labels.shape, dtype), lists.tile)
-
     table = make_table(splats)
 
     def one_batch(carry, ids_of_tiles):
@@ -211,9 +188,8 @@ _add_plan_compiled = jax.jit(_add_plan, static_argnums=3, donate_argnums=0)
 def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:
     """Each tile's distinct labels, ascending and to the left; _NOBODY after them, `slots` more columns than pixels."""
     ordered = jnp.sort(tiles, axis=1)
-    new = jnp.concatenate([jnp.ones_like(ordered[:, :1], bool), ordered[:, 1:] != ordered[:, :-1]], axis=1) & (
-        ordered >= 0
-    )
+    first = jnp.ones_like(ordered[:, :1], bool)
+    new = jnp.concatenate([first, ordered[:, 1:] != ordered[:, :-1]], axis=1) & (ordered >= 0)
     place = jnp.where(new, jnp.cumsum(new, axis=1) - 1, tiles.shape[1] + slots)
     table = jnp.full((tiles.shape[0], tiles.shape[1] + slots), _NOBODY, tiles.dtype)
     return table.at[jnp.arange(tiles.shape[0])[:, None], place].set(ordered, mode="drop")

@@ -43,13 +43,9 @@ def query_classes(
     experiments/replica.py measures it at the points of Replica's twin.
     """
     size = field.regions.embeddings.shape[1]
-    require(
-        texts.ndim == 2 and texts.shape[0] >= 1 and texts.shape[1] == size,
-        "query_classes",
-        f"texts {texts.shape}",
-        f"(Q >= 1, {size})",
-        "Embed the names of the classes with the field's embedder.",
-    )
+    fit = texts.ndim == 2 and texts.shape[0] >= 1 and texts.shape[1] == size
+    remedy = "Embed the names of the classes with the field's embedder."
+    require(fit, "query_classes", f"texts {texts.shape}", f"(Q >= 1, {size})", remedy)
     least = threshold_of(retrieval, retrieval_threshold, "query_classes")
     if field.regions.count == 0:
         count, dtype = field.codes.shape[0], jnp.asarray(field.regions.embeddings).dtype

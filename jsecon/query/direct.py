@@ -66,15 +66,11 @@ def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: 
 
 @jax.jit
 def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> Selection:
-    similarity, known = similarities(codes, text_code)
-    return Selection(known & (similarity >= threshold), similarity, jnp.asarray(-1, jnp.int32), best(similarity, known))
+    return _selection(*similarities(codes, text_code), threshold)
 
 
 def query_canonical(
-    features: Codes,
-    text: Float[Array, " d_text"],
-    canonical: Float[Array, "c d_canonical"],
-    threshold: Number,
+    features: Codes, text: Float[Array, " d_text"], canonical: Float[Array, "c d_canonical"], threshold: Number
 ) -> Selection:
     """The Gaussians whose relevancy to the text is at least `threshold`.
 
@@ -85,20 +81,15 @@ def query_canonical(
     Raises ValueError on shapes that disagree.
     """
     size = features.shape[1]
-    require(
-        text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1,
-        "query_canonical",
-        f"text {text.shape}, canonical {canonical.shape}",
-        f"({size},) and (C >= 1, {size})",
-        "Embed or encode text and canonical phrases as the features are.",
-    )
+    fit = text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1
+    found, expected = f"text {text.shape}, canonical {canonical.shape}", f"({size},) and (C >= 1, {size})"
+    require(fit, "query_canonical", found, expected, "Embed or encode text and canonical phrases as the features are.")
     return _canonical(as_codes(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
 
 
 @jax.jit
 def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number) -> Selection:
-    relevancy, known = relevancies(features, text, canonical)
-    return Selection(known & (relevancy >= threshold), relevancy, jnp.asarray(-1, jnp.int32), best(relevancy, known))
+    return _selection(*relevancies(features, text, canonical), threshold)
 
 
 def relevancies(features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
@@ -158,6 +149,8 @@ def _by_row(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
     return largest, jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
 
 
-def best(similarity: Float[Array, " n"], known: Bool[Array, " n"]) -> Float[Array, ""]:
-    """The largest similarity among the known, 0 where none is."""
-    return jnp.where(jnp.any(known), jnp.max(jnp.where(known, similarity, -jnp.inf), initial=-jnp.inf), 0.0)
+def _selection(similarity: Array, known: Array, threshold: Number) -> Selection:
+    """Those known whose similarity is at least the threshold; the score is the best of all, 0 where none is known."""
+    mask, nothing = known & (similarity >= threshold), jnp.asarray(-1, jnp.int32)
+    best = jnp.where(jnp.any(known), jnp.max(jnp.where(known, similarity, -jnp.inf), initial=-jnp.inf), 0.0)
+    return Selection(mask, similarity, nothing, best)

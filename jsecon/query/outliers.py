@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -42,13 +43,9 @@ def remove_outliers(
     for options out of range.
     """
     require_one_of("remove_outliers", keep, ("largest", "all"), "Use 'all' to keep several objects.")
-    require(
-        min_samples >= 1 and (eps is None or eps > 0),
-        "remove_outliers",
-        f"eps={eps}, min_samples={min_samples}",
-        "eps > 0 and min_samples >= 1",
-        "Leave eps out to have it follow the selection's spacing.",
-    )
+    positive, found = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
+    remedy = "Leave eps out to have it follow the selection's spacing."
+    require(positive, "remove_outliers", found, "eps > 0 and min_samples >= 1", remedy)
     means = np.asarray(means)
     kept = np.asarray(mask) & np.isfinite(means).all(axis=1)
     chosen = np.flatnonzero(kept)
@@ -134,9 +131,7 @@ def _distinct(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sizes = places.max(axis=0) - first_place + 1
     if np.prod(sizes) < 2.0**62:
         # One integer a row sorts some ten times faster than rows do.
-        keys = ((places - first_place).astype(np.int64) * np.array([sizes[1] * sizes[2], sizes[2], 1], np.int64)).sum(
-            axis=1
-        )
+        keys = (places - first_place).astype(np.int64) @ np.array([sizes[1] * sizes[2], sizes[2], 1], np.int64)
         _, first, which = np.unique(keys, return_index=True, return_inverse=True)
         return places[first], which
     distinct, which = np.unique(places, axis=0, return_inverse=True)
@@ -159,22 +154,13 @@ def _components(points: np.ndarray, cells: np.ndarray, cell_of: np.ndarray, eps:
     part = _join(count, pairs[gap <= eps])
 
     # The others are looked at point by point, and only where their parts are not one already.
-    parents = list(range(part.max() + 1))
-
-    def root(a: int) -> int:
-        while parents[a] != a:
-            parents[a] = parents[parents[a]]
-            a = parents[a]
-        return a
-
+    parts = DisjointSet(range(part.max() + 1))
     for a, b in pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]:
-        root_a, root_b = root(int(part[a])), root(int(part[b]))
-        if root_a == root_b:
-            continue
-        few, many = sorted((points[order[bounds[c] : bounds[c + 1]]] for c in (a, b)), key=len)
-        if _within(few, many, eps):
-            parents[root_a] = root_b
-    merged = np.array([root(a) for a in range(len(parents))])[part][own]
+        if not parts.connected(part[a], part[b]):
+            few, many = sorted((points[order[bounds[c] : bounds[c + 1]]] for c in (a, b)), key=len)
+            if _within(few, many, eps):
+                parts.merge(part[a], part[b])
+    merged = np.array([parts[a] for a in parts])[part][own]
     _, first, named = np.unique(merged, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[named]
 

@@ -54,14 +54,10 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
     if not 0 <= frame < frames:
         raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
     if not (0 <= x < width and 0 <= y < height):
-        raise InputError(
-            "pixel",
-            f"({x}, {y})",
-            f"column 0 to {width - 1}, row 0 to {height - 1}",
-            f"Give x and y in the frames as the run used them, {width}x{height}.",
-        )
-    gaussians, camera = jax.tree.map(jnp.asarray, (field.gaussians, _view(field.cameras, frame)))
-    ids, weights = pixel_weights(gaussians, camera, x, y)
+        remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
+        raise InputError("pixel", f"({x}, {y})", f"column 0 to {width - 1}, row 0 to {height - 1}", remedy)
+    gaussians, cameras = jax.tree.map(jnp.asarray, (field.gaussians, field.cameras))
+    ids, weights = pixel_weights(gaussians, cameras[frame], x, y)
     regions = np.asarray(field.votes.regions)[ids]
     share = np.nan_to_num(np.asarray(vote_shares(field.votes))[ids].astype(np.float64))
     shares = np.zeros(field.regions.count)
@@ -76,7 +72,3 @@ def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: fl
     """
     shares = region_shares_at(field, frame, x, y)
     return int(shares.argmax()) if shares.size and shares.max() >= min_share else -1
-
-
-def _view(cameras: Camera, frame: int) -> Camera:
-    return jax.tree.map(lambda a: jnp.asarray(a)[frame], cameras)

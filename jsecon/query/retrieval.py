@@ -149,13 +149,8 @@ def is_alike(
 
 
 def is_near(similarity: Float[Array, " r"], known: Bool[Array, " r"], nearness: Number) -> Bool[Array, " r"]:
-    """Which of R regions are about as similar to a text as the best one is:
-
-        s_r >= m + nearness (b - m),  b > m
-
-    with s the similarities (R,) where known (R,), b the largest and m the median of them: only the place between the
-    typical region and the best means something.
-    """
+    """Which of R regions are about as similar to a text as the best one is, by the rule of `regions_of_text`; none
+    where all are equally similar: only the place between the typical region and the best means something."""
     middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
     best = jnp.max(jnp.where(known, similarity, -jnp.inf))
     return known & (similarity >= middle + nearness * (best - middle)) & (best > middle)
@@ -170,12 +165,9 @@ def is_piece(
     nearness: Number = PIECE_NEARNESS,
     least: Number = PIECE_OVERLAP,
 ) -> Bool[Array, " r"]:
-    """Which of R regions are pieces of the things that the `chosen` regions (R,) are of, as a text sees them:
-
-        s_r >= m + nearness (b - m),  b > m,  max_{c chosen} o_rc >= least
-
-    the first two as in `is_near`, o the overlap (R, R) of `with_overlap`. A second thing of the kind is as near to the
-    text, but has Gaussians of its own.
+    """Which of R regions are pieces of the things that the `chosen` regions (R,) are of, as a text sees them: near to
+    it (`is_near`), and o_rc >= `least` for some chosen c, o the overlap (R, R) of `with_overlap`. A second thing of the
+    kind is as near to the text, but has Gaussians of its own.
     """
     near = is_near(similarity, known, nearness)
     return near & (jnp.max(jnp.where(chosen[:, None], overlap, 0.0), axis=0) >= least)

@@ -39,13 +39,9 @@ def query_several(
     """
     size = field.regions.embeddings.shape[1]
     unwanted = jnp.zeros((0, size)) if unwanted is None else jnp.asarray(unwanted)
-    require(
-        wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1,
-        "query_several",
-        f"wanted {wanted.shape}, unwanted {unwanted.shape}",
-        f"(Q >= 1, {size}) and (U, {size})",
-        "Embed the texts with the field's embedder.",
-    )
+    fit = wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1
+    found, expected = f"wanted {wanted.shape}, unwanted {unwanted.shape}", f"(Q >= 1, {size}) and (U, {size})"
+    require(fit, "query_several", found, expected, "Embed the texts with the field's embedder.")
     least = threshold_of(retrieval, retrieval_threshold, "query_several")
     if field.regions.count == 0:
         return nothing(field)
@@ -88,10 +84,6 @@ def parts_of_question(question: str) -> tuple[list[str], list[str]]:
     sides = [re.split(r"\s+or\s+", side, flags=re.IGNORECASE) for side in (first, *rest)]
     sides = [[part.strip().strip("\"'").strip() for part in side] for side in sides]
     if not all(part for side in sides for part in side) or re.fullmatch(r"but not\b.*", question.strip().lower()):
-        raise InputError(
-            question,
-            "a part without words",
-            'texts joined by "or" and "but not"',
-            'For example: "red mug" or "bowl" but not "handle"',
-        )
+        remedy = 'For example: "red mug" or "bowl" but not "handle"'
+        raise InputError(question, "a part without words", 'texts joined by "or" and "but not"', remedy)
     return sides[0], [part for side in sides[1:] for part in side]
