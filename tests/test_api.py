@@ -107,7 +107,7 @@ def test_modules_are_short_enough_to_be_read_whole():
 
 
 CORE = ("splat", "fit", "association", "language", "query")
-CORE_LINES, ALL_LINES = 7_260, 17_060
+CORE_LINES, ALL_LINES = 7_000, 16_500
 """What a reader may be asked to read. A feature that needs more raises both by its own lines, and says here which it is
 and how many."""
 
