@@ -50,11 +50,7 @@ def _window(camera, bound):
 
 
 def trace(
-    room: Room,
-    camera: Camera,
-    *,
-    dx: float = 0.0,
-    dy: float = 0.0,
+    room: Room, camera: Camera, *, dx: float = 0.0, dy: float = 0.0
 ) -> tuple[Float32[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]:
     """z-depth (m) and index into `room.parts` (-1 = a wall, the floor or the ceiling) of the rays through the pixels'
     centres shifted by (dx, dy) px. The camera must stand in the room and outside of every part."""
@@ -140,10 +136,7 @@ def srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"]:
 
 
 def render_views(
-    room: Room,
-    cameras: Camera,
-    *,
-    progress: Callable[[int, int], None] | None = None,
+    room: Room, cameras: Camera, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[UInt8[np.ndarray, "t h w 3"], Int16[np.ndarray, "t h w"], Float32[np.ndarray, "t h w"]]:
     """Frames, instances (index of the object, -1 = background) and z-depths (m) of a batch of cameras in the room."""
     baked = bake(room)

@@ -109,9 +109,7 @@ def contains(solid: Solid, points: Float[np.ndarray, "3 n"], *, margin: float = 
 
 
 def interval(
-    solid: Solid,
-    origin: Float[np.ndarray, "3 _"],
-    direction: Float[np.ndarray, "3 n"],
+    solid: Solid, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Ray parameters between which origin + t direction lies in the solid; enter >= leave where it misses."""
     d = solid.axes.T @ direction

@@ -37,11 +37,7 @@ SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
     ),
     "prompt_encoder": (
         {"coords": (1, None, 2), "labels": (1, None), "masks": (1, "L", "L"), "masks_enable": (1,)},
-        {
-            "sparse_embeddings": (1, None, "C"),
-            "dense_embeddings": (1, "C", "G", "G"),
-            "dense_pe": (1, "C", "G", "G"),
-        },
+        {"sparse_embeddings": (1, None, "C"), "dense_embeddings": (1, "C", "G", "G"), "dense_pe": (1, "C", "G", "G")},
     ),
     "mask_decoder": (
         {
@@ -52,12 +48,7 @@ SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
             "high_res_features1": (1, None, "L", "L"),
             "high_res_features2": (1, None, None, None),
         },
-        {
-            "masks": (1, 4, "L", "L"),
-            "iou_pred": (1, 4),
-            "sam_tokens_out": (1, 4, "C"),
-            "object_score_logits": (1, 1),
-        },
+        {"masks": (1, 4, "L", "L"), "iou_pred": (1, 4), "sam_tokens_out": (1, 4, "C"), "object_score_logits": (1, 1)},
     ),
     "mlp": ({"x": (None, "C")}, {"x_out": (None, "C")}),
     "memory_attention": (

@@ -87,9 +87,7 @@ def image_features(sam2: Sam2Graphs, frame: np.ndarray) -> Features:
     image = ((np.asarray(small) / 255.0).astype(np.float32) - MEAN) / STD
     found = sam2.run("image_encoder", {"input_image": image.transpose(2, 0, 1)[None]})
     return Features(
-        found["backbone_fpn_2"],
-        (found["backbone_fpn_0"], found["backbone_fpn_1"]),
-        found["vision_pos_enc_2"],
+        found["backbone_fpn_2"], (found["backbone_fpn_0"], found["backbone_fpn_1"]), found["vision_pos_enc_2"]
     )
 
 
@@ -161,10 +159,7 @@ def _resized(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _prompt(
-    sam2: Sam2Graphs,
-    points: np.ndarray | None = None,
-    labels: np.ndarray | None = None,
-    hint: np.ndarray | None = None,
+    sam2: Sam2Graphs, points: np.ndarray | None = None, labels: np.ndarray | None = None, hint: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """The prompt encoder's outputs for points (P, 2) in px of the network's image, and mask logits `hint` (L, L)."""
     low = sam2.sizes["L"]

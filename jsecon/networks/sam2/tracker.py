@@ -32,14 +32,7 @@ class Sam2Tracker:
     Raises InputError where a file of a SAM 2 model is missing in the folder, and later where one does not fit the rest.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        hole_area: int = 8,
-        keep: int = 16,
-        threads: int | None = None,
-    ):
+    def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
         self.name = f"sam2-{sam2_digest(folder, extra=repr(hole_area))}"
         self.hole_area = hole_area
         self._folder, self._keep, self._threads = folder, keep, threads
