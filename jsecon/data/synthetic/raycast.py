@@ -81,16 +81,8 @@ def _shade(baked, points, index, lamps):
     colour = np.empty((points.shape[1], 3), np.float32)
     background = np.flatnonzero(index < 0)
     p = points[:, background]
-    gaps = np.stack(
-        [
-            room.half[0] + p[0],
-            room.half[0] - p[0],
-            room.half[1] + p[1],
-            room.half[1] - p[1],
-            p[2] + np.float32(TABLE_HEIGHT),
-            np.float32(room.ceiling) - p[2],
-        ]
-    )
+    (a, b), (x, y, z) = room.half, p
+    gaps = np.stack([a + x, a - x, b + y, b - y, z + np.float32(TABLE_HEIGHT), np.float32(room.ceiling) - z])
     nearest = gaps.argmin(0)
     for side, plane in enumerate(baked.walls):
         on = nearest == side
