@@ -182,7 +182,7 @@ def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray
     return points, colours
 
 
-def _point(line: str) -> tuple[float, ...]:
+def _point(line: str) -> tuple[float, float, float, int, int, int]:
     _, x, y, z, red, green, blue, _ = line.split(maxsplit=8)[:8]
     colour = int(red), int(green), int(blue)
     if not all(0 <= value <= 255 for value in colour):
