@@ -56,12 +56,12 @@ def test_a_tensor_that_does_not_fit_is_named(affine, feeds, outputs, named):
 
 def test_requirements_name_the_tensor_and_what_was_wanted(affine):
     graph = Graph(affine, threads=1)
-    assert graph.require_input("x", (None, 3), "a test").dtype == "float32"
-    assert graph.require_output("y", (4, 2), "a test").name == "y"
+    assert graph.require("input", "x", (None, 3), "a test").dtype == "float32"
+    assert graph.require("output", "y", (4, 2), "a test").name == "y"
     with pytest.raises(InputError, match=r"input 'image'.*no such input.*x float32\[batch, 3\].*CLIP's image encoder"):
-        graph.require_input("image", (1, 3, 224, 224), "CLIP's image encoder")
+        graph.require("input", "image", (1, 3, 224, 224), "CLIP's image encoder")
     with pytest.raises(InputError, match=r"output 'y': found y float32\[batch, 2\].*\[\?, 512\]"):
-        graph.require_output("y", (None, 512), "CLIP's image encoder")
+        graph.require("output", "y", (None, 512), "CLIP's image encoder")
 
 
 def _damage(kind, path):

@@ -188,12 +188,8 @@ def _query(asked: Query) -> None:
     from jsecon.language.field import load_field
 
     if not asked.texts and not asked.at:
-        raise InputError(
-            "query",
-            "nothing to find",
-            "a TEXT, or --at FRAME X Y",
-            'For example: jsecon query field.npz "red mug" --out answers',
-        )
+        remedy = 'For example: jsecon query field.npz "red mug" --out answers'
+        raise InputError("query", "nothing to find", "a TEXT, or --at FRAME X Y", remedy)
     pixels = [(frame, _whole("X", x), _whole("Y", y)) for frame, x, y in asked.at or ()]
     require_writable(asked.out)
     field = load_field(asked.field)

@@ -49,7 +49,7 @@ def demo(
     metrics = _metrics(results, found, given)
     with listener.progress("report"):
         queries = _queries(found.field, embedder, labels, out / "queries")
-        write_text(out / "report.html", _page(found, given, results, queries, labels, metrics, seed))
+        write_text(out / "report.html", _page(found, results, queries, labels, metrics, seed))
         _write_picture(out / "demo.jpg", found, results["anchored"][0])
     single = sum(told["left_out"].get("DBSCAN") == "the selection is one component" for told in queries.values())
     metrics["left_out"]["DBSCAN"] = f"{single} of {len(queries)} selections are one component"
@@ -107,7 +107,6 @@ def _queries(field: LanguageField, embedder: Any, labels: list[LabelledFrame], o
 
 def _page(
     found: Run,
-    given: Run,
     results: dict[str, tuple[list[Row], dict[str, Any]]],
     queries: dict[str, dict[str, Any]],
     labels: list[LabelledFrame],
@@ -133,32 +132,18 @@ def _page(
         "true_masks": "text -> region -> its votes, true masks given",
         "true_masks_one_step": "text -> codes, directly, true masks given",
     }
-    rows = [
-        (
-            names[kind],
-            *(f"{told[n]:.3f}" for n in ("miou", "macc", "acc_50", "loc_acc")),
-            told["pairs"],
-            told["missing"],
-        )
-        for kind, (_, told) in results.items()
-    ]
-    measured = report.section(
-        "How well",
-        f"{metrics['protocol']}. Held-out views only; a missing prediction counts as 0.",
-        report.table(["query", "mIoU", "mAcc@0.25", "Acc@0.5", "Loc. acc.", "pairs", "missing"], rows),
-    )
-    return report.page(
-        f"jsecon demo, room {seed}",
-        "A made-up room as an ordinary capture: frames, poses and sparse points in, "
-        "answers to texts out, on a plain CPU and without any learned weights.",
-        [
-            head,
-            measured,
-            _query_part(found, results["anchored"][0], given, results["true_masks"][0], queries, labels),
-            *summary.scene_parts(found),
-            *summary.work_parts(found),
-        ],
-    )
+    rows = []
+    for kind, (_, told) in results.items():
+        shares = (f"{told[name]:.3f}" for name in ("miou", "macc", "acc_50", "loc_acc"))
+        rows.append((names[kind], *shares, told["pairs"], told["missing"]))
+    table = report.table(["query", "mIoU", "mAcc@0.25", "Acc@0.5", "Loc. acc.", "pairs", "missing"], rows)
+    words = f"{metrics['protocol']}. Held-out views only; a missing prediction counts as 0."
+    asked = _query_part(found, results["anchored"][0], results["true_masks"][0], queries, labels)
+    parts = [head, report.section("How well", words, table), asked]
+    lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
+    lead += "on a plain CPU and without any learned weights."
+    parts += [*summary.scene_parts(found), *summary.work_parts(found)]
+    return report.page(f"jsecon demo, room {seed}", lead, parts)
 
 
 def _write_picture(path: Path, found: Run, rows: list[Row]) -> None:
@@ -183,12 +168,7 @@ def _write_picture(path: Path, found: Run, rows: list[Row]) -> None:
 
 
 def _query_part(
-    found: Run,
-    rows: list[Row],
-    given: Run,
-    true_rows: list[Row],
-    queries: dict[str, dict[str, Any]],
-    labels: list[LabelledFrame],
+    found: Run, rows: list[Row], true_rows: list[Row], queries: dict[str, dict[str, Any]], labels: list[LabelledFrame]
 ) -> str:
     """For each query, the held-out view that shows it largest: the frame, the selection, the same with true masks."""
     frames = dict(zip(found.capture.names, np.asarray(found.capture.frames)))
@@ -199,21 +179,10 @@ def _query_part(
         row = max((row for row in rows if row.query == text), key=lambda row: truth[row.frame, text].sum())
         frame, true = frames[row.frame], truth[row.frame, text]
         other = given_rows[row.frame, text]
-        cells += [
-            report.figure(frame, row.frame, strong=text),
-            report.figure(
-                pictures.selection_overlay(frame, row.mask, true),
-                f"{row.selected} Gaussians, region {row.region}, score {row.score:.2f}",
-                strong=f"IoU {row.iou:.2f}",
-            ),
-            report.figure(
-                pictures.selection_overlay(frame, other.mask, true),
-                f"true masks given: {other.selected} Gaussians",
-                strong=f"IoU {other.iou:.2f}",
-            ),
-        ]
-    return report.section(
-        "Queries",
-        "Pink: the selected Gaussians, rendered alone, over a held-out view. White line: the ground truth.",
-        report.grid(cells, 3),
-    )
+        cells.append(report.figure(frame, row.frame, strong=text))
+        words = f"{row.selected} Gaussians, region {row.region}, score {row.score:.2f}"
+        for answer, caption in ((row, words), (other, f"true masks given: {other.selected} Gaussians")):
+            overlay = pictures.selection_overlay(frame, answer.mask, true)
+            cells.append(report.figure(overlay, caption, strong=f"IoU {answer.iou:.2f}"))
+    words = "Pink: the selected Gaussians, rendered alone, over a held-out view. White line: the ground truth."
+    return report.section("Queries", words, report.grid(cells, 3))

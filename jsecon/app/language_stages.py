@@ -38,12 +38,9 @@ def regions(work: Work) -> Stage:
         names = [capture.names[t] for t in training_frames(capture)]
         given = load_features(options.features, names, labels.shape[1:], level=options.level)
         if not len(given.embeddings):
-            raise InputError(
-                options.features,
-                f"no mask of level {options.level} in any frame",
-                "masks with their embeddings",
-                "Take another --level, or write the files again.",
-            )
+            there = f"no mask of level {options.level} in any frame"
+            remedy = "Take another --level, or write the files again."
+            raise InputError(options.features, there, "masks with their embeddings", remedy)
         found = given_embeddings(labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress)
         bare = int((~found.embeddings.any(1)).sum())
         notes = (f"{len(given.embeddings)} embeddings in the files",)

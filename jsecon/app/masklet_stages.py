@@ -37,16 +37,9 @@ def _read(work: Work) -> Stage:
         _require_regions(found.labels, str(folder))
         return Outcome(found.labels, notes=(f"{len(found.ids)} regions in the masks", *found.notes))
 
-    left = f"masks are given ({folder.name})"
-    return Stage(
-        "masklets",
-        f"read from {folder.name}",
-        compute,
-        after=("load",),
-        given=work.given("level"),
-        files=folder,
-        left_out={"segmenter": left, "association": left},
-    )
+    how, given, why = f"read from {folder.name}", work.given("level"), f"masks are given ({folder.name})"
+    left = {"segmenter": why, "association": why}
+    return Stage("masklets", how, compute, after=("load",), given=given, files=folder, left_out=left)
 
 
 def _found(work: Work) -> Stage:
@@ -185,6 +178,5 @@ def associated(
 
 def _require_regions(labels: np.ndarray, where: str) -> None:
     if labels.max(initial=-1) < 0:
-        raise InputError(
-            where, "no region in any frame", "at least one", "Give masks (--masks DIR), or frames with more contrast."
-        )
+        remedy = "Give masks (--masks DIR), or frames with more contrast."
+        raise InputError(where, "no region in any frame", "at least one", remedy)

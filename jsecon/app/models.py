@@ -60,12 +60,9 @@ def report_lines(findings: Findings) -> Iterable[str]:
 def require_usable(findings: Findings) -> None:
     """Raises InputError where the folder can be used for nothing."""
     if not any(use.usable for use in findings.uses):
-        raise InputError(
-            findings.folder,
-            "nothing that can be used",
-            " or ".join(use.model for use in findings.uses) + " as ONNX graphs",
-            "See above for what is missing and where such exports are published.",
-        )
+        expected = f"{' or '.join(use.model for use in findings.uses)} as ONNX graphs"
+        remedy = "See above for what is missing and where such exports are published."
+        raise InputError(findings.folder, "nothing that can be used", expected, remedy)
 
 
 def _signature(path: Path) -> str:
@@ -87,21 +84,16 @@ def _clip(folder: Path) -> str:
     embedder = ClipEmbedder(folder)
     embedder.check()
     size, files = embedder.size, embedder.files
-    told = (
-        f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}, "
-        f"tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
-    )
+    told = f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}"
     embedder.close()
-    return told
+    return f"{told}, tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
 
 
 def _sam(folder: Path) -> str:
     graphs = sam_graphs.SamGraphs(sam_graphs.find_sam(folder))
     many = "one prompt per call" if graphs.batch == 1 else f"{graphs.batch} prompts per call"
-    return (
-        f"masks of every frame; decoder of {graphs.dialect.name}, {many}, images of {graphs.side} px: "
-        f"jsecon run --segmenter {folder}"
-    )
+    made = f"masks of every frame; decoder of {graphs.dialect.name}, {many}, images of {graphs.side} px"
+    return f"{made}: jsecon run --segmenter {folder}"
 
 
 def _sam2(folder: Path) -> str:

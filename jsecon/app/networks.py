@@ -1,8 +1,6 @@
 """What looks at the frames: OpenCV and colours without any weights, or SAM, SAM 2 and CLIP from model folders.
 
 Networks are opened when first needed and closed when their stage is done: their memory would stay otherwise.
-
-The space of embeddings that came from files, where the model that made them is not at hand.
 """
 
 import json
@@ -45,12 +43,9 @@ def given_dim(name: str | None) -> int | None:
 
 def missing_model(dim: int) -> InputError:
     """That the model of a given space is needed."""
-    return InputError(
-        "field",
-        f"regions whose embeddings came from files, {dim} numbers each",
-        "the CLIP model that made them",
-        "Give its folder: --embedder DIR. Without it, ask by a pixel (--at).",
-    )
+    remedy = "Give its folder: --embedder DIR. Without it, ask by a pixel (--at)."
+    found = f"regions whose embeddings came from files, {dim} numbers each"
+    return InputError("field", found, "the CLIP model that made them", remedy)
 
 
 def networks_of(options: Options, store: Path) -> Networks:
@@ -62,9 +57,8 @@ def networks_of(options: Options, store: Path) -> Networks:
     if options.segmenter is not None:
         from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 
-        settings = SamSettings(
-            level=options.level, points_per_side=options.points_per_side, crop_layers=options.crop_layers
-        )
+        level, side, layers = options.level, options.points_per_side, options.crop_layers
+        settings = SamSettings(level=level, points_per_side=side, crop_layers=layers)
         segmenter = StoredSegmenter(SamSegmenter(options.segmenter, settings), store / "proposals")
     if options.tracker is not None:
         from jsecon.networks.sam2.tracker import Sam2Tracker
@@ -111,16 +105,11 @@ def embedder_named(
         if name is not None and name.startswith("clip-"):
             remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
         elif tuple(templates) != ("{}",):
-            raise InputError(
-                "--template", "a field whose texts are colours", "one made with CLIP", "Leave out --template."
-            )
+            there = "a field whose texts are colours"
+            raise InputError("--template", there, "one made with CLIP", "Leave out --template.")
     if dim is not None and found.dim != dim:
-        raise InputError(
-            "--embedder",
-            f"a model whose embeddings have {found.dim} numbers",
-            f"{dim}, as those from files have",
-            "Give the CLIP model that made the files.",
-        )
+        there, wanted = f"a model whose embeddings have {found.dim} numbers", f"{dim}, as those from files have"
+        raise InputError("--embedder", there, wanted, "Give the CLIP model that made the files.")
     if dim is None and name not in (None, found.name):
         raise InputError("field", f"regions embedded by {name!r}", f"{found.name!r}", remedy)
     return found

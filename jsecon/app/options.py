@@ -88,26 +88,17 @@ def require_inputs(options: Options) -> None:
     for argument in arguments_of(Options):
         value = getattr(options, argument.name)
         if isinstance(value, Path) and not value.exists():
-            raise InputError(
-                value,
-                "nothing there",
-                argument.help.partition(";")[0],
-                f"Mend the path{'' if argument.positional else f', or leave out {argument.flag}'}.",
-            )
+            remedy = f"Mend the path{'' if argument.positional else f', or leave out {argument.flag}'}."
+            raise InputError(value, "nothing there", argument.help.partition(";")[0], remedy)
         if argument.least is not None and isinstance(value, int | float) and not value >= argument.least:
             raise InputError(argument.flag, str(value), f"at least {argument.least}", "Mend the option.")
     sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
     if len(sources) > 1:
-        raise InputError(
-            " ".join(sources),
-            "more than one source of masks",
-            "one: tracked masks, masks of single frames, or a model that finds them",
-            "Leave out the others.",
-        )
+        expected = "one: tracked masks, masks of single frames, or a model that finds them"
+        raise InputError(" ".join(sources), "more than one source of masks", expected, "Leave out the others.")
     if not 0 < options.agreement <= 1:
-        raise InputError(
-            "--agreement", str(options.agreement), "a share above 0 and at most 1", "Leave it out, or use 0.3 to 0.6."
-        )
+        given, remedy = str(options.agreement), "Leave it out, or use 0.3 to 0.6."
+        raise InputError("--agreement", given, "a share above 0 and at most 1", remedy)
 
 
 def require_writable(folder: Path) -> None:
@@ -116,9 +107,5 @@ def require_writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise InputError(
-            folder,
-            error.strerror or type(error).__name__,
-            "a folder that can be written",
-            "Choose another output folder, or mend its permissions.",
-        ) from error
+        found, remedy = error.strerror or type(error).__name__, "Choose another output folder, or mend its permissions."
+        raise InputError(folder, found, "a folder that can be written", remedy) from error

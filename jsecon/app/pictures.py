@@ -51,10 +51,8 @@ def selection_overlay(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The frame, darkened outside of the selection's mask and tinted inside, with the ground truth's outline on top."""
     image = frame.astype(np.float32)
-    image = np.where(mask[..., None], 0.55 * image + 0.45 * np.array(SELECTED, np.float32), 0.5 * image).astype(
-        np.uint8
-    )
-    image = _outlined(image, mask, SELECTED, 1)
+    image = np.where(mask[..., None], 0.55 * image + 0.45 * np.array(SELECTED, np.float32), 0.5 * image)
+    image = _outlined(image.astype(np.uint8), mask, SELECTED, 1)
     if truth is not None:
         image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, TRUE, 1)
     return image

@@ -99,12 +99,8 @@ def run(
     listener, before = listener or Listener(), programs_built()
     folder = cache_folder or out / "cache"
     if out.resolve() == options.capture.resolve():
-        raise InputError(
-            out,
-            "the capture's own folder as the output folder",
-            "a folder of its own",
-            f"For example {out / 'field'}, or one elsewhere.",
-        )
+        found = "the capture's own folder as the output folder"
+        raise InputError(out, found, "a folder of its own", f"For example {out / 'field'}, or one elsewhere.")
     require_inputs(options)
     require_writable(out)
     work = Work(options, networks.networks_of(options, folder), out, load)
@@ -142,26 +138,12 @@ def run(
     save_field(out / FIELD_FILE, field)
     seconds["field"] = time.monotonic() - started
     listener.done("field", seconds["field"], True)
-    return Run(
-        field,
-        results["load"],
-        results["masklets"],
-        results["held_out"],
-        seconds,
-        tuple(steps),
-        tuple(notes),
-        options,
-        {name: count - before[name] for name, count in programs_built().items()},
-    )
+    capture, labels, psnr = (results[name] for name in ("load", "masklets", "held_out"))
+    programs = {name: count - before[name] for name, count in programs_built().items()}
+    return Run(field, capture, labels, psnr, seconds, tuple(steps), tuple(notes), options, programs)
 
 
 def _provenance(options: Options, keys: dict[str, str]) -> str:
     chosen = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    return json.dumps(
-        {
-            "jsecon": jsecon.__version__,
-            "options": {k: str(v) if isinstance(v, Path) else v for k, v in chosen.items()},
-            "keys": keys,
-        },
-        sort_keys=True,
-    )
+    chosen = {name: str(value) if isinstance(value, Path) else value for name, value in chosen.items()}
+    return json.dumps({"jsecon": jsecon.__version__, "options": chosen, "keys": keys}, sort_keys=True)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -94,39 +95,30 @@ class Console(Listener):
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Progress]:
         """Draws a bar with the time left, or writes a line now and then."""
-        with _Bar(name, self._err) if self._err.isatty() else _Lines(name, self._err) as callback:
-            yield callback
+        with contextlib.closing((_Bar if self._err.isatty() else _Lines)(name, self._err)) as shown:
+            yield shown.update
 
 
 class _Bar:
     """A tqdm bar that appears after two seconds and starts afresh when the total changes or the count falls back."""
 
     def __init__(self, name: str, err: Stream):
-        self._name, self._err, self._bar = name, err, None
-        self._started = time.monotonic()
+        self._bar = None
+        self._new = functools.partial(
+            tqdm, desc=f"  {name}", file=err, leave=False, delay=QUIET_SECONDS, dynamic_ncols=True
+        )
 
-    def __enter__(self) -> Callable[[int, int], None]:
-        return self._update
-
-    def _update(self, done: int, total: int) -> None:
+    def update(self, done: int, total: int) -> None:
         if self._bar is not None and (total != self._bar.total or done < self._bar.n):
-            self._bar.close()
-            self._bar = None
+            self.close()
         if self._bar is None:
-            self._bar = tqdm(
-                total=total,
-                desc=f"  {self._name}",
-                file=self._err,
-                leave=False,
-                delay=QUIET_SECONDS,
-                initial=done,
-                dynamic_ncols=True,
-            )
+            self._bar = self._new(total=total, initial=done)
         self._bar.update(done - self._bar.n)
 
-    def __exit__(self, *_) -> None:
+    def close(self) -> None:
         if self._bar is not None:
             self._bar.close()
+            self._bar = None
 
 
 class _Lines:
@@ -140,10 +132,7 @@ class _Lines:
     def _begin(self, done: int, total: int | None) -> None:
         self._started, self._first, self._total, self._done = time.monotonic(), done, total, done
 
-    def __enter__(self) -> Callable[[int, int], None]:
-        return self._update
-
-    def _update(self, done: int, total: int) -> None:
+    def update(self, done: int, total: int) -> None:
         if total != self._total or done < self._done:
             self._begin(done, total)
         self._done, now = done, time.monotonic()
@@ -152,5 +141,5 @@ class _Lines:
             print(f"  {self._name}: {done} of {total}, about {left:.0f} s left", file=self._err, flush=True)
             self._last = now
 
-    def __exit__(self, *_) -> None:
+    def close(self) -> None:
         pass

@@ -95,13 +95,13 @@ def ask_text(
         from jsecon.language.codes import encode
 
         code = encode(field.autoencoder, embedding)
+        usual = ONE_STEP_THRESHOLD if by == "one_step" else CANONICAL_THRESHOLD
+        least = usual if threshold is None else threshold
         if by == "one_step":
-            selection = query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
+            selection = query_one_step(field.codes, code, least)
         else:
             canonical = encode(field.autoencoder, jnp.asarray(field.canonical))
-            selection = query_canonical(
-                field.codes, code, canonical, CANONICAL_THRESHOLD if threshold is None else threshold
-            )
+            selection = query_canonical(field.codes, code, canonical, least)
     return _answer(field, text, by, selection, outliers, {})
 
 
@@ -123,39 +123,23 @@ def ask_pixel(
     region = region_at(field, index, x, y)
     name = field.names[index]
     if region < 0:
-        raise InputError(
-            f"--at {name} {x} {y}",
-            "no region under that pixel",
-            "a pixel of an object",
-            "Choose another pixel or frame: report.html of the run shows the regions.",
-        )
+        remedy = "Choose another pixel or frame: report.html of the run shows the regions."
+        raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
     membership = "code" if by == "code" else "votes"
     selection = query_region(field, region, by=membership, similarity_threshold=threshold)
-    return _answer(
-        field,
-        f"at {name} {x} {y}",
-        membership,
-        selection,
-        outliers,
-        {"text encoder": "the region under the pixel is the anchor"},
-    )
+    left = {"text encoder": "the region under the pixel is the anchor"}
+    return _answer(field, f"at {name} {x} {y}", membership, selection, outliers, left)
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:
     """A frame's index from its index or its name. Raises InputError for one that the field does not have."""
-    if str(frame) in field.names:
-        return field.names.index(str(frame))
-    stem = Path(str(frame)).stem
-    if stem in field.names:
-        return field.names.index(stem)
+    for name in (str(frame), Path(str(frame)).stem):
+        if name in field.names:
+            return field.names.index(name)
     if str(frame).isdecimal() and int(frame) < len(field.names):
         return int(frame)
-    raise InputError(
-        f"frame {frame}",
-        "no such frame in the field",
-        f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})",
-        "Held-out frames are not in the field.",
-    )
+    known = f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})"
+    raise InputError(f"frame {frame}", "no such frame in the field", known, "Held-out frames are not in the field.")
 
 
 def _answer(
@@ -205,14 +189,11 @@ def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
 def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[str, Any]:
     """What there is to say about an answer: count, score, region, and the place of the Gaussians `chosen`."""
     means = np.asarray(chosen.means, np.float64)
-    place = None
+    place = sure = None
     if len(means):
-        place = {
-            "centroid": means.mean(0).round(6).tolist(),
-            "bounding_box": {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()},
-        }
+        box = {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()}
+        place = {"centroid": means.mean(0).round(6).tolist(), "bounding_box": box}
     region = int(answer.selection.region)
-    sure = None
     if answer.by == "votes" and len(means):
         probability = np.asarray(membership_probability(answer.selection.similarity, field.votes))[answer.mask]
         sure = {"mean": round(float(probability.mean()), 4), "tenth": round(float(np.quantile(probability, 0.1)), 4)}

@@ -54,28 +54,20 @@ def section(title: str, words: str, *parts: str) -> str:
 
 def tiles(figures: Mapping[str, str]) -> str:
     """Headline figures: what -> value."""
-    return (
-        '<div class="tiles">'
-        + "".join(
-            f'<div class="tile"><b>{_text(value)}</b><span>{_text(what)}</span></div>'
-            for what, value in figures.items()
-        )
-        + "</div>"
-    )
+    tile = '<div class="tile"><b>{}</b><span>{}</span></div>'
+    told = "".join(tile.format(_text(value), _text(what)) for what, value in figures.items())
+    return f'<div class="tiles">{told}</div>'
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_from: int = 1) -> str:
     """A table; columns from `numbers_from` on are set to the right."""
 
     def cells(tag: str, row: Sequence[object]) -> str:
-        return "".join(
-            f"<{tag}{' class=n' if i >= numbers_from else ''}>{_text(cell)}</{tag}>" for i, cell in enumerate(row)
-        )
+        kinds = ("" if i < numbers_from else " class=n" for i in range(len(row)))
+        return "".join(f"<{tag}{kind}>{_text(cell)}</{tag}>" for kind, cell in zip(kinds, row))
 
-    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return (
-        f'<div class="scroll"><table><thead><tr>{cells("th", header)}</tr></thead><tbody>{body}</tbody></table></div>'
-    )
+    head, body = cells("th", header), "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def bars(seconds: Mapping[str, float]) -> str:

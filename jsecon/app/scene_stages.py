@@ -11,36 +11,23 @@ from jsecon.types import Camera, Capture, Gaussians
 
 def load(work: Work) -> Stage:
     """The capture, at the size that the options ask for."""
-    options = work.options
+    options, asked = work.options, work.given("downscale", "long_side", "frames", "holdout")
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         if work.load is not None:
             return _checked(work.load(), "by its adapter")
         from jsecon.data.capture import load_capture
 
-        capture = load_capture(
-            options.capture,
-            downscale=options.downscale,
-            long_side=options.long_side,
-            frames=options.frames,
-            holdout=options.holdout,
-            progress=progress,
-        )
-        return _checked(capture, size)
+        return _checked(load_capture(options.capture, **asked, progress=progress), size)
 
     if options.downscale is None:
         size = f"long side at most {options.long_side} px"
     else:
         size = "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
-    return Stage(
-        "load",
-        f"{count}, {size}, " + (f"1 in {options.holdout} held out" if options.holdout else "none held out"),
-        compute,
-        given=work.given("downscale", "long_side", "frames", "holdout")
-        | {"loader": getattr(work.load, "__qualname__", None)},
-        files=options.capture,
-    )
+    held = f"1 in {options.holdout} held out" if options.holdout else "none held out"
+    given = asked | {"loader": getattr(work.load, "__qualname__", None)}
+    return Stage("load", f"{count}, {size}, {held}", compute, given=given, files=options.capture)
 
 
 def _checked(capture: Capture, size: str) -> Outcome:
@@ -50,11 +37,9 @@ def _checked(capture: Capture, size: str) -> Outcome:
     train = training_frames(capture)
     check_views_overlap(capture)
     count, height, width = capture.frames.shape[:3]
-    told = (
-        f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out, "
-        f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
-    )
-    return Outcome(capture, notes=(told, *capture.notes))
+    told = f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out"
+    points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
+    return Outcome(capture, notes=(f"{told}, {points}", *capture.notes))
 
 
 def gaussians(work: Work) -> Stage:
@@ -73,14 +58,8 @@ def _read(work: Work) -> Stage:
         check_overlap(found, capture.cameras[training_frames(capture)], str(path))
         return Outcome(found)
 
-    return Stage(
-        "gaussians",
-        f"read from {path.name}",
-        compute,
-        after=("load",),
-        files=path,
-        left_out={"photometric fit": f"the scene's Gaussians are given ({path.name})"},
-    )
+    left = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
+    return Stage("gaussians", f"read from {path.name}", compute, after=("load",), files=path, left_out=left)
 
 
 def _fitted(work: Work) -> Stage:
@@ -96,28 +75,19 @@ def _fitted(work: Work) -> Stage:
             start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
+        key, steps = jax.random.key(options.seed), options.steps
+        keep = lambda current: record.keep(lambda: current)
         found, _ = fit_gaussians(
-            capture,
-            steps=options.steps,
-            key=jax.random.key(options.seed),
-            start=start,
-            state=state,
-            on_checkpoint=lambda current: record.keep(lambda: current),
-            progress=progress,
+            capture, steps=steps, key=key, start=start, state=state, on_checkpoint=keep, progress=progress
         )
         return Outcome(found, notes=notes)
 
     left = {"densification": "the fit keeps the points that it starts from"}
     if options.sh_degree == 0:
         left["view-dependent colour"] = "SH degree 0"
-    return Stage(
-        "gaussians",
-        f"fitted to the frames in {options.steps} steps, SH degree {options.sh_degree}",
-        compute,
-        after=("load",),
-        given=work.given("steps", "sh_degree", "seed"),
-        left_out=left,
-    )
+    how = f"fitted to the frames in {options.steps} steps, SH degree {options.sh_degree}"
+    given = work.given("steps", "sh_degree", "seed")
+    return Stage("gaussians", how, compute, after=("load",), given=given, left_out=left)
 
 
 def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: float = 0.01) -> None:
@@ -127,12 +97,9 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
     seen = jax.lax.map(lambda camera: project(gaussians, camera).visible, jax.tree.map(jnp.asarray, cameras))
     share = float(jnp.mean(seen.sum(0) >= 2)) if gaussians.count else 0.0
     if share < least:
-        raise InputError(
-            where,
-            f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames",
-            "views that overlap, and a scene in the world of their poses",
-            "Check that the poses belong to these frames, and the .ply to this capture.",
-        )
+        found = f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames"
+        remedy = "Check that the poses belong to these frames, and the .ply to this capture."
+        raise InputError(where, found, "views that overlap, and a scene in the world of their poses", remedy)
 
 
 def held_out(work: Work) -> Stage:

@@ -118,10 +118,6 @@ def training_frames(capture: Capture) -> np.ndarray:
     """Indices of the frames that may be fitted to. Raises InputError where there are fewer than two."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     if len(train) < 2:
-        raise InputError(
-            "frames",
-            f"{len(train)} of {len(capture.names)} frames to work with",
-            "at least 2",
-            "Hold out fewer frames (--holdout), or use more (--frames).",
-        )
+        found = f"{len(train)} of {len(capture.names)} frames to work with"
+        raise InputError("frames", found, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
     return train

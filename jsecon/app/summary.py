@@ -28,12 +28,8 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     with listener.progress("report"):
         parts = [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
-        write_text(
-            out / "report.html",
-            report.page(
-                f"Language field of {run.options.capture.resolve().name}", "Made by jsecon from posed frames.", parts
-            ),
-        )
+        title = f"Language field of {run.options.capture.resolve().name}"
+        write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
     if len(run.psnr):
         listener.say(f"held-out PSNR {metrics['held_out_psnr']:.2f} dB over {len(run.psnr)} frames")
     listener.say(
@@ -78,24 +74,13 @@ def write_answers(
             place = "nothing selected: no region answers it"
         else:
             place = "nothing selected"
-        listener.say(
-            f"{item.question!r}: {told['count']} of {told['of']} Gaussians, score {told['score']:.3f}, "
-            f"region {told['region']}, {place}"
-        )
-        parts.append(
-            report.section(
-                item.question,
-                f"{told['count']} of {told['of']} Gaussians by {item.by}; score {told['score']:.3f}; region "
-                f"{told['region']}; {told['outliers_dropped']} outliers dropped; {place}.",
-                report.grid(
-                    [
-                        report.figure(pictures.selection_overlay(renderer.photo(t), mask), field.names[t])
-                        for t, mask in shown.items()
-                    ],
-                    3,
-                ),
-            )
-        )
+        count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
+        listener.say(f"{item.question!r}: {count}, {score}, region {told['region']}, {place}")
+        dropped = f"{told['outliers_dropped']} outliers dropped"
+        words = f"{count} by {item.by}; {score}; region {told['region']}; {dropped}; {place}."
+        overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
+        figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
+        parts.append(report.section(item.question, words, report.grid(figures, 3)))
         with listener.progress("answers") as progress:
             progress(n + 1, len(answers))
     write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
@@ -150,15 +135,12 @@ def pair(row: Row) -> dict[str, Any]:
 
 def say_table(found: dict[str, tuple[list[Row], dict[str, Any]]], listener: Listener) -> None:
     """mIoU, mAcc@0.25 and localisation of each kind, with the protocol they were measured under."""
-    first = next(iter(found.values()))[1]
-    listener.say(
-        f"{first['protocol']}\n{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
-    )
+    told = next(iter(found.values()))[1]
+    listener.say(f"{told['protocol']}\n{told['pairs']} pairs of {told['queries']} queries in {told['frames']} frames")
     listener.say(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
     for kind, (_, told) in found.items():
-        listener.say(
-            f"  {kind:<14} {told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f} {told['missing']:>8}"
-        )
+        shares = f"{told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f}"
+        listener.say(f"  {kind:<14} {shares} {told['missing']:>8}")
 
 
 def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
@@ -188,54 +170,29 @@ def scene_parts(run: Run) -> list[str]:
             report.figure(renderer.colours(t, colours), "codes"),
             report.figure(renderer.photo(t), "the Gaussians' own colours"),
         ]
-    parts = [
-        report.section(
-            "Frames, masklets, codes",
-            "One colour is one region in every view. Codes are shown by their first three principal "
-            "components, as the Gaussians render them; grey is unknown.",
-            report.grid(cells, 4),
-        )
-    ]
+    words = "One colour is one region in every view. Codes are shown by their first three principal components, as the "
+    words += "Gaussians render them; grey is unknown."
+    parts = [report.section("Frames, masklets, codes", words, report.grid(cells, 4))]
     if len(run.psnr):
         out = np.flatnonzero(run.capture.held_out)
         order = out[np.unique(np.linspace(0, len(out) - 1, 4).round().astype(int))]
-        values = dict(zip(out.tolist(), run.psnr.tolist()))
-        parts.append(
-            report.section(
-                "Held-out frames",
-                "Never seen by any step; photograph and rendering.",
-                report.grid(
-                    [
-                        cell
-                        for t in order.tolist()
-                        for cell in (
-                            report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]),
-                            report.figure(renderer.photo(t), "rendered", strong=f"{values[t]:.2f} dB"),
-                        )
-                    ],
-                    4,
-                ),
-            )
-        )
+        values, cells = dict(zip(out.tolist(), run.psnr.tolist())), []
+        for t in order.tolist():
+            cells.append(report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]))
+            cells.append(report.figure(renderer.photo(t), "rendered", strong=f"{values[t]:.2f} dB"))
+        words = "Never seen by any step; photograph and rendering."
+        parts.append(report.section("Held-out frames", words, report.grid(cells, 4)))
     return parts
 
 
 def work_parts(run: Run) -> list[str]:
     """Seconds, stages, notes and where it all came from."""
     notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
+    origin = report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
+    measured = "Wall time of the computation, also where it happened in an earlier run."
+    ran = "What ran, and what was left out because this scene does not need it."
     return [
-        report.section(
-            "Seconds of each stage",
-            "Wall time of the computation, also where it happened in an earlier run.",
-            report.bars(run.seconds),
-        ),
-        report.section(
-            "Stages",
-            "What ran, and what was left out because this scene does not need it.",
-            report.steps(run.steps),
-            notes,
-        ),
-        report.section(
-            "Where it came from", "", report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
-        ),
+        report.section("Seconds of each stage", measured, report.bars(run.seconds)),
+        report.section("Stages", ran, report.steps(run.steps), notes),
+        report.section("Where it came from", "", origin),
     ]

@@ -46,12 +46,9 @@ def _posed(path: Path) -> Posed:
     if file.is_file() and file.suffix == ".json":
         return read_nerfstudio(file)
     found = "nothing there" if not path.exists() else "a file" if path.is_file() else "neither of them"
-    raise InputError(
-        path,
-        found,
-        "a folder with sparse/0 (COLMAP) and images, or with transforms.json",
-        "Give the capture's own folder; a transforms file of another name can be given itself.",
-    )
+    wanted = "a folder with sparse/0 (COLMAP) and images, or with transforms.json"
+    remedy = "Give the capture's own folder; a transforms file of another name can be given itself."
+    raise InputError(path, found, wanted, remedy)
 
 
 def check_views_overlap(capture: Capture) -> None:
@@ -71,17 +68,12 @@ def check_views_overlap(capture: Capture) -> None:
             return
         found = f"{count} views, no two of which see the same of {len(capture.points)} sparse points"
     else:
-        if any(
-            _frusta_meet(capture.cameras[a], capture.cameras[b]) for a, b in itertools.combinations(range(count), 2)
-        ):
+        cameras = [capture.cameras[index] for index in range(count)]
+        if any(_frusta_meet(a, b) for a, b in itertools.combinations(cameras, 2)):
             return
         found = f"{count} views that look apart from each other"
-    raise InputError(
-        f"capture of {capture.names[0]} ...",
-        found,
-        "at least two views of the same things",
-        "Check the poses and their axes (world-to-camera, OpenCV), and take views that overlap.",
-    )
+    remedy = "Check the poses and their axes (world-to-camera, OpenCV), and take views that overlap."
+    raise InputError(f"capture of {capture.names[0]} ...", found, "at least two views of the same things", remedy)
 
 
 def _share_points(cameras: Camera, points: np.ndarray) -> bool:

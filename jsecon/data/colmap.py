@@ -23,7 +23,7 @@ from jsecon.types import Capture
 def find_model(path: str | Path) -> Path | None:
     """The folder of the model below a capture: sparse/0, sparse, or None."""
     for folder in (Path(path) / "sparse" / "0", Path(path) / "sparse"):
-        if any((folder / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
+        if model_file(folder, "cameras") is not None:
             return folder
     return None
 
@@ -37,25 +37,17 @@ def read_colmap(path: Path, model: Path) -> Posed:
     lenses, images = read_cameras(model), read_images(model)
     missing = [name for name, _, _ in images if not (path / "images" / name).is_file()]
     if missing:
-        raise InputError(
-            path / "images",
-            f"{len(missing)} of {len(images)} images of the model missing (the first: {missing[0]})",
-            "every image that the model names",
-            "Copy them there, or take them out of the model (colmap image_deleter).",
-        )
+        found = f"{len(missing)} of {len(images)} images of the model missing (the first: {missing[0]})"
+        remedy = "Copy them there, or take them out of the model (colmap image_deleter)."
+        raise InputError(path / "images", found, "every image that the model names", remedy)
     shots = []
     for name, camera, pose in images:
         if camera not in lenses:
-            raise InputError(
-                model,
-                f"image {name} of camera {camera}, which is not in the cameras file",
-                "cameras and images of one model",
-                REMEDY,
-            )
+            found = f"image {name} of camera {camera}, which is not in the cameras file"
+            raise InputError(model, found, "cameras and images of one model", REMEDY)
         shots.append(Shot(name, path / "images" / name, lenses[camera], pose))
     if model_file(model, "points3D") is None:
-        note = "The model has no points3D file: there are no sparse points."
-        return Posed(shots, model, notes=(note,))
+        return Posed(shots, model, notes=("The model has no points3D file: there are no sparse points.",))
     return Posed(shots, model, *read_points(model))
 
 
@@ -78,9 +70,8 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
         for n, row in enumerate(distinct, start=1)
     ]
     image_bytes = [struct.pack("<Q", len(files))]
-    for n, (file, pose, camera) in enumerate(
-        zip(files, np.asarray(cameras.world_to_camera, np.float64), which.ravel()), start=1
-    ):
+    poses = np.asarray(cameras.world_to_camera, np.float64)
+    for n, (file, pose, camera) in enumerate(zip(files, poses, which.ravel()), start=1):
         quaternion = quaternion_of(pose[:3, :3])
         numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])
         image_bytes.append(struct.pack("<i7di", n, *numbers, camera + 1) + file.encode() + b"\0" + struct.pack("<Q", 0))

@@ -7,8 +7,9 @@ Format: https://colmap.github.io/format.html and src/colmap/scene/reconstruction
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -33,6 +34,7 @@ MODELS = {
 }
 _BY_NUMBER = {number: (name, count) for name, (number, count) in MODELS.items()}
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_UNDISTORT = "Run colmap image_undistorter and load its output."
 REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 
 
@@ -79,67 +81,53 @@ class _Bytes:
         return name.decode("utf-8", "surrogateescape")
 
 
-def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """(number, text) of each line but comments. Empty lines stay: an image without observations has one."""
-    text = file.read_text(encoding="utf-8", errors="surrogateescape")
-    return ((n, line) for n, line in enumerate(text.split("\n"), start=1) if not line.lstrip().startswith("#"))
-
-
-def _bad_line(file: Path, number: int, line: str, expected: str) -> InputError:
-    return bad_model(file, f"line {number}: {line.strip()[:80]!r}", expected)
+def _records(file: Path, expected: str, read: Callable[[str], Any], *, lines_each: int = 1) -> list[Any]:
+    """What `read` makes of the text file's records, all but comments and empty lines. Of `lines_each` lines only the
+    first is read; the others may be empty. Raises InputError, naming the line, where `read` raises ValueError."""
+    found, text = [], file.read_text(encoding="utf-8", errors="surrogateescape")
+    lines = ((n, line) for n, line in enumerate(text.split("\n"), start=1) if not line.lstrip().startswith("#"))
+    for number, line in lines:
+        if line.strip():
+            try:
+                found.append(read(line.strip()))
+            except InputError:
+                raise
+            except ValueError as error:
+                raise bad_model(file, f"line {number}: {line.strip()[:80]!r}", expected) from error
+            for _ in range(lines_each - 1):
+                next(lines, None)
+    return found
 
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
-    if model not in MODELS or model in ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"):
-        raise bad_model(
-            file,
-            f"camera model {model}",
-            (
-                "one that OpenCV can undistort: "
-                + ", ".join(name for name, (number, _) in MODELS.items() if number not in (7, 10, 11))
-            ),
-            "Run colmap image_undistorter and load its output.",
-        )
+    known = [name for name in MODELS if name not in ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE")]
+    if model not in known:
+        raise bad_model(file, f"camera model {model}", f"one that OpenCV undistorts: {', '.join(known)}", _UNDISTORT)
     if len(parameters) != MODELS[model][1]:
         raise bad_model(file, f"{len(parameters)} parameters of a {model} camera", str(MODELS[model][1]))
     focals = 1 if model in _ONE_FOCAL else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
     if not (np.isfinite(parameters).all() and fx > 0 and fy > 0 and width > 0 and height > 0):
-        raise bad_model(
-            file,
-            f"a camera of {width}x{height} px with parameters {parameters}",
-            "positive size and focal length",
-            "Estimate the cameras again.",
-        )
+        found = f"a camera of {width}x{height} px with parameters {parameters}"
+        raise bad_model(file, found, "positive size and focal length", "Estimate the cameras again.")
     return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="FISHEYE" in model)
 
 
 def read_cameras(model: Path) -> dict[int, Lens]:
     file = _existing(model, "cameras")
-    lenses = {}
+
+    def camera(line: str) -> tuple[int, Lens]:
+        identity, name, width, height, *parameters = line.split()
+        return int(identity), _lens(file, name, int(width), int(height), tuple(map(float, parameters)))
+
     if file.suffix == ".txt":
-        for number, line in _lines(file):
-            if not line.strip():
-                continue
-            try:
-                identity, name, width, height, *parameters = line.split()
-                lenses[int(identity)] = _lens(file, name, int(width), int(height), tuple(map(float, parameters)))
-            except InputError:
-                raise
-            except ValueError as error:
-                raise _bad_line(file, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
-        return lenses
-    data = _Bytes(file)
+        return dict(_records(file, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", camera))
+    data, lenses = _Bytes(file), {}
     for _ in range(data.take("Q")[0]):
         identity, number, width, height = data.take("iiQQ")
         if number not in _BY_NUMBER:
-            raise bad_model(
-                file,
-                f"camera model number {number}",
-                f"one of 0 to {max(_BY_NUMBER)}",
-                "Run colmap image_undistorter and load its output.",
-            )
+            raise bad_model(file, f"camera model number {number}", f"one of 0 to {max(_BY_NUMBER)}", _UNDISTORT)
         name, count = _BY_NUMBER[number]
         lenses[identity] = _lens(file, name, width, height, data.take(f"{count}d"))
     return lenses
@@ -150,12 +138,8 @@ def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     quaternion = np.array(numbers[:4], np.float64)
     length = np.linalg.norm(quaternion)
     if not np.isfinite(numbers).all() or not length > 1e-6:
-        raise bad_model(
-            file,
-            f"a pose of {name} with NaN or infinite numbers, or without rotation: {numbers}",
-            "finite poses",
-            "Estimate the poses again, or delete this image from the model.",
-        )
+        found = f"a pose of {name} with NaN or infinite numbers, or without rotation: {numbers}"
+        raise bad_model(file, found, "finite poses", "Estimate the poses again, or delete this image from the model.")
     w, x, y, z = quaternion / length
     pose = np.eye(4)
     pose[:3, :3] = [
@@ -170,24 +154,14 @@ def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
 def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
     """(name, camera, world_to_camera) of each image."""
     file = _existing(model, "images")
-    images = []
-    if file.suffix == ".txt":
-        lines = _lines(file)
-        for number, line in lines:
-            if not line.strip():
-                continue
-            try:
-                _, *numbers, camera, name = line.strip().split(maxsplit=9)
-                images.append((name, int(camera), _pose(file, name, tuple(map(float, numbers)))))
-            except InputError:
-                raise
-            except ValueError as error:
-                raise _bad_line(file, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
-            if len(numbers) != 7:
-                raise _bad_line(file, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-            next(lines, None)  # the observations
-        return images
-    data = _Bytes(file)
+
+    def image(line: str) -> tuple[str, int, np.ndarray]:
+        _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+        return name, int(camera), _pose(file, name, tuple(map(float, (qw, qx, qy, qz, tx, ty, tz))))
+
+    if file.suffix == ".txt":  # an image's second line holds its observations
+        return _records(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", image, lines_each=2)
+    data, images = _Bytes(file), []
     for _ in range(data.take("Q")[0]):
         _, *numbers, camera = data.take("i7di")
         name = data.name()
@@ -199,26 +173,21 @@ def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
 def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     file = _existing(model, "points3D")
     if file.suffix == ".txt":
-        points, colours = [], []
-        for number, line in _lines(file):
-            if not line.strip():
-                continue
-            try:
-                _, x, y, z, *rgb, _ = line.split(maxsplit=8)[:8]
-                points.append((float(x), float(y), float(z)))
-                colours.append(tuple(map(int, rgb)))
-                if len(rgb) != 3 or not all(0 <= value <= 255 for value in colours[-1]):
-                    raise ValueError("not a colour")
-            except ValueError as error:
-                raise _bad_line(file, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK") from error
-        points, colours = np.array(points, np.float64).reshape(-1, 3), np.array(colours, np.uint8).reshape(-1, 3)
+        rows = np.array(_records(file, "POINT3D_ID X Y Z R G B ERROR TRACK", _point), np.float64).reshape(-1, 6)
+        points, colours = rows[:, :3], rows[:, 3:].astype(np.uint8)
     else:
         points, colours = _read_binary_points(file)
     if not np.isfinite(points).all():
-        raise bad_model(
-            file, "sparse points with NaN or infinite coordinates", "finite points", "Estimate the model again."
-        )
+        raise bad_model(file, "points with NaN or infinite coordinates", "finite points", "Estimate the model again.")
     return points, colours
+
+
+def _point(line: str) -> tuple[float, float, float, int, int, int]:
+    _, x, y, z, red, green, blue, _ = line.split(maxsplit=8)[:8]
+    colour = int(red), int(green), int(blue)
+    if not all(0 <= value <= 255 for value in colour):
+        raise ValueError("not a colour")
+    return float(x), float(y), float(z), *colour
 
 
 def _read_binary_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:

@@ -63,13 +63,9 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     rotation = pose[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
-        raise InputError(
-            where,
-            f"a pose of {name} that is not rigid (R R^T is off by {error:.2g}, "
-            f"determinant {np.linalg.det(rotation):.3g})",
-            "a rotation and a translation, without scale, shear or mirror",
-            remedy,
-        )
+        measured = f"R R^T is off by {error:.2g}, determinant {np.linalg.det(rotation):.3g}"
+        expected = "a rotation and a translation, without scale, shear or mirror"
+        raise InputError(where, f"a pose of {name} that is not rigid ({measured})", expected, remedy)
     left, _, right = np.linalg.svd(rotation)
     result = pose.copy()
     result[:3, :3] = left @ right
@@ -87,12 +83,8 @@ def check_options(
     if frames is not None and frames < 1:
         raise InputError("frames", str(frames), "at least 1", "Leave it out to take every frame.")
     if holdout is not None and (holdout < 0 or holdout == 1):
-        raise InputError(
-            "holdout",
-            str(holdout),
-            "0 (none), or 2 and more (every second, ...)",
-            "8 is the custom; at 1 no frame would be left to fit to.",
-        )
+        expected, remedy = "0 (none), or at least 2 (every second)", "8 is the custom; 1 leaves no frame to fit to."
+        raise InputError("holdout", str(holdout), expected, remedy)
 
 
 def spread(count: int, wanted: int | None) -> np.ndarray:
@@ -114,12 +106,8 @@ def _short_names(shots: Sequence[Shot], where: object) -> tuple[str, ...]:
         if len(set(names)) == len(names):
             return tuple(names)
     twice = collections.Counter(names).most_common(1)[0][0]
-    raise InputError(
-        where,
-        f"two frames called {twice!r}",
-        "names that differ in more than their endings",
-        "Rename the images, or take one of the two out.",
-    )
+    expected, remedy = "names that differ in more than their endings", "Rename the images, or take one of the two out."
+    raise InputError(where, f"two frames called {twice!r}", expected, remedy)
 
 
 def _true_lens(shot: Shot) -> Lens:
@@ -129,12 +117,9 @@ def _true_lens(shot: Shot) -> Lens:
     if (width, height) == (lens.width, lens.height):
         return lens
     if min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) > 1:
-        raise InputError(
-            shot.image,
-            f"an image of {width}x{height}",
-            f"{lens.width}x{lens.height}, or that aspect",
-            "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them.",
-        )
+        remedy = "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them."
+        wanted = f"{lens.width}x{lens.height}, or that aspect"
+        raise InputError(shot.image, f"an image of {width}x{height}", wanted, remedy)
     return lens.resized(width, height)
 
 
@@ -177,9 +162,7 @@ def assemble(
     lenses = [_true_lens(shot) for shot in shots]
     rescaled = sum(lens != shot.lens for lens, shot in zip(lenses, shots))
     if rescaled:
-        notes.append(
-            f"{rescaled} images have another size than their camera model; its intrinsics were scaled to them."
-        )
+        notes.append(f"{rescaled} images differ in size from their camera model; its intrinsics were scaled to them.")
     pinholes = {lens: undistorted(lens, where) for lens in set(lenses)}
     bent = sum(lens.distorted for lens in lenses)
     if bent:
@@ -188,9 +171,7 @@ def assemble(
     width, height = collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
     odd = sum((lens.width, lens.height) != (width, height) for lens in lenses)
     if odd:
-        notes.append(
-            f"{odd} images were resized to {width}x{height}, the commonest size, and their intrinsics with them."
-        )
+        notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
     if downscale is None and long_side is not None:
         downscale = max(max(width, height) / long_side, 1.0)
     if downscale is not None:
@@ -210,12 +191,9 @@ def assemble(
         if shot.depth is not None and depths is not None:
             depth = read_depth(shot.depth, shot.depth_unit)
             if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
-                raise InputError(
-                    shot.depth,
-                    f"a depth map of {depth.shape[1]}x{depth.shape[0]}",
-                    f"the aspect of its image, {lens.width}x{lens.height}",
-                    "Register it to the image.",
-                )
+                found = f"a depth map of {depth.shape[1]}x{depth.shape[0]}"
+                wanted = f"the aspect of its image, {lens.width}x{lens.height}"
+                raise InputError(shot.depth, found, wanted, "Register it to the image.")
             # Nearest throughout: the mean of two depths lies on neither surface.
             if lens.distorted:
                 depth = cv2.resize(depth, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST_EXACT)

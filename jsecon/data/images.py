@@ -41,10 +41,8 @@ def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """(type, body) of each chunk, checked: OpenCV shows a PNG that was cut short as if its rest were black."""
     offset = len(_PNG)
     while True:
-        if offset + 12 > len(data):
-            raise _unreadable(path, f"a PNG that breaks off after {len(data)} bytes")
-        (length,), kind = struct.unpack_from(">I", data, offset), data[offset + 4 : offset + 8]
-        end = offset + 8 + length
+        kind = data[offset + 4 : offset + 8]
+        end = offset + 8 + int.from_bytes(data[offset : offset + 4])
         if end + 4 > len(data):
             raise _unreadable(path, f"a PNG that breaks off after {len(data)} bytes")
         if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
@@ -124,9 +122,7 @@ def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise InputError(
-            path, f"pixels of type {image.dtype}", "8 or 16 bits per channel", "Convert the image to PNG or JPEG."
-        )
+        raise InputError(path, f"pixels of type {image.dtype}", "8 or 16 bits a channel", "Convert it to PNG or JPEG.")
     if image.ndim == 2:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), False
     if image.shape[2] == 3:
@@ -138,13 +134,12 @@ def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
     return ((rgb.astype(np.uint16) * alpha + 127) // 255).astype(np.uint8), True
 
 
-def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"], *, jpeg_quality: int = 95) -> None:
+def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     """Writes RGB to `path`, whole or not at all; its ending says the format."""
     path = Path(path)
     bgr = cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR)
-    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if path.suffix.lower() in (".jpg", ".jpeg") else []
     try:
-        done, data = cv2.imencode(path.suffix, bgr, options)
+        done, data = cv2.imencode(path.suffix, bgr)
     except cv2.error:
         done = False
     if not done:
@@ -186,10 +181,8 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
     Raises InputError where the file is damaged or of another kind.
     """
     path = Path(path)
-    expected, remedy = (
-        "one channel of 16 bits (PNG), or a .npy of shape (H, W)",
-        "Write the depth in millimetres as a 16 bit PNG.",
-    )
+    expected = "one channel of 16 bits (PNG), or a .npy of shape (H, W)"
+    remedy = "Write the depth in millimetres as a 16 bit PNG."
     if path.suffix == ".npy":
         try:
             depth = np.load(path, allow_pickle=False)

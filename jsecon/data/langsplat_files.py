@@ -41,20 +41,14 @@ def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, 
         file = folder / f"{name}_f.npy"
         table = _read_table(file)
         if rows and table.shape[-1] != len(rows[0]):
-            raise InputError(
-                file,
-                f"rows of {table.shape[-1]} numbers",
-                f"{len(rows[0])}, as in the frames before",
-                "Write all frames' files with the same model.",
-            )
+            found, wanted = f"rows of {table.shape[-1]} numbers", f"{len(rows[0])}, as in the frames before"
+            raise InputError(file, found, wanted, "Write all frames' files with the same model.")
         found = load_labels(folder, [name], size, level=level)
-        if table.ndim != 2 or not np.isfinite(table).all() or max(found.ids, default=-1) >= len(table):
-            raise InputError(
-                file,
-                f"an array {table.shape} for ids up to {max(found.ids, default=-1)}",
-                "a finite row for each id of the _s.npy beside it",
-                "Write both files of the frame again.",
-            )
+        last = max(found.ids, default=-1)
+        if table.ndim != 2 or not np.isfinite(table).all() or last >= len(table):
+            wanted = "a finite row for each id of the _s.npy beside it"
+            there = f"an array {table.shape} for ids up to {last}"
+            raise InputError(file, there, wanted, "Write both files of the frame again.")
         kept = [k for k in range(len(found.ids)) if (found.labels[0] == k).any()]
         place = np.full(len(found.ids) + 1, -1, np.int32)
         place[kept] = len(rows) + np.arange(len(kept))
@@ -70,12 +64,8 @@ def feature_size(folder: Path) -> int:
     """E of the embeddings in `folder`. Raises InputError where it holds no `_f.npy`, or the first is damaged."""
     files = sorted(folder.glob("*_f.npy"))
     if not files:
-        raise InputError(
-            folder,
-            "no _f.npy",
-            "<frame>_f.npy beside <frame>_s.npy",
-            "Give the language_features folder that LangSplat's preprocess.py wrote.",
-        )
+        remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."
+        raise InputError(folder, "no _f.npy", "<frame>_f.npy beside <frame>_s.npy", remedy)
     return int(_read_table(files[0]).shape[-1])
 
 
@@ -85,10 +75,6 @@ def _read_table(file: Path) -> np.ndarray:
         if table.ndim == 0:
             raise ValueError("a single number")
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(
-            file,
-            f"nothing readable ({error})",
-            "a (M, E) array, one row per mask",
-            "Run LangSplat's preprocess.py on every frame.",
-        ) from error
+        wanted, remedy = "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."
+        raise InputError(file, f"nothing readable ({error})", wanted, remedy) from error
     return table

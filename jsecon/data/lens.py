@@ -103,12 +103,9 @@ def undistorted(lens: Lens, where: object) -> Lens:
     # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
     low, high = WIDEST, NARROWEST
     if not _covered(lens, high):
-        raise InputError(
-            where,
-            f"distortion {lens.distortion} that leaves no undistorted image",
-            "coefficients under which the image is one to one around its principal point",
-            "Calibrate again, or undistort the images first (colmap image_undistorter).",
-        )
+        expected = "coefficients under which the image is one to one around its principal point"
+        remedy = "Calibrate again, or undistort the images first (colmap image_undistorter)."
+        raise InputError(where, f"distortion {lens.distortion} that leaves no undistorted image", expected, remedy)
     if _covered(lens, low):
         high = low
     while high - low > 1e-4:

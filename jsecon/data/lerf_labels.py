@@ -57,11 +57,8 @@ def _bad(file: Path, found: str, expected: str) -> InputError:
 
 def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
     if not isinstance(record, dict) or not isinstance(record.get(key), kind):
-        raise _bad(
-            file,
-            f"no usable {key!r} in {where}",
-            "info (name, width, height) and objects (category, segmentation, bbox)",
-        )
+        expected = "info (name, width, height) and objects (category, segmentation, bbox)"
+        raise _bad(file, f"no usable {key!r} in {where}", expected)
     return record[key]
 
 
@@ -94,9 +91,8 @@ def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.
     try:
         array = np.array(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
-        raise _bad(
-            file, f"{what} that is no list of {shape[1]} numbers each", "[x, y] corners, and x1 y1 x2 y2"
-        ) from error
+        found = f"{what} that is no list of {shape[1]} numbers each"
+        raise _bad(file, found, "[x, y] corners, and x1 y1 x2 y2") from error
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
         raise _bad(file, f"{what} that is empty or out of all range", "pixels")
     return array
@@ -120,26 +116,14 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
     for frame in frames:
         objects = []
         for group, (category, (mask, boxes)) in enumerate(frame.objects.items(), start=1):
-            require(
-                mask.shape == (frame.height, frame.width) and bool(mask.any()) and len(boxes) > 0,
-                f"{frame.name}: {category}",
-                f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes",
-                f"({frame.height}, {frame.width}), with pixels and a box",
-                "Leave out what the frame does not show.",
-            )
+            fits = mask.shape == (frame.height, frame.width) and bool(mask.any()) and len(boxes) > 0
+            got = f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes"
+            wanted = f"({frame.height}, {frame.width}), with pixels and a box"
+            require(fits, f"{frame.name}: {category}", got, wanted, "Leave out what the frame does not show.")
             for polygon, box in _with_boxes(mask_polygons(mask), np.asarray(boxes, np.float64)):
-                objects.append(
-                    {
-                        "category": category,
-                        "group": group,
-                        "segmentation": polygon.astype(float).tolist(),
-                        "area": float(mask.sum()),
-                        "layer": 1.0,
-                        "bbox": box.tolist(),
-                        "iscrowd": 0,
-                        "note": "",
-                    }
-                )
+                shape = {"segmentation": polygon.astype(float).tolist(), "area": float(mask.sum()), "layer": 1.0}
+                rest = {"bbox": box.tolist(), "iscrowd": 0, "note": ""}
+                objects.append({"category": category, "group": group} | shape | rest)
         info = {"name": frame.name + image_ending, "width": frame.width, "height": frame.height, "depth": 3, "note": ""}
         write_text(Path(folder) / f"{frame.name}.json", json.dumps({"info": info, "objects": objects}))
 

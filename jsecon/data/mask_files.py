@@ -39,12 +39,9 @@ def read_objects(folders: Sequence[Path], name: str) -> Int64[np.ndarray, "h w"]
             mask = read_ids(folder / name)[0]
             image = np.full(mask.shape, -1, np.int64) if image is None else image
             if mask.shape != image.shape:
-                raise InputError(
-                    folder / name,
-                    f"a mask of {mask.shape[1]}x{mask.shape[0]}",
-                    f"{image.shape[1]}x{image.shape[0]}, like those of other objects",
-                    "Write all masks of a frame at one size.",
-                )
+                found, wanted = (f"{width}x{height}" for height, width in (mask.shape, image.shape))
+                remedy = "Write all masks of a frame at one size."
+                raise InputError(folder / name, f"a mask of {found}", f"{wanted}, like those of other objects", remedy)
             image[mask > 0] = int(folder.name)
     assert image is not None, f"{name} lies in none of the folders"
     return image
@@ -121,12 +118,8 @@ def load_labels(
         if progress is not None:
             progress(index + 1, len(names))
     if 0 < colours < len(files):
-        raise InputError(
-            folder,
-            f"{colours} colour images among {len(files)} masks",
-            "ids in all, or colours in all",
-            "Write every mask the same way, best as 16 bit grey PNGs.",
-        )
+        found = f"{colours} colour images among {len(files)} masks"
+        raise InputError(folder, found, "ids in all, or colours in all", "Write all alike, best as 16 bit grey PNGs.")
 
     if per_frame:
         ids = np.concatenate(own_ids)
@@ -136,27 +129,21 @@ def load_labels(
         ids = np.unique(np.concatenate(own_ids))
         tables = [np.searchsorted(ids, own) for own in own_ids]
     if len(ids) > MOST_REGIONS:
-        raise InputError(
-            folder,
-            f"{len(ids)} regions",
-            f"at most {MOST_REGIONS}",
-            "Take a coarser level, fewer frames, or say shared=True if the ids are tracked.",
-        )
+        remedy = "Take a coarser level, fewer frames, or say shared=True if the ids are tracked."
+        raise InputError(folder, f"{len(ids)} regions", f"at most {MOST_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    return MasksFromDisk(
-        labels, tuple(map(int, ids)), _notes(names, files, resized, colours, per_frame, (width, height))
-    )
+    notes = _notes(names, files, resized, colours, per_frame, size)
+    return MasksFromDisk(labels, tuple(map(int, ids)), notes)
 
 
 def _notes(names, files, resized, colours, per_frame, size) -> tuple[str, ...]:
     notes, missing = [], [name for name in names if name not in files]
     if missing:
-        notes.append(
-            f"{len(missing)} of {len(names)} frames have no mask (the first: {missing[0]}); they are unlabelled."
-        )
+        without = f"{len(missing)} of {len(names)} frames have no mask"
+        notes.append(f"{without} (the first: {missing[0]}); they are unlabelled.")
     if resized:
-        notes.append(f"{resized} masks were resized to {size[0]}x{size[1]} (nearest).")
+        notes.append(f"{resized} masks were resized to {size[1]}x{size[0]} (nearest).")
     if colours:
         notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
     if numbered := [name for name in files if files[name].stem.isdecimal() and files[name].stem != name]:
@@ -193,20 +180,13 @@ def _find(
         matched[".png"] = {name: numbered[order.index(name)] for name in names}
     if not matched[".png"] and not matched[_SUFFIX]:
         inside = len(set(found[".png"].values())) + len(found[_SUFFIX])
-        raise InputError(
-            folder,
-            f"{inside} masks, none of which is called like a frame",
-            f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png"
-            + ("" if order is None else f"; or a PNG for each number from 0 to {len(order) - 1}"),
-            "Name each mask like its frame.",
-        )
+        found_there = f"{inside} masks, none of which is called like a frame"
+        numbers = "" if order is None else f"; or a PNG for each number from 0 to {len(order) - 1}"
+        wanted = f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png{numbers}"
+        raise InputError(folder, found_there, wanted, "Name each mask like its frame.")
     if matched[".png"] and matched[_SUFFIX]:
-        raise InputError(
-            folder,
-            f"both .png and {_SUFFIX} masks of these frames",
-            "one kind",
-            "Keep each kind in a folder of its own.",
-        )
+        both = f"both .png and {_SUFFIX} masks of these frames"
+        raise InputError(folder, both, "one kind", "Keep each kind in a folder of its own.")
     kind = ".png" if matched[".png"] else _SUFFIX
     return matched[kind], kind
 
@@ -218,16 +198,11 @@ def read_level(path: Path, level: str | int) -> np.ndarray:
     try:
         image = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(
-            path, f"no whole array ({error})", f"a .npy of shape ({len(LEVELS)}, H, W)", "Write the masks again."
-        ) from error
+        wanted = f"a .npy of shape ({len(LEVELS)}, H, W)"
+        raise InputError(path, f"no whole array ({error})", wanted, "Write the masks again.") from error
     if image.ndim != 3 or len(image) != len(LEVELS):
-        raise InputError(
-            path,
-            f"an array of shape {image.shape}",
-            f"({len(LEVELS)}, H, W): LangSplat's levels {', '.join(LEVELS)}",
-            "Give the _s.npy files, not the _f.npy ones.",
-        )
+        wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
+        raise InputError(path, f"an array of shape {image.shape}", wanted, remedy)
     image = np.array(image[LEVELS.index(level) if isinstance(level, str) else level])
     if image.dtype.kind == "f" and not (np.isfinite(image).all() and (image == image.round()).all()):
         raise InputError(path, "numbers that are no integers", "ids, -1 = none", "Write the masks again.")
@@ -241,12 +216,9 @@ def fitted_to_frame(path: Path, image: np.ndarray, width: int, height: int) -> n
     rows, columns = image.shape
     # Within a pixel of the coarser of the two, whose size was rounded.
     if min(abs(columns * height / rows - width), abs(width * rows / height - columns)) > 1:
-        raise InputError(
-            path,
-            f"a mask of {columns}x{rows}",
-            f"{width}x{height} like its frame, or that aspect",
-            "Make the masks from the frames as they are loaded (undistorted, unrotated), at any scale.",
-        )
+        remedy = "Make the masks from the frames as they are loaded (undistorted, unrotated), at any scale."
+        wanted = f"{width}x{height} like its frame, or that aspect"
+        raise InputError(path, f"a mask of {columns}x{rows}", wanted, remedy)
     # Integers below 2^24 pass through float32 unchanged; OpenCV has no int64.
     return cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST_EXACT).astype(np.int64)
 
@@ -264,9 +236,8 @@ def _compact(path: Path, image: np.ndarray, none: int | None) -> tuple[np.ndarra
     if none is not None:
         ids = ids[ids != none]
     if len(ids) > MOST_REGIONS:
-        raise InputError(
-            path, f"{len(ids)} ids in one mask", f"at most {MOST_REGIONS}", "Give label images, not photographs."
-        )
+        remedy = "Give label images, not photographs."
+        raise InputError(path, f"{len(ids)} ids in one mask", f"at most {MOST_REGIONS}", remedy)
     if not len(ids):
         return ids, np.full(image.shape, -1, np.int16)
     position = np.minimum(np.searchsorted(ids, image), len(ids) - 1)

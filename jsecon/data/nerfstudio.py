@@ -42,46 +42,29 @@ def read_nerfstudio(file: Path) -> Posed:
         if not isinstance(entry, dict):
             raise _bad(file, f"{where} that is no object", "frames with file_path and transform_matrix")
         name = _key(file, entry, "file_path", where, str)
-        pose = _matrix(
-            file, _key(file, entry, "transform_matrix", f"{where} ({name})", list), f"transform_matrix of {name}"
-        )
-        image = _find_image(file.parent, name)
-        if image is None:
+        rows = _key(file, entry, "transform_matrix", f"{where} ({name})", list)
+        pose = _matrix(file, rows, f"transform_matrix of {name}")
+        if (image := _find_image(file.parent, name)) is None:
             missing.append(name)
             continue
-        depth = entry.get("depth_file_path")
-        if depth is not None and not (file.parent / depth).is_file():
-            raise _bad(file.parent / depth, "no such depth map", f"the depth_file_path of {name}")
+        depth = None if entry.get("depth_file_path") is None else file.parent / entry["depth_file_path"]
+        if depth is not None and not depth.is_file():
+            raise _bad(depth, "no such depth map", f"the depth_file_path of {name}")
         unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
-        shots.append(
-            Shot(
-                _order_name(name),
-                image,
-                _lens(file, scene, entry, name, image),
-                _world_to_camera(file, pose, name),
-                None if depth is None else file.parent / depth,
-                unit,
-            )
-        )
+        lens, world_to_camera = _lens(file, scene, entry, name, image), _world_to_camera(file, pose, name)
+        shots.append(Shot(_order_name(name), image, lens, world_to_camera, depth, unit))
+    first = f" (the first: {missing[0]})" if missing else ""
     if missing:
-        notes.append(
-            f"{len(missing)} of {len(entries)} frames of {file.name} were left out, since their images are missing "
-            f"(the first: {missing[0]})."
-        )
+        left_out = f"{len(missing)} of {len(entries)} frames of {file.name} were left out"
+        notes.append(f"{left_out}, since their images are missing{first}.")
     if not shots:
-        first = f" (the first: {missing[0]})" if missing else ""
-        raise _bad(
-            file,
-            f"{len(entries)} frames, none of which has its image{first}",
-            "images where file_path says, relative to this file",
-            "Copy the images beside it.",
-        )
+        found, wanted = f"{len(entries)} frames, none of which has its image{first}", "images where file_path says"
+        raise _bad(file, found, f"{wanted}, relative to this file", "Copy the images beside it.")
     if any("mask_path" in entry for entry in entries):
         notes.append("The masks named by mask_path (pixels to ignore) were not used.")
-    found = {"to_source": _to_source(file, scene, scale), "notes": tuple(notes)}
-    if scene.get("ply_file_path"):
-        return Posed(shots, file, *load_points_ply(file.parent / str(scene["ply_file_path"])), **found)
-    return Posed(shots, file, **found)
+    to_source, cloud = _to_source(file, scene, scale), scene.get("ply_file_path")
+    points = load_points_ply(file.parent / str(cloud)) if cloud else ()
+    return Posed(shots, file, *points, to_source=to_source, notes=tuple(notes))
 
 
 def _bad(file: Path, found: str, expected: str, remedy: str = _REMEDY) -> InputError:
@@ -163,12 +146,8 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     keys = {**scene, **entry}
     model = str(keys.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE | _FISHEYE:
-        raise _bad(
-            file,
-            f"camera_model {model}",
-            "one of " + ", ".join(sorted(_PERSPECTIVE | _FISHEYE)),
-            "Undistort the images first.",
-        )
+        known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE))
+        raise _bad(file, f"camera_model {model}", f"one of {known}", "Undistort the images first.")
     fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     width, height = (keys.get("w"), keys.get("h"))
     if width is None or height is None:
@@ -185,12 +164,8 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     distortion = tuple(_number(file, keys, key, 0.0) for key in order)
     if model == "OPENCV" and not fisheye and distortion[5] != 0:
         # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
-        raise _bad(
-            file,
-            f"k4 = {keys['k4']} with camera_model OPENCV",
-            "k1 k2 p1 p2 k3, or FULL_OPENCV",
-            "Undistort the images first.",
-        )
+        found = f"k4 = {keys['k4']} with camera_model OPENCV"
+        raise _bad(file, found, "k1 k2 p1 p2 k3, or FULL_OPENCV", "Undistort the images first.")
     cx, cy = _number(file, keys, "cx", width / 2), _number(file, keys, "cy", height / 2)
     return Lens(width, height, fx, fy, cx, cy, distortion, fisheye)
 

@@ -49,22 +49,14 @@ def load_ply(path: str | Path) -> Gaussians:
     path = Path(path)
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
-    missing = [name for name in _GAUSSIAN if name not in names]
-    if missing:
-        raise bad_ply(
-            path,
-            f"no properties {', '.join(missing)}",
-            _WANTED,
-            "A plain point cloud or a 2D Gaussian file won't do: export 3D Gaussians as an uncompressed PLY.",
-        )
+    if missing := [name for name in _GAUSSIAN if name not in names]:
+        remedy = "A plain point cloud or a 2D Gaussian file won't do: export 3D Gaussians as an uncompressed PLY."
+        raise bad_ply(path, f"no properties {', '.join(missing)}", _WANTED, remedy)
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in _REST_COUNTS or any(name not in names for name in rest_names):
-        raise bad_ply(
-            path,
-            f"{rest} properties f_rest",
-            "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)",
-        )
+        wanted = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
+        raise bad_ply(path, f"{rest} properties f_rest", wanted)
     first = _columns(vertices, _DC)[:, None]
     others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
     arrays = {
@@ -79,20 +71,12 @@ def load_ply(path: str | Path) -> Gaussians:
         wrong = np.isnan(array) if name == "opacity_logits" else ~np.isfinite(array)
         rows = np.asarray(wrong.any(axis=tuple(range(1, wrong.ndim))))
         if rows.any():
-            raise bad_ply(
-                path,
-                f"{rows.sum()} Gaussians of {len(rows)} whose {name} are not finite (the first: {rows.argmax()})",
-                "finite numbers",
-                clean,
-            )
+            found = f"{rows.sum()} Gaussians of {len(rows)} whose {name} are not finite (the first: {rows.argmax()})"
+            raise bad_ply(path, found, "finite numbers", clean)
     zero = (arrays["quaternions"] == 0).all(axis=1)
     if zero.any():
-        raise bad_ply(
-            path,
-            f"{zero.sum()} Gaussians of {len(zero)} without rotation (the first: {zero.argmax()})",
-            "quaternions that are not 0",
-            clean,
-        )
+        found = f"{zero.sum()} Gaussians of {len(zero)} without rotation (the first: {zero.argmax()})"
+        raise bad_ply(path, found, "quaternions that are not 0", clean)
     return Gaussians(**{name: jnp.asarray(array) for name, array in arrays.items()})
 
 
@@ -112,23 +96,11 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, rgb: Float[Array, "n 3"]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
     rest_names = (f"f_rest_{index}" for index in range(rest.shape[1]))
     names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
-    columns = [
-        gaussians.means,
-        np.zeros((count, 3), np.float32),
-        sh[:, 0],
-        rest,
-        np.asarray(gaussians.opacity_logits)[:, None],
-        gaussians.log_scales,
-        gaussians.quaternions,
-    ]
+    normals, opacity = np.zeros((count, 3)), np.asarray(gaussians.opacity_logits)[:, None]
+    columns = [gaussians.means, normals, sh[:, 0], rest, opacity, gaussians.log_scales, gaussians.quaternions]
     table = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1)
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {count}",
-        *(f"property float {name}" for name in names),
-        "end_header\n",
-    ]
+    properties = (f"property float {name}" for name in names)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         table.astype("<f4", copy=False).tofile(file)
@@ -143,8 +115,7 @@ def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[n
     path = Path(path)
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
-    missing = [name for name in ("x", "y", "z") if name not in names]
-    if missing:
+    if missing := [name for name in _POSITION if name not in names]:
         raise bad_ply(path, f"no properties {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION)
     if not np.isfinite(points).all():

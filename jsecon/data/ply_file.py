@@ -13,24 +13,9 @@ import numpy as np
 
 from jsecon.errors import InputError
 
-TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
+TYPES = {name: kind for kind, old in (_NAMES | {"f8": "double"}).items() for name in (old, np.dtype(kind).name)}
+"""a property's type, by its old name or with its size (uchar, uint8) -> NumPy's"""
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -59,9 +44,8 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     """(format, elements, offset of the first byte behind the header)."""
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
-        raise bad_ply(
-            path, "an empty file" if not data else "no .ply header", "a file that starts with 'ply' and a header"
-        )
+        found = "no .ply header" if data else "an empty file"
+        raise bad_ply(path, found, "a file that starts with 'ply' and a header")
     after = data.find(b"\n", end)
     after = len(data) if after < 0 else after + 1
     form, elements = "", []
@@ -102,20 +86,14 @@ def read_vertices(path: Path) -> np.ndarray:
     data, form, elements, offset = opened(path)
     names = [element.name for element in elements]
     if "chunk" in names or any(name == "packed_position" for element in elements for name, _ in element.fields):
-        raise bad_ply(
-            path,
-            "a compressed .ply (SuperSplat's packed chunks)",
-            "an uncompressed .ply",
-            "Export it from SuperSplat as an uncompressed PLY, or convert it with splat-transform.",
-        )
+        remedy = "Export it from SuperSplat as an uncompressed PLY, or convert it with splat-transform."
+        raise bad_ply(path, "a compressed .ply (SuperSplat's packed chunks)", "an uncompressed .ply", remedy)
     if "vertex" not in names:
         raise bad_ply(path, f"elements {', '.join(names) or 'none'}", "an element vertex")
     before = elements[: names.index("vertex")]
     vertex = elements[names.index("vertex")]
     if not all(element.fixed for element in [*before, vertex]):
-        raise bad_ply(
-            path, "list properties before or in the element vertex", "numbers only", "Export the points alone."
-        )
+        raise bad_ply(path, "list properties before or in the element vertex", "numbers", "Export the points alone.")
     if not vertex.fields:
         raise bad_ply(path, "an element vertex without properties", "x y z and more")
     if len({name for name, _ in vertex.fields}) < len(vertex.fields):
@@ -125,10 +103,8 @@ def read_vertices(path: Path) -> np.ndarray:
     offset += sum(element.count * element.dtype(ORDERS[form]).itemsize for element in before)
     dtype = vertex.dtype(ORDERS[form])
     if offset + vertex.count * dtype.itemsize > len(data):
-        raise bad_ply(
-            path,
-            f"{max(0, len(data) - offset) // max(1, dtype.itemsize)} of {vertex.count} vertices: the file is cut short",
-        )
+        there = max(0, len(data) - offset) // max(1, dtype.itemsize)
+        raise bad_ply(path, f"{there} of {vertex.count} vertices: the file is cut short")
     return np.frombuffer(data, dtype, vertex.count, offset)
 
 
@@ -137,9 +113,8 @@ def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: _Element) -> np.
     try:
         numbers = np.array([line.split() for line in lines], np.float64).reshape(len(lines), len(vertex.fields))
     except ValueError as error:
-        raise bad_ply(
-            path, f"vertex lines without {len(vertex.fields)} numbers each (or a file that is cut short)"
-        ) from error
+        found = f"vertex lines without {len(vertex.fields)} numbers each (or a file that is cut short)"
+        raise bad_ply(path, found) from error
     if len(lines) < vertex.count:
         raise bad_ply(path, f"{len(lines)} of {vertex.count} vertices: the file is cut short")
     result = np.empty(vertex.count, vertex.dtype("="))

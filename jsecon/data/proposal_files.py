@@ -1,14 +1,13 @@
 """Masks of single frames from disk, which still have to be brought together over the frames.
 
-Of each frame, under its name: `<name>.json`, run-length encoded masks as SAM's own generator writes them (they may
-overlap); `<name>_s.npy`, a level of LangSplat's; or `<name>.png`, one id per pixel. What an id is called does not
+Of each frame, under its name: `<name>.json`, COCO's run-length encoded masks as SAM's own generator writes them (they
+may overlap); `<name>_s.npy`, a level of LangSplat's; or `<name>.png`, one id per pixel. What an id is called does not
 matter.
 
-COCO's run-length encoded masks, as SAM's own generator writes them: {"size": [H, W], "counts": ...}.
-
-Runs alternate between 0 and 1, 0 first, down the columns. `counts` is a list of them, or a text of 6-bit digits: five
-bits a sign, the lowest first, the sixth says that more follow, the last one's highest bit is the sign of the number.
-From the third run after the first on, a number is the difference from the run two before.
+A run-length encoded mask is {"size": [H, W], "counts": ...}. Runs alternate between 0 and 1, 0 first, down the columns.
+`counts` is a list of them, or a text of 6-bit digits: five bits a sign, the lowest first, the sixth says that more
+follow, the last one's highest bit is the sign of the number. From the third run after the first on, a number is the
+difference from the run two before.
 Decoded here: about fifty lines, which also check that the runs fill the mask, spare a compiled dependency.
 """
 
@@ -24,6 +23,10 @@ from jsecon.data.images import read_ids
 from jsecon.data.mask_files import fitted_to_frame, read_level
 from jsecon.errors import InputError
 
+ENDINGS = (".json", "_s.npy", ".png")
+_REMEDY = "Write them with SAM's scripts/amg.py --convert-to-rle."
+_RLE = ('run-length encoded masks: {"size": [H, W], "counts": a text or a list}', _REMEDY)
+
 
 def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
     """The mask (H, W) of an encoded one. Raises InputError, at `where`, for anything else."""
@@ -32,9 +35,9 @@ def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
         counts = rle["counts"]
         runs = np.asarray(_numbers(counts) if isinstance(counts, str) else counts, np.int64)
     except (TypeError, KeyError, ValueError, IndexError) as error:
-        raise _no_mask(where, f"a mask that cannot be read ({error!r})") from error
+        raise InputError(where, f"a mask that cannot be read ({error!r})", *_RLE) from error
     if runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width or height * width == 0:
-        raise _no_mask(where, f"runs that fill {int(runs.sum())} of {height}x{width} pixels")
+        raise InputError(where, f"runs that fill {int(runs.sum())} of {height}x{width} pixels", *_RLE)
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
 
@@ -59,18 +62,6 @@ def _numbers(text: str) -> list[int]:
     return runs
 
 
-def _no_mask(where: str | Path, found: str) -> InputError:
-    return InputError(
-        where,
-        found,
-        'run-length encoded masks: {"size": [H, W], "counts": a text or a list}',
-        "Write them with SAM's scripts/amg.py --convert-to-rle.",
-    )
-
-
-ENDINGS = (".json", "_s.npy", ".png")
-
-
 def proposals_from_disk(
     folder: str | Path, names: Sequence[str], size: tuple[int, int], *, level: str = "l"
 ) -> tuple[Callable[[int], Bool[np.ndarray, "m h w"]], tuple[str, ...]]:
@@ -84,12 +75,9 @@ def proposals_from_disk(
     files = [next((p for p in _places(folder, name) if p.is_file()), None) for name in names]
     missing = [name for name, file in zip(names, files) if file is None]
     if len(missing) == len(names):
-        raise InputError(
-            folder,
-            "no masks called like a frame" if folder.is_dir() else "no such folder",
-            ", ".join(f"{names[0]}{ending}" for ending in ENDINGS) + " or the like",
-            "Name each file like its frame.",
-        )
+        found = "no masks called like a frame" if folder.is_dir() else "no such folder"
+        wanted = f"{', '.join(names[0] + ending for ending in ENDINGS)} or the like"
+        raise InputError(folder, found, wanted, "Name each file like its frame.")
     notes = (f"{len(missing)} of {len(names)} frames have no masks (the first: {missing[0]}).",) if missing else ()
 
     def of_frame(index: int) -> Bool[np.ndarray, "m h w"]:
@@ -121,10 +109,6 @@ def _read_json(file: Path) -> list[np.ndarray]:
         coded = [record["segmentation"] for record in records]
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            file,
-            f"what is no list of masks ({error!r})",
-            'a list of {"segmentation": {"size", "counts"}, ...}',
-            "Write it with SAM's scripts/amg.py --convert-to-rle.",
-        ) from error
+        wanted = 'a list of {"segmentation": {"size", "counts"}, ...}'
+        raise InputError(file, f"what is no list of masks ({error!r})", wanted, _REMEDY) from error
     return [decode_rle(coded[i], f"{file}, mask {i}") for i in np.argsort(-np.asarray(scores), kind="stable")]

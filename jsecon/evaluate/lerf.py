@@ -128,12 +128,8 @@ def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> lis
     """All (frame, query) pairs. Raises InputError for none, or another number than `expected`."""
     pairs = [(frame, query) for frame in labels for query in frame.objects]
     if not pairs or (expected is not None and len(pairs) != expected):
-        raise InputError(
-            "labels",
-            f"{len(pairs)} (frame, query) pairs",
-            f"{expected or 'at least one'}",
-            "Evaluate on the very label files of the protocol, all of them.",
-        )
+        remedy = "Evaluate on the very label files of the protocol, all of them."
+        raise InputError("labels", f"{len(pairs)} (frame, query) pairs", f"{expected or 'at least one'}", remedy)
     return pairs
 
 
@@ -154,8 +150,9 @@ def _rows(
     thresholds: tuple[float, ...],
 ) -> list[Row]:
     true, boxes = frame.objects[category]
-    if selection is None or not np.asarray(selection.mask).any():
-        region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
+    count = 0 if selection is None else int(np.asarray(selection.mask).sum())
+    region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
+    if selection is None or not count:
         nothing = np.zeros(true.shape, bool)
         return [Row(frame.name, category, 0.0, False, False, None, 0, region, score, nothing) for _ in thresholds]
     camera = jax.tree.map(jnp.asarray, camera)
@@ -164,20 +161,10 @@ def _rows(
     rows = []
     for threshold in thresholds:
         mask = alpha > threshold
-        rows.append(
-            Row(
-                frame.name,
-                category,
-                float(iou(mask, true)) if true.any() else 0.0,
-                point is not None and inside_any(point, boxes),
-                any(inside_any((int(x), int(y)), boxes) for y, x in np.argwhere(_peak(mask))),
-                point,
-                int(np.asarray(selection.mask).sum()),
-                int(selection.region),
-                float(selection.score),
-                mask,
-            )
-        )
+        share = float(iou(mask, true)) if true.any() else 0.0
+        located = point is not None and inside_any(point, boxes)
+        touched = any(inside_any((int(x), int(y)), boxes) for y, x in np.argwhere(_peak(mask)))
+        rows.append(Row(frame.name, category, share, located, touched, point, count, region, score, mask))
     return rows
 
 
@@ -200,17 +187,11 @@ def _middle(where: np.ndarray) -> tuple[int, int] | None:
 def _check(frame: LabelledFrame, cameras: Mapping[str, Camera]) -> None:
     if frame.name not in cameras:
         some = ", ".join(sorted(cameras)[:3])
-        raise InputError(
-            f"labels of {frame.name}",
-            "no frame of that name in the capture",
-            f"one of {some}, ...",
-            "Evaluate with the capture that was labelled, and leave none of its labelled frames out.",
-        )
+        remedy = "Evaluate with the capture that was labelled, and leave none of its labelled frames out."
+        found = "no frame of that name in the capture"
+        raise InputError(f"labels of {frame.name}", found, f"one of {some}, ...", remedy)
     camera = cameras[frame.name]
     if abs(frame.width / camera.width - frame.height / camera.height) > 0.02 * frame.width / camera.width:
-        raise InputError(
-            f"labels of {frame.name}",
-            f"{frame.width}x{frame.height}",
-            f"the aspect of the frame, {camera.width}x{camera.height}",
-            "Label the undistorted frames, or scale the labels to them.",
-        )
+        found, expected = (f"{size.width}x{size.height}" for size in (frame, camera))
+        remedy = "Label the undistorted frames, or scale the labels to them."
+        raise InputError(f"labels of {frame.name}", found, f"the aspect of the frame, {expected}", remedy)

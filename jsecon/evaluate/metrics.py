@@ -15,13 +15,8 @@ Point = tuple[float | int, float | int]
 
 def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array, ""]:
     """Intersection over union of two masks of one shape (pixels or points); 1 where both are empty. Jit-safe."""
-    require(
-        predicted.shape == true.shape,
-        "iou",
-        f"{predicted.shape} and {true.shape}",
-        "one shape",
-        "Render the prediction at the size of the truth.",
-    )
+    got, remedy = f"{predicted.shape} and {true.shape}", "Render the prediction at the size of the truth."
+    require(predicted.shape == true.shape, "iou", got, "one shape", remedy)
     both, either = jnp.sum(predicted & true), jnp.sum(predicted | true)
     return jnp.where(either > 0, both / jnp.maximum(either, 1), 1.0)
 

@@ -2,12 +2,10 @@
 
 A region is embedded as LangSplat does it: masked, cropped to its box, padded to a black square (preprocess.py). A text
 is embedded as it stands; with several `templates`, as the mean over them.
-
-Masked crops of a frame, as LangSplat hands them to CLIP (minghanqin/LangSplat, preprocess.py).
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -16,7 +14,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from jsecon.errors import InputError, require
 from jsecon.networks.clip_folder import ClipFiles, find_clip
-from jsecon.networks.onnx_graph import Graph, Tensor, describe
+from jsecon.networks.onnx_graph import Graph, Tensor, batches, describe
 from jsecon.networks.tokenizer import CONTEXT_LENGTH, ClipTokenizer, load_tokenizer
 from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.stores import EmbeddingStore, known_vectors, mask_key
@@ -31,13 +29,8 @@ def masked_crop(
     column are lost, unless the region has no other. Resized bilinearly. Raises ValueError for an empty mask or other
     shapes.
     """
-    require(
-        mask.shape == frame.shape[:2] and bool(mask.any()),
-        "mask",
-        f"{mask.shape}, {int(mask.sum())} pixels",
-        f"{frame.shape[:2]}, at least one pixel",
-        "Leave out empty masks.",
-    )
+    fits, got = mask.shape == frame.shape[:2] and bool(mask.any()), f"{mask.shape}, {int(mask.sum())} pixels"
+    require(fits, "mask", got, f"{frame.shape[:2]}, at least one pixel", "Leave out empty masks.")
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     height, width = max(int(rows[-1] - rows[0]), 1), max(int(columns[-1] - columns[0]), 1)
     box = slice(rows[0], rows[0] + height), slice(columns[0], columns[0] + width)
@@ -76,12 +69,9 @@ class ClipEmbedder:
         store: str | Path | None = None,
     ):
         if not templates or not all("{}" in template for template in templates):
-            raise InputError(
-                "--template",
-                ", ".join(map(repr, templates)) or "none",
-                "a phrase that holds {}",
-                'For example "a photo of a {}.", or "{}", the text alone.',
-            )
+            given = ", ".join(map(repr, templates)) or "none"
+            remedy = 'For example "a photo of a {}.", or "{}", the text alone.'
+            raise InputError("--template", given, "a phrase that holds {}", remedy)
         self.files = model if isinstance(model, ClipFiles) else find_clip(model)
         self.templates, self._batch, self._threads = tuple(templates), batch, threads
         self.name = f"clip-{self.files.digest()}"
@@ -90,10 +80,7 @@ class ClipEmbedder:
     @functools.cached_property
     def dim(self) -> int:
         """E."""
-        declared = self._visual_output.fixed(1)
-        if declared is not None:
-            return declared
-        return len(self._through_visual(np.zeros((1, self.size, self.size, 3), np.uint8))[0])
+        return self._visual_output.fixed(1) or self._through_visual(self._black()).shape[1]
 
     @functools.cached_property
     def canonical(self) -> Float32[np.ndarray, "c e"]:
@@ -133,9 +120,12 @@ class ClipEmbedder:
     def check(self) -> None:
         """Puts a black image and a word through the graphs and closes them. Raises InputError where they are damaged,
         or no CLIP model's."""
-        self._through_visual(np.zeros((1, self.size, self.size, 3), np.uint8))
+        self._through_visual(self._black())
         self._embedded(["word"])
         self.close()
+
+    def _black(self) -> UInt8[np.ndarray, "1 s s 3"]:
+        return np.zeros((1, self.size, self.size, 3), np.uint8)
 
     def close(self) -> None:
         """Drops the graphs and their memory; they are opened again when needed."""
@@ -155,7 +145,7 @@ class ClipEmbedder:
         name = next(iter(self._visual.inputs), "image")
         if len(self._visual.inputs) > 1:
             name = next((n for n in ("image", "pixel_values") if n in self._visual.inputs), "image")
-        return self._visual.require_input(name, (None, 3, None, None), "CLIP's graph of images")
+        return self._visual.require("input", name, (None, 3, None, None), "CLIP's graph of images")
 
     @property
     def _visual_output(self) -> Tensor:
@@ -172,7 +162,7 @@ class ClipEmbedder:
         tensor, output = self._visual_input, self._visual_output.name
         parts = [
             self._visual.run({tensor.name: part}, [output])[output][:count]
-            for part, count in _batches(images, tensor.fixed(0), self._batch)
+            for part, count in batches(images, tensor.fixed(0), self._batch)
         ]
         return np.concatenate(parts)
 
@@ -182,21 +172,18 @@ class ClipEmbedder:
         output = embedding_output(graph, _TEXTUAL_OUTPUTS, what)
         masks = [name for name in graph.inputs if "mask" in name]
         names = [name for name in graph.inputs if name not in masks]
-        tensor = graph.require_input(names[0] if len(names) == 1 else "input_ids", (None, None), what)
+        tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
         length = tensor.fixed(1) or CONTEXT_LENGTH
         ids = self._tokenizer(phrases, length)
         parts = []
-        for part, count in _batches(ids, tensor.fixed(0), self._batch):
+        for part, count in batches(ids, tensor.fixed(0), self._batch):
             feeds = {tensor.name: part} | {name: _up_to_end(part, self._tokenizer.end) for name in masks}
             parts.append(graph.run(feeds, [output.name])[output.name][:count])
         rows = np.concatenate(parts)
         if rows.shape[1] != self.dim:
-            raise InputError(
-                self.files.textual,
-                f"texts of {rows.shape[1]} numbers",
-                f"{self.dim}, like the images of {self.files.visual.name}",
-                "Take both graphs from one model, with their projections.",
-            )
+            expected = f"{self.dim}, like the images of {self.files.visual.name}"
+            remedy = "Take both graphs from one model, with their projections."
+            raise InputError(self.files.textual, f"texts of {rows.shape[1]} numbers", expected, remedy)
         return _unit(rows, self.files.textual)
 
 
@@ -208,28 +195,13 @@ def embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
     """
     for name in names:
         if name in graph.outputs:
-            return graph.require_output(name, (None, None), what)
+            return graph.require("output", name, (None, None), what)
     flat = [t for t in graph.outputs.values() if t.shape is not None and len(t.shape) == 2 and "pooler" not in t.name]
     if len(flat) != 1:
-        raise InputError(
-            f"{graph.path}, output {names[0]!r}",
-            describe(graph.outputs.values()),
-            f"one output of two axes, as {what} has, called {', '.join(names)} or otherwise",
-            "Export the graph with its projection.",
-        )
+        where, found = f"{graph.path}, output {names[0]!r}", describe(graph.outputs.values())
+        expected = f"one output of two axes, as {what} has, called {', '.join(names)} or otherwise"
+        raise InputError(where, found, expected, "Export the graph with its projection.")
     return flat[0]
-
-
-def _batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Rows in batches of the size that a graph fixes (the last filled up with zeros), or of at most `free`; and how
-    many of each are real."""
-    size = fixed or free
-    for start in range(0, len(rows), size):
-        part = rows[start : start + size]
-        count = len(part)
-        if fixed and count < fixed:
-            part = np.concatenate([part, np.zeros((fixed - count, *rows.shape[1:]), rows.dtype)])
-        yield part, count
 
 
 def _up_to_end(ids: Int64[np.ndarray, "b l"], end: int) -> Int64[np.ndarray, "b l"]:
@@ -242,10 +214,6 @@ def _unit(rows: np.ndarray, path: Path) -> Float32[np.ndarray, "b e"]:
     rows = np.asarray(rows, np.float64)
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     if not (np.isfinite(length).all() and (length > 0).all()):
-        raise InputError(
-            path,
-            "an embedding that is zero or not finite",
-            "finite numbers",
-            "Export the graph again, best in 32 bit floats.",
-        )
+        found, remedy = "an embedding that is zero or not finite", "Export the graph again, best in 32 bit floats."
+        raise InputError(path, found, "finite numbers", remedy)
     return (rows / length).astype(np.float32)

@@ -75,12 +75,8 @@ def _graphs(folder: Path) -> tuple[str, tuple[Path, Path]]:
     for layout, names in LAYOUTS.items():
         present = [name for name in names if (folder / name).is_file()]
         if len(present) == 1:
-            raise InputError(
-                folder,
-                f"{present[0]} without its other half",
-                f"{names[0]} and {names[1]}, the layout of {layout}",
-                "Fetch the missing file. " + PUBLISHED,
-            )
+            found, expected = f"{present[0]} without its other half", f"{' and '.join(names)}, the layout of {layout}"
+            raise InputError(folder, found, expected, f"Fetch the missing file. {PUBLISHED}")
         if present:
             return layout, (folder / names[0], folder / names[1])
     graphs = {path: Graph(path, threads=1, optimise=False) for path in sorted(folder.glob("*.onnx"))}
@@ -88,14 +84,9 @@ def _graphs(folder: Path) -> tuple[str, tuple[Path, Path]]:
     textual = [path for path, graph in graphs.items() if is_textual(graph)]
     if len(visual) != 1 or len(textual) != 1:
         seen = "; ".join(f"{path.name} takes {describe(graph.inputs.values())}" for path, graph in graphs.items())
-        raise InputError(
-            folder,
-            seen or "no .onnx file in a place known",
-            "one graph of images and one of texts: "
-            + ", or ".join(" and ".join(names) for names in LAYOUTS.values())
-            + ", or two .onnx files",
-            PUBLISHED,
-        )
+        known = ", or ".join(" and ".join(names) for names in LAYOUTS.values())
+        expected = f"one graph of images and one of texts: {known}, or two .onnx files"
+        raise InputError(folder, seen or "no .onnx file in a place known", expected, PUBLISHED)
     return "flat", (visual[0], textual[0])
 
 

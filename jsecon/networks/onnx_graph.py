@@ -1,14 +1,15 @@
 """ONNX graphs: opened with bounded threads, their signatures read from the file, run by the names of their tensors.
 
 What a file holds is never assumed. A room that needs a graph says which tensors it means to give and to take
-(`Graph.require_input`, `Graph.require_output`); what does not fit ends in an InputError that names file and tensor.
+(`Graph.require`); what does not fit ends in an InputError that names file and tensor.
 """
 
 import dataclasses
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import onnxruntime
@@ -26,6 +27,7 @@ _DTYPES = {
     "tensor(int8)": "int8",
     "tensor(bool)": "bool",
 }
+_MISUSED = "This graph is of another size or kind than the one it is used as."
 _LFS = b"version https://git-lfs"
 Size = int | str | None
 """of an axis: a number where it is fixed, the name of a symbol or None where it is free"""
@@ -87,34 +89,24 @@ class Graph:
         try:
             self._session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's own kinds have no common base but this
-            raise InputError(
-                self.path,
-                f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})",
-                "a whole ONNX graph, with its external data files beside it",
-                "Fetch or export the file again.",
-            ) from error
+            found = f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})"
+            expected = "a whole ONNX graph, with its external data files beside it"
+            raise InputError(self.path, found, expected, "Fetch or export the file again.") from error
         self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
         self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
         self._run_options = onnxruntime.RunOptions()
         self._run_options.log_severity_level = 4
 
-    def require_input(self, name: str, shape: Sequence[Size], what: str) -> Tensor:
-        """The input called `name`, which must take `shape` (None = any size). `what` says what the graph should be."""
-        return self._require("input", self.inputs, name, shape, what)
-
-    def require_output(self, name: str, shape: Sequence[Size], what: str) -> Tensor:
-        """The output called `name`, which must have `shape` (None = any size). `what` says what the graph should be."""
-        return self._require("output", self.outputs, name, shape, what)
-
-    def _require(self, side: str, tensors: Mapping[str, Tensor], name: str, shape: Sequence[Size], what: str) -> Tensor:
+    def require(self, side: Literal["input", "output"], name: str, shape: Sequence[Size], what: str) -> Tensor:
+        """The input or output called `name`, which must have `shape` (None = any size). `what` says what the graph
+        should be."""
+        tensors = self.inputs if side == "input" else self.outputs
         if name not in tensors or not tensors[name].fits(shape):
             missing = f"no such {side}; the graph has {describe(tensors.values())}"
-            raise InputError(
-                f"{self.path}, {side} {name!r}",
-                str(tensors[name]) if name in tensors else missing,
-                f"{Tensor(name, '', tuple(shape))}, as {what} has".replace(" [", "["),
-                "Give the right file; `jsecon models check DIR` lists what each one is.",
-            )
+            found = str(tensors[name]) if name in tensors else missing
+            expected = f"{Tensor(name, '', tuple(shape))}, as {what} has".replace(" [", "[")
+            remedy = "Give the right file; `jsecon models check DIR` lists what each one is."
+            raise InputError(f"{self.path}, {side} {name!r}", found, expected, remedy)
         return tensors[name]
 
     def run(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str] | None = None) -> dict[str, np.ndarray]:
@@ -127,23 +119,17 @@ class Graph:
         unknown = [n for n in feeds if n not in self.inputs] + [n for n in wanted if n not in self.outputs]
         missing = [n for n in self.inputs if n not in feeds]
         if unknown or missing:
-            raise InputError(
-                f"{self.path}, tensor {(unknown + missing)[0]!r}",
-                f"inputs {describe(self.inputs.values())}; outputs {describe(self.outputs.values())}",
-                f"inputs {', '.join(feeds)}; outputs {', '.join(wanted)}",
-                "This graph is of another kind than the one it is used as.",
-            )
+            found = f"inputs {describe(self.inputs.values())}; outputs {describe(self.outputs.values())}"
+            expected = f"inputs {', '.join(feeds)}; outputs {', '.join(wanted)}"
+            raise InputError(f"{self.path}, tensor {(unknown + missing)[0]!r}", found, expected, _MISUSED)
         ready = {name: self._converted(self.inputs[name], np.asarray(array)) for name, array in feeds.items()}
         try:
             found = self._session.run(wanted, ready, self._run_options)
         except Exception as error:  # ONNX Runtime's own kinds have no common base but this
             given = ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in ready.items())
-            raise InputError(
-                self.path,
-                f"a graph that fails on {given} ({_reason(error)})",
-                "one that runs on its declared inputs",
-                "Export the graph again.",
-            ) from error
+            reason = f"a graph that fails on {given} ({_reason(error)})"
+            expected = "one that runs on its declared inputs"
+            raise InputError(self.path, reason, expected, "Export the graph again.") from error
         return dict(zip(wanted, (np.asarray(array) for array in found)))
 
     def _converted(self, tensor: Tensor, array: np.ndarray) -> np.ndarray:
@@ -151,18 +137,26 @@ class Graph:
         wanted = np.dtype(tensor.dtype) if tensor.dtype in _DTYPES.values() else None
         same_kind = wanted is not None and kinds.get(array.dtype.kind) == kinds[wanted.kind]
         if not same_kind or not tensor.fits(array.shape):
-            raise InputError(
-                f"{self.path}, input {tensor.name!r}",
-                str(tensor),
-                f"{array.dtype}{list(array.shape)}",
-                "This graph is of another size or kind than the one it is used as.",
-            )
+            given = f"{array.dtype}{list(array.shape)}"
+            raise InputError(f"{self.path}, input {tensor.name!r}", str(tensor), given, _MISUSED)
         return np.ascontiguousarray(array, wanted)
 
 
 def describe(tensors: Iterable[Tensor]) -> str:
     """Tensors in a line: name, type and shape."""
     return ", ".join(map(str, tensors)) or "nothing"
+
+
+def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np.ndarray, int]]:
+    """Rows in batches of the size that a graph fixes (the last filled up with zeros), or of at most `free`; and how
+    many of each are real."""
+    size = fixed or free
+    for start in range(0, len(rows), size):
+        part = rows[start : start + size]
+        count = len(part)
+        if fixed and count < fixed:
+            part = np.concatenate([part, np.zeros((fixed - count, *rows.shape[1:]), rows.dtype)])
+        yield part, count
 
 
 def graph_files(path: str | os.PathLike) -> tuple[Path, ...]:

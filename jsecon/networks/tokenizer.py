@@ -77,13 +77,10 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
         pairs = [(str(a), str(b)) for a, b in (m.split(" ") if isinstance(m, str) else m for m in merges)]
         return ClipTokenizer(vocabulary, pairs)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(
-            path,
-            f"no tokenizer of CLIP's kind ({error!r})",
-            "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
-            f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}",
-            "Fetch the file again, from a CLIP model.",
-        ) from error
+        expected = "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
+        expected += f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}"
+        found, remedy = f"no tokenizer of CLIP's kind ({error!r})", "Fetch the file again, from a CLIP model."
+        raise InputError(path, found, expected, remedy) from error
 
 
 def word_splitter() -> Any:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from jsecon.errors import require
+from jsecon.errors import require, require_shape
 from jsecon.vision.region_graph import borders, merge
 from jsecon.vision.surfaces import Surface, log_depth
 
@@ -57,13 +57,8 @@ class ClassicalSegmenter:
 
     def partition(self, frame: np.ndarray, index: int) -> Int32[np.ndarray, "h w"]:
         """frame (H, W, 3) uint8 -> labels (H, W) int32, 0 .. M-1, every pixel labelled, each label connected."""
-        require(
-            frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8,
-            "frame",
-            (frame.shape, frame.dtype),
-            "(H, W, 3) uint8",
-            "Give RGB frames as 8-bit arrays.",
-        )
+        fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
+        require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Give RGB frames as 8-bit arrays.")
         features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
         minimum = self.min_area * frame.shape[0] * frame.shape[1]
         surface = None if self.surfaces is None else self.surfaces(index)
@@ -75,13 +70,7 @@ class ClassicalSegmenter:
         shape = None
         if self.depths is not None:
             depth = self.depths(index)
-            require(
-                depth.shape == frame.shape[:2],
-                "depths",
-                depth.shape,
-                str(frame.shape[:2]),
-                "Give depth of the frame's own size.",
-            )
+            require_shape("depths", depth, frame.shape[:2], "Give depth of the frame's own size.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
         return merge(atoms, features, borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum)
@@ -89,19 +78,12 @@ class ClassicalSegmenter:
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 6) colour and normal, in which a crease weighs as a step of `merge_distance`; and (H, W, 7) what small
         regions are cut by: the same, the normal at half its weight, with depth."""
-        require(
-            surface.points.shape == surface.normals.shape == colour.shape,
-            "surface",
-            (surface.points.shape, surface.normals.shape),
-            str(colour.shape),
-            "Give surfaces of the frame's own size.",
-        )
-        turned = surface.normals * np.float32(
-            self.merge_distance / (2.0 * np.sin(np.radians(self.crease_degrees) / 2.0))
-        )
-        depth = np.log(np.maximum(surface.points[..., 2:], 1e-6)) * np.float32(
-            0.5 * self.merge_distance / np.log1p(self.depth_jump)
-        )
+        for array in (surface.points, surface.normals):
+            require_shape("surface", array, colour.shape, "Give surfaces of the frame's own size.")
+        crease = 2.0 * np.sin(np.radians(self.crease_degrees) / 2.0)
+        turned = surface.normals * np.float32(self.merge_distance / crease)
+        jump = np.float32(0.5 * self.merge_distance / np.log1p(self.depth_jump))
+        depth = np.log(np.maximum(surface.points[..., 2:], 1e-6)) * jump
         return np.concatenate([colour, turned], -1), np.concatenate([colour, 0.5 * turned, depth], -1)
 
 

@@ -36,59 +36,24 @@ PALETTE: dict[str, tuple[int, int, int]] = {
     "magenta": (216, 36, 168), "burgundy": (112, 18, 46), "rose": (236, 96, 136), "bronze": (150, 106, 46),
     "copper": (184, 106, 62), "silver": (192, 194, 198), "ivory": (246, 240, 222), "charcoal": (52, 54, 58),
 }
+_SYNONYMS = {
+    "gray": "grey", "azure": "sky", "scarlet": "red", "aqua": "cyan", "fuchsia": "magenta", "golden": "gold",
+    "silvery": "silver", "aquamarine": "turquoise", "amber": "gold", "chocolate": "dark brown", "mauve": "lilac",
+    "plum": "dark purple", "ochre": "mustard", "rust": "dark orange", "emerald": "green", "ruby": "dark red",
+    "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy", "rosy": "rose",
+    "creamy": "cream", "rusty": "dark orange", "peachy": "peach",
+}
+# Words of what surrounds the things in a room; they turn the extent's coordinate towards large regions.
+_SURROUNDINGS = {
+    "wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "table", "tabletop", "tablecloth",
+    "curtain", "curtains", "desk", "counter", "countertop", "lawn",
+}
 # fmt: on
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
-_SYNONYMS = {
-    "gray": "grey",
-    "azure": "sky",
-    "scarlet": "red",
-    "aqua": "cyan",
-    "fuchsia": "magenta",
-    "golden": "gold",
-    "silvery": "silver",
-    "aquamarine": "turquoise",
-    "amber": "gold",
-    "chocolate": "dark brown",
-    "mauve": "lilac",
-    "plum": "dark purple",
-    "ochre": "mustard",
-    "rust": "dark orange",
-    "emerald": "green",
-    "ruby": "dark red",
-    "sapphire": "blue",
-    "ebony": "black",
-    "snowy": "white",
-    "sandy": "tan",
-    "wine": "burgundy",
-    "rosy": "rose",
-    "creamy": "cream",
-    "rusty": "dark orange",
-    "peachy": "peach",
-}
 _DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
 _PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
 _NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
-# Words of what surrounds the things in a room; they turn the extent's coordinate towards large regions.
-_SURROUNDINGS = {
-    "wall",
-    "walls",
-    "floor",
-    "ceiling",
-    "ground",
-    "carpet",
-    "rug",
-    "background",
-    "table",
-    "tabletop",
-    "tablecloth",
-    "curtain",
-    "curtains",
-    "desk",
-    "counter",
-    "countertop",
-    "lawn",
-}
 # A colour word names a range: its point, and a darker and a lighter neighbour.
 _SPREAD = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
 _SPREAD_WEIGHTS = np.asarray([0.7, 0.15, 0.15], np.float32)
@@ -139,8 +104,7 @@ class ColourEmbedder:
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
         self.dim = int(kept.sum()) + 2
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
-        colours = [self._mean(self._points)]
-        colours += [self._mean(point[None]) for point in neutral]
+        colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
 
     def embed_regions(
@@ -169,9 +133,8 @@ class ColourEmbedder:
             points = np.stack([self._colour(phrase) for phrase in self._phrases(text)])  # (colours, 3)
             spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
             weights = np.tile(_SPREAD_WEIGHTS, len(points))
-            row[:] = _joined(
-                self._mean(spread.astype(np.float32), weights), float(bool(_SURROUNDINGS & set(_words(text))))
-            )
+            surrounds = float(bool(_SURROUNDINGS & set(_words(text))))
+            row[:] = _joined(self._mean(spread.astype(np.float32), weights), surrounds)
         return out
 
     def _mean(self, points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -185,12 +148,8 @@ class ColourEmbedder:
         """Splits a text into runs of modifiers and colour words, one run a colour."""
         words = _words(text, separators=True)
         if _NEGATION & set(words):
-            raise InputError(
-                f"query {text!r}",
-                "a negation",
-                "the colours that the thing has",
-                "Say what colour it is, instead of what it is not.",
-            )
+            remedy = "Say what colour it is, instead of what it is not."
+            raise InputError(f"query {text!r}", "a negation", "the colours that the thing has", remedy)
         phrases: list[list[str]] = []
         modifiers: list[str] = []
         run_open = False  # the last word was a colour
@@ -206,15 +165,11 @@ class ColourEmbedder:
             else:
                 modifiers, run_open = [], False
         if not phrases:
-            raise InputError(
-                f"query {text!r}",
-                "no colour word",
-                "a text that names a colour, such as 'dark green bottle' or 'red and white box'",
-                "The embedder in use knows things by their colours only ("
-                + ", ".join(sorted({n for n in self.names if " " not in n}))
-                + "; dark, light, -ish). Name the thing's colour, "
-                "or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights.",
-            )
+            expected = "a text that names a colour, such as 'dark green bottle' or 'red and white box'"
+            known = ", ".join(sorted({n for n in self.names if " " not in n}))
+            remedy = f"The embedder in use knows things by their colours only ({known}; dark, light, -ish). Name the "
+            remedy += "thing's colour, or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights."
+            raise InputError(f"query {text!r}", "no colour word", expected, remedy)
         return phrases
 
     def _base(self, word: str) -> tuple[str | None, bool]:
@@ -241,9 +196,8 @@ class ColourEmbedder:
         for base, ish in names:
             shaded = self._by_name.get(prefix + base)
             if shaded is None:
-                shaded = self._by_name[base] + np.asarray(
-                    [-22.0 if dark else 22.0 if light else 0.0, 0.0, 0.0], np.float32
-                )
+                step = -22.0 if dark else 22.0 if light else 0.0
+                shaded = self._by_name[base] + np.asarray([step, 0.0, 0.0], np.float32)
             points.append(shaded)
             # 'bluish green' is more green than blue; 'navy blue' is navy, its basic term only says what kind navy is.
             weights.append(0.25 if base in BASIC and weights and names[0][0] not in BASIC else 0.5 if ish else 1.0)
@@ -270,10 +224,8 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
     """Unit colour vector and extent (0 thing .. 1 surroundings) -> unit vector of the joint space."""
     angle = 0.5 * np.pi * min(max(float(extent), 0.0), 1.0)
-    both = np.concatenate(
-        [np.sqrt(1.0 - EXTENT_WEIGHT) * colour, np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])]
-    )
-    return both.astype(np.float32)
+    turned = np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])
+    return np.concatenate([np.sqrt(1.0 - EXTENT_WEIGHT) * colour, turned]).astype(np.float32)
 
 
 def _pixels_inside(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -47,11 +47,15 @@ class EmbeddingStore:
         if not vectors:
             return
         keys = np.stack([np.frombuffer(key, np.uint8) for key in vectors])
-        with written_whole(self._path(frame)) as temporary, open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, keys=keys, vectors=np.stack(list(vectors.values())))
+        _write(self._path(frame), keys=keys, vectors=np.stack(list(vectors.values())))
 
     def _path(self, frame: np.ndarray) -> Path:
         return self.folder / f"{frame_digest(self.model, frame)}.npz"
+
+
+def _write(path: Path, **arrays: np.ndarray) -> None:
+    with written_whole(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
@@ -80,9 +84,6 @@ def known_vectors(
     return rows, missing
 
 
-_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile)
-
-
 class StoredSegmenter:
     """Segmenter (jsecon.vision.protocols) that asks `segmenter` for what `folder` does not hold.
 
@@ -105,8 +106,7 @@ class StoredSegmenter:
         except _UNREADABLE:
             masks = np.asarray(self._segmenter(frame, index), bool)
         bits = np.packbits(masks.reshape(len(masks), frame.shape[0] * frame.shape[1]), axis=1)
-        with written_whole(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, allow_pickle=False, bits=bits, shape=np.asarray(masks.shape))
+        _write(path, bits=bits, shape=np.asarray(masks.shape))
         return masks
 
     def check(self) -> None:

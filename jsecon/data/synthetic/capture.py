@@ -20,6 +20,9 @@ from jsecon.errors import require
 from jsecon.files import write_text, written_whole
 from jsecon.types import Camera, Capture
 
+LABEL_PIXELS = 40
+"""visible ones from which `write_room` labels an object in a frame"""
+
 
 def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int = 240) -> Camera:
     """`views` cameras on a walk once around the table, at changing height, looking at it; 60 degrees across."""
@@ -65,13 +68,8 @@ def room_capture(
     """
     check_options(None, views, holdout)
     out = held_out(views, holdout)
-    require(
-        int((~out).sum()) >= 2,
-        "views",
-        f"{views} with every {holdout}. held out",
-        "2 that are not held out",
-        "Sparse points are those that two views see: take more views.",
-    )
+    got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
+    require(int((~out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
     room = make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=views, width=width, height=height)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
@@ -138,48 +136,34 @@ def write_room(
     folder: str | Path,
     seed: int,
     *,
-    views: int = 30,
-    width: int = 320,
-    height: int = 240,
     holdout: int = 5,
-    points: int = 6000,
-    num_objects: int = 12,
-    label_pixels: int = 40,
     progress: Callable[[int, int], None] | None = None,
+    **options: int,
 ) -> Path:
     """Writes the room of `seed` to `folder` as a COLMAP capture (images/, sparse/0/), and its ground truth beside it.
 
-    masks/<frame>.png: 8-bit integers, 0 = none, else the object's id from 1. label/<frame>.json: LangSplat's layout of
-    LERF labels, for the held-out frames, of the objects with at least `label_pixels` visible pixels there. scene.json,
-    written last: seed, options, objects by id. Returns the folder; raises InputError where it cannot be written.
+    `options` as for `room_capture`. masks/<frame>.png: 8-bit integers, 0 = none, else the object's id from 1.
+    label/<frame>.json: LangSplat's layout of LERF labels, for the held-out frames, of the objects with at least
+    LABEL_PIXELS visible pixels there. scene.json, written last: seed, options, objects by id. Returns the folder;
+    raises InputError where it cannot be written.
     """
     folder = Path(folder)
     _clear(folder)
-    capture, instances, names = room_capture(
-        seed,
-        views=views,
-        width=width,
-        height=height,
-        holdout=holdout,
-        points=points,
-        num_objects=num_objects,
-        progress=progress,
-    )
+    capture, instances, names = room_capture(seed, holdout=holdout, progress=progress, **options)
     write_colmap(capture, folder)
     for name, instance in zip(capture.names, instances):
         write_ids(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
-    write_lerf_labels(
-        folder / "label",
-        [labelled(capture.names[t], instances[t], names, label_pixels) for t in np.flatnonzero(capture.held_out)],
-    )
+    held = np.flatnonzero(capture.held_out)
+    labels = [labelled(capture.names[t], instances[t], names, LABEL_PIXELS) for t in held]
+    write_lerf_labels(folder / "label", labels)
     scene = {
         "seed": seed,
-        "views": views,
-        "width": width,
-        "height": height,
+        "views": len(capture.names),
+        "width": capture.cameras.width,
+        "height": capture.cameras.height,
         "holdout": holdout,
         "points": len(capture.points),
-        "held_out": [name for name, out in zip(capture.names, capture.held_out) if out],
+        "held_out": [capture.names[t] for t in held],
         "objects": {str(k + 1): name for k, name in enumerate(names)},
     }
     write_text(folder / "scene.json", json.dumps(scene, indent=2) + "\n")
@@ -189,13 +173,9 @@ def write_room(
 def _clear(folder):
     """Removes what an earlier room in `folder` may have more of than this one; its other files are written over."""
     if (folder / "scene.json").is_file():
-        stale = [
-            *folder.glob("label/frame_*.json"),
-            *folder.glob("masks/frame_*.png"),
-            *folder.glob("images/frame_*.png"),
-        ]
-        for file in [folder / "scene.json", *stale]:
-            file.unlink()
+        for pattern in ("scene.json", "label/frame_*.json", "masks/frame_*.png", "images/frame_*.png"):
+            for file in list(folder.glob(pattern)):
+                file.unlink()
 
 
 def labelled(frame, instance, names, label_pixels):

@@ -50,11 +50,7 @@ def _window(camera, bound):
 
 
 def trace(
-    room: Room,
-    camera: Camera,
-    *,
-    dx: float = 0.0,
-    dy: float = 0.0,
+    room: Room, camera: Camera, *, dx: float = 0.0, dy: float = 0.0
 ) -> tuple[Float32[np.ndarray, "h w"], Int16[np.ndarray, "h w"]]:
     """z-depth (m) and index into `room.parts` (-1 = a wall, the floor or the ceiling) of the rays through the pixels'
     centres shifted by (dx, dy) px. The camera must stand in the room and outside of every part."""
@@ -85,16 +81,8 @@ def _shade(baked, points, index, lamps):
     colour = np.empty((points.shape[1], 3), np.float32)
     background = np.flatnonzero(index < 0)
     p = points[:, background]
-    gaps = np.stack(
-        [
-            room.half[0] + p[0],
-            room.half[0] - p[0],
-            room.half[1] + p[1],
-            room.half[1] - p[1],
-            p[2] + np.float32(TABLE_HEIGHT),
-            np.float32(room.ceiling) - p[2],
-        ]
-    )
+    (a, b), (x, y, z) = room.half, p
+    gaps = np.stack([a + x, a - x, b + y, b - y, z + np.float32(TABLE_HEIGHT), np.float32(room.ceiling) - z])
     nearest = gaps.argmin(0)
     for side, plane in enumerate(baked.walls):
         on = nearest == side
@@ -140,10 +128,7 @@ def srgb(rgb: Float[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"]:
 
 
 def render_views(
-    room: Room,
-    cameras: Camera,
-    *,
-    progress: Callable[[int, int], None] | None = None,
+    room: Room, cameras: Camera, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[UInt8[np.ndarray, "t h w 3"], Int16[np.ndarray, "t h w"], Float32[np.ndarray, "t h w"]]:
     """Frames, instances (index of the object, -1 = background) and z-depths (m) of a batch of cameras in the room."""
     baked = bake(room)

@@ -135,13 +135,8 @@ def make_room(seed: int, *, num_objects: int = 12) -> Room:
 
     Raises ValueError where `num_objects` is out of range.
     """
-    require(
-        2 <= num_objects <= len(PALETTE),
-        "num_objects",
-        num_objects,
-        f"2 to {len(PALETTE)}",
-        "There is one object per colour name.",
-    )
+    fits = 2 <= num_objects <= len(PALETTE)
+    require(fits, "num_objects", num_objects, f"2 to {len(PALETTE)}", "There is one object per colour name.")
     draw = np.random.default_rng([seed, 2])
     colours = list(PALETTE)[:num_objects]
     shapes = _draw_shapes(draw, colours)
@@ -187,21 +182,14 @@ def _stand(draw, index, colour, shape, body, radius, spot):
     albedo = linear(PALETTE[colour]) * np.float32(draw.uniform(0.94, 1.0))
     # Stripes across many small parts would hide what the object is.
     kinds = ["plain", "marble"] if len(body) > 4 else ["plain", "stripes", "checks", "marble", "marble"]
-    texture = Texture(
-        str(draw.choice(kinds)),
-        draw.uniform(0.03, 0.05),
-        draw.uniform(0.12, 0.2),
-        draw.uniform(-0.1, 0.1, 3).astype(np.float32),
-    )
-    parts = tuple(
-        Part(
-            place(solid, centre, axes),
-            None if hollow is None else place(hollow, centre, axes),
-            index,
-            np.minimum(albedo * np.float32(tone), 0.95),
-        )
-        for solid, hollow, tone in body
-    )
+    kind, scale, depth = str(draw.choice(kinds)), draw.uniform(0.03, 0.05), draw.uniform(0.12, 0.2)
+    texture = Texture(kind, scale, depth, draw.uniform(-0.1, 0.1, 3).astype(np.float32))
+
+    def part(solid, hollow, tone):
+        inner = None if hollow is None else place(hollow, centre, axes)
+        return Part(place(solid, centre, axes), inner, index, np.minimum(albedo * np.float32(tone), 0.95))
+
+    parts = tuple(part(*row) for row in body)
     return RoomObject(f"{colour} {shape}", colour, shape, centre, axes, float(radius), texture, parts)
 
 

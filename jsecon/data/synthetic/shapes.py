@@ -131,27 +131,15 @@ def _duck(draw):
 
 def _pig(draw):
     s = draw.uniform(0.95, 1.15)
-    legs = [
-        (place(frustum(0.017 * s, 0.019 * s, 0.05 * s), (x * s, y * s, 0)), None, 1.0)
-        for x in (-0.05, 0.05)
-        for y in (-0.032, 0.032)
-    ]
-    ears = [
-        (
-            place(frustum(0.018 * s, 0.002 * s, 0.032 * s), (0.085 * s, y * s, 0.15 * s), rotation(roll=-8 * y)),
-            None,
-            0.85,
-        )
-        for y in (-0.03, 0.03)
-    ]
+    leg = frustum(0.017 * s, 0.019 * s, 0.05 * s)
+    legs = [(place(leg, (x * s, y * s, 0)), None, 1.0) for x in (-0.05, 0.05) for y in (-0.032, 0.032)]
+    ear = frustum(0.018 * s, 0.002 * s, 0.032 * s)
+    ears = [(place(ear, (0.085 * s, y * s, 0.15 * s), rotation(roll=-8 * y)), None, 0.85) for y in (-0.03, 0.03)]
+    snout = place(frustum(0.024 * s, 0.021 * s, 0.026 * s), (0.125 * s, 0, 0.108 * s), rotation(pitch=np.pi / 2))
     return [
         (place(ellipsoid(0.095 * s, 0.066 * s, 0.064 * s), (0, 0, 0.095 * s)), None, 1.0),
         (place(ellipsoid(0.052 * s, 0.05 * s, 0.05 * s), (0.085 * s, 0, 0.115 * s)), None, 1.0),
-        (
-            place(frustum(0.024 * s, 0.021 * s, 0.026 * s), (0.125 * s, 0, 0.108 * s), rotation(pitch=np.pi / 2)),
-            None,
-            0.8,
-        ),
+        (snout, None, 0.8),
         *legs,
         *ears,
     ]
@@ -187,21 +175,12 @@ def _lamp(draw):
 
 def _toy_car(draw):
     s = draw.uniform(0.95, 1.1)
-    wheels = [
-        (
-            place(
-                frustum(0.027 * s, 0.027 * s, 0.02 * s), (x * s, (y + 0.01) * s, 0.027 * s), rotation(roll=np.pi / 2)
-            ),
-            None,
-            0.5,
-        )
-        for x in (-0.06, 0.06)
-        for y in (-0.052, 0.052)
-    ]
+    wheel, turn = frustum(0.027 * s, 0.027 * s, 0.02 * s), rotation(roll=np.pi / 2)
+    places = [(x * s, (y + 0.01) * s, 0.027 * s) for x in (-0.06, 0.06) for y in (-0.052, 0.052)]
     return [
         (place(box(0.2 * s, 0.1 * s, 0.05 * s), (0, 0, 0.025 * s)), None, 1.0),
         (place(box(0.1 * s, 0.086 * s, 0.045 * s), (-0.01 * s, 0, 0.075 * s)), None, 1.0),
-        *wheels,
+        *((place(wheel, at, turn), None, 0.5) for at in places),
     ]
 
 

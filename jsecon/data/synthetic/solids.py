@@ -57,25 +57,15 @@ def frustum(bottom: float, top: float, height: float) -> Solid:
     """Upright cone section, radius `bottom` at z = 0 and `top` at z = `height`; a cylinder where they agree."""
     slope = (top - bottom) / height
     planes = [(0, 0, 1, height), (0, 0, -1, 0.0)]
-    return _solid(
-        (1.0, 1.0, -(slope**2), -bottom * slope, -(bottom**2)),
-        planes,
-        float(np.hypot(height / 2, max(bottom, top))),
-        (0, 0, height / 2),
-        slope,
-    )
+    quadric = (1.0, 1.0, -(slope**2), -bottom * slope, -(bottom**2))
+    radius = float(np.hypot(height / 2, max(bottom, top)))
+    return _solid(quadric, planes, radius, (0, 0, height / 2), slope)
 
 
 def box(width: float, depth: float, height: float) -> Solid:
     """Upright box standing on z = 0, centred in x and y."""
-    planes = [
-        (1, 0, 0, width / 2),
-        (-1, 0, 0, width / 2),
-        (0, 1, 0, depth / 2),
-        (0, -1, 0, depth / 2),
-        (0, 0, 1, height),
-        (0, 0, -1, 0.0),
-    ]
+    sides = [(1, 0, 0, width / 2), (-1, 0, 0, width / 2), (0, 1, 0, depth / 2), (0, -1, 0, depth / 2)]
+    planes = [*sides, (0, 0, 1, height), (0, 0, -1, 0.0)]
     radius = 0.5 * float(np.sqrt(width**2 + depth**2 + height**2))
     return _solid((0, 0, 0, 0, -1.0), planes, radius, (0, 0, height / 2))
 
@@ -109,9 +99,7 @@ def contains(solid: Solid, points: Float[np.ndarray, "3 n"], *, margin: float = 
 
 
 def interval(
-    solid: Solid,
-    origin: Float[np.ndarray, "3 _"],
-    direction: Float[np.ndarray, "3 n"],
+    solid: Solid, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Ray parameters between which origin + t direction lies in the solid; enter >= leave where it misses."""
     d = solid.axes.T @ direction

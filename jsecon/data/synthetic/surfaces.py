@@ -68,10 +68,7 @@ def bake(room: Room) -> BakedRoom:
         ((-x, -y, floor), right, 2 * x, back),
         ((-x, y, floor), right, 2 * x, -back),
     ]
-    walls = [
-        _wall(room, draw, np.array(corner, np.float32), first, span, tall, normal)
-        for corner, first, span, normal in sides
-    ]
+    walls = [_wall(room, draw, tall, *side) for side in sides]
     ground = _flat(room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006, 0.05, _tiles)
     above = _flat(room, draw, np.array([-x, -y, ceiling], np.float32), 2 * x, 2 * y, -up, 0.02, None, _plaster)
     tx, ty = TABLE_HALF
@@ -119,9 +116,7 @@ def _plaster(draw, u, v):
 def _planks(draw, u, v):
     wood = Texture("wood", 0.07, 1.0, draw.uniform(-1, 1, 3).astype(np.float32))
     board = np.floor(v / 0.16)
-    flat = np.stack([u.ravel() + 0.37 * board.ravel(), v.ravel() + 0.11 * board.ravel(), 0 * u.ravel()]).astype(
-        np.float32
-    )
+    flat = np.stack([u + 0.37 * board, v + 0.11 * board, 0 * u]).astype(np.float32).reshape(3, -1)
     grain = pattern(wood, flat).reshape(u.shape)
     tone = 0.1 * grain + 0.05 * _noise(draw, u.shape, 24) + 0.05 * ((board * 7) % 3 - 1) - 0.2 * ((v % 0.16) < 0.004)
     return linear(TABLE_WOOD) * (1 + tone)[..., None]
@@ -152,8 +147,8 @@ def _under_table(points):
     return np.clip(0.75 + 0.4 * beyond.max(0), 0.6, 1)
 
 
-def _wall(room, draw, origin, first, span, tall, normal):
-    up = np.array([0, 0, 1], np.float32)
+def _wall(room, draw, tall, corner, first, span, normal):
+    origin, up = np.array(corner, np.float32), np.array([0, 0, 1], np.float32)
     points, u, v = _grid(origin, first, up, span, tall, 0.008)
     tone = 0.05 * _noise(draw, u.shape, 36) + 0.035 * np.sign(np.sin(2 * np.pi * u / 0.24))
     low = v < 0.95

@@ -18,7 +18,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from jsecon.errors import InputError
-from jsecon.networks.onnx_graph import Graph, Tensor, content_digest, describe, graph_files
+from jsecon.networks.onnx_graph import Graph, Tensor, batches, content_digest, describe, graph_files
 
 MEAN, STD = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
 """of RGB in 0..255"""
@@ -90,13 +90,10 @@ def find_sam(folder: str | Path) -> SamFiles:
     encoders = [path for path in graphs if "encoder" in path.name and path not in decoders]
     encoder, decoder = _one_of(encoders, ENCODERS), _one_of(decoders, DECODERS)
     if encoder is None or decoder is None:
-        raise InputError(
-            folder,
-            ", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file",
-            f"an image encoder ({' or '.join(ENCODERS)}, or one *encoder*.onnx) and a mask decoder "
-            f"({' or '.join(DECODERS)}, or one *decoder*.onnx)",
-            PUBLISHED,
-        )
+        found = ", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file"
+        first = f"an image encoder ({' or '.join(ENCODERS)}, or one *encoder*.onnx)"
+        second = f"a mask decoder ({' or '.join(DECODERS)}, or one *decoder*.onnx)"
+        raise InputError(folder, found, f"{first} and {second}", PUBLISHED)
     return SamFiles(encoder, decoder)
 
 
@@ -129,30 +126,27 @@ class SamGraphs:
         inputs = list(self._encoder.inputs.values())
         if len(inputs) == 1 and (inputs[0].fits((1, 3, None, None)) or inputs[0].fits((None, None, 3))):
             return inputs[0]
-        raise InputError(
-            f"{self.files.encoder}, input {inputs[0].name if inputs else 'image'!r}",
-            describe(inputs),
-            "one image, float32[1, 3, S, S] or float32[H, W, 3], as SAM's image encoder has",
-            PUBLISHED,
-        )
+        where = f"{self.files.encoder}, input {inputs[0].name if inputs else 'image'!r}"
+        expected = "one image, float32[1, 3, S, S] or float32[H, W, 3], as SAM's image encoder has"
+        raise InputError(where, describe(inputs), expected, PUBLISHED)
 
     def _checked_decoder(self) -> Dialect:
         inputs = self._decoder.inputs
         dialect = HUB if HUB.coords in inputs else SECOND if "high_res_feats_0" in inputs else OWN
         lead = (1,) if dialect.nested else ()
         what = f"SAM's mask decoder ({dialect.name})"
-        self._decoder.require_input(dialect.coords, (*lead, None, None, 2), what)
-        self._decoder.require_input(dialect.labels, (*lead, None, None), what)
-        self._decoder.require_output(dialect.scores, (*lead, None, None), what)
-        masks = self._decoder.require_output(dialect.masks, (*lead, None, None, None, None), what)
+        self._decoder.require("input", dialect.coords, (*lead, None, None, 2), what)
+        self._decoder.require("input", dialect.labels, (*lead, None, None), what)
+        self._decoder.require("output", dialect.scores, (*lead, None, None), what)
+        masks = self._decoder.require("output", dialect.masks, (*lead, None, None, None, None), what)
         if masks.fixed(-3) not in (None, 3, 4):
-            raise InputError(
-                f"{self.files.decoder}, output {masks.name!r}",
-                str(masks),
-                "3 or 4 masks per prompt, from the smallest part to the whole",
-                "Export the decoder without --return-single-mask.",
-            )
+            raise self._not_three(masks.name, str(masks))
         return dialect
+
+    def _not_three(self, masks: str, found: str) -> InputError:
+        expected = "3 or 4 masks per prompt, from the smallest part to the whole, each with its score"
+        remedy = "Export the decoder without --return-single-mask."
+        return InputError(f"{self.files.decoder}, output {masks!r}", found, expected, remedy)
 
     def _checked_links(self) -> dict[str, str]:
         """Decoder input -> encoder output, for all that the decoder takes from the frame."""
@@ -163,16 +157,14 @@ class SamGraphs:
         if len(left) == 1 and len(maps) == 1:  # the encoder's only map, whatever its exporter called it
             links[left.pop()] = maps[0]
         for name in left:
-            raise InputError(
-                f"{self.files.decoder}, input {name!r}",
-                f"no such output of {self.files.encoder.name}, which gives {describe(self._encoder.outputs.values())}",
-                str(self._decoder.inputs[name]),
-                "Take encoder and decoder from one export.",
-            )
+            where, given = f"{self.files.decoder}, input {name!r}", describe(self._encoder.outputs.values())
+            found = f"no such output of {self.files.encoder.name}, which gives {given}"
+            raise InputError(where, found, str(self._decoder.inputs[name]), "Take encoder and decoder from one export.")
         for name, output in links.items():
             needed = self._decoder.inputs[name].shape
             if needed is not None:
-                self._encoder.require_output(output, needed, f"the encoder that {self.files.decoder.name} belongs to")
+                what = f"the encoder that {self.files.decoder.name} belongs to"
+                self._encoder.require("output", output, needed, what)
         return links
 
     def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> Encoded:
@@ -197,26 +189,14 @@ class SamGraphs:
         """P points (x, y) in px of the frame -> batch by batch, three mask logits (B, 3, L, L), from part to whole, and
         their predicted IoUs (B, 3)."""
         scale = np.array([encoded.scaled_width / encoded.width, encoded.scaled_height / encoded.height], np.float32)
-        for start in range(0, len(points), self.batch):
-            part = points[start : start + self.batch] * scale
-            count = len(part)
-            if self._fixed_batch and count < self._fixed_batch:
-                part = np.concatenate([part, np.zeros((self._fixed_batch - count, 2), np.float32)])
-            names = [self.dialect.masks, self.dialect.scores]
+        names, lead = [self.dialect.masks, self.dialect.scores], int(self.dialect.nested)
+        for part, count in batches(points * scale, self._fixed_batch, self.batch):
             found = self._decoder.run(encoded.features | self._prompts(part), names)
-            lead = 1 if self.dialect.nested else 0
             masks, scores = (found[name].reshape(found[name].shape[lead:])[:count] for name in names)
             if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
-                raise InputError(
-                    f"{self.files.decoder}, output {names[0]!r}",
-                    f"{list(masks.shape)} with scores {list(scores.shape)}",
-                    "3 or 4 masks per prompt, each with its score",
-                    "Export the decoder without --return-single-mask.",
-                )
-            yield (
-                masks[:, -3:].astype(np.float32),
-                scores[:, -3:].astype(np.float32),
-            )  # of 4, the first is the single one
+                raise self._not_three(names[0], f"{list(masks.shape)} with scores {list(scores.shape)}")
+            # of 4, the first is the single one
+            yield masks[:, -3:].astype(np.float32), scores[:, -3:].astype(np.float32)
 
     def _prompts(self, points: Float32[np.ndarray, "b 2"]) -> dict[str, np.ndarray]:
         count, dialect = len(points), self.dialect

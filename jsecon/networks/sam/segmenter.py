@@ -155,9 +155,8 @@ class SamSegmenter:
             own = [c for c in candidates if c.token in tokens]
             left += [own[i] for i in box_nms(_boxes(own), np.asarray([c.iou for c in own]), self.settings.box_iou)]
         # Of what several crops show, the smaller crop's is the finer; with one crop this changes nothing.
-        left = [
-            left[i] for i in box_nms(_boxes(left), np.asarray([1.0 / c.crop.area for c in left]), self.settings.box_iou)
-        ]
+        fineness = np.asarray([1.0 / c.crop.area for c in left])
+        left = [left[i] for i in box_nms(_boxes(left), fineness, self.settings.box_iou)]
         masks, changed = np.zeros((len(left), *size), bool), np.zeros(len(left), bool)
         for n, candidate in enumerate(left):
             whole = np.unpackbits(candidate.bits, count=size[0] * size[1]).reshape(size).astype(bool)
@@ -165,13 +164,8 @@ class SamSegmenter:
         boxes = np.asarray([box_of(mask) for mask in masks], np.float64).reshape(-1, 4)
         kept = np.sort(box_nms(boxes, 1.0 - changed, self.settings.box_iou))
         masks, scores = masks[kept], np.asarray([left[i].iou * left[i].stability for i in kept], np.float64)
-        kept = langsplat_nms(
-            masks,
-            scores,
-            iou_threshold=self.settings.mask_iou,
-            score_threshold=self.settings.mask_score,
-            inner_threshold=self.settings.mask_inner,
-        )
+        iou, score, inner = self.settings.mask_iou, self.settings.mask_score, self.settings.mask_inner
+        kept = langsplat_nms(masks, scores, iou_threshold=iou, score_threshold=score, inner_threshold=inner)
         return masks[kept], scores[kept]
 
 

@@ -37,11 +37,7 @@ SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
     ),
     "prompt_encoder": (
         {"coords": (1, None, 2), "labels": (1, None), "masks": (1, "L", "L"), "masks_enable": (1,)},
-        {
-            "sparse_embeddings": (1, None, "C"),
-            "dense_embeddings": (1, "C", "G", "G"),
-            "dense_pe": (1, "C", "G", "G"),
-        },
+        {"sparse_embeddings": (1, None, "C"), "dense_embeddings": (1, "C", "G", "G"), "dense_pe": (1, "C", "G", "G")},
     ),
     "mask_decoder": (
         {
@@ -52,12 +48,7 @@ SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
             "high_res_features1": (1, None, "L", "L"),
             "high_res_features2": (1, None, None, None),
         },
-        {
-            "masks": (1, 4, "L", "L"),
-            "iou_pred": (1, 4),
-            "sam_tokens_out": (1, 4, "C"),
-            "object_score_logits": (1, 1),
-        },
+        {"masks": (1, 4, "L", "L"), "iou_pred": (1, 4), "sam_tokens_out": (1, 4, "C"), "object_score_logits": (1, 1)},
     ),
     "mlp": ({"x": (None, "C")}, {"x_out": (None, "C")}),
     "memory_attention": (
@@ -141,12 +132,9 @@ def sam2_files(folder: Path) -> dict[str, Path]:
     for role in SIGNATURES:
         found = sorted(folder.glob(f"{role}*.onnx"))
         if len(found) > 1 or (not found and role not in ONLY_SAM2_1):
-            raise _bad(
-                folder / f"{role}*.onnx",
-                ", ".join(path.name for path in found) or "no such file",
-                f"one file with SAM 2's {role.replace('_', ' ')}",
-                "Keep one model a folder; python -m experiments.export_models writes one from a checkpoint.",
-            )
+            there, wanted = ", ".join(path.name for path in found), f"one file with SAM 2's {role.replace('_', ' ')}"
+            remedy = "Keep one model a folder; python -m experiments.export_models writes one from a checkpoint."
+            raise _bad(folder / f"{role}*.onnx", there or "no such file", wanted, remedy)
         if found:
             files[role] = found[0]
     return files
@@ -163,19 +151,16 @@ def _read_constants(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as stored:
             constants = {name: stored[name].astype(np.float32) for name in stored.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise _bad(
-            path,
-            "no such file" if isinstance(error, FileNotFoundError) else f"what cannot be read ({error})",
-            f"the arrays {', '.join(CONSTANTS)}",
-        ) from error
+        found = "no such file" if isinstance(error, FileNotFoundError) else f"what cannot be read ({error})"
+        raise _bad(path, found, f"the arrays {', '.join(CONSTANTS)}") from error
     return constants
 
 
 def _agreed_sizes(folder: Path, graphs: Mapping[str, Graph], constants: Mapping[str, np.ndarray]) -> dict[str, int]:
-    size = graphs["image_encoder"].require_input("input_image", (1, 3, None, None), "SAM 2's image encoder").fixed(2)
-    size = size or 1024
+    encoder = graphs["image_encoder"]
+    size = encoder.require("input", "input_image", (1, 3, None, None), "SAM 2's image encoder").fixed(2) or 1024
     if size % STRIDE:
-        raise _bad(graphs["image_encoder"].path, f"an image of {size} px a side", f"a multiple of {STRIDE}")
+        raise _bad(encoder.path, f"an image of {size} px a side", f"a multiple of {STRIDE}")
     grid = size // STRIDE
     sizes = {"S": size, "G": grid, "L": 4 * grid, "T": grid * grid}
     shapes: dict[str, Shape] = dict(CONSTANTS)
@@ -188,18 +173,12 @@ def _agreed_sizes(folder: Path, graphs: Mapping[str, Graph], constants: Mapping[
         wanted = _with_sizes(shape, sizes)
         found = constants[name].shape if name in constants else None
         if found is None or len(found) != len(wanted) or any(w not in (None, f) for w, f in zip(wanted, found)):
-            raise _bad(
-                f"{folder / 'constants.npz'}, {name!r}",
-                "no such array" if found is None else f"shape {found}",
-                f"shape {wanted} (None: any)",
-            )
+            there = "no such array" if found is None else f"shape {found}"
+            raise _bad(f"{folder / 'constants.npz'}, {name!r}", there, f"shape {wanted} (None: any)")
     for role, graph in graphs.items():
-        what = f"SAM 2's {role.replace('_', ' ')}"
-        inputs, outputs = SIGNATURES[role]
-        for name, shape in inputs.items():
-            graph.require_input(name, _with_sizes(shape, sizes), what)
-        for name, shape in outputs.items():
-            graph.require_output(name, _with_sizes(shape, sizes), what)
+        for side, tensors in zip(("input", "output"), SIGNATURES[role]):
+            for name, shape in tensors.items():
+                graph.require(side, name, _with_sizes(shape, sizes), f"SAM 2's {role.replace('_', ' ')}")
     return sizes | {"N": len(constants["maskmem_tpos_enc"])}
 
 

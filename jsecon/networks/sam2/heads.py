@@ -49,13 +49,8 @@ class Prompt:
 
     def __post_init__(self):
         given = [value is not None for value in (self.mask, self.points, self.labels)]
-        require(
-            given in ([True, False, False], [False, True, True]),
-            "Prompt",
-            f"mask, points, labels given: {given}",
-            "a mask, or points with labels",
-            "Give one of the two.",
-        )
+        fits, got = given in ([True, False, False], [False, True, True]), f"mask, points, labels given: {given}"
+        require(fits, "Prompt", got, "a mask, or points with labels", "Give one of the two.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,11 +81,8 @@ def image_features(sam2: Sam2Graphs, frame: np.ndarray) -> Features:
     small = Image.fromarray(frame).resize((size, size), Image.Resampling.BICUBIC)
     image = ((np.asarray(small) / 255.0).astype(np.float32) - MEAN) / STD
     found = sam2.run("image_encoder", {"input_image": image.transpose(2, 0, 1)[None]})
-    return Features(
-        found["backbone_fpn_2"],
-        (found["backbone_fpn_0"], found["backbone_fpn_1"]),
-        found["vision_pos_enc_2"],
-    )
+    fine = found["backbone_fpn_0"], found["backbone_fpn_1"]
+    return Features(found["backbone_fpn_2"], fine, found["vision_pos_enc_2"])
 
 
 def prompted(sam2: Sam2Graphs, features: Features, prompt: Prompt, size: tuple[int, int]) -> Prediction:
@@ -161,10 +153,7 @@ def _resized(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _prompt(
-    sam2: Sam2Graphs,
-    points: np.ndarray | None = None,
-    labels: np.ndarray | None = None,
-    hint: np.ndarray | None = None,
+    sam2: Sam2Graphs, points: np.ndarray | None = None, labels: np.ndarray | None = None, hint: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """The prompt encoder's outputs for points (P, 2) in px of the network's image, and mask logits `hint` (L, L)."""
     low = sam2.sizes["L"]

@@ -32,14 +32,7 @@ class Sam2Tracker:
     Raises InputError where a file of a SAM 2 model is missing in the folder, and later where one does not fit the rest.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        hole_area: int = 8,
-        keep: int = 16,
-        threads: int | None = None,
-    ):
+    def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
         self.name = f"sam2-{sam2_digest(folder, extra=repr(hole_area))}"
         self.hole_area = hole_area
         self._folder, self._keep, self._threads = folder, keep, threads
@@ -65,26 +58,16 @@ class Sam2Tracker:
     def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
         """frames (T, H, W, 3) uint8, frame `index`, its masks `prompts` (B, H, W) bool -> labels (T, H, W) int16."""
         height, width = frames.shape[1:3]
-        require(
-            prompts.ndim == 3 and prompts.shape[1:] == (height, width) and 0 <= index < len(frames),
-            "Sam2Tracker",
-            (prompts.shape, index),
-            f"(B, {height}, {width}) and a frame below {len(frames)}",
-            "Give masks of the frames' own size.",
-        )
+        fits = prompts.ndim == 3 and prompts.shape[1:] == (height, width) and 0 <= index < len(frames)
+        expected = f"(B, {height}, {width}) and a frame below {len(frames)}"
+        require(fits, "Sam2Tracker", (prompts.shape, index), expected, "Give masks of the frames' own size.")
         labels = np.full(frames.shape[:3], -1, np.int16)
         given = [b for b, mask in enumerate(prompts) if mask.any()]
         if not given:
             return labels
         numbers = np.array([*given, -1], np.int16)
-        for t, logits in follow(
-            self.sam2,
-            frames,
-            [[Prompt(index, prompts[b])] for b in given],
-            start=index,
-            hole_area=self.hole_area,
-            encode=self._encode,
-        ):
+        asked, area = [[Prompt(index, prompts[b])] for b in given], self.hole_area
+        for t, logits in follow(self.sam2, frames, asked, start=index, hole_area=area, encode=self._encode):
             labels[t] = numbers[strongest(logits, (height, width))]
         return labels
 
@@ -140,17 +123,14 @@ def follow(
     count, size = len(frames), (int(frames.shape[1]), int(frames.shape[2]))
     encode = encode or FrameEncoder(sam2)
     asked = sorted({prompt.frame for own in prompts for prompt in own})
-    require(
-        bool(asked) and asked[0] >= 0 and asked[-1] < count and all(prompts),
-        "follow",
-        f"prompts of {len(prompts)} objects at frames {asked}",
-        f"at least one for each object, at frames below {count}",
-        "Leave out objects without prompts.",
-    )
+    fits = bool(asked) and asked[0] >= 0 and asked[-1] < count and all(prompts)
+    got, expected = f"prompts of {len(prompts)} objects at {asked}", f"one at least for each, at frames below {count}"
+    require(fits, "follow", got, expected, "Leave out objects without prompts.")
     banks, known = _prompted_banks(sam2, frames, prompts, asked, size, hole_area, encode)
     start = asked[0] if start is None else start
     standing = heads.standing(sam2, encode(frames[asked[-1]]))
     for step, order in ((1, range(start, count)), (-1, range(start - 1, -1, -1))):
+        turn = start if step == 1 and start > 0 else None
         for t in order:
             features, logits = encode(frames[t]), []
             for number, bank in enumerate(banks):
@@ -159,13 +139,8 @@ def follow(
                     continue
                 found = heads.tracked(sam2, features, bank, t, step=step, count=count, standing=standing)
                 spatial = heads.spatial_memory(sam2, features, found, given=False)
-                banks[number] = forget(
-                    bank.with_tracked(t, Memory(spatial, found.pointer)),
-                    t,
-                    step,
-                    slots=sam2.sizes["N"],
-                    turn=start if step == 1 and start > 0 else None,
-                )
+                remembered = bank.with_tracked(t, Memory(spatial, found.pointer))
+                banks[number] = forget(remembered, t, step, slots=sam2.sizes["N"], turn=turn)
                 logits.append(heads.fill_holes(found.logits, hole_area))
             yield t, logits
 
