@@ -162,7 +162,7 @@ def assemble(
     lenses = [_true_lens(shot) for shot in shots]
     rescaled = sum(lens != shot.lens for lens, shot in zip(lenses, shots))
     if rescaled:
-        notes.append(f"{rescaled} images differ in size from their camera model; its intrinsics were scaled to them.")
+        notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
     pinholes = {lens: undistorted(lens, where) for lens in set(lenses)}
     bent = sum(lens.distorted for lens in lenses)
     if bent:
