@@ -13,6 +13,7 @@ freed memory kept; unless XLA_FLAGS and MALLOC_* say otherwise.
 
 import argparse
 import atexit
+import functools
 import json
 import shutil
 import subprocess
@@ -31,7 +32,7 @@ from metrics import Metric, interleaved, show
 from scenes import GARDEN, ball, garden
 
 import jsecon
-from jsecon.parallel import host_mesh
+from jsecon.parallel import MESH_OPTIONS, host_mesh
 from jsecon.splat.composite import composite
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.types import Camera, Gaussians
@@ -51,13 +52,14 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
     for devices, spread in (("1 device", None), (f"{jax.local_device_count()} devices", mesh)):
         if devices in [key.split(", ")[-1] for key in calls]:
             continue
-        forward = jax.jit(lambda g, f, m=spread: jsecon.render(g, camera, f, capacity=capacity, mesh=m).features)
+        jit = functools.partial(jax.jit, compiler_options=None if spread is None else MESH_OPTIONS)
+        forward = jit(lambda g, f, m=spread: jsecon.render(g, camera, f, capacity=capacity, mesh=m).features)
         loss = lambda g, f, forward=forward: (forward(g, f) ** 2).sum()
         plan = plan_view(gaussians, camera, capacity=capacity, mesh=spread)
-        planned = jax.jit(lambda plan, f: render_plan(plan, f).features)
+        planned = jit(lambda plan, f: render_plan(plan, f).features)
         planned_loss = lambda f, plan, planned=planned: (planned(plan, f) ** 2).sum()
-        alone = jax.jit(lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m))
-        by_all, by_features = jax.jit(jax.grad(loss, argnums=(0, 1))), jax.jit(jax.grad(planned_loss))
+        alone = jit(lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m))
+        by_all, by_features = jit(jax.grad(loss, argnums=(0, 1))), jit(jax.grad(planned_loss))
         calls |= {
             f"forward, {devices}": lambda forward=forward: forward(gaussians, narrow),
             f"forward D=16, {devices}": lambda forward=forward: forward(gaussians, features[16]),

@@ -18,6 +18,10 @@ from jax.sharding import AxisType, Mesh, PartitionSpec
 
 AXIS = "devices"
 """the mesh's one axis"""
+MESH_OPTIONS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+"""`compiler_options` of jax.jit for a program over a host's mesh. Without them XLA's CPU backend also cuts the kernels
+of each device into parts for the threads of all, and such kernels take up to three times as long: projecting 111,785
+Gaussians 7.4 instead of 2.6 ms. Programs of one device are better off with the parts."""
 
 
 def host_mesh() -> Mesh | None:

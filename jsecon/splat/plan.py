@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require_shape
 from jsecon.numerics import NEAR, finite, is_traced
-from jsecon.parallel import over_rows
+from jsecon.parallel import MESH_OPTIONS, over_rows
 from jsecon.splat.autodiff import splat_contained, view_lists
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import check_shapes, project
@@ -71,12 +71,11 @@ def plan_view(
         size = default_capacity(gaussians.means.shape[0], camera.width, camera.height, strips=strips)
     # Colour has no part in it: Gaussians with and without share one program.
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
-    if is_traced((bare, camera, near)):
+    if is_traced((bare, camera, near, jnp.zeros(()))):  # the last inside a jit whose arguments are others
         return _plan(bare, camera, size, near, mesh)
-    plan = _plan_compiled(bare, camera, size, near, mesh)
-    # Inside a jit whose arguments are others, what was concrete here is traced in the result.
-    if capacity is None and not is_traced(plan) and (overflow := np.asarray(plan.lists.overflow)).any():
-        plan = _plan_compiled(bare, camera, enough_capacity(size, overflow), near, mesh)
+    plan = _plan_compiled[mesh is not None](bare, camera, size, near, mesh)
+    if capacity is None and (overflow := np.asarray(plan.lists.overflow)).any():
+        plan = _plan_compiled[mesh is not None](bare, camera, enough_capacity(size, overflow), near, mesh)
     return plan
 
 
@@ -92,7 +91,8 @@ def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Arr
     return ViewPlan(splats, depths, sound, lists, camera.width, camera.height, mesh)
 
 
-_plan_compiled = jax.jit(_plan, static_argnums=(2, 4))
+# of one device, and over a mesh
+_plan_compiled = [jax.jit(_plan, static_argnums=(2, 4), compiler_options=options) for options in (None, MESH_OPTIONS)]
 
 
 def plan_views(
@@ -139,7 +139,8 @@ def render_plan(
     `render`. Raises ValueError on shapes that disagree.
     """
     require_shape("features", features, (plan.splats.shape[0], "D"), "Give one row of features per Gaussian.")
-    run = _render_plan if is_traced((plan, features, background)) else _render_plan_compiled
+    traced = is_traced((plan, features, background, jnp.zeros(())))
+    run = _render_plan if traced else _render_plan_compiled[plan.mesh is not None]
     return run(plan, features, background, depth)
 
 
@@ -160,4 +161,4 @@ def _render_plan(plan: ViewPlan, features: Array, background: Array | None, dept
     return Rendering(image, alpha, plan.overflow, expected)
 
 
-_render_plan_compiled = jax.jit(_render_plan, static_argnums=(3,))
+_render_plan_compiled = [jax.jit(_render_plan, static_argnums=3, compiler_options=o) for o in (None, MESH_OPTIONS)]

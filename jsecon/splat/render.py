@@ -42,7 +42,7 @@ def render(
 
     `mesh` (`jsecon.parallel.host_mesh()`) spreads the work over several devices of this process, in value and
     gradient: a program that calls `jsecon.process.prepare_process()` before jax starts has all cores of a CPU that way.
-    Without it, one device.
+    A jit of your own around it is faster with `compiler_options=jsecon.parallel.MESH_OPTIONS`. Without it, one device.
 
     Features in bfloat16 are read as such, which halves what a wide walk gathers, and summed in the Gaussians' dtype,
     that of the image: the error is that of rounding the features (experiments/work_precision_render.py), the time the
