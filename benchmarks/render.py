@@ -53,11 +53,11 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
         if devices in [key.split(", ")[-1] for key in calls]:
             continue
         jit = functools.partial(jax.jit, compiler_options=None if spread is None else MESH_OPTIONS)
-        forward = jit(lambda g, f, m=spread: jsecon.render(g, camera, f, capacity=capacity, mesh=m).features)
-        loss = lambda g, f, forward=forward: (forward(g, f) ** 2).sum()
+        rendered = lambda g, f, m=spread: jsecon.render(g, camera, f, capacity=capacity, mesh=m).features
+        forward, loss = jit(rendered), lambda g, f, rendered=rendered: (rendered(g, f) ** 2).sum()
         plan = plan_view(gaussians, camera, capacity=capacity, mesh=spread)
         planned = jit(lambda plan, f: render_plan(plan, f).features)
-        planned_loss = lambda f, plan, planned=planned: (planned(plan, f) ** 2).sum()
+        planned_loss = lambda f, plan: (render_plan(plan, f).features ** 2).sum()
         alone = jit(lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m))
         by_all, by_features = jit(jax.grad(loss, argnums=(0, 1))), jit(jax.grad(planned_loss))
         calls |= {
