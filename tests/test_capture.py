@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 
 from jsecon.data.capture import check_views_overlap, load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.frames import held_out, spread
+from jsecon.data.frames import camera_jumps, held_out, spread
 from jsecon.types import Camera
 
 CAPTURE = small_capture()
@@ -150,3 +150,38 @@ def test_frusta_against_linear_programming():
             with refused("look apart"):
                 check_views_overlap(capture)
     assert 40 < sum(answers) < 190
+
+
+def walk(count=40):
+    """(T, 4, 4) poses on an arc, steps of a tenth to twice the usual, and their names."""
+    along = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, count)) / count
+    centres = np.stack([np.cos(along), np.zeros(count), np.sin(along)], axis=1)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(count, 3, 3)))[0]
+    poses[:, :3, 3] = -np.einsum("tij,tj->ti", poses[:, :3, :3], centres)
+    return poses, [f"frame_{t:03d}" for t in range(count)]
+
+
+def test_poses_that_jump_are_told():
+    poses, names = walk()
+    assert camera_jumps(poses, names) == []
+    poses[12:15, :3, 3] -= poses[12:15, :3, :3] @ [15 / 40, 0, 0]  # the centres move along x
+    (note,) = camera_jumps(poses, names)
+    assert "2 places" in note
+    assert "frame_011 to frame_012, frame_014 to frame_015)" in note
+
+
+def test_frames_that_do_not_move_or_have_no_order_do_not_jump():
+    poses, names = walk()
+    order = np.random.default_rng(2).permutation(len(poses))
+    assert camera_jumps(poses[order], names) == []
+    assert camera_jumps(np.tile(np.eye(4), (9, 1, 1)), names) == []
+    assert camera_jumps(poses[:1], names) == []
+
+
+def test_a_loaded_capture_says_where_its_poses_jump(tmp_path):
+    poses = np.array(CAPTURE.cameras.world_to_camera)
+    poses[-1, :3, 3] += 1000
+    moved = dataclasses.replace(CAPTURE, cameras=dataclasses.replace(CAPTURE.cameras, world_to_camera=poses))
+    write_transforms(moved, tmp_path)
+    assert any("jumps in" in note for note in load_capture(tmp_path).notes)

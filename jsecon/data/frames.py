@@ -23,6 +23,10 @@ Progress = Callable[[int, int], None] | None
 RIGID_TOLERANCE = 1e-3
 """largest entry of R R^T - I still taken for rounding in a text file; the rotation is then made exact"""
 
+JUMP = 10.0
+"""median steps between neighbouring frames' cameras from which a step is told. A reconstruction of 125 photographs that
+was wrong in five places had 11 to 20 there; when right, its largest was 2.2, and that of a walk with one cut 9.9."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
@@ -130,6 +134,19 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
+def camera_jumps(poses: Float[np.ndarray, "t 4 4"], names: Sequence[str]) -> list[str]:
+    """A note where neighbouring frames' cameras (world to camera) lie more than JUMP median steps apart, else none."""
+    centres = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    far = np.flatnonzero(steps > JUMP * usual)
+    if usual == 0 or not len(far):
+        return []
+    places = ", ".join(f"{names[t]} to {names[t + 1]}" for t in far[:5]) + (" ..." if len(far) > 5 else "")
+    told = f"The camera jumps in {len(far)} places, by up to {steps.max() / usual:.0f} of its usual steps ({places})."
+    return [f"{told} Where the frames are one walk, poses there are wrong: look at them before you trust the fit."]
+
+
 def assemble(
     posed: Posed,
     *,
@@ -153,7 +170,7 @@ def assemble(
     shots = sorted(posed.shots, key=lambda shot: shot.name)
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
-    notes = list(posed.notes)
+    notes = [*posed.notes, *camera_jumps(poses, names)]
     chosen = spread(len(shots), frames)
     if len(chosen) < len(shots):
         notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
