@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.scenes import ball, garden
 from experiments import results
-from jsecon.splat import autodiff, composite, gradient, tiles, walk
+from jsecon.splat import autodiff, composite, gradient, project, tiles, walk
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.reference import render_reference
 from jsecon.splat.render import render
@@ -36,7 +36,7 @@ SCENES = {
     "deep": ball(2000, (0.05, 0.25), 160, 120, 150),
     "sparse: nothing to win": ball(150, (0.005, 0.02), 160, 120, 150),
 }
-MODULES = (autodiff, composite, gradient, tiles, walk)
+MODULES = (autodiff, composite, gradient, project, tiles, walk)
 
 
 @dataclasses.dataclass(frozen=True)
