@@ -33,7 +33,7 @@ def one(count: int, width: int, height: int, channels: int, repeats: int) -> dic
     from scenes import ball
 
     import jsecon
-    from jsecon.parallel import host_mesh
+    from jsecon.parallel import MESH_OPTIONS, host_mesh
     from jsecon.splat.plan import plan_view
 
     size = 0.6 * count ** (-1 / 3)
@@ -41,8 +41,10 @@ def one(count: int, width: int, height: int, channels: int, repeats: int) -> dic
     features = jnp.asarray(np.random.default_rng(1).normal(size=(count, channels)), jnp.float32)
     capacity = jsecon.plan_capacity(gaussians, camera, margin=1.0)
     start = time.perf_counter()
-    draw = lambda g, f: jsecon.render(g, camera, f, capacity=capacity, mesh=host_mesh())
-    render = jax.jit(draw).lower(gaussians, features).compile()
+    mesh = host_mesh()
+    draw = lambda g, f: jsecon.render(g, camera, f, capacity=capacity, mesh=mesh)
+    options = None if mesh is None else MESH_OPTIONS
+    render = jax.jit(draw, compiler_options=options).lower(gaussians, features).compile()
     compile_s = time.perf_counter() - start
     taken = []
     for _ in range(repeats + 1):

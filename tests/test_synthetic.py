@@ -210,7 +210,7 @@ def test_patterns_stay_in_their_range_and_vary():
     assert not pattern(dataclasses.replace(texture, kind="plain"), points).any()
 
 
-# The recipe.
+# The room.
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -1,7 +1,7 @@
 """What a stage of a run is: its name, what its result depends on, what it leaves out and why, and its function.
 
-The stages themselves stand in `scene_stages` (load, gaussians, held_out) and `language_stages` (masklets, regions,
-codes, votes, distil), each made whole by one function of the run's `Work`.
+The stages themselves stand in `scene_stages` (load, gaussians, held_out), `masklet_stages` and `language_stages`
+(regions, codes, votes, distil), each made whole by one function of the run's `Work`.
 """
 
 import contextlib
