@@ -24,7 +24,9 @@ from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.optimise import LearningRates, evaluate_psnr, fit_gaussians
+from jsecon.fit.optimise import fit_gaussians
+from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.distill import distill_votes
 from jsecon.language.shares import with_shown
@@ -144,7 +146,12 @@ def build_gaussians(capture: Capture, options: Options) -> Gaussians:
     if options.fit_steps:
         rates = LearningRates(means=0.0, quaternions=0.0)
         gaussians, _ = fit_gaussians(
-            capture, steps=options.fit_steps, key=jax.random.key(options.seed), start=gaussians, rates=rates
+            capture,
+            steps=options.fit_steps,
+            key=jax.random.key(options.seed),
+            start=gaussians,
+            schedule=Schedule(growth="none"),
+            rates=rates,
         )
     return jax.tree.map(jnp.asarray, gaussians)
 

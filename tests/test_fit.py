@@ -10,20 +10,19 @@ from conftest import look_at
 
 from jsecon.errors import InputError
 from jsecon.fit import optimise
-from jsecon.fit.optimise import (
-    LearningRates,
-    cameras_extent,
-    evaluate_psnr,
-    fit_gaussians,
-    start_state,
-    view_order,
-)
-from jsecon.splat.render import render_rgb
+from jsecon.fit.growth import in_use
+from jsecon.fit.optimise import cameras_extent, fit_gaussians, start_state, view_order
+from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.parallel import host_mesh
+from jsecon.splat.render import render, render_rgb
 from jsecon.types import Camera, Capture, Gaussians
 
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
+SCHEDULE = Schedule(growth="none", degree_every=0.25)
+WHOLE = Schedule(sizes=((1.0, 1.0),), growth="none")
 INRIA_RATES = LearningRates(
     means=1.6e-4,
     means_last=1.6e-6,
@@ -85,7 +84,14 @@ def start(truth):
 def fitted(capture, start):
     states = []
     gaussians, losses = fit_gaussians(
-        capture, steps=STEPS, key=KEY, start=start, rates=RATES, chunk=10, on_checkpoint=states.append
+        capture,
+        steps=STEPS,
+        key=KEY,
+        start=start,
+        schedule=SCHEDULE,
+        rates=RATES,
+        chunk=10,
+        on_checkpoint=states.append,
     )
     return gaussians, losses, states
 
@@ -108,7 +114,13 @@ def test_held_out_frames_are_never_fitted_to(capture, start, fitted):
     frames = capture.frames.copy()
     frames[2] = 255 - frames[2]
     again, losses = fit_gaussians(
-        dataclasses.replace(capture, frames=frames), steps=STEPS, key=KEY, start=start, rates=RATES, chunk=10
+        dataclasses.replace(capture, frames=frames),
+        steps=STEPS,
+        key=KEY,
+        start=start,
+        schedule=SCHEDULE,
+        rates=RATES,
+        chunk=10,
     )
     assert same(again, fitted[0])
     np.testing.assert_array_equal(losses, fitted[1])
@@ -116,14 +128,15 @@ def test_held_out_frames_are_never_fitted_to(capture, start, fitted):
 
 def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
     stopped = jax.tree.map(np.asarray, fitted[2][1])
-    assert int(stopped.step) == 20
-    assert np.isnan(stopped.losses[20:]).all()
+    assert stopped.losses.shape == (20,)
+    assert float(stopped.done) == 0.5
     seen = []
     again, losses = fit_gaussians(
         capture,
         steps=STEPS,
         key=KEY,
         state=stopped,
+        schedule=SCHEDULE,
         rates=RATES,
         chunk=10,
         progress=lambda done, total: seen.append((done, total)),
@@ -131,34 +144,76 @@ def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
     assert same(again, fitted[0])
     np.testing.assert_array_equal(losses, fitted[1])
     assert seen == [(30, 40), (40, 40)]
-    whole, _ = fit_gaussians(capture, steps=STEPS, key=KEY, state=fitted[2][-1], rates=RATES)
+    whole, _ = fit_gaussians(capture, steps=STEPS, key=KEY, state=fitted[2][-1], schedule=SCHEDULE)
     assert same(whole, fitted[0])
 
 
-def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, fitted, monkeypatch):
-    asked = []
+def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monkeypatch):
+    given = {"steps": 20, "key": KEY, "start": start, "schedule": WHOLE, "rates": RATES, "chunk": 10}
+    twin, _ = fit_gaussians(capture, **given)
+    asked, inner = [], optimise._step_compiled
 
-    def narrow(count, width, height):
-        return 32
+    def counted(step):
+        def taken(*args, capacity, **options):
+            asked.append(capacity)
+            return step(*args, capacity=capacity, **options)
 
-    inner = optimise._step
+        return taken
 
-    def counted(*args, capacity, **options):
-        asked.append(capacity)
-        return inner(*args, capacity=capacity, **options)
-
-    monkeypatch.setattr(optimise, "default_capacity", narrow)
-    monkeypatch.setattr(optimise, "_step", counted)
-    gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0.0)
+    monkeypatch.setattr(optimise, "default_capacity", lambda count, width, height, strips: 32)
+    monkeypatch.setattr(optimise, "_step_compiled", [counted(step) for step in inner])
+    gaussians, losses = fit_gaussians(capture, **given)
     assert asked[0] == 32
     assert asked[-1] > 32
     assert asked.count(asked[-1]) == 20
     assert np.isfinite(losses).all()
-    # The schedule of the positions depends on the number of steps, so the twin is a fit of 20 steps with room enough.
-    monkeypatch.undo()
-    twin, _ = fit_gaussians(capture, steps=20, key=KEY, start=start, rates=RATES, chunk=10, coarse=0.0)
     for a, b in zip(jax.tree.leaves(gaussians), jax.tree.leaves(twin), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to_the_same(capture, start):
+    """Half of the scene's Gaussians are missing: those that are there are told to multiply."""
+    few = jax.tree.map(lambda a: a[:20], start)
+    schedule = dataclasses.replace(WHOLE, growth="votes", at_most=60, grows_from=0.1, grows_until=0.7)
+    given, states = {"steps": STEPS, "key": KEY, "schedule": schedule, "rates": RATES, "chunk": 5}, []
+    gaussians, _ = fit_gaussians(capture, start=few, on_checkpoint=states.append, **given)
+    counts = [int(in_use(state.gaussians).sum()) for state in states]
+    assert counts == sorted(counts)
+    assert 50 <= gaussians.count <= 60
+    kept, _ = fit_gaussians(capture, start=few, **given | {"schedule": WHOLE})
+    assert kept.count == 20
+    assert evaluate_psnr(gaussians, capture) > evaluate_psnr(kept, capture)
+    again, _ = fit_gaussians(capture, state=jax.tree.map(np.asarray, states[3]), **given)
+    assert same(again, gaussians)
+
+
+def test_the_votes_are_the_weights_on_the_errors(capture, start):
+    """Against their definition: the gradient of sum(w e) as a feature's, one view."""
+    states = []
+    fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=WHOLE, on_checkpoint=states.append)
+    view = np.array([0, 1, 3, 4])[view_order(KEY, 4, 0, 1)[0]]
+    camera, target = capture.cameras[view], capture.frames[view] / np.float32(255)
+    error = np.abs(np.asarray(render_rgb(start, camera).features) - target).mean(-1)
+    one = lambda features: jnp.sum(render(start, camera, features).features[..., 0] * error)
+    expected = jax.grad(one)(jnp.ones((start.count, 1)))[:, 0]
+    np.testing.assert_allclose(states[0].votes[: start.count], expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_fit_of_seconds_ends_about_then_and_says_how_far_it_is(capture, start):
+    seen = []
+    given = {"key": KEY, "start": start, "schedule": WHOLE, "chunk": 5}
+    _, losses = fit_gaussians(capture, seconds=1.0, progress=lambda *done: seen.append(done), **given)
+    assert len(losses) > 5
+    assert seen[-1] == (1, 1)
+
+
+def test_one_program_serves_a_size_and_a_number_of_rows(capture, start):
+    """Two sizes, rows that suffice: two programs, whatever the number of steps."""
+    programs = optimise._step_compiled[host_mesh() is not None]
+    before = programs._cache_size()
+    schedule = dataclasses.replace(SCHEDULE, sizes=((0.75, 0.5), (1.0, 1.0)), growth="votes", at_most=80)
+    fit_gaussians(capture, steps=STEPS, key=KEY, start=start, schedule=schedule, chunk=5)
+    assert programs._cache_size() - before <= 2
 
 
 def test_view_order_takes_every_view_once_a_round_and_can_be_entered_anywhere():
@@ -174,16 +229,18 @@ def test_view_order_takes_every_view_once_a_round_and_can_be_entered_anywhere():
 def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
     """Adam's first update is rate * sign(gradient), whatever the gradient's size: this pins each group's rate."""
     rates, extent = INRIA_RATES, cameras_extent(capture.cameras[np.array([0, 1, 3, 4])])
-    after, _ = fit_gaussians(capture, steps=1, key=KEY, start=start, rates=rates, band_every=1000)
-    moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), after, start_state(start, 1).gaussians)
+    after, _ = fit_gaussians(capture, steps=1, key=KEY, start=start, rates=rates, schedule=WHOLE)
+    moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b).max(), after, start)
     assert float(moved.means) == pytest.approx(1.6e-4 * extent, rel=1e-2)
     assert float(moved.log_scales) == pytest.approx(5e-3, rel=1e-2)
     assert float(moved.quaternions) == pytest.approx(1e-3, rel=1e-2)
     assert float(moved.opacity_logits) == pytest.approx(5e-2, rel=1e-2)
     assert np.abs(after.sh[:, 0] - start.sh[:, 0]).max() == pytest.approx(2.5e-3, rel=1e-2)
     assert not np.asarray(after.sh[:, 1:]).any()  # degree 1 waits for its turn
-    opened, _ = fit_gaussians(capture, steps=2, key=KEY, start=start, rates=rates, band_every=1)
-    assert np.abs(opened.sh[:, 1:]).max() == pytest.approx(2.5e-3 / 20, rel=0.1)
+    opened, _ = fit_gaussians(
+        capture, steps=2, key=KEY, start=start, rates=rates, schedule=dataclasses.replace(WHOLE, degree_every=0.0)
+    )
+    assert np.abs(opened.sh[:, 1:]).max() == pytest.approx(2 * 2.5e-3 / 20, rel=0.1)
 
 
 def test_extent_is_inrias():
@@ -195,27 +252,13 @@ def test_extent_is_inrias():
 def test_wrong_fits_are_refused(capture, start):
     with pytest.raises(ValueError, match="exactly one"):
         fit_gaussians(capture, steps=1, key=KEY)
-    with pytest.raises(ValueError, match="steps"):
-        fit_gaussians(capture, steps=2, key=KEY, state=start_state(start, 1))
+    with pytest.raises(ValueError, match="exactly one"):
+        fit_gaussians(capture, steps=1, seconds=1.0, key=KEY, start=start)
+    half = dataclasses.replace(start_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
+    with pytest.raises(ValueError, match="a fit of 4 steps"):
+        fit_gaussians(capture, steps=4, key=KEY, state=half)
     with pytest.raises(InputError, match="held out"):
         fit_gaussians(dataclasses.replace(capture, held_out=np.ones(VIEWS, bool)), steps=1, key=KEY, start=start)
     astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
     with pytest.raises(InputError, match="not finite"):
         fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, chunk=1)
-
-
-def test_halved_views_are_block_means_seen_by_cameras_of_half_the_size(capture):
-    cameras = jax.tree.map(jnp.asarray, capture.cameras)
-    frames = np.ascontiguousarray(capture.frames[:, :23, :31])  # odd: the last row and column are left out
-    half, mean = optimise._halved(dataclasses.replace(cameras, width=31, height=23), frames)
-    assert (half.width, half.height) == (15, 11)
-    assert mean.shape == (VIEWS, 11, 15, 3)
-    expected = frames[:, :22, :30].reshape(VIEWS, 11, 2, 15, 2, 3).mean(axis=(2, 4))
-    np.testing.assert_allclose(mean, expected, atol=0.51)
-    np.testing.assert_allclose(half.cx, cameras.cx / 2)
-    np.testing.assert_allclose(half.fy, cameras.fy / 2)
-
-
-def test_wrong_shares_of_coarse_steps_are_refused(capture, start):
-    with pytest.raises(ValueError, match="coarse"):
-        fit_gaussians(capture, steps=STEPS, key=KEY, start=start, coarse=1.5)

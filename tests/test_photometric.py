@@ -85,6 +85,22 @@ def test_vmap_equals_a_loop():
     np.testing.assert_allclose(together, [photometric_loss(b, target) for b in batch], rtol=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(23, 17, 3), (12, 31, 3)])
+def test_over_a_mesh_the_loss_and_its_gradient_are_the_same(shape):
+    """Odd rows, rows that a device has none of, and halos that reach past the image."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:2]), ("devices",), axis_types=(jax.sharding.AxisType.Auto,))
+    image, target = images(shape)
+    value, gradient = jax.value_and_grad(photometric_loss)(image, target)
+    shared = jax.jit(jax.value_and_grad(lambda x: photometric_loss(x, target, mesh)))(image)
+    assert float(shared[0]) == pytest.approx(float(value), rel=1e-6)
+    np.testing.assert_allclose(shared[1], gradient, atol=2e-7)
+    with jax.enable_x64(True):
+        image, target = (jnp.asarray(a) for a in images((13, 6, 2), dtype=np.float64))
+        check_grads(
+            jax.jit(lambda x: photometric_loss(x, target, mesh)), (image,), order=1, modes=["rev"], atol=1e-6, rtol=1e-6
+        )
+
+
 def test_psnr():
     target = np.zeros((4, 4, 3), np.float32)
     assert float(psnr(target + 0.1, target)) == pytest.approx(20, abs=1e-4)

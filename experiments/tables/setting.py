@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from jsecon.data.langsplat_files import load_features
 from jsecon.data.mask_files import load_labels
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.fit.optimise import fit_gaussians
+from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
 from jsecon.types import Camera, Gaussians
 
@@ -74,6 +76,13 @@ def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: i
     )
 
 
+FIT: Any = {
+    "schedule": Schedule(growth="none"),
+    "rates": LearningRates(means=2e-3, means_last=2e-5),
+}
+"""of the scenes without Gaussians: few steps, one Gaussian for each point of the start"""
+
+
 def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int) -> Gaussians:
     """The scene's Gaussians: its points, one each and in order; or those of <folder>/point_cloud.ply; or fitted, and
     left in `kept` under a name that says to what: levels of noise share the frames, and so the fit."""
@@ -88,6 +97,6 @@ def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int) -> Gaus
     file = kept / f"{bench.name}_{seen}_{steps}.ply"
     if not file.exists():
         start, _ = starting_gaussians(bench.capture)
-        gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start)
+        gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **FIT)
         save_ply(file, gaussians)
     return load_ply(file)

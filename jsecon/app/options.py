@@ -33,6 +33,12 @@ class Options:
     """keep every K-th frame for measuring only; 0 = none"""
     steps: Annotated[int, {"least": 1}] = 1500
     """of the photometric fit"""
+    minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None
+    """of the photometric fit, instead of --steps: the best that can be had in that time on this machine"""
+    gaussians_at_most: Annotated[int, {"metavar": "N", "least": 1}] = 100_000
+    """that the fit may have; a start with more keeps its number"""
+    growth: Literal["votes", "none"] = "votes"
+    """of their number during the fit: where the picture is wrong, or none"""
     sh_degree: Annotated[int, {"choices": range(4)}] = 1
     """of the fitted colours"""
     masks: Folder = None

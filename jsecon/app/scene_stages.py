@@ -63,10 +63,11 @@ def _read(work: Work) -> Stage:
 
 
 def _fitted(work: Work) -> Stage:
-    options = work.options
+    options, minutes = work.options, work.options.minutes
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.fit.optimise import fit_gaussians
+        from jsecon.fit.schedule import Schedule
         from jsecon.fit.start import starting_gaussians
 
         capture, state = results["load"], record.read()
@@ -75,18 +76,28 @@ def _fitted(work: Work) -> Stage:
             start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
-        key, steps = jax.random.key(options.seed), options.steps
-        keep = lambda current: record.keep(lambda: current)
-        found, _ = fit_gaussians(
-            capture, steps=steps, key=key, start=start, state=state, on_checkpoint=keep, progress=progress
+        found, losses = fit_gaussians(
+            capture,
+            key=jax.random.key(options.seed),
+            steps=options.steps if minutes is None else None,
+            seconds=None if minutes is None else 60 * minutes,
+            start=start,
+            state=state,
+            schedule=Schedule(growth=options.growth, at_most=options.gaussians_at_most),
+            on_checkpoint=lambda current: record.keep(lambda: current),
+            progress=progress,
         )
+        if options.growth != "none":
+            notes = (*notes, f"{found.count} Gaussians after {len(losses)} steps")
         return Outcome(found, notes=notes)
 
-    left = {"densification": "the fit keeps the points that it starts from"}
+    left = {} if options.growth != "none" else {"densification": "the fit keeps the points that it starts from"}
     if options.sh_degree == 0:
         left["view-dependent colour"] = "SH degree 0"
-    how = f"fitted to the frames in {options.steps} steps, SH degree {options.sh_degree}"
-    given = work.given("steps", "sh_degree", "seed")
+    length = f"{options.steps} steps" if minutes is None else f"{minutes:g} minutes"
+    number = "" if options.growth == "none" else f", at most {options.gaussians_at_most} Gaussians"
+    how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
+    given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "seed")
     return Stage("gaussians", how, compute, after=("load",), given=given, left_out=left)
 
 
@@ -106,7 +117,7 @@ def held_out(work: Work) -> Stage:
     """(frames held out,) PSNR in dB of the rendered colours against the photographs."""
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.fit.optimise import evaluate_psnr
+        from jsecon.fit.quality import evaluate_psnr
 
         return Outcome(evaluate_psnr(results["gaussians"], results["load"], progress=progress))
 

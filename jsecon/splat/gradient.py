@@ -14,7 +14,17 @@ from jsecon.numerics import MAX_ALPHA
 from jsecon.splat.fusion import stored
 from jsecon.splat.strips import over_strips, split
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import ATTRIBUTES, make_batches, make_table, pixel_centres, running, to_tiles, walk, weights
+from jsecon.splat.walk import (
+    ATTRIBUTES,
+    BATCH_BACKWARD,
+    make_batches,
+    make_table,
+    pixel_centres,
+    running,
+    to_tiles,
+    walk,
+    weights,
+)
 from jsecon.types import Array
 
 _UNROLLED = 8
@@ -46,7 +56,8 @@ def composite_vjp(
 
     def local(strip, dealt, table):
         lists, (packed,) = dealt
-        batches, in_tiles = make_batches(lists, width, strip), to_tiles(packed, lists.tile)
+        batches = make_batches(lists, width, strip, BATCH_BACKWARD)
+        in_tiles = to_tiles(packed, lists.tile)
 
         def one_batch(gradient, tiles):
             values = jnp.moveaxis(in_tiles[tiles], -1, 1)  # pixels innermost on both sides: the faster product
@@ -76,7 +87,7 @@ def composite_vjp(
 
 
 def _along(features: Array, cotangent: Array) -> Array:
-    """(BATCH, CHUNK, D), (BATCH, D, pixels) -> (BATCH, CHUNK, pixels), the sum over the channels."""
+    """(B, CHUNK, D), (B, D, pixels) -> (B, CHUNK, pixels), the sum over the channels."""
     if features.shape[-1] > _UNROLLED:
         return jnp.einsum("bcd,bdp->bcp", features, cotangent)
     terms = [features[..., d, None] * cotangent[:, None, d] for d in range(features.shape[-1])]
@@ -84,7 +95,7 @@ def _along(features: Array, cotangent: Array) -> Array:
 
 
 def _slopes(weight: Array, alpha: Array, along: Array, before: Array, final: Array) -> tuple[Array, Array]:
-    """alpha dL/dalpha of a chunk (BATCH, CHUNK, pixels), and the running sum of w <G, f> behind it (BATCH, pixels)."""
+    """alpha dL/dalpha of a chunk (B, CHUNK, pixels), and the running sum of w <G, f> behind it (B, pixels)."""
     share = weight * along
     until, after = running(jnp.add, before, share)
     rest = final[:, None] - (until + share)
@@ -93,7 +104,7 @@ def _slopes(weight: Array, alpha: Array, along: Array, before: Array, final: Arr
 
 
 def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array, Array], half: float) -> Array:
-    """(BATCH, CHUNK, 6) gradient from the six moments of h = alpha dL/dalpha about the tile's centre."""
+    """(B, CHUNK, 6) gradient from the six moments of h = alpha dL/dalpha about the tile's centre."""
     m, mx, my, mxx, mxy, myy = (moments[..., k] for k in range(6))
     x, y, l11, l21, l22, opacity = (attributes[..., k] for k in range(6))
     # moments about the Gaussian's centre

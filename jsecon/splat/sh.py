@@ -1,10 +1,12 @@
 """Real spherical harmonics of colour, degrees 0 to 3, in the order and signs of the INRIA layout."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import normalize
+from jsecon.splat.fusion import stored, surely
 from jsecon.types import Array, Camera, Gaussians
 
 C0 = 0.28209479177387814
@@ -17,7 +19,10 @@ C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.37317633259
 def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]:
     """The first `bands` (1, 4, 9 or 16) basis functions at unit `directions`."""
     require(bands in (1, 4, 9, 16), "bands", bands, "1, 4, 9 or 16", "Pad sh to a whole degree.")
-    x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    return jnp.stack(_basis(directions[:, 0], directions[:, 1], directions[:, 2], bands), axis=-1)
+
+
+def _basis(x: Array, y: Array, z: Array, bands: int) -> list:
     xx, yy, zz = x * x, y * y, z * z
     basis = [jnp.full_like(x, C0)]
     if bands > 1:
@@ -28,7 +33,30 @@ def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]
         basis += [C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy),
                   C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[4] * x * (4 * zz - xx - yy), C3[5] * z * (xx - yy),
                   C3[6] * x * (xx - 3 * yy)]  # fmt: skip
-    return jnp.stack(basis, axis=-1)
+    return basis
+
+
+@jax.custom_vjp
+def _shown(directions: Array, sh: Array) -> Array:
+    """(N, 3) sum over the bands of sh (N, K, 3) times the basis at unit `directions`. A column of numbers at a time:
+    stacked, XLA's CPU backend asks of every number in the innermost loop which band it is of."""
+    basis = stored(surely(sh[0, 0, 0]), lambda d: _basis(d[:, 0], d[:, 1], d[:, 2], sh.shape[1]), directions)
+    colour = lambda c: sum((b * sh[:, k, c] for k, b in enumerate(basis[1:], start=1)), basis[0] * sh[:, 0, c])
+    return jnp.stack([colour(c) for c in range(3)], axis=-1)
+
+
+def _shown_backward(given: tuple[Array, Array], bar: Array) -> tuple[Array, Array]:
+    directions, sh = given
+    bands = sh.shape[1]
+    always, columns = surely(sh[0, 0, 0]), [directions[:, i] for i in range(3)]
+    by_basis = stored(always, lambda sh, bar: [(sh[:, k] * bar).sum(1) for k in range(bands)], sh, bar)
+    of_bands = lambda x, y, z: _basis(x, y, z, bands)
+    along = lambda x, y, z, by: jnp.stack(jax.vjp(of_bands, x, y, z)[1](by), axis=-1)
+    basis = stored(always, lambda d: sh_basis(d, bands), directions)
+    return stored(always, along, *columns, by_basis), basis[:, :, None] * bar[:, None]
+
+
+_shown.defvjp(lambda directions, sh: (_shown(directions, sh), (directions, sh)), _shown_backward)
 
 
 def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]:
@@ -40,12 +68,12 @@ def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]
     bands = gaussians.sh.shape[1]
     sound = jnp.isfinite(gaussians.sh).all((1, 2))[:, None]
     sh = jnp.where(sound[:, :, None], gaussians.sh, 0.0)
-    if bands == 1:
+    if bands == 1 or not len(sh):
         rgb = C0 * sh[:, 0]
     else:
         away = gaussians.means - camera.centres[None]
         away = jnp.where(jnp.isfinite(away).all(1, keepdims=True), away, 0.0)
-        rgb = (sh_basis(normalize(away), bands)[:, :, None] * sh).sum(1)
+        rgb = _shown(normalize(away), sh)
     return jnp.where(sound, jnp.maximum(rgb + 0.5, 0.0), jnp.nan)
 
 

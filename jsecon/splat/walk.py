@@ -26,14 +26,16 @@ from jsecon.splat.tiles import TileLists, grid
 from jsecon.types import Array
 
 BATCH = 64
-"""tiles walked side by side; speed only"""
+"""tiles walked side by side, at most; speed only"""
+BATCH_BACKWARD = 32
+"""the same for gradients, which keep more arrays of a chunk at once"""
 
 
 class Batches(NamedTuple):
-    """Tiles sorted by list length, in batches of BATCH; the last is filled up with empty tiles."""
+    """Tiles sorted by list length, in batches of B; the last is filled up with empty tiles."""
 
     tiles: Array
-    """(batches, BATCH) tile ids; `number` = an empty tile outside the image."""
+    """(batches, B) tile ids; `number` = an empty tile outside the image."""
     starts: Array
     """(number + 1,) where a tile's list begins."""
     lengths: Array
@@ -49,18 +51,22 @@ class Batches(NamedTuple):
         return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
 
-def make_batches(lists: TileLists, width: int, strip: Strip = WHOLE) -> Batches:
-    """The batches of one strip's lists, the longest first."""
+def make_batches(lists: TileLists, width: int, strip: Strip = WHOLE, most: int | None = None) -> Batches:
+    """The batches of one strip's lists, the longest first, of at most `most` tiles (default BATCH).
+
+    A batch walks as far as its longest list: where tiles are few their lists differ more, and batches are smaller.
+    """
     number = lists.lengths.shape[0]
+    batch = min(most or BATCH, max(16, 1 << (max(number // 12, 1).bit_length() - 1)))
     order = jnp.argsort(-lists.lengths).astype(jnp.int32)
-    order = jnp.concatenate([order, jnp.full(-number % BATCH, number, jnp.int32)])
+    order = jnp.concatenate([order, jnp.full(-number % batch, number, jnp.int32)])
     empty = jnp.zeros(1, jnp.int32)
     starts, lengths = (jnp.concatenate([a, empty]) for a in (lists.starts, lists.lengths))
-    return Batches(order.reshape(-1, BATCH), starts, lengths, -(-width // lists.tile), number, lists.tile, strip)
+    return Batches(order.reshape(-1, batch), starts, lengths, -(-width // lists.tile), number, lists.tile, strip)
 
 
 def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> Float[Array, "h w d"]:
-    """(batches, BATCH, D, pixels) -> (rows, W, D), all rows of the strip's tiles."""
+    """(batches, B, D, pixels) -> (rows, W, D), all rows of the strip's tiles."""
     down, tile, channels = batches.number // batches.across, batches.tile, batched.shape[2]
     slots = batches.tiles.reshape(-1)
     place = jnp.zeros(batches.number + 1, jnp.int32).at[slots].set(lax.iota(jnp.int32, slots.shape[0]))[:-1]
@@ -101,15 +107,15 @@ class Chunk(NamedTuple):
     """CHUNK Gaussians of each tile of a batch."""
 
     ids: Array
-    """(BATCH, CHUNK) Gaussian ids; past a list's end anything, with alpha 0."""
+    """(B, CHUNK) Gaussian ids; past a list's end anything, with alpha 0."""
     places: Array
-    """(BATCH, CHUNK) where the lists hold them; past a list's end beyond all lists."""
+    """(B, CHUNK) where the lists hold them; past a list's end beyond all lists."""
     columns: Array
-    """(BATCH, CHUNK, K) the columns of the table that were asked for."""
+    """(B, CHUNK, K) the columns of the table that were asked for."""
     attributes: Array
-    """(BATCH, CHUNK, 6) the columns of splats."""
+    """(B, CHUNK, 6) the columns of splats."""
     alpha: Array
-    """(BATCH, CHUNK, pixels), 0 below the cut."""
+    """(B, CHUNK, pixels), 0 below the cut."""
     always: Array
     """() bool, true: for `stored`."""
 
@@ -142,7 +148,7 @@ def pixel_centres(tile: int, dtype) -> tuple[Array, Array]:
 
 
 def _alphas(coefficients: Array, tile: int) -> Array:
-    """(BATCH, CHUNK, pixels) from l11, l21, c1, l22, c2, e (BATCH, CHUNK, 6): with x, y from the tile's corner,
+    """(B, CHUNK, pixels) from l11, l21, c1, l22, c2, e (B, CHUNK, 6): with x, y from the tile's corner,
     u = l11 x + l21 y + c1, v = l22 y + c2, alpha = 2^(e - u^2 - v^2)."""
     l11, l21, c1, l22, c2, e = (coefficients[..., i, None] for i in range(6))
     x, y = pixel_centres(tile, coefficients.dtype)
@@ -153,7 +159,7 @@ def _alphas(coefficients: Array, tile: int) -> Array:
 
 
 def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
-    """Along the second axis of `values` (BATCH, CHUNK, pixels): `start` (BATCH, pixels) combined with all values before
+    """Along the second axis of `values` (B, CHUNK, pixels): `start` (B, pixels) combined with all values before
     each, and with all.
 
     Written out in groups, so that each value is read a handful of times rather than CHUNK times by a fused kernel.
@@ -170,7 +176,7 @@ def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Arra
 
 
 def weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
-    """alpha T of a chunk (BATCH, CHUNK, pixels), and the transmittance behind it (BATCH, pixels).
+    """alpha T of a chunk (B, CHUNK, pixels), and the transmittance behind it (B, pixels).
 
     The transmittance is the plain product of 1 - alpha: it only falls, so a pixel has stopped before the first
     Gaussian that would take it to MIN_TRANSMITTANCE exactly where the product is still above.
@@ -184,10 +190,10 @@ def walk(
     table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any
 ) -> tuple[Any, Array]:
     """Applies `transmittance, state = body(transmittance, state, chunk)` chunk by chunk down the lists of one batch of
-    `tiles` (BATCH,), until the longest has ended or every pixel has stopped.
+    `tiles` (B,), until the longest has ended or every pixel has stopped.
 
-    Returns the last state, and (BATCH,) int32 how far down its list each tile had a pixel that had not stopped: nothing
-    behind is seen. transmittance (BATCH, pixels) starts at 1. `table` is `make_table`'s.
+    Returns the last state, and (B,) int32 how far down its list each tile had a pixel that had not stopped: nothing
+    behind is seen. transmittance (B, pixels) starts at 1. `table` is `make_table`'s.
     """
     start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
     corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))

@@ -1,0 +1,70 @@
+"""How well a scene shows its photographs, frame by frame: PSNR and SSIM, and which frames stay far below the others."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from jsecon.fit.photometric import psnr, ssim
+from jsecon.splat.render import render_rgb
+from jsecon.types import Array, Capture, Gaussians, record
+
+FAR_BELOW_DB = 5.0
+"""below the median frame at least, for a frame to be called weak"""
+SPREADS = 5.0
+"""and so many times the median distance from it"""
+
+
+@record
+class Quality:
+    """Of F frames."""
+
+    frames: Array
+    """(F,) indices into the capture"""
+    psnr: Array
+    """(F,) dB"""
+    ssim: Array
+    """(F,) in [-1, 1]"""
+
+
+@jax.jit
+def _compared(image: Array, frame: UInt8[Array, "h w 3"]) -> tuple[Array, Array]:
+    image, target = jnp.clip(image, 0, 1), frame.astype(jnp.float32) / 255.0
+    return psnr(image, target), ssim(image, target)
+
+
+def quality(
+    gaussians: Gaussians,
+    capture: Capture,
+    *,
+    frames: Int[np.ndarray, " f"] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Quality:
+    """PSNR and SSIM of `frames` (by default those held out) against the photographs; renderings clamped to [0, 1]."""
+    chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
+    gaussians, values = jax.device_put(gaussians), []
+    for n, t in enumerate(chosen):
+        image = render_rgb(gaussians, capture.cameras[int(t)]).features
+        values.append([float(value) for value in _compared(image, np.asarray(capture.frames[t]))])
+        if progress:
+            progress(n + 1, len(chosen))
+    by_frame = np.array(values).reshape(-1, 2)
+    return Quality(chosen, by_frame[:, 0], by_frame[:, 1])
+
+
+def evaluate_psnr(
+    gaussians: Gaussians, capture: Capture, *, progress: Callable[[int, int], None] | None = None
+) -> Float[np.ndarray, " f"]:
+    """PSNR (dB) of each held-out frame."""
+    return np.asarray(quality(gaussians, capture, progress=progress).psnr)
+
+
+def weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """(F,) bool: frames so far below the median that the scene does not explain them: a wrong pose, something that
+    moved, a finger before the lens."""
+    if not len(psnr):
+        return np.zeros(0, bool)
+    below = np.median(psnr) - np.asarray(psnr)
+    return below > max(FAR_BELOW_DB, SPREADS * float(np.median(np.abs(below))))

@@ -1,0 +1,98 @@
+"""What a fit does when: the sizes of its frames, its learning rates, its degree of colour, its number of Gaussians.
+
+All of it follows the share of the fit that is done, in [0, 1], so that a fit of so many steps and one of so many
+minutes go the same way.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.errors import require
+from jsecon.types import Array, Camera, Gaussians, record
+
+
+@record
+class LearningRates:
+    """Step sizes of Adam per group. Positions are in units of the cameras' extent. All decay log-linearly over the
+    fit."""
+
+    means: Any = 1e-3
+    """at the first step, times the extent"""
+    means_last: Any = 1e-5
+    """at the last step, times the extent"""
+    log_scales: Any = 2e-2
+    quaternions: Any = 1e-2
+    opacity_logits: Any = 5e-2
+    colors: Any = 1.5e-2
+    """of the constant band of the spherical harmonics; the higher bands take a twentieth"""
+    rest_last: Any = 0.3
+    """what the other rates have decayed to at the last step, log-linearly too, as a share of their first"""
+
+
+def rates_at(done: Array, rates: LearningRates, gaussians: Gaussians, extent: Array, degree: Array) -> Gaussians:
+    """One rate per array (one per band for sh), in the shape of Gaussians; bands above `degree` have none."""
+    of_band = np.floor(np.sqrt(np.arange(gaussians.sh.shape[1]))).astype(np.int32)
+    sh = jnp.where(of_band <= degree, jnp.where(of_band == 0, rates.colors, rates.colors / 20), 0.0)
+    # Log-linear; written so that a rate of 0 (frozen positions) stays 0.
+    decay = jnp.where(rates.means > 0, rates.means_last / jnp.where(rates.means > 0, rates.means, 1.0), 0.0)
+    means, rest = extent * rates.means * decay**done, rates.rest_last**done
+    return Gaussians(
+        means, rest * rates.log_scales, rest * rates.quaternions, rest * rates.opacity_logits, rest * sh[None, :, None]
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """How a fit goes."""
+
+    sizes: tuple[tuple[float, float], ...] = ((0.5, 0.5), (1.0, 1.0))
+    """(size of the frames, share of the fit at which it ends): smaller frames cost less and move what is large first
+    (arXiv 2503.18402)"""
+    growth: Literal["votes", "none"] = "votes"
+    """Gaussians are added where the picture is wrong, or keep their number"""
+    at_most: int = 100_000
+    """Gaussians; a start with more keeps its number"""
+    grows_from: float = 0.05
+    grows_until: float = 0.6
+    """shares of the fit between which the number of Gaussians rises evenly to `at_most`"""
+    degree_every: float = 0.1
+    """share of the fit after which the degree of the spherical harmonics rises by one, up to what the start holds"""
+
+    def __post_init__(self) -> None:
+        ends = [end for _, end in self.sizes]
+        sound = ends == sorted(ends) and ends[-1:] == [1.0] and all(0 < size <= 1 for size, _ in self.sizes)
+        require(sound, "sizes", self.sizes, "pairs of a size in (0, 1] and its end, the last end 1", "((1, 1),) is one")
+        order = 0 <= self.grows_from < self.grows_until <= 1
+        require(order, "grows_from, grows_until", (self.grows_from, self.grows_until), "0 <= from < until <= 1", "")
+
+    def size(self, done: float) -> float:
+        """Of the frames, as a share of their own."""
+        return next(size for size, end in self.sizes if done < end or end == 1.0)
+
+    def degree(self, done: float) -> int:
+        """The highest of the spherical harmonics that learns."""
+        return int(done / self.degree_every) if self.degree_every > 0 else 3
+
+    def count(self, done: float, start: int) -> int | None:
+        """Gaussians wanted, or None where none are added now."""
+        if self.growth == "none" or not self.grows_from <= done <= self.grows_until or self.at_most <= start:
+            return None
+        share = (done - self.grows_from) / (self.grows_until - self.grows_from)
+        return round(start + share * (self.at_most - start))
+
+
+def resized(cameras: Camera, frames: np.ndarray, size: float) -> tuple[Camera, np.ndarray]:
+    """Batches of views at `size` times theirs, whole px; each pixel the mean of those that it covers."""
+    height, width = frames.shape[1:3]
+    to = max(round(height * size), 1), max(round(width * size), 1)
+    if to == (height, width):
+        return cameras, frames
+    small = np.stack([cv2.resize(frame, to[::-1], interpolation=cv2.INTER_AREA) for frame in frames])
+    x, y = np.float32(to[1] / width), np.float32(to[0] / height)
+    return Camera(
+        cameras.world_to_camera, cameras.fx * x, cameras.fy * y, cameras.cx * x, cameras.cy * y, *to[::-1]
+    ), small

@@ -1,0 +1,106 @@
+"""Growth: halves keep what the whole was, rows stay where they are, and the draw follows the votes."""
+
+import jax
+import numpy as np
+import pytest
+
+from jsecon.fit.growth import FAINT, compact, drawn, grown, halves, in_use, rows_for, with_free_rows
+from jsecon.types import Gaussians
+
+
+def scene(count=30, seed=0):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.normal(size=(count, 3)).astype(np.float32),
+        rng.normal(-2, 0.5, (count, 3)).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.uniform(-2, 3, count).astype(np.float32),
+        rng.normal(size=(count, 4, 3)).astype(np.float32),
+    )
+
+
+def covariance(gaussians):
+    w, x, y, z = (gaussians.quaternions / np.linalg.norm(gaussians.quaternions, axis=1, keepdims=True)).T
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * gaussians.log_scales), rotation)
+
+
+def test_halves_have_the_mean_and_covariance_of_the_whole():
+    whole = scene()
+    one, other = halves(whole)
+    np.testing.assert_allclose((one.means + other.means) / 2, whole.means, atol=1e-6)
+    offset = (one.means - whole.means)[:, :, None]
+    both = covariance(one) + offset @ offset.transpose(0, 2, 1)
+    np.testing.assert_allclose(both, covariance(whole), rtol=1e-4, atol=1e-6)
+
+
+def test_halves_give_the_centre_the_alpha_it_had():
+    whole = scene()
+    one, other = halves(whole)
+    alpha = lambda g: 1 / (1 + np.exp(-g.opacity_logits))
+    near = np.exp(-((0.6 / 0.8) ** 2) / 2)
+    at_centre = 1 - (1 - near * alpha(one)) * (1 - near * alpha(other))
+    free = alpha(one) < alpha(whole) - 1e-6  # where it would have to be more opaque than the whole, it is as opaque
+    np.testing.assert_allclose(at_centre[free], alpha(whole)[free], rtol=1e-4)
+    assert free.sum() > 5
+    assert (alpha(one) <= alpha(whole) + 1e-6).all()
+
+
+def test_free_rows_are_not_in_use_and_go_when_compacted():
+    whole = scene()
+    longer = with_free_rows(whole, 64)
+    assert longer.count == 64
+    np.testing.assert_array_equal(in_use(longer), np.arange(64) < 30)
+    for a, b in zip(jax.tree.leaves(compact(longer)), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(longer))
+
+
+def test_draws_follow_the_votes_and_never_repeat():
+    votes = np.array([0.0, 1.0, 2.0, 4.0, 0.0, 8.0])
+    counts = np.zeros(6)
+    for seed in range(2000):
+        counts[drawn(votes, 1, np.random.default_rng(seed))] += 1
+    np.testing.assert_allclose(counts / 2000, votes / votes.sum(), atol=0.04)
+    all_of_them = drawn(votes, 100, np.random.default_rng(0))
+    assert sorted(all_of_them) == [1, 2, 3, 5]
+
+
+@pytest.mark.parametrize("target", [36, 80, 2000])
+def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target):
+    whole = with_free_rows(scene(), 32)
+    moments = jax.tree.map(np.ones_like, whole), jax.tree.map(np.ones_like, whole)
+    votes = np.where(np.arange(32) < 30, 1.0 + np.arange(32), 7.0).astype(np.float32)
+    after, (first, second) = grown(whole, moments, votes, target, [0, 1])
+    added = min(target - 30, 10)  # at most 0.3 of those there are, and one
+    assert in_use(after).sum() == 30 + added
+    assert after.count == (32 if added <= 2 else rows_for(min(target, 48)) if target <= 48 else after.count)
+    fresh = ~first.opacity_logits.astype(bool) & in_use(after)
+    assert fresh.sum() == 2 * added
+    assert not second.means[fresh].any()
+    assert second.means[in_use(after) & ~fresh].all()
+    untouched = in_use(after) & ~fresh & (np.arange(after.count) < 30)
+    np.testing.assert_array_equal(after.means[untouched], whole.means[: after.count][untouched[:32]])
+
+
+def test_faint_gaussians_make_room():
+    whole = scene()
+    whole.opacity_logits[:5] = np.log(FAINT / 2)
+    moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
+    after, _ = grown(whole, moments, np.ones(30, np.float32), 30, [0])
+    assert after.count == 30
+    assert in_use(after).all()
+
+
+def test_nothing_is_added_where_nothing_is_wrong():
+    whole = with_free_rows(scene(), 64)
+    moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
+    after, _ = grown(whole, moments, np.zeros(64, np.float32), 60, [0])
+    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(a, b)
