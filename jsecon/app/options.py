@@ -31,6 +31,11 @@ class Options:
     """use at most N frames, evenly spaced (default: all)"""
     holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
     """keep every K-th frame for measuring only; 0 = none"""
+    refine: Literal["none", "poses", "exposure", "both", "auto"] = "none"
+    """where cameras stood and how bright pictures are, by a probe fit before anything else; frames held out are aligned
+    to the frozen probe; auto: both where the frames have depth"""
+    drop_frames: Literal["none", "auto"] = "none"
+    """auto: leave out training frames that a probe fit does not explain"""
     steps: Annotated[int, {"least": 1}] = 1500
     """of the photometric fit"""
     minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None

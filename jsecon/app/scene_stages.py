@@ -10,7 +10,38 @@ from jsecon.types import Camera, Capture, Gaussians
 
 
 def load(work: Work) -> Stage:
-    """The capture, at the size that the options ask for."""
+    """The capture, at the size that the options ask for, put right where they ask for that."""
+    options = work.options
+    return _as_it_is(work) if options.refine == "none" and options.drop_frames == "none" else _put_right(work)
+
+
+def _put_right(work: Work) -> Stage:
+    """Poses and exposures as a probe fit finds them, without the frames that it does not explain."""
+    options, plain = work.options, _as_it_is(work)
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.fit.corrections import Refine
+        from jsecon.fit.settle import settled
+        from jsecon.fit.start import starting_gaussians
+
+        loaded = plain.compute(results, progress, record)
+        capture, asked = loaded.value, options.refine
+        if asked == "auto":
+            asked = "none" if capture.depths is None else "both"
+        refine = None if asked == "none" else Refine(asked in ("poses", "both"), asked in ("exposure", "both"))
+        told, start = len(capture.notes), starting_gaussians(capture, progress=progress)[0]
+        given = {"refine": refine, "drop_weak": options.drop_frames == "auto", "progress": progress}
+        better = settled(capture, start, key=jax.random.key(options.seed), **given)
+        training_frames(better)
+        return Outcome(better, notes=(*loaded.notes, *better.notes[told:]))
+
+    asked = work.given("refine", "drop_frames", "seed")
+    how = f"{plain.how}, put right by a probe fit (refine {options.refine}, drop frames {options.drop_frames})"
+    return Stage("load", how, compute, given={**plain.given, **asked}, files=plain.files)
+
+
+def _as_it_is(work: Work) -> Stage:
+    """The capture as its files say."""
     options, asked = work.options, work.given("downscale", "long_side", "frames", "holdout")
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
@@ -68,6 +99,7 @@ def _fitted(work: Work) -> Stage:
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.fit.optimise import fit_gaussians
         from jsecon.fit.schedule import Schedule
+        from jsecon.fit.settle import weak_frames
         from jsecon.fit.start import starting_gaussians
 
         capture, state = results["load"], record.read()
@@ -89,6 +121,9 @@ def _fitted(work: Work) -> Stage:
         )
         if options.growth != "none":
             notes = (*notes, f"{found.count} Gaussians after {len(losses)} steps")
+        weak = ", ".join(capture.names[t] for t in weak_frames(found, capture))
+        if weak:
+            notes = (*notes, f"frames that the scene shows far worse than the others (--drop-frames auto): {weak}")
         return Outcome(found, notes=notes)
 
     left = {} if options.growth != "none" else {"densification": "the fit keeps the points that it starts from"}

@@ -15,17 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
+from jsecon.fit.corrections import Corrections, Refine, Refined, refined_further, start_refined
 from jsecon.fit.growth import compact, grown, rows_for, with_free_rows
-from jsecon.fit.photometric import photometric_loss
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized
+from jsecon.fit.schedule import LearningRates, Schedule, rates_at
+from jsecon.fit.view import View, view_loss, views_at, views_of
 from jsecon.numerics import finite
 from jsecon.parallel import MESH_OPTIONS, host_mesh, over_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.splat.render import render
-from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Capture, Gaussians, record
 
 
@@ -51,6 +50,8 @@ class FitState:
     """() Gaussians at the start"""
     losses: Array
     """(steps,) loss of each step's view before the step"""
+    refined: Refined | None = None
+    """corrections of the capture's T frames, or None where nothing is refined"""
 
 
 def cameras_extent(cameras: Camera) -> float:
@@ -71,48 +72,44 @@ def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
     return jax.random.permutation(jax.random.fold_in(key, index), views)
 
 
-def start_state(gaussians: Gaussians) -> FitState:
-    """The state before the first step."""
+def start_state(gaussians: Gaussians, refined: int | None = None) -> FitState:
+    """The state before the first step; `refined` is the number of frames that corrections are kept of."""
     count = np.asarray(gaussians.count)
     gaussians = with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows_for(int(count)))
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
-    return FitState(gaussians, zeros, zeros, zeros.opacity_logits, zero, zero, zero, count, np.zeros(0, np.float32))
+    corrections = None if refined is None else start_refined(refined)
+    numbers = zero, zero, zero, count, np.zeros(0, np.float32)
+    return FitState(gaussians, zeros, zeros, zeros.opacity_logits, *numbers, corrections)
 
 
 _ADAM, _RATES, _SCHEDULE = optax.scale_by_adam(eps=1e-15), LearningRates(), Schedule()
-Current: TypeAlias = tuple[Gaussians, Gaussians, Gaussians, Array]
-"""the Gaussians, Adam's moments, the votes"""
+Current: TypeAlias = tuple[Gaussians, Gaussians, Gaussians, Array, Refined | None]
+"""the Gaussians, Adam's moments, the votes, the corrections"""
 
 
 def _step(
     current: Current,
-    camera: Camera,
-    frame: UInt8[Array, "h w 3"],
+    view: View,
+    number: Array,
     step: Array,
+    taken: Array,
     done: Array,
     degree: Array,
     extent: Array,
     rates: LearningRates,
+    refine_rates: Corrections | None,
     capacity: int,
     mesh: Mesh | None,
 ) -> tuple[Current, Array, Array]:
-    """One Adam step on one view, the `step`-th. Returns what is current after it, the loss before it, the pairs that
-    overflowed. Over a mesh, projection, compositing, loss and update are each shared out among its devices."""
-    gaussians, *moments, votes = current
-    target = frame.astype(jnp.float32) / 255.0
-
-    def loss(gaussians: Gaussians, nothing: Array):
-        colours = over_rows(colours_from_sh, gaussians, camera, mesh)
-        # The votes are the gradient of a fourth channel that shows nothing: they cost no pass of their own.
-        features = jnp.concatenate([colours, nothing], axis=1)
-        rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh)
-        image, fourth = rendering.features[..., :3], rendering.features[..., 3]
-        value = photometric_loss(image, target, mesh)
-        error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
-        return value + jnp.sum(error * fourth), (value, rendering.overflow)
-
+    """One Adam step, the `step`-th, on one view, the `number`-th, which was `taken` so often before. Returns what is
+    current after it, the loss before it, the pairs that overflowed. Over a mesh, projection, compositing, loss and
+    update are each shared out among its devices."""
+    gaussians, *moments, votes, refined = current
     nothing = jnp.zeros((gaussians.count, 1))
-    (_, (value, overflow)), (gradient, by_error) = jax.value_and_grad(loss, (0, 1), has_aux=True)(gaussians, nothing)
+    own = None if refined is None else jax.tree.map(lambda a: a[number], refined.now)
+    loss = functools.partial(view_loss, view=view, extent=extent, capacity=capacity, mesh=mesh)
+    by = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, nothing, own)
+    (_, (value, overflow)), (gradient, by_error, by_own) = by
 
     def update(rows, common):
         (gaussians, gradient, first, second), (step, rate) = rows, common
@@ -122,7 +119,9 @@ def _step(
 
     rate = rates_at(done, rates, gaussians, extent, degree)
     after = over_rows(update, (gaussians, gradient, *moments), (step, rate), mesh)
-    after = *after, votes + by_error[:, 0]
+    if refined is not None and refine_rates is not None:
+        refined = refined_further(refined, number, by_own, taken, refine_rates)
+    after = *after, votes + by_error[:, 0], refined
     if mesh is not None:  # as it came: one program serves every step
         after = jax.lax.with_sharding_constraint(after, NamedSharding(mesh, PartitionSpec()))
     return after, value, overflow
@@ -137,13 +136,12 @@ _step_compiled = [
 class _Views:
     """The frames to fit to, at the size that is wanted now, and the room that a view of them needs."""
 
-    def __init__(self, capture: Capture, mesh: Mesh | None):
+    def __init__(self, capture: Capture, refine: Refine | None, mesh: Mesh | None):
         self.used, self.mesh, self.size, self.capacity = np.flatnonzero(~np.asarray(capture.held_out)), mesh, 0.0, {}
         if not len(self.used):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])  # to index them is free
-        self.whole = cameras, np.asarray(capture.frames[self.used])
-        self.extent = np.asarray(cameras_extent(cameras), np.float32)
+        self.whole, self.refine = views_of(capture, self.used), refine
+        self.extent = np.asarray(cameras_extent(self.whole.camera), np.float32)
 
     def put(self, tree: Any) -> Any:
         """On every device."""
@@ -152,16 +150,17 @@ class _Views:
     def at(self, size: float) -> None:
         """Takes the frames at that size."""
         if size != self.size:
-            self.size, self.sized = size, resized(*self.whole, size)
+            self.size, self.sized = size, views_at(self.whole, size)
 
     def step(self, current: Current, view: int, step: int, done: float, degree: int, rates: LearningRates) -> tuple:
         """`_step` on that view."""
-        (cameras, frames), shape = self.sized, (current[0].count, self.size)
-        strips = 1 if self.mesh is None else self.mesh.size
-        fresh = default_capacity(current[0].count, cameras.width, cameras.height, strips=strips)
+        shape, strips = (current[0].count, self.size), 1 if self.mesh is None else self.mesh.size
+        fresh = default_capacity(current[0].count, self.sized.camera.width, self.sized.camera.height, strips=strips)
         capacity = self.capacity.setdefault(shape, fresh)
-        numbers = np.int32(step), np.float32(done), np.int32(degree), self.extent, rates
-        given = self.put((cameras[view], frames[view], *numbers))
+        refine_rates = None if self.refine is None else self.refine.rates(done, float(self.extent))
+        numbers = *map(np.int32, (self.used[view], step, step // len(self.used))), np.float32(done), np.int32(degree)
+        own = jax.tree.map(lambda a: a[view], self.sized)
+        given = self.put((own, *numbers, self.extent, rates, refine_rates))
         return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh)
 
     def widen(self, current: Current, overflow: int) -> None:
@@ -196,6 +195,7 @@ def fit_gaussians(
     state: FitState | None = None,
     schedule: Schedule = _SCHEDULE,
     rates: LearningRates = _RATES,
+    refine: Refine | None = None,
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -203,7 +203,8 @@ def fit_gaussians(
     """Fits `start` (or goes on from `state`) to the frames that are not held out; returns the Gaussians and the losses.
 
     Either `steps` of one view each, to the same result on the same devices, or as many as `seconds` allow, without the
-    time that jax takes to compile them the first time on a machine. All views are taken once before any comes again, in
+    time that jax takes to compile them the first time on a machine. With `refine` each view's pose or exposure is
+    corrected on the way (corrections.py; FitState.refined). All views are taken once before any comes again, in
     an order drawn by `key`; the background is black. After every `chunk` steps Gaussians are added as `schedule` says,
     and `on_checkpoint` is given the state. A chunk in which a view overflowed its tile lists is taken again with more
     room, so the result does not depend on the capacity. All devices of this process take part in every step.
@@ -214,15 +215,18 @@ def fit_gaussians(
     require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
     given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
     require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
-    views = _Views(capture, host_mesh())
-    state = start_state(start) if start is not None else state
+    views = _Views(capture, refine, host_mesh())
+    if start is not None:
+        state = start_state(start, None if refine is None else len(capture.names))
     assert state is not None
+    given, alike = state.refined is not None, (state.refined is None) == (refine is None)
+    require(alike, "state with corrections", given, f"{refine is not None}", "Go on with the options of its start.")
     if steps is not None:
         own = abs(float(state.done) * steps - len(state.losses)) < 1e-6
         found = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
         require(own, "state", found, f"a fit of {steps} steps", "Go on with the options of its start.")
     seed = int(jax.random.bits(key))
-    current = views.put((state.gaussians, state.first_moment, state.second_moment, state.votes))
+    current = views.put((state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined))
     while float(state.done) < 1:
         first, done = len(state.losses), float(state.done)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
@@ -236,19 +240,19 @@ def fit_gaussians(
         current, taken = _chunk(current, views, order, first, dones, schedule.degree(done), rates)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        if not (np.isfinite(losses[-1]) and bool(_all_finite(current[0]))):
+        if not (np.isfinite(losses[-1]) and bool(_all_finite((current[0], current[4])))):
             found = f"numbers that are not finite after step {len(losses)}"
             remedy = "Check the start, the poses and the intrinsics, or lower the learning rates."
             raise InputError("fit", found, "a fit that converges", remedy)
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
-            gaussians, first_moment, second_moment, votes = jax.tree.map(np.asarray, current)
+            gaussians, first_moment, second_moment, votes, refined = jax.tree.map(np.asarray, current)
             moments = first_moment, second_moment
             gaussians, moments = grown(gaussians, moments, votes, target, [seed, len(losses)])
-            current = views.put((gaussians, *moments, np.zeros_like(gaussians.opacity_logits)))
+            current = views.put((gaussians, *moments, np.zeros_like(gaussians.opacity_logits), refined))
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
-        gaussians, first_moment, second_moment, votes = current
+        gaussians, first_moment, second_moment, votes, refined = current
         state = FitState(
             gaussians=gaussians,
             first_moment=first_moment,
@@ -259,6 +263,7 @@ def fit_gaussians(
             seconds=np.asarray(spent),
             started=state.started,
             losses=losses,
+            refined=refined,
         )
         if on_checkpoint:
             on_checkpoint(state)
@@ -267,4 +272,4 @@ def fit_gaussians(
     return compact(state.gaussians), np.asarray(state.losses)
 
 
-_all_finite = jax.jit(lambda gaussians: finite(*jax.tree.leaves(gaussians)))
+_all_finite = jax.jit(lambda tree: finite(*jax.tree.leaves(tree)))
