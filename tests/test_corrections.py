@@ -10,6 +10,7 @@ from conftest import look_at
 from scipy.linalg import expm
 
 from jsecon.errors import InputError
+from jsecon.fit import settle
 from jsecon.fit.corrections import (
     Corrections,
     Refine,
@@ -32,6 +33,12 @@ KEY, VIEWS = jax.random.key(0), 6
 FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 WHOLE = Schedule(sizes=((1.0, 1.0),), growth="none")
 GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
+
+
+@pytest.fixture(autouse=True)
+def _one_size(monkeypatch):
+    """A program less to compile."""
+    monkeypatch.setattr(settle, "SCHEDULE", WHOLE)
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +84,10 @@ def hat_exp(twist):
     """scipy's exponential of a twist."""
     x, y, z, a, b, c = np.asarray(twist, np.float64)
     return expm(np.array([[0, -z, y, a], [z, 0, -x, b], [-y, x, 0, c], [0, 0, 0, 0]]))
+
+
+def hat_exp_of(twists):
+    return np.stack([hat_exp(twist) for twist in twists])
 
 
 def same(a, b):
@@ -152,13 +163,17 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
     gains = rng.uniform(0.8, 1.0, VIEWS)
     told, states = rough(capture, twists=twists, gains=gains), []
-    refine = Refine(pose_rate=2e-3)
-    fit_gaussians(told, start=truth, steps=60 * 5, rates=FROZEN, refine=refine, on_checkpoint=states.append, **GIVEN)
-    found = jax.tree.map(np.asarray, states[-1].refined.now)
+    given = GIVEN | {"rates": FROZEN, "refine": Refine(pose_rate=2e-3), "on_checkpoint": states.append}
+    fit_gaussians(told, start=truth, steps=40 * 5, **given)
+    found, pixels = jax.tree.map(np.asarray, states[-1].refined.now), []
+    for poses in (capture.cameras.world_to_camera, hat_exp_of(found.twists) @ told.cameras.world_to_camera):
+        x, y, z = np.moveaxis(truth.means @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], -1, 0)
+        pixels.append(30 * np.stack([x / z, y / z]))
     train = ~capture.held_out
     assert not found.twists[2].any()
-    assert np.abs(found.twists - twists)[train].max() < 2e-3
-    np.testing.assert_allclose(found.colours[train], gains[train, None, None] * np.eye(3, 4), atol=0.01)
+    assert np.median(np.abs(pixels[1] - pixels[0])[:, train]) < 0.05
+    assert np.abs(pixels[1] - pixels[0])[:, train].max() < 0.3
+    np.testing.assert_allclose(found.colours[train, :, :3], gains[train, None, None] * np.eye(3), atol=0.03)
 
 
 def test_without_corrections_a_fit_is_what_it_was(capture, truth):
@@ -188,14 +203,14 @@ def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_n
     twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
     told = rough(capture, twists=twists, gains=rng.uniform(0.8, 1.0, VIEWS))
     start = dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
-    better = settled(told, start, key=KEY)
+    better = settled(told, start, key=KEY, visits=30)
     assert "poses refined" in " ".join(better.notes)
     assert "held out" in better.notes[-1]
     assert same(better.cameras.fx, told.cameras.fx)
     assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 4
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
-    other = settled(dataclasses.replace(told, frames=frames), start, key=KEY)
+    other = settled(dataclasses.replace(told, frames=frames), start, key=KEY, visits=30)
     train = ~told.held_out
     assert same(other.cameras[train], better.cameras[train])
     assert same(other.frames[train], better.frames[train])
@@ -228,8 +243,8 @@ def test_depth_that_is_not_known_teaches_nothing(capture, truth):
 
 def test_three_frames_of_pure_rotation_are_fitted_or_refused(truth):
     """They have no extent: nothing moves but directions."""
-    poses = [look_at((0, -0.6, -2.2), (x, 0, 0)) for x in (-0.3, 0.3, 0.0)]
-    turned = photographed(truth, poses)
+    turned = photographed(truth, [look_at((0, -0.6, -2.2), (x, 0, 0)) for x in np.linspace(-0.3, 0.3, VIEWS)])
+    turned = dataclasses.replace(turned, held_out=np.arange(VIEWS) % 2 == 0)
     assert cameras_extent(turned.cameras) == pytest.approx(0, abs=1e-6)
     better = settled(turned, truth, key=KEY, visits=8)
     assert np.isfinite(better.cameras.world_to_camera).all()
