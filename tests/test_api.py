@@ -107,9 +107,10 @@ def test_modules_are_short_enough_to_be_read_whole():
 
 
 CORE = ("splat", "fit", "association", "language", "query")
-CORE_LINES, ALL_LINES = 7_000, 16_500
+CORE_LINES, ALL_LINES = 7_000 + 550, 16_500 + 900
 """What a reader may be asked to read. A feature that needs more raises both by its own lines, and says here which it is
-and how many."""
+and how many: fitting photographs (growth, schedule, dense start, corrections of poses and exposure, quality) 550 and,
+with structure from motion and the verb `fit`, 900."""
 
 
 def test_the_library_stays_within_its_budget_of_lines():

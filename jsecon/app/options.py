@@ -15,14 +15,11 @@ Folder = Annotated[Path | None, {"metavar": "DIR"}]
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """All that the result of a run depends on, but for the files themselves."""
+class SceneOptions:
+    """What the Gaussians of a capture depend on."""
 
     capture: Annotated[Path, {"positional": True}]
     """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)"""
-    gaussians: Annotated[Path | None, {"metavar": "PLY"}] = None
-    """a scene of 3D Gaussians (.ply, INRIA layout) in the capture's world; without it, Gaussians are fitted to the
-    frames"""
     downscale: Annotated[float | None, {"metavar": "K", "least": 1}] = None
     """make frames K times smaller (default: so that the longer side is at most --long-side)"""
     long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400
@@ -39,8 +36,19 @@ class Options:
     """that the fit may have; a start with more keeps its number"""
     growth: Literal["votes", "none"] = "votes"
     """of their number during the fit: where the picture is wrong, or none"""
-    sh_degree: Annotated[int, {"choices": range(4)}] = 1
+    sh_degree: Annotated[int, {"choices": range(4)}] = 2
     """of the fitted colours"""
+    seed: int = 0
+    """of whatever is drawn at random"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(SceneOptions):
+    """All that the result of a run depends on, but for the files themselves."""
+
+    gaussians: Annotated[Path | None, {"metavar": "PLY"}] = None
+    """a scene of 3D Gaussians (.ply, INRIA layout) in the capture's world; without it, Gaussians are fitted to the
+    frames"""
     masks: Folder = None
     """instance masks, one integer PNG per frame under the frame's name (0 = none), <id>/<frame>.png, or LangSplat's
     _s.npy; without it, they are found in the frames"""
@@ -80,8 +88,6 @@ class Options:
     """from a Gaussian's votes to its code"""
     top: Annotated[int, {"metavar": "N", "least": 1}] = 8
     """regions whose votes a Gaussian keeps"""
-    seed: int = 0
-    """of whatever is drawn at random"""
 
     @property
     def associated_by(self) -> Literal["consensus", "tracking"]:

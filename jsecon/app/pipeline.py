@@ -40,7 +40,7 @@ from jsecon.app.scene_stages import gaussians, held_out, load
 from jsecon.app.stages import Outcome, Record, Stage, Work
 from jsecon.errors import InputError
 from jsecon.process import programs_built
-from jsecon.types import Capture, LanguageField
+from jsecon.types import Capture, Gaussians, LanguageField, Quality
 
 FIELD_FILE = "field.npz"
 
@@ -53,8 +53,8 @@ class Run:
     capture: Capture
     labels: np.ndarray
     """(T, H, W) int16 masklets of the field's views."""
-    psnr: np.ndarray
-    """(frames held out,) dB."""
+    held_out: Quality
+    """PSNR and SSIM of the frames held out."""
     seconds: dict[str, float]
     """of each stage, also where it was computed in an earlier run."""
     steps: tuple[Step, ...]
@@ -63,6 +63,11 @@ class Run:
     options: Options
     programs: dict[str, int]
     """that jax built for it: "all" of them, and those that it read "from_disk"."""
+
+    @property
+    def psnr(self) -> np.ndarray:
+        """(frames held out,) dB."""
+        return np.asarray(self.held_out.psnr)
 
     @property
     def left_out(self) -> dict[str, str]:
@@ -82,6 +87,52 @@ def peak_memory_mib() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Done:
+    """What stages made, see Run."""
+
+    results: dict[str, Any]
+    keys: dict[str, str]
+    seconds: dict[str, float]
+    steps: list[Step]
+    notes: list[str]
+
+
+def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
+    """The stages, told first, then each computed or read from `folder`."""
+    options, keys = work.options, {}
+    if work.out.resolve() == options.capture.resolve():
+        found = "the capture's own folder as the output folder"
+        raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
+    require_inputs(options)
+    require_writable(work.out)
+    cache.prepare(folder)
+    for stage in stages:
+        keys[stage.name] = stage.key(work, keys)
+    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
+    steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
+    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
+    listener.steps(f"{options.capture} -> {work.out}", steps)
+    work.networks.require_ready([step.name for step in steps if step.status == "run"])
+    done = _Done({}, keys, {}, steps, [])
+    for stage in stages:
+        record = Record(cache.record_path_of(place[stage.name]))
+        with listener.progress(stage.name) as progress:
+            compute = functools.partial(stage.compute, done.results, progress, record)
+            kept = cache.fetch(place[stage.name], compute, note=listener.note)
+        outcome: Outcome = kept.value
+        done.results[stage.name], done.seconds[stage.name] = outcome.value, kept.seconds
+        record.remove()
+        listener.done(stage.name, kept.seconds, kept.fresh)
+        for part, why in outcome.left_out.items():
+            steps.append(Step(part, "left out", why))
+            listener.step(steps[-1])
+        for note in outcome.notes:
+            done.notes.append(note)
+            listener.note(note)
+    return done
+
+
 def run(
     options: Options,
     out: Path,
@@ -98,49 +149,27 @@ def run(
     """
     listener, before = listener or Listener(), programs_built()
     folder = cache_folder or out / "cache"
-    if out.resolve() == options.capture.resolve():
-        found = "the capture's own folder as the output folder"
-        raise InputError(out, found, "a folder of its own", f"For example {out / 'field'}, or one elsewhere.")
-    require_inputs(options)
-    require_writable(out)
     work = Work(options, networks.networks_of(options, folder), out, load)
-    cache.prepare(folder)
-    stages, keys = stages_of(work), {}
-    for stage in stages:
-        keys[stage.name] = stage.key(work, keys)
-    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
-    steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
-    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
-    listener.steps(f"{options.capture} -> {out}", steps)
-    work.networks.require_ready([step.name for step in steps if step.status == "run"])
-    results: dict[str, Any] = {}
-    seconds: dict[str, float] = {}
-    notes: list[str] = []
-    for stage in stages:
-        record = Record(cache.record_path_of(place[stage.name]))
-        with listener.progress(stage.name) as progress:
-            compute = functools.partial(stage.compute, results, progress, record)
-            kept = cache.fetch(place[stage.name], compute, note=listener.note)
-        outcome: Outcome = kept.value
-        results[stage.name], seconds[stage.name] = outcome.value, kept.seconds
-        record.remove()
-        listener.done(stage.name, kept.seconds, kept.fresh)
-        for part, why in outcome.left_out.items():
-            steps.append(Step(part, "left out", why))
-            listener.step(steps[-1])
-        for note in outcome.notes:
-            notes.append(note)
-            listener.note(note)
+    done = _computed(work, stages_of(work), folder, listener)
     started = time.monotonic()
-    field = field_of(results, work.networks.embedder, _provenance(options, keys))
+    field = field_of(done.results, work.networks.embedder, _provenance(options, done.keys))
     from jsecon.language.field import save_field
 
     save_field(out / FIELD_FILE, field)
-    seconds["field"] = time.monotonic() - started
-    listener.done("field", seconds["field"], True)
-    capture, labels, psnr = (results[name] for name in ("load", "masklets", "held_out"))
+    done.seconds["field"] = time.monotonic() - started
+    listener.done("field", done.seconds["field"], True)
+    capture, labels, quality = (done.results[name] for name in ("load", "masklets", "held_out"))
     programs = {name: count - before[name] for name, count in programs_built().items()}
-    return Run(field, capture, labels, psnr, seconds, tuple(steps), tuple(notes), options, programs)
+    return Run(field, capture, labels, quality, done.seconds, tuple(done.steps), tuple(done.notes), options, programs)
+
+
+def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:
+    """The stages of `run` that make and measure the scene; OUT/cache is theirs too, so a `run` into OUT goes on from
+    it. Returns the Gaussians, their capture, and the quality of the frames held out."""
+    work = Work(options, networks.networks_of(options, out / "cache"), out)
+    stages = [stage(work) for stage in (load, gaussians, held_out)]
+    results = _computed(work, stages, out / "cache", listener or Listener()).results
+    return results["gaussians"], results["load"], results["held_out"]
 
 
 def _provenance(options: Options, keys: dict[str, str]) -> str:

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jsecon.app.progress import Progress
 from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
@@ -114,11 +115,17 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 
 
 def held_out(work: Work) -> Stage:
-    """(frames held out,) PSNR in dB of the rendered colours against the photographs."""
+    """PSNR and SSIM of the frames held out, against the photographs; and which of the others stay far below them."""
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.fit.quality import evaluate_psnr
+        from jsecon.fit.quality import quality, weak
 
-        return Outcome(evaluate_psnr(results["gaussians"], results["load"], progress=progress))
+        capture, scene = results["load"], results["gaussians"]
+        fitted = quality(scene, capture, frames=np.flatnonzero(~np.asarray(capture.held_out)), progress=progress)
+        low = np.flatnonzero(weak(np.asarray(fitted.psnr)))
+        names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in low[:5])
+        more = f" and {len(low) - 5} more" if len(low) > 5 else ""
+        told = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or a change"
+        return Outcome(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
-    return Stage("held_out", "PSNR of the rendered colours", compute, after=("load", "gaussians"))
+    return Stage("held_out", "PSNR and SSIM of the rendered colours", compute, after=("load", "gaussians"))
