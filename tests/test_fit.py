@@ -262,3 +262,32 @@ def test_wrong_fits_are_refused(capture, start):
     astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
     with pytest.raises(InputError, match="not finite"):
         fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, chunk=1)
+
+
+def _odd(capture, start, kind):
+    if kind == "one view":
+        return dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1), start
+    if kind == "black images":
+        return dataclasses.replace(capture, frames=np.zeros_like(capture.frames)), start
+    if kind == "two points":
+        return capture, jax.tree.map(lambda a: a[:2], start)
+    if kind == "all behind the cameras":
+        return capture, dataclasses.replace(start, means=start.means + np.float32([0, 0, -50]))
+    poses = np.array(capture.cameras.world_to_camera)
+    poses[:, :3, 3] = -np.einsum("tij,j->ti", poses[:, :3, :3], np.array([0, 0, -2.5]))  # one centre for all
+    return dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=poses)), start
+
+
+@pytest.mark.parametrize(
+    "kind", ["one view", "black images", "two points", "all behind the cameras", "nothing but rotation"]
+)
+def test_odd_captures_are_fitted_without_a_number_that_is_none(capture, start, kind):
+    capture, start = _odd(capture, start, kind)
+    schedule = dataclasses.replace(WHOLE, growth="votes", at_most=80, grows_from=0.1)
+    gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, schedule=schedule, rates=RATES, chunk=5)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaussians))
+    assert np.isfinite(losses).all()
+    if kind in ("one view", "nothing but rotation"):
+        assert losses[-4:].mean() < losses[:4].mean()
+    if kind == "all behind the cameras":  # nobody sees them: nothing to learn, nothing to add
+        np.testing.assert_array_equal(gaussians.means, start.means)

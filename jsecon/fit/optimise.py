@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 from jsecon.errors import InputError, require
 from jsecon.fit.growth import compact, grown, rows_for, with_free_rows
 from jsecon.fit.photometric import photometric_loss
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized
+from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized, resized_frame
 from jsecon.numerics import finite
 from jsecon.parallel import MESH_OPTIONS, host_mesh, over_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
@@ -135,15 +135,15 @@ _step_compiled = [
 
 
 class _Views:
-    """The frames to fit to, at the size that is wanted now, and the room that a view of them needs."""
+    """The frames to fit to, read one at a time, at the size that is wanted now; and the room that a view needs."""
 
     def __init__(self, capture: Capture, mesh: Mesh | None):
-        self.used, self.mesh, self.size, self.capacity = np.flatnonzero(~np.asarray(capture.held_out)), mesh, 0.0, {}
+        self.used, self.mesh, self.frames, self.capacity = np.flatnonzero(~capture.held_out), mesh, capture.frames, {}
         if not len(self.used):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])  # to index them is free
-        self.whole = cameras, np.asarray(capture.frames[self.used])
-        self.extent = np.asarray(cameras_extent(cameras), np.float32)
+        self.whole = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
+        self.size, self.cameras = 1.0, self.whole  # in NumPy, to index them compiles nothing
+        self.extent = np.asarray(cameras_extent(self.whole), np.float32)
 
     def put(self, tree: Any) -> Any:
         """On every device."""
@@ -152,16 +152,17 @@ class _Views:
     def at(self, size: float) -> None:
         """Takes the frames at that size."""
         if size != self.size:
-            self.size, self.sized = size, resized(*self.whole, size)
+            self.size, self.cameras = size, resized(self.whole, size)
 
     def step(self, current: Current, view: int, step: int, done: float, degree: int, rates: LearningRates) -> tuple:
         """`_step` on that view."""
-        (cameras, frames), shape = self.sized, (current[0].count, self.size)
+        cameras, shape = self.cameras, (current[0].count, self.size)
         strips = 1 if self.mesh is None else self.mesh.size
         fresh = default_capacity(current[0].count, cameras.width, cameras.height, strips=strips)
         capacity = self.capacity.setdefault(shape, fresh)
         numbers = np.int32(step), np.float32(done), np.int32(degree), self.extent, rates
-        given = self.put((cameras[view], frames[view], *numbers))
+        frame = resized_frame(np.asarray(self.frames[self.used[view]]), cameras)
+        given = self.put((cameras[view], frame, *numbers))
         return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh)
 
     def widen(self, current: Current, overflow: int) -> None:

@@ -85,14 +85,16 @@ class Schedule:
         return round(start + share * (self.at_most - start))
 
 
-def resized(cameras: Camera, frames: np.ndarray, size: float) -> tuple[Camera, np.ndarray]:
-    """Batches of views at `size` times theirs, whole px; each pixel the mean of those that it covers."""
-    height, width = frames.shape[1:3]
-    to = max(round(height * size), 1), max(round(width * size), 1)
-    if to == (height, width):
-        return cameras, frames
-    small = np.stack([cv2.resize(frame, to[::-1], interpolation=cv2.INTER_AREA) for frame in frames])
-    x, y = np.float32(to[1] / width), np.float32(to[0] / height)
-    return Camera(
-        cameras.world_to_camera, cameras.fx * x, cameras.fy * y, cameras.cx * x, cameras.cy * y, *to[::-1]
-    ), small
+def resized(cameras: Camera, size: float) -> Camera:
+    """A batch of cameras whose images are `size` times theirs, in whole px."""
+    width, height = max(round(cameras.width * size), 1), max(round(cameras.height * size), 1)
+    x, y = np.float32(width / cameras.width), np.float32(height / cameras.height)
+    lens = cameras.fx * x, cameras.fy * y, cameras.cx * x, cameras.cy * y
+    return Camera(cameras.world_to_camera, *lens, width=width, height=height)
+
+
+def resized_frame(frame: np.ndarray, cameras: Camera) -> np.ndarray:
+    """A frame (h, w, 3) uint8 at the size of `cameras`: each pixel the mean of those that it covers."""
+    if frame.shape[:2] == (cameras.height, cameras.width):
+        return np.asarray(frame)
+    return cv2.resize(np.asarray(frame), (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
