@@ -181,6 +181,9 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
     assert counts == sorted(counts)
     assert 50 <= gaussians.count <= 60
     kept, _ = fit_gaussians(capture, start=few, **given | {"schedule": WHOLE})
+    mcmc, _ = fit_gaussians(capture, start=few, **given | {"schedule": dataclasses.replace(schedule, growth="mcmc")})
+    assert 50 <= mcmc.count <= 60
+    assert evaluate_psnr(mcmc, capture) > evaluate_psnr(few, capture) + 2
     assert kept.count == 20
     assert evaluate_psnr(gaussians, capture) > evaluate_psnr(kept, capture)
     again, _ = fit_gaussians(capture, state=jax.tree.map(np.asarray, states[3]), **given)

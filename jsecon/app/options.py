@@ -34,8 +34,8 @@ class SceneOptions:
     """of the photometric fit, instead of --steps: the best that can be had in that time on this machine"""
     gaussians_at_most: Annotated[int, {"metavar": "N", "least": 1}] = 100_000
     """that the fit may have; a start with more keeps its number"""
-    growth: Literal["votes", "none"] = "votes"
-    """of their number during the fit: where the picture is wrong, or none"""
+    growth: Literal["votes", "mcmc", "none"] = "votes"
+    """of their number during the fit: where the picture is wrong; by opacity, with noise; or none"""
     sh_degree: Annotated[int, {"choices": range(4)}] = 2
     """of the fitted colours"""
     seed: int = 0

@@ -4,6 +4,7 @@ The state between chunks of steps is a record of arrays, so a fit can be stopped
 the same result.
 """
 
+import dataclasses
 import functools
 import math
 import time
@@ -18,7 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 
 from jsecon.errors import InputError, require
-from jsecon.fit.growth import compact, grown, rows_for, with_free_rows
+from jsecon.fit.growth import compact, copies, grown, halves, noise, opacities, pressure, rows_for, with_free_rows
 from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized, resized_frame
 from jsecon.numerics import finite
@@ -80,6 +81,8 @@ def start_state(gaussians: Gaussians) -> FitState:
 
 
 _ADAM, _RATES, _SCHEDULE = optax.scale_by_adam(eps=1e-15), LearningRates(), Schedule()
+AHEAD = 2
+"""steps that are dispatched before one is done; each holds a scene and its moments"""
 Current: TypeAlias = tuple[Gaussians, Gaussians, Gaussians, Array]
 """the Gaussians, Adam's moments, the votes"""
 
@@ -95,6 +98,7 @@ def _step(
     rates: LearningRates,
     capacity: int,
     mesh: Mesh | None,
+    mcmc: bool,
 ) -> tuple[Current, Array, Array]:
     """One Adam step on one view, the `step`-th. Returns what is current after it, the loss before it, the pairs that
     overflowed. Over a mesh, projection, compositing, loss and update are each shared out among its devices."""
@@ -109,7 +113,8 @@ def _step(
         image, fourth = rendering.features[..., :3], rendering.features[..., 3]
         value = photometric_loss(image, target, mesh)
         error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
-        return value + jnp.sum(error * fourth), (value, rendering.overflow)
+        total = value + jnp.sum(error * fourth)
+        return total + pressure(gaussians) if mcmc else total, (value, rendering.overflow)
 
     nothing = jnp.zeros((gaussians.count, 1))
     (_, (value, overflow)), (gradient, by_error) = jax.value_and_grad(loss, (0, 1), has_aux=True)(gaussians, nothing)
@@ -121,8 +126,10 @@ def _step(
         return jax.tree.map(lambda p, u, r: p - r * u, gaussians, change, rate), moments.mu, moments.nu
 
     rate = rates_at(done, rates, gaussians, extent, degree)
-    after = over_rows(update, (gaussians, gradient, *moments), (step, rate), mesh)
-    after = *after, votes + by_error[:, 0]
+    moved, *moments = over_rows(update, (gaussians, gradient, *moments), (step, rate), mesh)
+    if mcmc:
+        moved = dataclasses.replace(moved, means=moved.means + noise(moved, rate.means, step))
+    after = moved, *moments, votes + by_error[:, 0]
     if mesh is not None:  # as it came: one program serves every step
         after = jax.lax.with_sharding_constraint(after, NamedSharding(mesh, PartitionSpec()))
     return after, value, overflow
@@ -130,18 +137,19 @@ def _step(
 
 # of one device, and over a mesh
 _step_compiled = [
-    jax.jit(_step, static_argnames=("capacity", "mesh"), compiler_options=options) for options in (None, MESH_OPTIONS)
+    jax.jit(_step, static_argnames=("capacity", "mesh", "mcmc"), compiler_options=options)
+    for options in (None, MESH_OPTIONS)
 ]
 
 
 class _Views:
     """The frames to fit to, read one at a time, at the size that is wanted now; and the room that a view needs."""
 
-    def __init__(self, capture: Capture, mesh: Mesh | None):
+    def __init__(self, capture: Capture, mesh: Mesh | None, mcmc: bool):
         self.used, self.mesh, self.frames, self.capacity = np.flatnonzero(~capture.held_out), mesh, capture.frames, {}
         if not len(self.used):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        self.whole = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
+        self.mcmc, self.whole = mcmc, jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
         self.size, self.cameras = 1.0, self.whole  # in NumPy, to index them compiles nothing
         self.extent = np.asarray(cameras_extent(self.whole), np.float32)
 
@@ -163,7 +171,7 @@ class _Views:
         numbers = np.int32(step), np.float32(done), np.int32(degree), self.extent, rates
         frame = resized_frame(np.asarray(self.frames[self.used[view]]), cameras)
         given = self.put((cameras[view], frame, *numbers))
-        return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh)
+        return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh, mcmc=self.mcmc)
 
     def widen(self, current: Current, overflow: int) -> None:
         """Gives room for `overflow` pairs more in views of this size."""
@@ -181,6 +189,8 @@ def _chunk(
             after, loss, missing = views.step(after, int(view), first + n, float(done[n]), degree, rates)
             losses.append(loss)
             overflow.append(missing)
+            if n >= AHEAD:
+                jax.block_until_ready(losses[n - AHEAD])
         most = int(max(jax.device_get(overflow)))
         if not most:
             return after, jax.device_get(losses)
@@ -215,7 +225,7 @@ def fit_gaussians(
     require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
     given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
     require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
-    views = _Views(capture, host_mesh())
+    views = _Views(capture, host_mesh(), schedule.growth == "mcmc")
     state = start_state(start) if start is not None else state
     assert state is not None
     if steps is not None:
@@ -244,8 +254,9 @@ def fit_gaussians(
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
             gaussians, first_moment, second_moment, votes = jax.tree.map(np.asarray, current)
-            moments = first_moment, second_moment
-            gaussians, moments = grown(gaussians, moments, votes, target, [seed, len(losses)])
+            moments, how = (first_moment, second_moment), (target, [seed, len(losses)])
+            by, divide = (opacities(gaussians), copies) if views.mcmc else (votes, halves)
+            gaussians, moments = grown(gaussians, moments, by, *how, divide)
             current = views.put((gaussians, *moments, np.zeros_like(gaussians.opacity_logits)))
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)

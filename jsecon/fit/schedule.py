@@ -20,9 +20,9 @@ class LearningRates:
     """Step sizes of Adam per group. Positions are in units of the cameras' extent. All decay log-linearly over the
     fit."""
 
-    means: Any = 1e-3
+    means: Any = 5e-4
     """at the first step, times the extent"""
-    means_last: Any = 1e-5
+    means_last: Any = 5e-6
     """at the last step, times the extent"""
     log_scales: Any = 2e-2
     quaternions: Any = 1e-2
@@ -52,8 +52,9 @@ class Schedule:
     sizes: tuple[tuple[float, float], ...] = ((0.5, 0.5), (1.0, 1.0))
     """(size of the frames, share of the fit at which it ends): smaller frames cost less and move what is large first
     (arXiv 2503.18402)"""
-    growth: Literal["votes", "none"] = "votes"
-    """Gaussians are added where the picture is wrong, or keep their number"""
+    growth: Literal["votes", "mcmc", "none"] = "votes"
+    """Gaussians are added where the picture is wrong, or by their opacity while all are moved by noise (arXiv
+    2404.09591), or keep their number"""
     at_most: int = 100_000
     """Gaussians; a start with more keeps its number"""
     grows_from: float = 0.05
