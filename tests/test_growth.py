@@ -92,10 +92,10 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
     whole = with_free_rows(scene(), 32)
     moments = jax.tree.map(np.ones_like, whole), jax.tree.map(np.ones_like, whole)
     votes = np.where(np.arange(32) < 30, 1.0 + np.arange(32), 7.0).astype(np.float32)
-    after, (first, second) = grown(whole, moments, votes, target, [0, 1])
+    after, (first, second) = grown(whole, moments, votes, target, 2000, [0, 1])
     added = min(target - 30, 10)  # at most 0.3 of those there are, and one
     assert in_use(after).sum() == 30 + added
-    assert after.count == (32 if added <= 2 else rows_for(min(target, 48)) if target <= 48 else after.count)
+    assert after.count == rows_for(64)  # both, as few rows as there can be
     fresh = ~first.opacity_logits.astype(bool) & in_use(after)
     assert fresh.sum() == 2 * added
     assert not second.means[fresh].any()
@@ -108,7 +108,7 @@ def test_faint_gaussians_make_room():
     whole = scene()
     whole.opacity_logits[:5] = np.log(FAINT / 2)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grown(whole, moments, np.ones(30, np.float32), 30, [0])
+    after, _ = grown(whole, moments, np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
     assert in_use(after).all()
 
@@ -116,7 +116,7 @@ def test_faint_gaussians_make_room():
 def test_nothing_is_added_where_nothing_is_wrong():
     whole = with_free_rows(scene(), 64)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grown(whole, moments, np.zeros(64, np.float32), 60, [0])
+    after, _ = grown(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(a, b)
 

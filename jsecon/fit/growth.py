@@ -120,17 +120,19 @@ def grown(
     moments: tuple[Gaussians, Gaussians],
     votes: Float[Array, " n"],
     target: int,
+    most: int,
     seed: list[int],
     divide: Callable[[Gaussians], tuple[Gaussians, Gaussians]] = halves,
 ) -> tuple[Gaussians, tuple[Gaussians, Gaussians]]:
-    """The arrays with up to `target` Gaussians: as many as are wanted, drawn by their votes, are each divided in two;
-    longer only where the rows do not suffice. The moments of the two begin at zero."""
+    """The arrays with up to `target` Gaussians: as many as are wanted, drawn by their votes, are each divided in two.
+    The moments of the two begin at zero. Where the rows do not suffice they are doubled, up to those of the `most` that
+    there will ever be: for each number of rows jax compiles anew."""
     gaussians, moments = jax.tree.map(np.array, (gaussians, moments))
     seen = in_use(gaussians)
     count = int(seen.sum())
     add = min(max(target - count, 0), int(AT_ONCE * count) + 1)
     if count + add > len(seen):
-        rows = max(rows_for(count + add), min(rows_for(target), rows_for(int(1.5 * len(seen)))))
+        rows = max(rows_for(count + add), min(rows_for(most), rows_for(2 * len(seen))))
         gaussians = with_free_rows(gaussians, rows)
         moments, votes = lengthened((moments, np.asarray(votes)), rows)
         seen = in_use(gaussians)

@@ -254,7 +254,7 @@ def fit_gaussians(
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
             gaussians, first_moment, second_moment, votes = jax.tree.map(np.asarray, current)
-            moments, how = (first_moment, second_moment), (target, [seed, len(losses)])
+            moments, how = (first_moment, second_moment), (target, schedule.at_most, [seed, len(losses)])
             by, divide = (opacities(gaussians), copies) if views.mcmc else (votes, halves)
             gaussians, moments = grown(gaussians, moments, by, *how, divide)
             current = views.put((gaussians, *moments, np.zeros_like(gaussians.opacity_logits)))
