@@ -32,8 +32,9 @@ class SceneOptions:
     """of the photometric fit"""
     minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None
     """of the photometric fit, instead of --steps: the best that can be had in that time on this machine"""
-    gaussians_at_most: Annotated[int, {"metavar": "N", "least": 1}] = 100_000
-    """that the fit may have; a start with more keeps its number"""
+    gaussians_at_most: Annotated[int | None, {"metavar": "N", "least": 1}] = None
+    """that the fit may have; a start with more keeps its number (default: one for every other pixel of a frame, in fits
+    from 3 minutes or 3000 steps on one for each, at most 100,000)"""
     growth: Literal["votes", "mcmc", "none"] = "votes"
     """of their number during the fit: where the picture is wrong; by opacity, with noise; or none"""
     sh_degree: Annotated[int, {"choices": range(4)}] = 2

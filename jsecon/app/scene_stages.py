@@ -68,7 +68,7 @@ def _fitted(work: Work) -> Stage:
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.fit.optimise import fit_gaussians
-        from jsecon.fit.schedule import Schedule
+        from jsecon.fit.schedule import Schedule, gaussians_for
         from jsecon.fit.start import starting_gaussians
 
         capture, state = results["load"], record.read()
@@ -77,6 +77,8 @@ def _fitted(work: Work) -> Stage:
             start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
+        pixels = capture.cameras.width * capture.cameras.height
+        most = options.gaussians_at_most or gaussians_for(pixels, steps=options.steps, minutes=minutes)
         found, losses = fit_gaussians(
             capture,
             key=jax.random.key(options.seed),
@@ -84,7 +86,7 @@ def _fitted(work: Work) -> Stage:
             seconds=None if minutes is None else 60 * minutes,
             start=start,
             state=state,
-            schedule=Schedule(growth=options.growth, at_most=options.gaussians_at_most),
+            schedule=Schedule(growth=options.growth, at_most=most),
             on_checkpoint=lambda current: record.keep(lambda: current),
             progress=progress,
         )
@@ -96,7 +98,8 @@ def _fitted(work: Work) -> Stage:
     if options.sh_degree == 0:
         left["view-dependent colour"] = "SH degree 0"
     length = f"{options.steps} steps" if minutes is None else f"{minutes:g} minutes"
-    number = "" if options.growth == "none" else f", at most {options.gaussians_at_most} Gaussians"
+    most = options.gaussians_at_most
+    number = "" if most is None or options.growth == "none" else f", at most {most} Gaussians"
     how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
     given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "seed")
     return Stage("gaussians", how, compute, after=("load",), given=given, left_out=left)

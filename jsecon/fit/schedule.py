@@ -86,6 +86,20 @@ class Schedule:
         return round(start + share * (self.at_most - start))
 
 
+LONG_STEPS, LONG_MINUTES = 3000, 3.0
+"""from which on a fit is long"""
+MOST = 100_000
+"""Gaussians, where nothing else is asked for"""
+
+
+def gaussians_for(pixels: int, *, steps: int | None, minutes: float | None) -> int:
+    """How many Gaussians a fit to frames of so many pixels may have: one for every other pixel, in a long fit one for
+    each, at most MOST. More of them make a step slower: bonsai at 400x266 after two minutes has 28.3 dB with 50,000,
+    28.5 with 100,000, 27.8 with 200,000 (experiments/work_precision_fit.py)."""
+    long = steps >= LONG_STEPS if minutes is None and steps is not None else (minutes or 0) >= LONG_MINUTES
+    return min(pixels if long else pixels // 2, MOST)
+
+
 def resized(cameras: Camera, size: float) -> Camera:
     """A batch of cameras whose images are `size` times theirs, in whole px."""
     width, height = max(round(cameras.width * size), 1), max(round(cameras.height * size), 1)
