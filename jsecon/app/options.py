@@ -28,7 +28,7 @@ class SceneOptions:
     """use at most N frames, evenly spaced (default: all)"""
     holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
     """keep every K-th frame for measuring only; 0 = none"""
-    steps: Annotated[int, {"least": 1}] = 1500
+    steps: Annotated[int, {"least": 1}] = 2000
     """of the photometric fit"""
     minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None
     """of the photometric fit, instead of --steps: the best that can be had in that time on this machine"""
