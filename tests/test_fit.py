@@ -193,7 +193,8 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
 def test_the_votes_are_the_weights_on_the_errors(capture, start):
     """Against their definition: the gradient of sum(w e) as a feature's, one view."""
     states = []
-    fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=WHOLE, on_checkpoint=states.append)
+    voting = dataclasses.replace(WHOLE, growth="votes")
+    fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=voting, on_checkpoint=states.append)
     view = np.array([0, 1, 3, 4])[view_order(KEY, 4, 0, 1)[0]]
     camera, target = capture.cameras[view], capture.frames[view] / np.float32(255)
     error = np.abs(np.asarray(render_rgb(start, camera).features) - target).mean(-1)

@@ -22,6 +22,12 @@ def test_the_number_of_gaussians_rises_evenly_and_stops():
     assert dataclasses.replace(schedule, growth="none").count(0.3, 100) is None
 
 
+def test_votes_are_counted_as_long_as_they_are_of_use():
+    schedule = Schedule(grows_until=0.5)
+    assert [schedule.growth_at(done) for done in (0.0, 0.5, 0.51)] == ["votes", "votes", "none"]
+    assert dataclasses.replace(schedule, growth="mcmc").growth_at(0.9) == "mcmc"
+
+
 def test_degrees_open_one_after_another():
     schedule = Schedule(degree_every=0.1)
     assert [schedule.degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]

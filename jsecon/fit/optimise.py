@@ -9,7 +9,7 @@ import functools
 import math
 import time
 from collections.abc import Callable
-from typing import Any, TypeAlias, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from jsecon.fit.growth import compact, copies, grown, halves, noise, opacities, 
 from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized, resized_frame
 from jsecon.numerics import finite
-from jsecon.parallel import MESH_OPTIONS, host_mesh, over_rows
+from jsecon.parallel import AXIS, MESH_OPTIONS, host_mesh, over_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
@@ -85,6 +85,9 @@ AHEAD = 2
 """steps that are dispatched before one is done; each holds a scene and its moments"""
 Current: TypeAlias = tuple[Gaussians, Gaussians, Gaussians, Array]
 """the Gaussians, Adam's moments, the votes"""
+Growth: TypeAlias = Literal["votes", "mcmc", "none"]
+How: TypeAlias = tuple[int, Growth, LearningRates]
+"""the highest degree that learns, what the step does for growth, the learning rates"""
 
 
 def _step(
@@ -98,7 +101,7 @@ def _step(
     rates: LearningRates,
     capacity: int,
     mesh: Mesh | None,
-    mcmc: bool,
+    growth: Growth,
 ) -> tuple[Current, Array, Array]:
     """One Adam step on one view, the `step`-th. Returns what is current after it, the loss before it, the pairs that
     overflowed. Over a mesh, projection, compositing, loss and update are each shared out among its devices."""
@@ -107,16 +110,15 @@ def _step(
 
     def loss(gaussians: Gaussians, nothing: Array):
         colours = over_rows(colours_from_sh, gaussians, camera, mesh)
-        # The votes are the gradient of a fourth channel that shows nothing: they cost no pass of their own.
-        features = jnp.concatenate([colours, nothing], axis=1)
-        rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh)
-        image, fourth = rendering.features[..., :3], rendering.features[..., 3]
+        rendering = render(gaussians, camera, jnp.concatenate([colours, nothing], 1), capacity=capacity, mesh=mesh)
+        image, fourth = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)
         value = photometric_loss(image, target, mesh)
         error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
         total = value + jnp.sum(error * fourth)
-        return total + pressure(gaussians) if mcmc else total, (value, rendering.overflow)
+        return total + pressure(gaussians) if growth == "mcmc" else total, (value, rendering.overflow)
 
-    nothing = jnp.zeros((gaussians.count, 1))
+    # The votes are the gradient of a fourth channel that shows nothing: they cost no pass of their own.
+    nothing = jnp.zeros((gaussians.count, 1 if growth == "votes" else 0))
     (_, (value, overflow)), (gradient, by_error) = jax.value_and_grad(loss, (0, 1), has_aux=True)(gaussians, nothing)
 
     def update(rows, common):
@@ -127,17 +129,30 @@ def _step(
 
     rate = rates_at(done, rates, gaussians, extent, degree)
     moved, *moments = over_rows(update, (gaussians, gradient, *moments), (step, rate), mesh)
-    if mcmc:
+    if growth == "mcmc":
         moved = dataclasses.replace(moved, means=moved.means + noise(moved, rate.means, step))
-    after = moved, *moments, votes + by_error[:, 0]
+    after = moved, *moments, votes + by_error.sum(1)
     if mesh is not None:  # as it came: one program serves every step
-        after = jax.lax.with_sharding_constraint(after, NamedSharding(mesh, PartitionSpec()))
+        after = jax.lax.with_sharding_constraint(after, _places(mesh))
     return after, value, overflow
+
+
+def _places(mesh: Mesh) -> tuple:
+    """Where a device finds what is current: the Gaussians and votes whole, of the moments its own rows."""
+    whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
+    return whole, rows, rows, whole
+
+
+def on_devices(current: Current, mesh: Mesh | None) -> Current:
+    """What is current, where the devices of a step want it."""
+    if mesh is None:
+        return jax.device_put(current)
+    return cast(Current, tuple(jax.device_put(part, place) for part, place in zip(current, _places(mesh), strict=True)))
 
 
 # of one device, and over a mesh
 _step_compiled = [
-    jax.jit(_step, static_argnames=("capacity", "mesh", "mcmc"), compiler_options=options)
+    jax.jit(_step, static_argnames=("capacity", "mesh", "growth"), compiler_options=options)
     for options in (None, MESH_OPTIONS)
 ]
 
@@ -145,11 +160,11 @@ _step_compiled = [
 class _Views:
     """The frames to fit to, read one at a time, at the size that is wanted now; and the room that a view needs."""
 
-    def __init__(self, capture: Capture, mesh: Mesh | None, mcmc: bool):
+    def __init__(self, capture: Capture, mesh: Mesh | None):
         self.used, self.mesh, self.frames, self.capacity = np.flatnonzero(~capture.held_out), mesh, capture.frames, {}
         if not len(self.used):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        self.mcmc, self.whole = mcmc, jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
+        self.whole = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
         self.size, self.cameras = 1.0, self.whole  # in NumPy, to index them compiles nothing
         self.extent = np.asarray(cameras_extent(self.whole), np.float32)
 
@@ -162,16 +177,17 @@ class _Views:
         if size != self.size:
             self.size, self.cameras = size, resized(self.whole, size)
 
-    def step(self, current: Current, view: int, step: int, done: float, degree: int, rates: LearningRates) -> tuple:
+    def step(self, current: Current, view: int, step: int, done: float, how: How) -> tuple:
         """`_step` on that view."""
         cameras, shape = self.cameras, (current[0].count, self.size)
         strips = 1 if self.mesh is None else self.mesh.size
         fresh = default_capacity(current[0].count, cameras.width, cameras.height, strips=strips)
         capacity = self.capacity.setdefault(shape, fresh)
+        degree, growth, rates = how
         numbers = np.int32(step), np.float32(done), np.int32(degree), self.extent, rates
         frame = resized_frame(np.asarray(self.frames[self.used[view]]), cameras)
         given = self.put((cameras[view], frame, *numbers))
-        return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh, mcmc=self.mcmc)
+        return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh, growth=growth)
 
     def widen(self, current: Current, overflow: int) -> None:
         """Gives room for `overflow` pairs more in views of this size."""
@@ -180,13 +196,13 @@ class _Views:
 
 
 def _chunk(
-    current: Current, views: _Views, order: np.ndarray, first: int, done: np.ndarray, degree: int, rates: LearningRates
+    current: Current, views: _Views, order: np.ndarray, first: int, done: np.ndarray, how: How
 ) -> tuple[Current, list]:
     """A step on each view of `order`, taken again with more room where one overflowed; and their losses."""
     while True:
         after, losses, overflow = current, [], []
         for n, view in enumerate(order):
-            after, loss, missing = views.step(after, int(view), first + n, float(done[n]), degree, rates)
+            after, loss, missing = views.step(after, int(view), first + n, float(done[n]), how)
             losses.append(loss)
             overflow.append(missing)
             if n >= AHEAD:
@@ -225,15 +241,15 @@ def fit_gaussians(
     require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
     given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
     require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
-    views = _Views(capture, host_mesh(), schedule.growth == "mcmc")
+    views = _Views(capture, host_mesh())
     state = start_state(start) if start is not None else state
     assert state is not None
     if steps is not None:
         own = abs(float(state.done) * steps - len(state.losses)) < 1e-6
         found = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
         require(own, "state", found, f"a fit of {steps} steps", "Go on with the options of its start.")
-    seed = int(jax.random.bits(key))
-    current = views.put((state.gaussians, state.first_moment, state.second_moment, state.votes))
+    seed, compiled = int(jax.random.bits(key)), set()
+    current = on_devices((state.gaussians, state.first_moment, state.second_moment, state.votes), views.mesh)
     while float(state.done) < 1:
         first, done = len(state.losses), float(state.done)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
@@ -241,10 +257,12 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         views.at(schedule.size(done))
         order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
-        if (current[0].count, views.size) not in views.capacity:  # compiled here, which is not the fit's time
-            jax.block_until_ready(views.step(current, int(order[0]), first, done, schedule.degree(done), rates))
+        how = schedule.degree(done), schedule.growth_at(done), rates
+        if (program := (current[0].count, views.size, how[1])) not in compiled:  # here, which is not the fit's time
+            jax.block_until_ready(views.step(current, int(order[0]), first, done, how))
+            compiled.add(program)
         began = time.monotonic()
-        current, taken = _chunk(current, views, order, first, dones, schedule.degree(done), rates)
+        current, taken = _chunk(current, views, order, first, dones, how)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
         if not (np.isfinite(losses[-1]) and bool(_all_finite(current[0]))):
@@ -255,9 +273,9 @@ def fit_gaussians(
         if target is not None and len(losses) % chunk == 0:
             gaussians, first_moment, second_moment, votes = jax.tree.map(np.asarray, current)
             moments, how = (first_moment, second_moment), (target, schedule.at_most, [seed, len(losses)])
-            by, divide = (opacities(gaussians), copies) if views.mcmc else (votes, halves)
+            by, divide = (opacities(gaussians), copies) if schedule.growth == "mcmc" else (votes, halves)
             gaussians, moments = grown(gaussians, moments, by, *how, divide)
-            current = views.put((gaussians, *moments, np.zeros_like(gaussians.opacity_logits)))
+            current = on_devices((gaussians, *moments, np.zeros_like(votes, shape=gaussians.count)), views.mesh)
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
         gaussians, first_moment, second_moment, votes = current

@@ -58,7 +58,7 @@ class Schedule:
     at_most: int = 100_000
     """Gaussians; a start with more keeps its number"""
     grows_from: float = 0.05
-    grows_until: float = 0.6
+    grows_until: float = 0.5
     """shares of the fit between which the number of Gaussians rises evenly to `at_most`"""
     degree_every: float = 0.1
     """share of the fit after which the degree of the spherical harmonics rises by one, up to what the start holds"""
@@ -77,6 +77,10 @@ class Schedule:
     def degree(self, done: float) -> int:
         """The highest of the spherical harmonics that learns."""
         return int(done / self.degree_every) if self.degree_every > 0 else 3
+
+    def growth_at(self, done: float) -> Literal["votes", "mcmc", "none"]:
+        """What a step does for growth: votes are counted only as long as they are of use."""
+        return "none" if self.growth == "votes" and done > self.grows_until else self.growth
 
     def count(self, done: float, start: int) -> int | None:
         """Gaussians wanted, or None where none are added now."""
