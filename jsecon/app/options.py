@@ -19,7 +19,8 @@ class Options:
     """All that the result of a run depends on, but for the files themselves."""
 
     capture: Annotated[Path, {"positional": True}]
-    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)"""
+    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
+    photographs or a video, whose poses are then found (extra sfm)"""
     gaussians: Annotated[Path | None, {"metavar": "PLY"}] = None
     """a scene of 3D Gaussians (.ply, INRIA layout) in the capture's world; without it, Gaussians are fitted to the
     frames"""
@@ -28,7 +29,7 @@ class Options:
     long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400
     """of the frames, where --downscale is not given"""
     frames: Annotated[int | None, {"metavar": "N", "least": 2}] = None
-    """use at most N frames, evenly spaced (default: all)"""
+    """use at most N frames, evenly spaced (default: all; of a video 150)"""
     holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
     """keep every K-th frame for measuring only; 0 = none"""
     steps: Annotated[int, {"least": 1}] = 1500
