@@ -1,9 +1,13 @@
 """Poses of bare photographs: found up to a similarity, kept, gone on with, and refused where they can't be."""
 
+import contextlib
 import dataclasses
+import importlib.util
 import shutil
+import sqlite3
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -35,7 +39,8 @@ def photos(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(photos, tmp_path_factory):
     """What structure from motion finds, where it works, and what it told on the way."""
-    pytest.importorskip("pycolmap")
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("no pycolmap")
     work, told = tmp_path_factory.mktemp("work"), []
     motion_found, capture = find_poses(photographs(photos[0]), work, progress=lambda *at: told.append(at))
     return motion_found, capture, work, told
@@ -109,6 +114,29 @@ def test_pairs_are_the_neighbours_and_the_frames_that_look_alike(monkeypatch, tm
     assert {(1, 2), (1, 11), (1, 41), (20, 60)} <= pairs
     assert (1, 12) not in pairs
     assert len(motion_steps._pairs(tmp_path / "none", images[:40])) == 40 * 39 // 2
+
+
+def test_a_photograph_whose_matches_become_no_points_is_in_a_wrong_place(tmp_path):
+    """Five photographs of the same 20 things; the last one's are points of its own, but for two."""
+    count, things = 5, 20
+    rows = np.stack([np.arange(things)] * 2, axis=-1).astype(np.uint32)
+    with contextlib.closing(sqlite3.connect(tmp_path / "database.db")) as held, held:
+        held.execute("create table two_view_geometries (pair_id, rows, data)")
+        for a in range(1, count + 1):
+            for b in range(a + 1, count + 1):
+                held.execute("insert into two_view_geometries values (?, ?, ?)", (a * motion_steps.PAIR + b, 20, rows))
+
+    def image(numbers):
+        points = [
+            SimpleNamespace(point3D_id=number, has_point3D=lambda number=number: number > 0) for number in numbers
+        ]
+        return SimpleNamespace(has_pose=True, points2D=points)
+
+    right, wrong = image([*range(1, 18), 0, 0, 0]), image([1, 2, *range(101, 119)])
+    model = SimpleNamespace(images={number: right for number in range(1, count)} | {count: wrong})
+    assert motion_steps._misplaced(tmp_path / "database.db", model) == [count]
+    model.images[count] = right
+    assert motion_steps._misplaced(tmp_path / "database.db", model) == []
 
 
 def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monkeypatch, capsys):

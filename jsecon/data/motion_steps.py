@@ -133,9 +133,11 @@ def _mapping(colmap: Any, total: int, database: Path, links: Path, progress: Pro
         return list(colmap.incremental_mapping(database, links, folder, **how, **start).values())
 
     found = mapped("models", 1)
-    best: Any = max(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    if not found:
+        return None, 0
+    best = max(found, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     options.multiple_models = False
-    for turn in range(REPAIRS if best is not None else 0):
+    for turn in range(REPAIRS):
         if not (wrong := _misplaced(database, best)):
             break
         for image in wrong:
