@@ -17,6 +17,7 @@ EPILOG = """
 examples
   jsecon demo                                           a made-up room, from frames to answers and a report
   jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.npz
+  jsecon run my_photos --out my_field                   photographs or a video: finds their poses first (extra sfm)
   jsecon run my_capture --out my_field --gaussians point_cloud.ply
                                                         the same on a scene that is already splatted
   jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
@@ -53,9 +54,9 @@ class Demo:
 class Run(Options):
     """build the language field of a capture
 
-    From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found in the frames and
-    brought together, or given as masks), one embedding per region, codes distilled into the Gaussians. Prints its
-    stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
+    From frames to a language field: poses (found where the capture has none), Gaussians (fitted, or given as a .ply),
+    masklets (found in the frames and brought together, or given as masks), one embedding per region, codes distilled
+    into the Gaussians. Prints its stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
     """
 
     out: Path

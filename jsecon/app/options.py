@@ -19,13 +19,14 @@ class SceneOptions:
     """What the Gaussians of a capture depend on."""
 
     capture: Annotated[Path, {"positional": True}]
-    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)"""
+    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
+    photographs or a video, whose poses are then found (extra sfm)"""
     downscale: Annotated[float | None, {"metavar": "K", "least": 1}] = None
     """make frames K times smaller (default: so that the longer side is at most --long-side)"""
     long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400
     """of the frames, where --downscale is not given"""
     frames: Annotated[int | None, {"metavar": "N", "least": 2}] = None
-    """use at most N frames, evenly spaced (default: all)"""
+    """use at most N frames, evenly spaced (default: all; of a video 150)"""
     holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
     """keep every K-th frame for measuring only; 0 = none"""
     steps: Annotated[int, {"least": 1}] = 2000

@@ -2,6 +2,8 @@
 
     load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field, then the held-out frames measured
 
+Before it all, `poses` where the capture has none (data/motion, data/video).
+
 The keys of all stages are known before any runs, so all of it is told first: what will run, what is cached, what is
 left out and why. Read on the way, by default, without the ground (the root's modules); behind each file lies more of
 its own room, behind splat/render the engine:
@@ -36,8 +38,8 @@ from jsecon.app.language_stages import codes, distil, field_of, regions, votes
 from jsecon.app.masklet_stages import masklets
 from jsecon.app.options import Options, require_inputs, require_writable
 from jsecon.app.progress import Listener, Step
-from jsecon.app.scene_stages import gaussians, held_out, load
-from jsecon.app.stages import Outcome, Record, Stage, Work
+from jsecon.app.scene_stages import gaussians, held_out, loaded
+from jsecon.app.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.errors import InputError
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
@@ -78,7 +80,7 @@ class Run:
 def stages_of(work: Work) -> list[Stage]:
     """The stages of a run in order. Mask files come before the long fit: what is wrong with them is said at once."""
     first = (masklets, gaussians) if work.options.masks is not None else (gaussians, masklets)
-    return [stage(work) for stage in (load, *first, regions, codes, votes, distil, held_out)]
+    return [*loaded(work), *(stage(work) for stage in (*first, regions, codes, votes, distil, held_out))]
 
 
 def peak_memory_mib() -> float:
@@ -110,6 +112,9 @@ def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener)
     for stage in stages:
         keys[stage.name] = stage.key(work, keys)
     place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
+    for stage in stages:
+        if stage.leaves is not None and not _left(stage, stages, place):
+            place[stage.name].unlink(missing_ok=True)
     steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
     steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
     listener.steps(f"{options.capture} -> {work.out}", steps)
@@ -167,9 +172,17 @@ def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tup
     """The stages of `run` that make and measure the scene; OUT/cache is theirs too, so a `run` into OUT goes on from
     it. Returns the Gaussians, their capture, and the quality of the frames held out."""
     work = Work(options, networks.networks_of(options, out / "cache"), out)
-    stages = [stage(work) for stage in (load, gaussians, held_out)]
+    stages = [*loaded(work), gaussians(work), held_out(work)]
     results = _computed(work, stages, out / "cache", listener or Listener()).results
     return results["gaussians"], results["load"], results["held_out"]
+
+
+def _left(stage: Stage, stages: list[Stage], place: dict[str, Path]) -> bool:
+    """Whether the folder that the stage left is still its own, or nobody will look for it."""
+    key = stage.leaves / KEY_FILE if stage.leaves is not None else None
+    if key is not None and key.is_file() and key.read_text() == cache.record_path_of(place[stage.name]).stem:
+        return True
+    return all(place[other.name].exists() for other in stages if stage.name in other.after)
 
 
 def _provenance(options: Options, keys: dict[str, str]) -> str:

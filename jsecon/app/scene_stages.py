@@ -1,13 +1,72 @@
-"""The stages about the scene: the capture is loaded, its Gaussians are read or fitted, held-out frames are measured."""
+"""The stages about the scene: poses are found where there are none, the capture is loaded, its Gaussians are read or
+fitted, held-out frames are measured."""
+
+import dataclasses
+import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app.progress import Progress
-from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.app.stages import KEY_FILE, Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.errors import InputError
+from jsecon.files import write_text
 from jsecon.types import Camera, Capture, Gaussians
+
+
+def loaded(work: Work) -> list[Stage]:
+    """The capture; before it, where there are photographs or a video without poses, the poses."""
+    if work.load is not None or not _bare(work.options.capture):
+        return [load(work)]
+    found = poses(work)
+    posed = dataclasses.replace(work, options=dataclasses.replace(work.options, capture=found.leaves))
+    return [found, dataclasses.replace(load(posed), after=("poses",), files=None)]
+
+
+def _bare(capture: Path) -> bool:
+    """Whether it is a video, or a folder of photographs without a file of poses."""
+    from jsecon.data.colmap import find_model
+
+    if find_model(capture) is not None or (capture / "transforms.json").exists() or capture.suffix == ".json":
+        return False
+    from jsecon.data.motion import photographs
+    from jsecon.data.video import is_video
+
+    return is_video(capture) or len(photographs(capture)) > 0
+
+
+def poses(work: Work) -> Stage:
+    """The poses of bare photographs or of a video's frames, as a COLMAP capture in OUT/poses."""
+    from jsecon.data.motion import find_poses, photographs
+    from jsecon.data.video import VIDEO_FRAMES, is_video, write_frames
+
+    capture, out, video = work.options.capture, work.out / "poses", is_video(work.options.capture)
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        folder = record.folder
+        if video:
+            photos = write_frames(capture, folder / "frames", frames=work.options.frames, progress=progress)
+        else:
+            photos = photographs(capture)
+        found, posed = find_poses(photos, folder, where=capture, progress=progress)
+        if video:
+            shutil.rmtree(posed / "images")
+            (folder / "frames").rename(posed / "images")
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.move(posed, out)
+        write_text(out / KEY_FILE, folder.name)
+        return Outcome(found, notes=(*found.notes(), f"The poses are in {out}: COLMAP opens them."))
+
+    if video:
+        what = f"the {work.options.frames or VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
+    else:
+        what = f"{len(photographs(capture))} photographs, which have none"
+    how = f"found by structure from motion (pycolmap) for {what}"
+    given = work.given("frames") if video else {}
+    files = capture / "images" if (capture / "images").is_dir() else capture
+    return Stage("poses", how, compute, given=given, files=files, leaves=out)
 
 
 def load(work: Work) -> Stage:
