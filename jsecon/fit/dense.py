@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
+from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
@@ -24,8 +25,9 @@ AGREEMENT, AGREEING = 0.02, 2
 """relative difference up to which two depths agree, and how many maps have to"""
 MAX_SIDE = 640
 """px: larger frames are shrunk by a whole factor first, as the time grows with the cube of their size"""
-MIN_SAMPLES = 3
-"""pixels that a voxel's point is the mean of, of all frames; what fewer have seen stands alone in the air"""
+MIN_SAMPLES, ALONE = 3, 3.0
+"""pixels that a voxel's point is the mean of, of all frames, at least; edges of its voxel within which a point has
+three others. What fails either stands alone in the air, and as a Gaussian as wide as the gap it fogs whole views."""
 MAX_DISPARITIES, BLOCK, STEP_COST, JUMP_COST = 256, 3, 4 * 9, 16 * 9
 """steps of the search, px; side of the matching's window, px; its costs of a step of one and of more, in grey values
 summed over the window: half of what is usual, so that objects do not grow into the blank walls behind them"""
@@ -188,8 +190,12 @@ def _merged(samples: np.ndarray, at_most: int) -> np.ndarray:
         middle = np.sqrt(low * high)
         low, high = (middle, high) if too_many(middle) else (low, middle)
     ids, count = voxels(high)
-    mean = np.stack([np.bincount(ids, a) / count for a in samples[:, :6].T], axis=1)
-    return mean[count >= MIN_SAMPLES]
+    mean = np.stack([np.bincount(ids, a) / count for a in (*samples[:, :6].T, grid[:, 0])], axis=1)
+    mean = mean[count >= MIN_SAMPLES]
+    if len(mean) < 4:
+        return mean[:0, :6]
+    third = KDTree(mean[:, :3]).query(mean[:, :3], k=4, workers=-1)[0][:, 3]
+    return mean[third < ALONE * high * mean[:, 6], :6]
 
 
 def dense_points(
