@@ -110,7 +110,7 @@ def test_what_cannot_be_matched_is_refused():
     with pytest.raises(InputError, match=r"1 frames to match.*at least 3"):
         dense_points(chosen([0]), at_most=1000)
     blank = dataclasses.replace(without_depth(room()), frames=np.full_like(room().frames, 90))
-    with pytest.raises(InputError, match=r"pixels that three views agree on.*texture"):
+    with pytest.raises(InputError, match=r"points that three views agree on.*texture"):
         dense_points(blank, at_most=1000)
     apart = chosen([0, 1, 3])
     poses = np.array(apart.cameras.world_to_camera)

@@ -121,7 +121,9 @@ def _stereo(views: _Views, i: int, j: int, near: float, far: float) -> tuple[np.
         homography = np.linalg.inv(half) @ to_common @ turn @ half
         # The matching leaves out the columns at the left whose matches could lie outside: they are put in front.
         pad = np.array([[1, 0, first + count], [0, 1, 0], [0, 0, 1]])
-        turned.append(cv2.warpPerspective(picture, pad @ homography, (int(size[0]) + first + count, int(size[1]))))
+        # What lies outside a picture repeats its border: black there would make the border a thing to match.
+        whole = (int(size[0]) + first + count, int(size[1]))
+        turned.append(cv2.warpPerspective(picture, pad @ homography, whole, borderMode=cv2.BORDER_REPLICATE))
     matcher = cv2.StereoSGBM.create(
         first, count, BLOCK, STEP_COST, JUMP_COST, 1, 31, 10, 0, 0, cv2.STEREO_SGBM_MODE_SGBM_3WAY
     )
@@ -168,9 +170,10 @@ def _points(views: _Views, maps: list[np.ndarray], partners: list[np.ndarray], t
 def _merged(samples: np.ndarray, at_most: int) -> np.ndarray:
     """(P, 6) mean points and colours of those of at most `at_most` voxels that hold MIN_SAMPLES of the samples (S, 7).
 
-    A voxel's edge is one number of pixels, the smallest from 1/2 that leaves so few, of the power of two below the size
-    of a pixel at the point: near things keep more points.
+    A voxel's edge is a number of pixels, of the power of two below the size of a pixel at the point: near things keep
+    more points. It is the smallest number from 1/2 that leaves so few voxels and 2 MIN_SAMPLES samples in the mean one.
     """
+    at_most = max(1, min(at_most, len(samples) // (2 * MIN_SAMPLES)))
     level = np.floor(np.log2(samples[:, 6])).astype(np.int64)
     offset, grid = samples[:, :3] - np.median(samples[:, :3], axis=0), np.exp2(level)[:, None]
     level = np.clip(level - level.min(), 0, 63)
@@ -235,7 +238,7 @@ def dense_points(
     if len(merged) >= MIN_POINTS:
         return merged[:, :3].astype(np.float32), np.rint(merged[:, 3:6]).astype(np.uint8)
     remedy = "The views must overlap sideways and have texture, and the poses be theirs; or start from sparse points."
-    raise InputError("capture", f"{len(samples)} pixels that three views agree on", f"at least {MIN_POINTS}", remedy)
+    raise InputError("capture", f"{len(merged)} points that three views agree on", f"at least {MIN_POINTS}", remedy)
 
 
 def random_points(capture: Capture, count: int) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
