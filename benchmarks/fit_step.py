@@ -8,6 +8,7 @@ loss against the plain formula of the loss on the same image (photometric_loss w
 """
 
 import argparse
+import dataclasses
 import functools
 import json
 import time
@@ -24,10 +25,11 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from jsecon.data.capture import load_capture
 from jsecon.fit.growth import rows_for, with_free_rows
-from jsecon.fit.optimise import _step_compiled, cameras_extent, on_devices
 from jsecon.fit.photometric import l1, photometric_loss
 from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
+from jsecon.fit.step import Current, Steps, Way, on_devices
+from jsecon.fit.view import Views
 from jsecon.parallel import MESH_OPTIONS, host_mesh, over_rows
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.render import render, render_rgb
@@ -58,11 +60,10 @@ def main() -> None:
         return l1(image, frame.astype(jnp.float32) / 255)
 
     zeros = jax.tree.map(np.zeros_like, gaussians)
-    current = on_devices((gaussians, zeros, zeros, zeros.opacity_logits), mesh)
-    numbers = np.int32(0), np.float32(0), np.int32(3), np.float32(cameras_extent(cameras)), LearningRates()
-    step = functools.partial(_step_compiled[mesh is not None], current, camera, frame, *put(numbers))
-    static: dict[str, Any] = {"capacity": room, "mesh": mesh}
-    voting, plain_step = (functools.partial(step, **static, growth=growth) for growth in ("votes", "none"))
+    current = on_devices(Current(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
+    views = Views(dataclasses.replace(capture, held_out=np.arange(9) != 4))
+    steps, ways = Steps(views, mesh), [Way(3, growth, LearningRates(), None) for growth in ("votes", "none")]
+    voting, plain_step = (functools.partial(steps.take, current, 0, 0, 0.0, way) for way in ways)
     reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current[0], camera, frame)
     runs = {"l1": reference, "step": plain_step, "step_with_votes": voting}
     seconds: dict[str, list[float]] = {name: [] for name in runs}

@@ -107,6 +107,8 @@ class Capture:
     """T file names without folder or ending, in frame order."""
     notes: tuple[str, ...] = static(default=())
     """What the loader left out or changed, a sentence each."""
+    ignored: Array | None = None
+    """(T, H, W) bool: what a fit shall not look at, as what moved; or None."""
 
 
 @record

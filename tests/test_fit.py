@@ -9,11 +9,12 @@ import pytest
 from conftest import look_at
 
 from jsecon.errors import InputError
-from jsecon.fit import optimise
+from jsecon.fit import step as one_step
 from jsecon.fit.growth import in_use
-from jsecon.fit.optimise import cameras_extent, fit_gaussians, start_state, view_order
+from jsecon.fit.optimise import fit_gaussians, start_state, view_order
 from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.view import cameras_extent
 from jsecon.parallel import host_mesh
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import Camera, Capture, Gaussians
@@ -151,7 +152,7 @@ def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
 def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monkeypatch):
     given = {"steps": 20, "key": KEY, "start": start, "schedule": WHOLE, "rates": RATES, "chunk": 10}
     twin, _ = fit_gaussians(capture, **given)
-    asked, inner = [], optimise._step_compiled
+    asked, inner = [], one_step.step_compiled
 
     def counted(step):
         def taken(*args, capacity, **options):
@@ -160,8 +161,8 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monke
 
         return taken
 
-    monkeypatch.setattr(optimise, "default_capacity", lambda count, width, height, strips: 32)
-    monkeypatch.setattr(optimise, "_step_compiled", [counted(step) for step in inner])
+    monkeypatch.setattr(one_step, "default_capacity", lambda count, width, height, strips: 32)
+    monkeypatch.setattr(one_step, "step_compiled", [counted(step) for step in inner])
     gaussians, losses = fit_gaussians(capture, **given)
     assert asked[0] == 32
     assert asked[-1] > 32
@@ -213,7 +214,7 @@ def test_a_fit_of_seconds_ends_about_then_and_says_how_far_it_is(capture, start)
 
 def test_one_program_serves_a_size_and_a_number_of_rows(capture, start):
     """Two sizes, rows that suffice: two programs, whatever the number of steps."""
-    programs = optimise._step_compiled[host_mesh() is not None]
+    programs = one_step.step_compiled[host_mesh() is not None]
     before = programs._cache_size()
     schedule = dataclasses.replace(SCHEDULE, sizes=((0.75, 0.5), (1.0, 1.0)), growth="votes", at_most=80)
     fit_gaussians(capture, steps=STEPS, key=KEY, start=start, schedule=schedule, chunk=5)

@@ -29,6 +29,11 @@ class SceneOptions:
     """use at most N frames, evenly spaced (default: all; of a video 150)"""
     holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
     """keep every K-th frame for measuring only; 0 = none"""
+    refine: Literal["none", "poses", "exposure", "both", "auto"] = "none"
+    """where cameras stood and how bright pictures are, by a probe fit before anything else; frames held out are aligned
+    to the frozen probe; auto: both where the frames have depth"""
+    drop_frames: Literal["none", "auto"] = "none"
+    """auto: leave out training frames that a probe fit does not explain"""
     steps: Annotated[int, {"least": 1}] = 2000
     """of the photometric fit"""
     minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None
@@ -40,6 +45,9 @@ class SceneOptions:
     """of their number during the fit: where the picture is wrong; by opacity, with noise; or none"""
     sh_degree: Annotated[int, {"choices": range(4)}] = 2
     """of the fitted colours"""
+    start: Literal["auto", "sparse", "dense", "random"] = "auto"
+    """of the fit: from the capture's own points, or points triangulated; by stereo between neighbouring views; at
+    random; auto: from depth where there is depth, else as sparse"""
     seed: int = 0
     """of whatever is drawn at random"""
 

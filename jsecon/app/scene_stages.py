@@ -70,7 +70,38 @@ def poses(work: Work) -> Stage:
 
 
 def load(work: Work) -> Stage:
-    """The capture, at the size that the options ask for."""
+    """The capture, at the size that the options ask for, put right where they ask for that."""
+    options = work.options
+    return _as_it_is(work) if options.refine == "none" and options.drop_frames == "none" else _put_right(work)
+
+
+def _put_right(work: Work) -> Stage:
+    """Poses and exposures as a probe fit finds them, without the frames that it does not explain."""
+    options, plain = work.options, _as_it_is(work)
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.fit.corrections import Refine
+        from jsecon.fit.settle import settled
+        from jsecon.fit.start import starting_gaussians
+
+        loaded = plain.compute(results, progress, record)
+        capture, asked = loaded.value, options.refine
+        if asked == "auto":
+            asked = "none" if capture.depths is None else "both"
+        refine = None if asked == "none" else Refine(asked in ("poses", "both"), asked in ("exposure", "both"))
+        told, start = len(capture.notes), starting_gaussians(capture, progress=progress)[0]
+        given = {"refine": refine, "drop_weak": options.drop_frames == "auto", "progress": progress}
+        better = settled(capture, start, key=jax.random.key(options.seed), **given)
+        training_frames(better)
+        return Outcome(better, notes=(*loaded.notes, *better.notes[told:]))
+
+    asked = work.given("refine", "drop_frames", "seed")
+    how = f"{plain.how}, put right by a probe fit (refine {options.refine}, drop frames {options.drop_frames})"
+    return Stage("load", how, compute, given={**plain.given, **asked}, files=plain.files)
+
+
+def _as_it_is(work: Work) -> Stage:
+    """The capture as its files say."""
     options, asked = work.options, work.given("downscale", "long_side", "frames", "holdout")
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
@@ -133,7 +164,8 @@ def _fitted(work: Work) -> Stage:
         capture, state = results["load"], record.read()
         start, notes = None, ()
         if state is None:
-            start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
+            given = {"sh_degree": options.sh_degree, "start": options.start, "progress": progress}
+            start, whence = starting_gaussians(capture, **given)
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
         pixels = capture.cameras.width * capture.cameras.height
@@ -160,7 +192,7 @@ def _fitted(work: Work) -> Stage:
     most = options.gaussians_at_most
     number = "" if most is None or options.growth == "none" else f", at most {most} Gaussians"
     how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
-    given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "seed")
+    given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "start", "seed")
     return Stage("gaussians", how, compute, after=("load",), given=given, left_out=left)
 
 
@@ -187,7 +219,8 @@ def held_out(work: Work) -> Stage:
         low = np.flatnonzero(weak(np.asarray(fitted.psnr)))
         names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in low[:5])
         more = f" and {len(low) - 5} more" if len(low) > 5 else ""
-        told = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or a change"
+        told = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
+        told += "something moved (--drop-frames auto leaves them out)"
         return Outcome(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
     return Stage("held_out", "PSNR and SSIM of the rendered colours", compute, after=("load", "gaussians"))

@@ -4,30 +4,25 @@ The state between chunks of steps is a record of arrays, so a fit can be stopped
 the same result.
 """
 
-import dataclasses
 import functools
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Literal, TypeAlias, cast
+from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
-from jsecon.fit.growth import compact, copies, grown, halves, noise, opacities, pressure, rows_for, with_free_rows
-from jsecon.fit.photometric import photometric_loss
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized, resized_frame
+from jsecon.fit.corrections import Refine, Refined, start_refined
+from jsecon.fit.growth import compact, copies, grown, halves, opacities, rows_for, with_free_rows
+from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.step import Current, Steps, Way, on_devices
+from jsecon.fit.view import Views
 from jsecon.numerics import finite
-from jsecon.parallel import AXIS, MESH_OPTIONS, host_mesh, over_rows
-from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.splat.render import render
-from jsecon.splat.sh import colours_from_sh
-from jsecon.types import Array, Camera, Capture, Gaussians, record
+from jsecon.parallel import host_mesh
+from jsecon.types import Array, Capture, Gaussians, record
 
 
 @record
@@ -52,12 +47,8 @@ class FitState:
     """() Gaussians at the start"""
     losses: Array
     """(steps,) loss of each step's view before the step"""
-
-
-def cameras_extent(cameras: Camera) -> float:
-    """1.1 times the largest distance of a camera's centre from their mean, world units (INRIA's `spatial_lr_scale`)."""
-    centres = jax.tree.map(lambda a: np.asarray(a, np.float64), cameras).centres
-    return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    refined: Refined | None = None
+    """corrections of the capture's T frames, or None where nothing is refined"""
 
 
 def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
@@ -72,137 +63,29 @@ def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
     return jax.random.permutation(jax.random.fold_in(key, index), views)
 
 
-def start_state(gaussians: Gaussians) -> FitState:
-    """The state before the first step."""
+def start_state(gaussians: Gaussians, refined: int | None = None) -> FitState:
+    """The state before the first step; `refined` is the number of frames that corrections are kept of."""
     count = np.asarray(gaussians.count)
     gaussians = with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows_for(int(count)))
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
-    return FitState(gaussians, zeros, zeros, zeros.opacity_logits, zero, zero, zero, count, np.zeros(0, np.float32))
+    corrections = None if refined is None else start_refined(refined)
+    numbers = zero, zero, zero, count, np.zeros(0, np.float32)
+    return FitState(gaussians, zeros, zeros, zeros.opacity_logits, *numbers, corrections)
 
 
-_ADAM, _RATES, _SCHEDULE = optax.scale_by_adam(eps=1e-15), LearningRates(), Schedule()
+_RATES, _SCHEDULE = LearningRates(), Schedule()
 AHEAD = 2
 """steps that are dispatched before one is done; each holds a scene and its moments"""
-Current: TypeAlias = tuple[Gaussians, Gaussians, Gaussians, Array]
-"""the Gaussians, Adam's moments, the votes"""
-Growth: TypeAlias = Literal["votes", "mcmc", "none"]
-How: TypeAlias = tuple[int, Growth, LearningRates]
-"""the highest degree that learns, what the step does for growth, the learning rates"""
-
-
-def _step(
-    current: Current,
-    camera: Camera,
-    frame: UInt8[Array, "h w 3"],
-    step: Array,
-    done: Array,
-    degree: Array,
-    extent: Array,
-    rates: LearningRates,
-    capacity: int,
-    mesh: Mesh | None,
-    growth: Growth,
-) -> tuple[Current, Array, Array]:
-    """One Adam step on one view, the `step`-th. Returns what is current after it, the loss before it, the pairs that
-    overflowed. Over a mesh, projection, compositing, loss and update are each shared out among its devices."""
-    gaussians, *moments, votes = current
-    target = frame.astype(jnp.float32) / 255.0
-
-    def loss(gaussians: Gaussians, nothing: Array):
-        colours = over_rows(colours_from_sh, gaussians, camera, mesh)
-        rendering = render(gaussians, camera, jnp.concatenate([colours, nothing], 1), capacity=capacity, mesh=mesh)
-        image, fourth = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)
-        value = photometric_loss(image, target, mesh)
-        error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
-        total = value + jnp.sum(error * fourth)
-        return total + pressure(gaussians) if growth == "mcmc" else total, (value, rendering.overflow)
-
-    # The votes are the gradient of a fourth channel that shows nothing: they cost no pass of their own.
-    nothing = jnp.zeros((gaussians.count, 1 if growth == "votes" else 0))
-    (_, (value, overflow)), (gradient, by_error) = jax.value_and_grad(loss, (0, 1), has_aux=True)(gaussians, nothing)
-
-    def update(rows, common):
-        (gaussians, gradient, first, second), (step, rate) = rows, common
-        moments: Any = optax.ScaleByAdamState(*cast(Any, (step, first, second)))
-        change, moments = _ADAM.update(gradient, moments)
-        return jax.tree.map(lambda p, u, r: p - r * u, gaussians, change, rate), moments.mu, moments.nu
-
-    rate = rates_at(done, rates, gaussians, extent, degree)
-    moved, *moments = over_rows(update, (gaussians, gradient, *moments), (step, rate), mesh)
-    if growth == "mcmc":
-        moved = dataclasses.replace(moved, means=moved.means + noise(moved, rate.means, step))
-    after = moved, *moments, votes + by_error.sum(1)
-    if mesh is not None:  # as it came: one program serves every step
-        after = jax.lax.with_sharding_constraint(after, _places(mesh))
-    return after, value, overflow
-
-
-def _places(mesh: Mesh) -> tuple:
-    """Where a device finds what is current: the Gaussians and votes whole, of the moments its own rows."""
-    whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    return whole, rows, rows, whole
-
-
-def on_devices(current: Current, mesh: Mesh | None) -> Current:
-    """What is current, where the devices of a step want it."""
-    if mesh is None:
-        return jax.device_put(current)
-    return cast(Current, tuple(jax.device_put(part, place) for part, place in zip(current, _places(mesh), strict=True)))
-
-
-# of one device, and over a mesh
-_step_compiled = [
-    jax.jit(_step, static_argnames=("capacity", "mesh", "growth"), compiler_options=options)
-    for options in (None, MESH_OPTIONS)
-]
-
-
-class _Views:
-    """The frames to fit to, read one at a time, at the size that is wanted now; and the room that a view needs."""
-
-    def __init__(self, capture: Capture, mesh: Mesh | None):
-        self.used, self.mesh, self.frames, self.capacity = np.flatnonzero(~capture.held_out), mesh, capture.frames, {}
-        if not len(self.used):
-            raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        self.whole = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
-        self.size, self.cameras = 1.0, self.whole  # in NumPy, to index them compiles nothing
-        self.extent = np.asarray(cameras_extent(self.whole), np.float32)
-
-    def put(self, tree: Any) -> Any:
-        """On every device."""
-        return jax.device_put(tree, None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec()))
-
-    def at(self, size: float) -> None:
-        """Takes the frames at that size."""
-        if size != self.size:
-            self.size, self.cameras = size, resized(self.whole, size)
-
-    def step(self, current: Current, view: int, step: int, done: float, how: How) -> tuple:
-        """`_step` on that view."""
-        cameras, shape = self.cameras, (current[0].count, self.size)
-        strips = 1 if self.mesh is None else self.mesh.size
-        fresh = default_capacity(current[0].count, cameras.width, cameras.height, strips=strips)
-        capacity = self.capacity.setdefault(shape, fresh)
-        degree, growth, rates = how
-        numbers = np.int32(step), np.float32(done), np.int32(degree), self.extent, rates
-        frame = resized_frame(np.asarray(self.frames[self.used[view]]), cameras)
-        given = self.put((cameras[view], frame, *numbers))
-        return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh, growth=growth)
-
-    def widen(self, current: Current, overflow: int) -> None:
-        """Gives room for `overflow` pairs more in views of this size."""
-        shape = current[0].count, self.size
-        self.capacity[shape] = enough_capacity(self.capacity[shape], np.array([overflow]))
 
 
 def _chunk(
-    current: Current, views: _Views, order: np.ndarray, first: int, done: np.ndarray, how: How
+    current: Current, steps: Steps, order: np.ndarray, first: int, done: np.ndarray, way: Way
 ) -> tuple[Current, list]:
     """A step on each view of `order`, taken again with more room where one overflowed; and their losses."""
     while True:
         after, losses, overflow = current, [], []
         for n, view in enumerate(order):
-            after, loss, missing = views.step(after, int(view), first + n, float(done[n]), how)
+            after, loss, missing = steps.take(after, int(view), first + n, float(done[n]), way)
             losses.append(loss)
             overflow.append(missing)
             if n >= AHEAD:
@@ -210,7 +93,7 @@ def _chunk(
         most = int(max(jax.device_get(overflow)))
         if not most:
             return after, jax.device_get(losses)
-        views.widen(current, most)
+        steps.widen(current, most)
 
 
 def fit_gaussians(
@@ -223,6 +106,7 @@ def fit_gaussians(
     state: FitState | None = None,
     schedule: Schedule = _SCHEDULE,
     rates: LearningRates = _RATES,
+    refine: Refine | None = None,
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -230,7 +114,8 @@ def fit_gaussians(
     """Fits `start` (or goes on from `state`) to the frames that are not held out; returns the Gaussians and the losses.
 
     Either `steps` of one view each, to the same result on the same devices, or as many as `seconds` allow, without the
-    time that jax takes to compile them the first time on a machine. All views are taken once before any comes again, in
+    time that jax takes to compile them the first time on a machine. With `refine` each view's pose or exposure is
+    corrected on the way (corrections.py; FitState.refined). All views are taken once before any comes again, in
     an order drawn by `key`; the background is black. After every `chunk` steps Gaussians are added as `schedule` says,
     and `on_checkpoint` is given the state. A chunk in which a view overflowed its tile lists is taken again with more
     room, so the result does not depend on the capacity. All devices of this process take part in every step.
@@ -241,15 +126,20 @@ def fit_gaussians(
     require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
     given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
     require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
-    views = _Views(capture, host_mesh())
-    state = start_state(start) if start is not None else state
+    views, mesh = Views(capture), host_mesh()
+    taking = Steps(views, mesh)
+    if start is not None:
+        state = start_state(start, None if refine is None else len(capture.names))
     assert state is not None
+    given, alike = state.refined is not None, (state.refined is None) == (refine is None)
+    require(alike, "state with corrections", given, f"{refine is not None}", "Go on with the options of its start.")
     if steps is not None:
         own = abs(float(state.done) * steps - len(state.losses)) < 1e-6
         found = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
         require(own, "state", found, f"a fit of {steps} steps", "Go on with the options of its start.")
-    seed, compiled = int(jax.random.bits(key)), set()
-    current = on_devices((state.gaussians, state.first_moment, state.second_moment, state.votes), views.mesh)
+    seed = int(jax.random.bits(key))
+    fitted = Current(state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined)
+    current = on_devices(fitted, mesh)
     while float(state.done) < 1:
         first, done = len(state.losses), float(state.done)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
@@ -257,38 +147,32 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         views.at(schedule.size(done))
         order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
-        how = schedule.degree(done), schedule.growth_at(done), rates
-        if (program := (current[0].count, views.size, how[1])) not in compiled:  # here, which is not the fit's time
-            jax.block_until_ready(views.step(current, int(order[0]), first, done, how))
-            compiled.add(program)
+        way = Way(schedule.degree(done), schedule.growth_at(done), rates, refine)
+        taking.compile(current, int(order[0]), first, done, way)  # which is not the fit's time
         began = time.monotonic()
-        current, taken = _chunk(current, views, order, first, dones, how)
+        current, taken = _chunk(current, taking, order, first, dones, way)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        if not (np.isfinite(losses[-1]) and bool(_all_finite(current[0]))):
+        if not (np.isfinite(losses[-1]) and bool(_all_finite((current.gaussians, current.refined)))):
             found = f"numbers that are not finite after step {len(losses)}"
             remedy = "Check the start, the poses and the intrinsics, or lower the learning rates."
             raise InputError("fit", found, "a fit that converges", remedy)
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
-            gaussians, first_moment, second_moment, votes = jax.tree.map(np.asarray, current)
-            moments, how = (first_moment, second_moment), (target, schedule.at_most, [seed, len(losses)])
-            by, divide = (opacities(gaussians), copies) if schedule.growth == "mcmc" else (votes, halves)
-            gaussians, moments = grown(gaussians, moments, by, *how, divide)
-            current = on_devices((gaussians, *moments, np.zeros_like(votes, shape=gaussians.count)), views.mesh)
+            current = on_devices(_grown(current, schedule, target, [seed, len(losses)]), mesh)
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
-        gaussians, first_moment, second_moment, votes = current
         state = FitState(
-            gaussians=gaussians,
-            first_moment=first_moment,
-            second_moment=second_moment,
-            votes=votes,
+            gaussians=current.gaussians,
+            first_moment=current.first_moment,
+            second_moment=current.second_moment,
+            votes=current.votes,
             done=np.asarray(now),
             pace=np.asarray((now - done) / count),
             seconds=np.asarray(spent),
             started=state.started,
             losses=losses,
+            refined=current.refined,
         )
         if on_checkpoint:
             on_checkpoint(state)
@@ -297,4 +181,13 @@ def fit_gaussians(
     return compact(state.gaussians), np.asarray(state.losses)
 
 
-_all_finite = jax.jit(lambda gaussians: finite(*jax.tree.leaves(gaussians)))
+def _grown(current: Current, schedule: Schedule, target: int, seed: list[int]) -> Current:
+    """With up to `target` Gaussians; the votes are counted anew."""
+    host = jax.tree.map(np.asarray, current)
+    by, divide = (opacities(host.gaussians), copies) if schedule.growth == "mcmc" else (host.votes, halves)
+    moments = host.first_moment, host.second_moment
+    gaussians, moments = grown(host.gaussians, moments, by, target, schedule.at_most, seed, divide)
+    return Current(gaussians, *moments, np.zeros_like(host.votes, shape=gaussians.count), host.refined)
+
+
+_all_finite = jax.jit(lambda tree: finite(*jax.tree.leaves(tree)))

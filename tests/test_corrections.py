@@ -1,0 +1,259 @@
+"""Poses and exposures put right within a fit: the maths, recovery of what is known, and captures that are hard."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import look_at
+from scipy.linalg import expm
+
+from jsecon.errors import InputError
+from jsecon.fit.corrections import (
+    Corrections,
+    Refine,
+    at_rest,
+    away_from_rest,
+    corrected_camera,
+    exponential,
+    exposed,
+)
+from jsecon.fit.optimise import fit_gaussians, start_state
+from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.settle import _drift, settled
+from jsecon.fit.start import starting_gaussians
+from jsecon.fit.view import Views, cameras_extent, view_loss
+from jsecon.splat.render import render
+from jsecon.types import Camera, Capture, Gaussians
+
+KEY, VIEWS = jax.random.key(0), 6
+FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
+WHOLE = Schedule(sizes=((1.0, 1.0),), growth="none")
+GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
+
+
+@pytest.fixture(scope="module")
+def truth():
+    rng = np.random.default_rng(0)
+    return Gaussians(
+        rng.uniform(-0.7, 0.7, (40, 3)).astype(np.float32),
+        np.log(rng.uniform(0.1, 0.25, (40, 3))).astype(np.float32),
+        rng.normal(size=(40, 4)).astype(np.float32),
+        rng.uniform(0, 3, 40).astype(np.float32),
+        rng.uniform(-1.5, 1.2, (40, 1, 3)).astype(np.float32),
+    )
+
+
+def photographed(truth, poses):
+    """A capture of `truth` with depth, the third frame held out."""
+    count = len(poses)
+    cameras = Camera(np.stack(poses), *(np.full(count, v, np.float32) for v in (30, 30, 16, 12)), width=32, height=24)
+    views = [render(truth, camera, np.maximum(0.5 + 0.28209479 * truth.sh[:, 0], 0), depth=True) for camera in
+             (jax.tree.map(jnp.asarray, cameras[t]) for t in range(count))]  # fmt: skip
+    frames = np.stack([np.rint(np.clip(view.features, 0, 1) * 255).astype(np.uint8) for view in views])
+    depths = np.stack([np.where(view.alpha > 0.5, view.depth, 0) for view in views]).astype(np.float32)
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    names = tuple(f"f{t}" for t in range(count))
+    return Capture(frames, cameras, *nothing, np.arange(count) == 2, depths, np.eye(4), names)
+
+
+@pytest.fixture(scope="module")
+def capture(truth):
+    turns = np.linspace(-0.8, 0.8, VIEWS)
+    return photographed(truth, [look_at((2.2 * np.sin(a), -0.6, -2.2 * np.cos(a))) for a in turns])
+
+
+def rough(capture, *, twists, gains):
+    """The capture as told wrongly."""
+    poses = np.stack([hat_exp(-t) @ pose for t, pose in zip(twists, capture.cameras.world_to_camera)])
+    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses.astype(np.float32))
+    frames = np.clip(np.rint(capture.frames * np.asarray(gains)[:, None, None, None]), 0, 255).astype(np.uint8)
+    return dataclasses.replace(capture, cameras=cameras, frames=frames)
+
+
+def hat_exp(twist):
+    """scipy's exponential of a twist."""
+    x, y, z, a, b, c = np.asarray(twist, np.float64)
+    return expm(np.array([[0, -z, y, a], [z, 0, -x, b], [-y, x, 0, c], [0, 0, 0, 0]]))
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_exponential_is_scipys_over_all_angles(x64):
+    rng = np.random.default_rng(1)
+    one = jax.jit(exponential)
+    for angle in (0.0, 1e-30, 1e-9, 1e-4, 0.5, 0.999, 1.001, 3.0, 6.5, 40.0):
+        twist = rng.normal(size=6)
+        twist[:3] *= angle / np.linalg.norm(twist[:3])
+        np.testing.assert_allclose(one(twist), hat_exp(twist), rtol=1e-12, atol=1e-12)
+        single = one(twist.astype(np.float32))
+        assert single.dtype == np.float32
+        np.testing.assert_allclose(single, hat_exp(twist.astype(np.float32)), rtol=1e-5, atol=2e-6)
+
+
+def test_exponential_is_smooth_everywhere(x64):
+    slope = jax.jit(jax.jacfwd(exponential))
+    back = jax.jit(jax.jacrev(exponential))
+    for twist in (np.zeros(6), np.array([1e-20, 0, 0, 1, 2, 3]), np.array([0.6, -0.6, 0.529, 1, 2, 3]), np.ones(6)):
+        steps = 1e-6 * np.eye(6)
+        by = np.stack([(hat_exp(twist + h) - hat_exp(twist - h)) / 2e-6 for h in steps], axis=-1)
+        np.testing.assert_allclose(slope(twist), by, atol=1e-8)
+        np.testing.assert_allclose(back(twist), by, atol=1e-8)
+
+
+def test_at_rest_nothing_changes(capture):
+    rest = jax.tree.map(lambda a: jnp.asarray(a[0]), at_rest(1))
+    camera = jax.tree.map(jnp.asarray, capture.cameras[0])
+    assert same(corrected_camera(camera, rest.twists), camera)
+    image = jnp.asarray(capture.frames[0], jnp.float32)
+    assert same(exposed(image, rest.colours), image)
+    assert float(away_from_rest(rest, jnp.float32(0))) == 0
+
+
+def test_gradients_through_the_whole_step_are_central_differences(capture, truth, x64):
+    """Photometric loss, depth, pose, exposure and scene, in float64. (What is ignored is a constant to the gradient and
+    has its own test.)"""
+    rng = np.random.default_rng(2)
+    views = Views(dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1))
+    double = lambda a: jnp.asarray(a, jnp.float64) if np.asarray(a).dtype == np.float32 else jnp.asarray(a)
+    view = jax.tree.map(double, views[0])
+    scene = jax.tree.map(lambda a: double(a) + 0.02 * rng.normal(size=a.shape), truth)
+    own = Corrections(double(0.02 * rng.normal(size=6)), np.eye(3, 4) + 0.05 * rng.normal(size=(3, 4)))
+    nothing, extent = jnp.zeros((40, 1)), jnp.float64(1.7)
+    loss = lambda scene, own: view_loss(scene, nothing, own, view, extent, 4096)[0]
+    both = jax.jit(jax.value_and_grad(loss, (0, 1)))
+    gradient = both(scene, own)[1]
+    leaves, tree = jax.tree.flatten((scene, own))
+    for n, (leaf, slope) in enumerate(zip(leaves, jax.tree.leaves(gradient), strict=True)):
+        direction = rng.normal(size=leaf.shape)
+        moved = lambda h: both(*tree.unflatten([*leaves[:n], leaf + h * direction, *leaves[n + 1 :]]))[0]  # noqa: B023
+        by = [float(moved(h) - moved(-h)) / (2 * h) for h in (1e-6, 3e-7)]
+        exact = float((slope * direction).sum())
+        assert min(abs(value - exact) for value in by) <= 1e-5 * abs(exact), (n, by, exact)
+
+
+def test_what_not_to_fit_has_no_part_in_the_fit(capture, truth):
+    ignored = np.zeros(capture.frames.shape[:3], bool)
+    ignored[:, 5:15, 8:20] = True
+    frames = np.where(ignored[..., None], 255 - capture.frames, capture.frames)
+    one, other = (dataclasses.replace(capture, ignored=ignored, frames=f) for f in (capture.frames, frames))
+    (a, losses), (b, again) = (fit_gaussians(c, start=truth, steps=10, **GIVEN) for c in (one, other))
+    assert same(a, b)
+    np.testing.assert_array_equal(losses, again)
+
+
+def test_a_known_twist_and_gain_are_found(capture, truth):
+    """The scene is known: each frame's correction is its own problem."""
+    rng = np.random.default_rng(3)
+    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
+    gains = rng.uniform(0.8, 1.0, VIEWS)
+    told, states = rough(capture, twists=twists, gains=gains), []
+    refine = Refine(pose_rate=2e-3)
+    fit_gaussians(told, start=truth, steps=60 * 5, rates=FROZEN, refine=refine, on_checkpoint=states.append, **GIVEN)
+    found = jax.tree.map(np.asarray, states[-1].refined.now)
+    train = ~capture.held_out
+    assert not found.twists[2].any()
+    assert np.abs(found.twists - twists)[train].max() < 2e-3
+    np.testing.assert_allclose(found.colours[train], gains[train, None, None] * np.eye(3, 4), atol=0.01)
+
+
+def test_without_corrections_a_fit_is_what_it_was(capture, truth):
+    """Rates of zero leave every frame at rest, and the scene as without."""
+    off = Refine(poses=False, exposure=False)
+    plain, losses = fit_gaussians(capture, start=truth, steps=10, **GIVEN)
+    still, others = fit_gaussians(capture, start=truth, steps=10, refine=off, **GIVEN)
+    np.testing.assert_allclose(losses, others, rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(still), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3)
+    assert start_state(truth).refined is None
+
+
+def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, truth):
+    states, given = [], {"steps": 30, "refine": Refine(), **GIVEN}
+    whole, losses = fit_gaussians(capture, start=truth, on_checkpoint=states.append, **given)
+    stopped, ends = jax.tree.map(np.asarray, states[0]), []
+    again, others = fit_gaussians(capture, state=stopped, on_checkpoint=ends.append, **given)
+    assert same((again, ends[-1].refined), (whole, states[-1].refined))
+    np.testing.assert_array_equal(losses, others)
+    with pytest.raises(ValueError, match="corrections"):
+        fit_gaussians(capture, state=stopped, steps=30, **GIVEN)
+
+
+def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_no_part_in_it(capture, truth):
+    rng = np.random.default_rng(4)
+    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
+    told = rough(capture, twists=twists, gains=rng.uniform(0.8, 1.0, VIEWS))
+    start = dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
+    better = settled(told, start, key=KEY)
+    assert "poses refined" in " ".join(better.notes)
+    assert "held out" in better.notes[-1]
+    assert same(better.cameras.fx, told.cameras.fx)
+    assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 4
+    frames = told.frames.copy()
+    frames[2] = 255 - frames[2]
+    other = settled(dataclasses.replace(told, frames=frames), start, key=KEY)
+    train = ~told.held_out
+    assert same(other.cameras[train], better.cameras[train])
+    assert same(other.frames[train], better.frames[train])
+    assert settled(told, start, key=KEY, refine=None) is told
+
+
+def test_the_world_stays_where_it_was(capture):
+    given = np.asarray(capture.cameras.world_to_camera, np.float64)
+    motion = hat_exp([0.1, -0.2, 0.3, 1.0, 2.0, -1.0])
+    np.testing.assert_allclose(_drift(given @ np.linalg.inv(motion), given, 1.0), motion, atol=1e-6)
+
+
+@pytest.mark.parametrize("rate", [0.1, 10.0])
+def test_a_frame_ten_times_as_bright_or_dark_leaves_finite_numbers(capture, truth, rate):
+    told = rough(capture, twists=np.zeros((VIEWS, 6)), gains=np.where(np.arange(VIEWS) == 3, rate, 1.0))
+    depths = np.where(np.arange(32) < 9, np.nan, capture.depths).astype(np.float32)
+    better = settled(dataclasses.replace(told, depths=depths), truth, key=KEY, visits=8)
+    assert np.isfinite(better.cameras.world_to_camera).all()
+    found, losses = fit_gaussians(better, start=truth, steps=10, **GIVEN)
+    assert all(np.isfinite(leaf).all() for leaf in (losses, *jax.tree.leaves(found)))
+
+
+def test_depth_that_is_not_known_teaches_nothing(capture, truth):
+    unknown = dataclasses.replace(capture, depths=np.full_like(capture.depths, np.nan))
+    zero = dataclasses.replace(capture, depths=np.zeros_like(capture.depths))
+    assert not Views(unknown)[0].depth.any()
+    (a, _), (b, _) = (fit_gaussians(c, start=truth, steps=10, **GIVEN) for c in (unknown, zero))
+    assert same(a, b)
+
+
+def test_three_frames_of_pure_rotation_are_fitted_or_refused(truth):
+    """They have no extent: nothing moves but directions."""
+    poses = [look_at((0, -0.6, -2.2), (x, 0, 0)) for x in (-0.3, 0.3, 0.0)]
+    turned = photographed(truth, poses)
+    assert cameras_extent(turned.cameras) == pytest.approx(0, abs=1e-6)
+    better = settled(turned, truth, key=KEY, visits=8)
+    assert np.isfinite(better.cameras.world_to_camera).all()
+    np.testing.assert_allclose(better.cameras.centres, turned.cameras.centres, atol=1e-5)
+    with pytest.raises(InputError):
+        starting_gaussians(dataclasses.replace(turned, depths=None))
+
+
+def test_a_frame_that_nothing_explains_is_left_out(capture, truth):
+    frames = capture.frames.copy()
+    frames[4] = np.random.default_rng(5).integers(0, 256, frames[4].shape, np.uint8)
+    kept = settled(dataclasses.replace(capture, frames=frames), truth, key=KEY, refine=None, drop_weak=True, visits=8)
+    assert kept.names == ("f0", "f1", "f2", "f3", "f5")
+    assert "f4" in kept.notes[-1]
+    assert len(kept.frames) == len(kept.depths) == len(kept.cameras.fx) == len(kept.held_out) == 5
+
+
+def test_depths_and_masks_are_made_smaller_without_mixing(capture):
+    ignored = np.zeros(capture.frames.shape[:3], bool)
+    ignored[:, 5, 7] = True
+    views = Views(dataclasses.replace(capture, ignored=ignored))
+    depth = views[0].depth
+    assert np.array_equal(views[0].ignored, ignored[views.used[0]])
+    views.at(0.5)
+    assert views[0].depth.shape == views[0].ignored.shape == views[0].frame.shape[:2] == (12, 16)
+    assert np.isin(views[0].depth, depth).all()
+    assert views[0].ignored.sum() == 1
