@@ -21,7 +21,7 @@ from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.quality import quality
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
-from jsecon.process import cores
+from jsecon.process import cores, forget_programs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +50,7 @@ def _with(**changes: Any) -> Knobs:
 WAYS: dict[str, Knobs] = {
     "as it is": _with(),
     "no growth": _with(growth="none"),
+    "MCMC": _with(growth="mcmc"),
     "full size only": _with(sizes=((1.0, 1.0),)),
     "three sizes": _with(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0))),
     "50,000 Gaussians": _with(at_most=50_000),
@@ -57,8 +58,8 @@ WAYS: dict[str, Knobs] = {
     "SH degree 0": _with(sh_degree=0),
     "SH degree 1": _with(sh_degree=1),
     "SH degree 3": _with(sh_degree=3),
-    "positions' rate halved": _with(means=5e-4, means_last=5e-6),
-    "positions' rate doubled": _with(means=2e-3, means_last=2e-5),
+    "positions' rate halved": _with(means=2.5e-4, means_last=2.5e-6),
+    "positions' rate doubled": _with(means=1e-3, means_last=1e-5),
 }
 
 
@@ -104,6 +105,7 @@ def main() -> None:
             cell = next((cell for cell in cells if key.items() <= cell.items()), None)
             if cell is None:
                 cell = key | {"cores": cores()} | fit(load(), WAYS[way], minutes)
+                forget_programs()
                 with place.open("a") as file:
                     file.write(json.dumps(cell) + "\n")
             print(json.dumps(cell), flush=True)

@@ -126,6 +126,18 @@ class Rendering:
 
 
 @record
+class Quality:
+    """How well a scene shows F photographs."""
+
+    frames: Array
+    """(F,) int indices into the capture's frames."""
+    psnr: Array
+    """(F,) dB."""
+    ssim: Array
+    """(F,) in [-1, 1]."""
+
+
+@record
 class Votes:
     """The weight that each region casts on each Gaussian: the K strongest regions of W^T onto one-hot labels."""
 

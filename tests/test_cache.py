@@ -197,3 +197,19 @@ def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):
     assert not old.exists()
     assert young.exists()
     assert (tmp_path / "CACHEDIR.TAG").read_text().startswith("Signature: 8a477f597d28d172789f06886806bc55")
+
+
+def test_large_arrays_are_mapped_and_a_damaged_one_is_noticed(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "MAPPED", 1000)
+    value = {"large": np.arange(3000, dtype=np.float32).reshape(30, 100), "small": np.arange(5)}
+    cache.save(tmp_path / "kept.npz", value)
+    found = cache.load(tmp_path / "kept.npz")
+    assert isinstance(found["large"], np.memmap)
+    assert not isinstance(found["small"], np.memmap)
+    for name, array in value.items():
+        np.testing.assert_array_equal(found[name], array)
+    content = bytearray((tmp_path / "kept.npz").read_bytes())
+    content[content.index(value["large"].tobytes()) + 500] ^= 1
+    (tmp_path / "kept.npz").write_bytes(content)
+    with pytest.raises(cache.CorruptCacheError):
+        cache.load(tmp_path / "kept.npz")

@@ -15,6 +15,7 @@ from jsecon.app.arguments import parsed
 from jsecon.app.options import Options
 from jsecon.app.progress import Console, Listener
 from jsecon.data.ply import load_ply, save_ply
+from jsecon.splat.transform import transform_gaussians
 
 
 def _run(*arguments):
@@ -45,7 +46,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
         "--steps",
         150,
         "--sh-degree",
-        1,
+        2,
     )
     told = capsys.readouterr().out
     assert code == 0
@@ -61,6 +62,21 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
     assert page.count("data:image/") >= 24
     assert "Held-out frames" in page
     assert (tmp_path / "out" / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
+
+
+def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, room_run, tmp_path, capsys):
+    run, out = room_run
+    shutil.copytree(out / "cache", tmp_path / "scene" / "cache")  # a run into the folder, gone on with
+    asked = "fit", room, "--out", tmp_path / "scene.ply", "--holdout", 4, "--steps", 150
+    assert _run(*asked) == 0
+    told = capsys.readouterr().out
+    assert "gaussians        cached" in told
+    assert f"held-out PSNR {run.psnr.mean():.2f} dB, SSIM 0." in told
+    scene = load_ply(tmp_path / "scene.ply")
+    expected = transform_gaussians(run.field.gaussians, run.capture.to_source)
+    np.testing.assert_allclose(scene.means, expected.means, atol=1e-5)
+    assert _run(*asked[:3], tmp_path / "scene.sog") == 2
+    assert "ends in .ply" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("by", ["votes", "code", "one_step", "canonical"])

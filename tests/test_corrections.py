@@ -20,12 +20,12 @@ from jsecon.fit.corrections import (
     exponential,
     exposed,
 )
-from jsecon.fit.optimise import cameras_extent, fit_gaussians, start_state
+from jsecon.fit.optimise import fit_gaussians, start_state
 from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.settle import _drift, settled
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.view import View, view_loss, views_at, views_of
+from jsecon.fit.view import Views, cameras_extent, view_loss
 from jsecon.splat.render import render
 from jsecon.types import Camera, Capture, Gaussians
 
@@ -129,9 +129,9 @@ def test_gradients_through_the_whole_step_are_central_differences(capture, truth
     """Photometric loss, depth, pose, exposure and scene, in float64. (What is ignored is a constant to the gradient and
     has its own test.)"""
     rng = np.random.default_rng(2)
-    views = views_of(capture, np.array([1]))
+    views = Views(dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1))
     double = lambda a: jnp.asarray(a, jnp.float64) if np.asarray(a).dtype == np.float32 else jnp.asarray(a)
-    view = jax.tree.map(lambda a: double(a[0]), views)
+    view = jax.tree.map(double, views[0])
     scene = jax.tree.map(lambda a: double(a) + 0.02 * rng.normal(size=a.shape), truth)
     own = Corrections(double(0.02 * rng.normal(size=6)), np.eye(3, 4) + 0.05 * rng.normal(size=(3, 4)))
     nothing, extent = jnp.zeros((40, 1)), jnp.float64(1.7)
@@ -236,7 +236,7 @@ def test_a_frame_ten_times_as_bright_or_dark_leaves_finite_numbers(capture, trut
 def test_depth_that_is_not_known_teaches_nothing(capture, truth):
     unknown = dataclasses.replace(capture, depths=np.full_like(capture.depths, np.nan))
     zero = dataclasses.replace(capture, depths=np.zeros_like(capture.depths))
-    assert not views_of(unknown, np.arange(2)).depth.any()
+    assert not Views(unknown)[0].depth.any()
     (a, _), (b, _) = (fit_gaussians(c, start=truth, steps=10, **GIVEN) for c in (unknown, zero))
     assert same(a, b)
 
@@ -265,9 +265,10 @@ def test_a_frame_that_nothing_explains_is_left_out(capture, truth):
 def test_depths_and_masks_are_made_smaller_without_mixing(capture):
     ignored = np.zeros(capture.frames.shape[:3], bool)
     ignored[:, 5, 7] = True
-    views = views_of(dataclasses.replace(capture, ignored=ignored), np.arange(VIEWS))
-    assert views_at(views, 1.0) is views
-    small: View = views_at(views, 0.5)
-    assert small.depth.shape == small.ignored.shape == (VIEWS, 12, 16)
-    assert np.isin(small.depth, views.depth).all()
-    assert small.ignored.sum() == VIEWS
+    views = Views(dataclasses.replace(capture, ignored=ignored))
+    depth = views[0].depth
+    assert np.array_equal(views[0].ignored, ignored[views.used[0]])
+    views.at(0.5)
+    assert views[0].depth.shape == views[0].ignored.shape == views[0].frame.shape[:2] == (12, 16)
+    assert np.isin(views[0].depth, depth).all()
+    assert views[0].ignored.sum() == 1

@@ -45,7 +45,7 @@ def test_metrics_have_every_figure_that_is_promised(finished):
     assert {"gaussians", "masklets", "votes", "votes (true masks)", "field"} <= set(metrics["seconds"])
     assert 0.1 * seconds < sum(metrics["seconds"].values()) <= seconds
     assert metrics["seconds_in_all"] == pytest.approx(sum(metrics["seconds"].values()), abs=0.2)
-    assert {"densification", "segmenter (true masks)", "DBSCAN"} <= set(metrics["left_out"])
+    assert {"segmenter (true masks)", "DBSCAN"} <= set(metrics["left_out"])
     assert metrics["peak_memory_mib"] == pytest.approx(pipeline.peak_memory_mib(), rel=0.05)
 
 

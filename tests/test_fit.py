@@ -9,11 +9,12 @@ import pytest
 from conftest import look_at
 
 from jsecon.errors import InputError
-from jsecon.fit import optimise
+from jsecon.fit import step as one_step
 from jsecon.fit.growth import in_use
-from jsecon.fit.optimise import cameras_extent, fit_gaussians, start_state, view_order
+from jsecon.fit.optimise import fit_gaussians, start_state, view_order
 from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.view import cameras_extent
 from jsecon.parallel import host_mesh
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import Camera, Capture, Gaussians
@@ -151,7 +152,7 @@ def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
 def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monkeypatch):
     given = {"steps": 20, "key": KEY, "start": start, "schedule": WHOLE, "rates": RATES, "chunk": 10}
     twin, _ = fit_gaussians(capture, **given)
-    asked, inner = [], optimise._step_compiled
+    asked, inner = [], one_step.step_compiled
 
     def counted(step):
         def taken(*args, capacity, **options):
@@ -160,8 +161,8 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monke
 
         return taken
 
-    monkeypatch.setattr(optimise, "default_capacity", lambda count, width, height, strips: 32)
-    monkeypatch.setattr(optimise, "_step_compiled", [counted(step) for step in inner])
+    monkeypatch.setattr(one_step, "default_capacity", lambda count, width, height, strips: 32)
+    monkeypatch.setattr(one_step, "step_compiled", [counted(step) for step in inner])
     gaussians, losses = fit_gaussians(capture, **given)
     assert asked[0] == 32
     assert asked[-1] > 32
@@ -181,6 +182,9 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
     assert counts == sorted(counts)
     assert 50 <= gaussians.count <= 60
     kept, _ = fit_gaussians(capture, start=few, **given | {"schedule": WHOLE})
+    mcmc, _ = fit_gaussians(capture, start=few, **given | {"schedule": dataclasses.replace(schedule, growth="mcmc")})
+    assert 50 <= mcmc.count <= 60
+    assert evaluate_psnr(mcmc, capture) > evaluate_psnr(few, capture) + 2
     assert kept.count == 20
     assert evaluate_psnr(gaussians, capture) > evaluate_psnr(kept, capture)
     again, _ = fit_gaussians(capture, state=jax.tree.map(np.asarray, states[3]), **given)
@@ -190,7 +194,8 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
 def test_the_votes_are_the_weights_on_the_errors(capture, start):
     """Against their definition: the gradient of sum(w e) as a feature's, one view."""
     states = []
-    fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=WHOLE, on_checkpoint=states.append)
+    voting = dataclasses.replace(WHOLE, growth="votes")
+    fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=voting, on_checkpoint=states.append)
     view = np.array([0, 1, 3, 4])[view_order(KEY, 4, 0, 1)[0]]
     camera, target = capture.cameras[view], capture.frames[view] / np.float32(255)
     error = np.abs(np.asarray(render_rgb(start, camera).features) - target).mean(-1)
@@ -209,7 +214,7 @@ def test_a_fit_of_seconds_ends_about_then_and_says_how_far_it_is(capture, start)
 
 def test_one_program_serves_a_size_and_a_number_of_rows(capture, start):
     """Two sizes, rows that suffice: two programs, whatever the number of steps."""
-    programs = optimise._step_compiled[host_mesh() is not None]
+    programs = one_step.step_compiled[host_mesh() is not None]
     before = programs._cache_size()
     schedule = dataclasses.replace(SCHEDULE, sizes=((0.75, 0.5), (1.0, 1.0)), growth="votes", at_most=80)
     fit_gaussians(capture, steps=STEPS, key=KEY, start=start, schedule=schedule, chunk=5)
@@ -262,3 +267,32 @@ def test_wrong_fits_are_refused(capture, start):
     astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
     with pytest.raises(InputError, match="not finite"):
         fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, chunk=1)
+
+
+def _odd(capture, start, kind):
+    if kind == "one view":
+        return dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1), start
+    if kind == "black images":
+        return dataclasses.replace(capture, frames=np.zeros_like(capture.frames)), start
+    if kind == "two points":
+        return capture, jax.tree.map(lambda a: a[:2], start)
+    if kind == "all behind the cameras":
+        return capture, dataclasses.replace(start, means=start.means + np.float32([0, 0, -50]))
+    poses = np.array(capture.cameras.world_to_camera)
+    poses[:, :3, 3] = -np.einsum("tij,j->ti", poses[:, :3, :3], np.array([0, 0, -2.5]))  # one centre for all
+    return dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=poses)), start
+
+
+@pytest.mark.parametrize(
+    "kind", ["one view", "black images", "two points", "all behind the cameras", "nothing but rotation"]
+)
+def test_odd_captures_are_fitted_without_a_number_that_is_none(capture, start, kind):
+    capture, start = _odd(capture, start, kind)
+    schedule = dataclasses.replace(WHOLE, growth="votes", at_most=80, grows_from=0.1)
+    gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, schedule=schedule, rates=RATES, chunk=5)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaussians))
+    assert np.isfinite(losses).all()
+    if kind in ("one view", "nothing but rotation"):
+        assert losses[-4:].mean() < losses[:4].mean()
+    if kind == "all behind the cameras":  # nobody sees them: nothing to learn, nothing to add
+        np.testing.assert_array_equal(gaussians.means, start.means)

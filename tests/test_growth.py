@@ -1,10 +1,25 @@
 """Growth: halves keep what the whole was, rows stay where they are, and the draw follows the votes."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.fit.growth import FAINT, compact, drawn, grown, halves, in_use, rows_for, with_free_rows
+from jsecon.fit.growth import (
+    FAINT,
+    compact,
+    copies,
+    drawn,
+    grown,
+    halves,
+    in_use,
+    noise,
+    opacities,
+    rows_for,
+    with_free_rows,
+)
 from jsecon.types import Gaussians
 
 
@@ -77,10 +92,10 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
     whole = with_free_rows(scene(), 32)
     moments = jax.tree.map(np.ones_like, whole), jax.tree.map(np.ones_like, whole)
     votes = np.where(np.arange(32) < 30, 1.0 + np.arange(32), 7.0).astype(np.float32)
-    after, (first, second) = grown(whole, moments, votes, target, [0, 1])
+    after, (first, second) = grown(whole, moments, votes, target, 2000, [0, 1])
     added = min(target - 30, 10)  # at most 0.3 of those there are, and one
     assert in_use(after).sum() == 30 + added
-    assert after.count == (32 if added <= 2 else rows_for(min(target, 48)) if target <= 48 else after.count)
+    assert after.count == rows_for(64)  # both, as few rows as there can be
     fresh = ~first.opacity_logits.astype(bool) & in_use(after)
     assert fresh.sum() == 2 * added
     assert not second.means[fresh].any()
@@ -93,7 +108,7 @@ def test_faint_gaussians_make_room():
     whole = scene()
     whole.opacity_logits[:5] = np.log(FAINT / 2)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grown(whole, moments, np.ones(30, np.float32), 30, [0])
+    after, _ = grown(whole, moments, np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
     assert in_use(after).all()
 
@@ -101,6 +116,33 @@ def test_faint_gaussians_make_room():
 def test_nothing_is_added_where_nothing_is_wrong():
     whole = with_free_rows(scene(), 64)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grown(whole, moments, np.zeros(64, np.float32), 60, [0])
+    after, _ = grown(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_copies_look_as_the_one_did():
+    """Through its centre two of them let as much light pass, and over all directions together they hide as much."""
+    whole = scene()
+    one, other = copies(whole)
+    assert one is other
+    before, after = opacities(whole), opacities(one)
+    free = (after > 2 * FAINT + 1e-9) & (after < 1 - FAINT - 1e-9)
+    np.testing.assert_allclose((1 - (1 - after) ** 2)[free], before[free], rtol=1e-4)
+    # The integral of 1 - (1 - o' g)^2 over a line, g = exp(-x^2 / 2 s'^2), against that of o g.
+    x = np.linspace(-40, 40, 20001)[:, None]
+    shrunk = np.exp(one.log_scales[:, 0] - whole.log_scales[:, 0])
+    two = 1 - (1 - after * np.exp(-((x / shrunk) ** 2) / 2)) ** 2
+    integral = lambda y: y.sum(0) * (x[1, 0] - x[0, 0])
+    np.testing.assert_allclose(integral(two)[free], integral(before * np.exp(-(x**2) / 2))[free], rtol=1e-3)
+
+
+def test_noise_has_the_covariance_of_the_gaussian_and_spares_what_shows():
+    many = jax.tree.map(lambda a: np.repeat(a[:1], 20000, axis=0), scene())
+    faint = dataclasses.replace(many, opacity_logits=np.full(20000, -12.0, np.float32))
+    moved = np.asarray(noise(faint, jnp.float32(1e-5), jnp.int32(3)))
+    shape = covariance(jax.tree.map(lambda a: a[:1], many))[0]
+    expected = (shape @ shape) * (1 / (1 + np.exp(-0.5))) ** 2  # the factor of an opacity of 0
+    np.testing.assert_allclose(np.cov(moved.T), expected, rtol=0.1, atol=0.03 * np.abs(expected).max())
+    shown = dataclasses.replace(many, opacity_logits=np.full(20000, 1.0, np.float32))
+    assert np.abs(noise(shown, jnp.float32(1e-5), jnp.int32(3))).max() < 1e-20

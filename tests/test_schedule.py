@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized
+from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized, resized_frame
 from jsecon.types import Camera, Gaussians
 
 
@@ -20,6 +20,12 @@ def test_the_number_of_gaussians_rises_evenly_and_stops():
     assert [schedule.count(done, 100) for done in (0.05, 0.1, 0.35, 0.6, 0.61)] == [None, 100, 200, 300, None]
     assert schedule.count(0.3, 400) is None
     assert dataclasses.replace(schedule, growth="none").count(0.3, 100) is None
+
+
+def test_votes_are_counted_as_long_as_they_are_of_use():
+    schedule = Schedule(grows_until=0.5)
+    assert [schedule.growth_at(done) for done in (0.0, 0.5, 0.51)] == ["votes", "votes", "none"]
+    assert dataclasses.replace(schedule, growth="mcmc").growth_at(0.9) == "mcmc"
 
 
 def test_degrees_open_one_after_another():
@@ -47,13 +53,13 @@ def test_rates_decay_log_linearly_and_frozen_positions_stay():
 def test_smaller_frames_are_means_seen_by_cameras_as_much_smaller():
     frames = np.random.default_rng(0).integers(0, 256, (2, 24, 32, 3)).astype(np.uint8)
     cameras = Camera(np.tile(np.eye(4), (2, 1, 1)), *(np.full(2, v) for v in (30.0, 31.0, 16.0, 12.0)), 32, 24)
-    half, small = resized(cameras, frames, 0.5)
+    half = resized(cameras, 0.5)
     assert (half.width, half.height) == (16, 12)
-    expected = frames.reshape(2, 12, 2, 16, 2, 3).mean(axis=(2, 4))
-    np.testing.assert_allclose(small, expected, atol=0.51)
+    small = resized_frame(frames[1], half)
+    np.testing.assert_allclose(small, frames[1].reshape(12, 2, 16, 2, 3).mean(axis=(1, 3)), atol=0.51)
     np.testing.assert_allclose([half.fx[0], half.fy[0], half.cx[0], half.cy[0]], [15, 15.5, 8, 6])
-    odd, smaller = resized(cameras, frames, 0.3)
+    odd = resized(cameras, 0.3)
     assert (odd.width, odd.height) == (10, 7)
-    assert smaller.shape == (2, 7, 10, 3)
+    assert resized_frame(frames[0], odd).shape == (7, 10, 3)
     np.testing.assert_allclose(odd.cx / odd.width, cameras.cx / 32)  # the same part of the image
-    assert resized(cameras, frames, 1.0)[1] is frames
+    assert np.shares_memory(resized_frame(frames[0], resized(cameras, 1.0)), frames)

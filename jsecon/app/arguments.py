@@ -22,7 +22,7 @@ class Argument:
     name: str
     help: str
     positional: bool
-    least: int | None
+    least: int | float | None
     """the smallest number allowed; None: any."""
     keywords: Mapping[str, Any]
     """of `add_argument`."""

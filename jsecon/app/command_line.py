@@ -1,4 +1,4 @@
-"""The command line: demo, run, query, eval, models. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
+"""The command line: its verbs and what each takes. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
 
 import argparse
 import dataclasses
@@ -10,15 +10,17 @@ from typing import Annotated, Any, Literal
 
 import jsecon
 from jsecon.app.arguments import add_arguments, parsed
-from jsecon.app.options import Folder, Options, require_writable
+from jsecon.app.options import Folder, Options, SceneOptions, require_writable
 from jsecon.errors import InputError
 
 EPILOG = """
 examples
   jsecon demo                                           a made-up room, from frames to answers and a report
   jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.npz
+  jsecon run my_photos --out my_field                   photographs or a video: finds their poses first (extra sfm)
   jsecon run my_capture --out my_field --gaussians point_cloud.ply
                                                         the same on a scene that is already splatted
+  jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
   jsecon query my_field/field.npz "red mug" "dark green bottle" --out answers
   jsecon query my_field/field.npz --at frame_00012 310 145 --out answers
   jsecon eval my_field/field.npz --labels my_capture/label --out evaluation
@@ -28,7 +30,7 @@ examples
 
 A run that is stopped goes on where it stopped when the same command is given again.
 """
-RUN_GROUPS = {"gaussians": "frames and scene", "masks": "masks", "segmenter": "models", "weighting": "field"}
+RUN_GROUPS = {"downscale": "frames and scene", "masks": "masks", "segmenter": "models", "weighting": "field"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,13 +54,26 @@ class Demo:
 class Run(Options):
     """build the language field of a capture
 
-    From posed frames to a language field: Gaussians (fitted, or given as a .ply), masklets (found in the frames and
-    brought together, or given as masks), one embedding per region, codes distilled into the Gaussians. Prints its
-    stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
+    From frames to a language field: poses (found where the capture has none), Gaussians (fitted, or given as a .ply),
+    masklets (found in the frames and brought together, or given as masks), one embedding per region, codes distilled
+    into the Gaussians. Prints its stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
     """
 
     out: Path
     """folder for the field, the report and the cache"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fit(SceneOptions):
+    """fit Gaussians to a capture, and no more
+
+    From posed frames to a scene of 3D Gaussians as a .ply (INRIA layout, in the capture's own world; SuperSplat opens
+    it), with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the same name without the ending,
+    from which it goes on when it was stopped, and `jsecon run` into that folder too.
+    """
+
+    out: Annotated[Path, {"metavar": "PLY"}]
+    """the .ply file to write"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -181,6 +196,18 @@ def _run(asked: Run) -> None:
     write_run(pipeline.run(options, asked.out, listener=console), asked.out, console)
 
 
+def _fit(asked: Fit) -> None:
+    from jsecon.app import pipeline
+    from jsecon.app.progress import Console
+    from jsecon.app.summary import write_scene
+
+    if asked.out.suffix != ".ply":
+        raise InputError("--out", str(asked.out), "a file that ends in .ply", "For example: --out scene.ply")
+    console = Console()
+    options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(SceneOptions)})
+    write_scene(*pipeline.fit(options, asked.out.with_suffix(""), listener=console), asked.out, console)
+
+
 def _query(asked: Query) -> None:
     from jsecon.app import question
     from jsecon.app.progress import Console
@@ -237,6 +264,7 @@ def _whole(name: str, text: str) -> int:
 _VERBS: dict[str, tuple[Any, type]] = {
     "demo": (_demo, Demo),
     "run": (_run, Run),
+    "fit": (_fit, Fit),
     "query": (_query, Query),
     "eval": (_eval, Eval),
     "models": (_models, Models),

@@ -15,20 +15,18 @@ Folder = Annotated[Path | None, {"metavar": "DIR"}]
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """All that the result of a run depends on, but for the files themselves."""
+class SceneOptions:
+    """What the Gaussians of a capture depend on."""
 
     capture: Annotated[Path, {"positional": True}]
-    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp)"""
-    gaussians: Annotated[Path | None, {"metavar": "PLY"}] = None
-    """a scene of 3D Gaussians (.ply, INRIA layout) in the capture's world; without it, Gaussians are fitted to the
-    frames"""
+    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
+    photographs or a video, whose poses are then found (extra sfm)"""
     downscale: Annotated[float | None, {"metavar": "K", "least": 1}] = None
     """make frames K times smaller (default: so that the longer side is at most --long-side)"""
     long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400
     """of the frames, where --downscale is not given"""
     frames: Annotated[int | None, {"metavar": "N", "least": 2}] = None
-    """use at most N frames, evenly spaced (default: all)"""
+    """use at most N frames, evenly spaced (default: all; of a video 150)"""
     holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
     """keep every K-th frame for measuring only; 0 = none"""
     refine: Literal["none", "poses", "exposure", "both", "auto"] = "none"
@@ -36,16 +34,31 @@ class Options:
     to the frozen probe; auto: both where the frames have depth"""
     drop_frames: Literal["none", "auto"] = "none"
     """auto: leave out training frames that a probe fit does not explain"""
-    steps: Annotated[int, {"least": 1}] = 1500
+    steps: Annotated[int, {"least": 1}] = 2000
     """of the photometric fit"""
     minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None
     """of the photometric fit, instead of --steps: the best that can be had in that time on this machine"""
-    gaussians_at_most: Annotated[int, {"metavar": "N", "least": 1}] = 100_000
-    """that the fit may have; a start with more keeps its number"""
-    growth: Literal["votes", "none"] = "votes"
-    """of their number during the fit: where the picture is wrong, or none"""
-    sh_degree: Annotated[int, {"choices": range(4)}] = 1
+    gaussians_at_most: Annotated[int | None, {"metavar": "N", "least": 1}] = None
+    """that the fit may have; a start with more keeps its number (default: one for every other pixel of a frame, in fits
+    from 3 minutes or 3000 steps on one for each, at most 100,000)"""
+    growth: Literal["votes", "mcmc", "none"] = "votes"
+    """of their number during the fit: where the picture is wrong; by opacity, with noise; or none"""
+    sh_degree: Annotated[int, {"choices": range(4)}] = 2
     """of the fitted colours"""
+    start: Literal["auto", "sparse", "dense", "random"] = "auto"
+    """of the fit: from the capture's own points, or points triangulated; by stereo between neighbouring views; at
+    random; auto: from depth where there is depth, else as sparse"""
+    seed: int = 0
+    """of whatever is drawn at random"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(SceneOptions):
+    """All that the result of a run depends on, but for the files themselves."""
+
+    gaussians: Annotated[Path | None, {"metavar": "PLY"}] = None
+    """a scene of 3D Gaussians (.ply, INRIA layout) in the capture's world; without it, Gaussians are fitted to the
+    frames"""
     masks: Folder = None
     """instance masks, one integer PNG per frame under the frame's name (0 = none), <id>/<frame>.png, or LangSplat's
     _s.npy; without it, they are found in the frames"""
@@ -85,8 +98,6 @@ class Options:
     """from a Gaussian's votes to its code"""
     top: Annotated[int, {"metavar": "N", "least": 1}] = 8
     """regions whose votes a Gaussian keeps"""
-    seed: int = 0
-    """of whatever is drawn at random"""
 
     @property
     def associated_by(self) -> Literal["consensus", "tracking"]:

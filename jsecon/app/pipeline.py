@@ -2,6 +2,8 @@
 
     load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field, then the held-out frames measured
 
+Before it all, `poses` where the capture has none (data/motion, data/video).
+
 The keys of all stages are known before any runs, so all of it is told first: what will run, what is cached, what is
 left out and why. Read on the way, by default, without the ground (the root's modules); behind each file lies more of
 its own room, behind splat/render the engine:
@@ -36,11 +38,11 @@ from jsecon.app.language_stages import codes, distil, field_of, regions, votes
 from jsecon.app.masklet_stages import masklets
 from jsecon.app.options import Options, require_inputs, require_writable
 from jsecon.app.progress import Listener, Step
-from jsecon.app.scene_stages import gaussians, held_out, load
-from jsecon.app.stages import Outcome, Record, Stage, Work
+from jsecon.app.scene_stages import gaussians, held_out, loaded
+from jsecon.app.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.errors import InputError
 from jsecon.process import programs_built
-from jsecon.types import Capture, LanguageField
+from jsecon.types import Capture, Gaussians, LanguageField, Quality
 
 FIELD_FILE = "field.npz"
 
@@ -53,8 +55,8 @@ class Run:
     capture: Capture
     labels: np.ndarray
     """(T, H, W) int16 masklets of the field's views."""
-    psnr: np.ndarray
-    """(frames held out,) dB."""
+    held_out: Quality
+    """PSNR and SSIM of the frames held out."""
     seconds: dict[str, float]
     """of each stage, also where it was computed in an earlier run."""
     steps: tuple[Step, ...]
@@ -65,6 +67,11 @@ class Run:
     """that jax built for it: "all" of them, and those that it read "from_disk"."""
 
     @property
+    def psnr(self) -> np.ndarray:
+        """(frames held out,) dB."""
+        return np.asarray(self.held_out.psnr)
+
+    @property
     def left_out(self) -> dict[str, str]:
         """part -> why it was not needed."""
         return {step.name: step.why for step in self.steps if step.status == "left out"}
@@ -73,13 +80,62 @@ class Run:
 def stages_of(work: Work) -> list[Stage]:
     """The stages of a run in order. Mask files come before the long fit: what is wrong with them is said at once."""
     first = (masklets, gaussians) if work.options.masks is not None else (gaussians, masklets)
-    return [stage(work) for stage in (load, *first, regions, codes, votes, distil, held_out)]
+    return [*loaded(work), *(stage(work) for stage in (*first, regions, codes, votes, distil, held_out))]
 
 
 def peak_memory_mib() -> float:
     """Largest resident memory of this process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Done:
+    """What stages made, see Run."""
+
+    results: dict[str, Any]
+    keys: dict[str, str]
+    seconds: dict[str, float]
+    steps: list[Step]
+    notes: list[str]
+
+
+def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
+    """The stages, told first, then each computed or read from `folder`."""
+    options, keys = work.options, {}
+    if work.out.resolve() == options.capture.resolve():
+        found = "the capture's own folder as the output folder"
+        raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
+    require_inputs(options)
+    require_writable(work.out)
+    cache.prepare(folder)
+    for stage in stages:
+        keys[stage.name] = stage.key(work, keys)
+    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
+    for stage in stages:
+        if stage.leaves is not None and not _left(stage, stages, place):
+            place[stage.name].unlink(missing_ok=True)
+    steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
+    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
+    listener.steps(f"{options.capture} -> {work.out}", steps)
+    work.networks.require_ready([step.name for step in steps if step.status == "run"])
+    done = _Done({}, keys, {}, steps, [])
+    for stage in stages:
+        record = Record(cache.record_path_of(place[stage.name]))
+        with listener.progress(stage.name) as progress:
+            compute = functools.partial(stage.compute, done.results, progress, record)
+            kept = cache.fetch(place[stage.name], compute, note=listener.note)
+        outcome: Outcome = kept.value
+        done.results[stage.name], done.seconds[stage.name] = outcome.value, kept.seconds
+        record.remove()
+        listener.done(stage.name, kept.seconds, kept.fresh)
+        for part, why in outcome.left_out.items():
+            steps.append(Step(part, "left out", why))
+            listener.step(steps[-1])
+        for note in outcome.notes:
+            done.notes.append(note)
+            listener.note(note)
+    return done
 
 
 def run(
@@ -98,49 +154,35 @@ def run(
     """
     listener, before = listener or Listener(), programs_built()
     folder = cache_folder or out / "cache"
-    if out.resolve() == options.capture.resolve():
-        found = "the capture's own folder as the output folder"
-        raise InputError(out, found, "a folder of its own", f"For example {out / 'field'}, or one elsewhere.")
-    require_inputs(options)
-    require_writable(out)
     work = Work(options, networks.networks_of(options, folder), out, load)
-    cache.prepare(folder)
-    stages, keys = stages_of(work), {}
-    for stage in stages:
-        keys[stage.name] = stage.key(work, keys)
-    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
-    steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
-    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
-    listener.steps(f"{options.capture} -> {out}", steps)
-    work.networks.require_ready([step.name for step in steps if step.status == "run"])
-    results: dict[str, Any] = {}
-    seconds: dict[str, float] = {}
-    notes: list[str] = []
-    for stage in stages:
-        record = Record(cache.record_path_of(place[stage.name]))
-        with listener.progress(stage.name) as progress:
-            compute = functools.partial(stage.compute, results, progress, record)
-            kept = cache.fetch(place[stage.name], compute, note=listener.note)
-        outcome: Outcome = kept.value
-        results[stage.name], seconds[stage.name] = outcome.value, kept.seconds
-        record.remove()
-        listener.done(stage.name, kept.seconds, kept.fresh)
-        for part, why in outcome.left_out.items():
-            steps.append(Step(part, "left out", why))
-            listener.step(steps[-1])
-        for note in outcome.notes:
-            notes.append(note)
-            listener.note(note)
+    done = _computed(work, stages_of(work), folder, listener)
     started = time.monotonic()
-    field = field_of(results, work.networks.embedder, _provenance(options, keys))
+    field = field_of(done.results, work.networks.embedder, _provenance(options, done.keys))
     from jsecon.language.field import save_field
 
     save_field(out / FIELD_FILE, field)
-    seconds["field"] = time.monotonic() - started
-    listener.done("field", seconds["field"], True)
-    capture, labels, psnr = (results[name] for name in ("load", "masklets", "held_out"))
+    done.seconds["field"] = time.monotonic() - started
+    listener.done("field", done.seconds["field"], True)
+    capture, labels, quality = (done.results[name] for name in ("load", "masklets", "held_out"))
     programs = {name: count - before[name] for name, count in programs_built().items()}
-    return Run(field, capture, labels, psnr, seconds, tuple(steps), tuple(notes), options, programs)
+    return Run(field, capture, labels, quality, done.seconds, tuple(done.steps), tuple(done.notes), options, programs)
+
+
+def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:
+    """The stages of `run` that make and measure the scene; OUT/cache is theirs too, so a `run` into OUT goes on from
+    it. Returns the Gaussians, their capture, and the quality of the frames held out."""
+    work = Work(options, networks.networks_of(options, out / "cache"), out)
+    stages = [*loaded(work), gaussians(work), held_out(work)]
+    results = _computed(work, stages, out / "cache", listener or Listener()).results
+    return results["gaussians"], results["load"], results["held_out"]
+
+
+def _left(stage: Stage, stages: list[Stage], place: dict[str, Path]) -> bool:
+    """Whether the folder that the stage left is still its own, or nobody will look for it."""
+    key = stage.leaves / KEY_FILE if stage.leaves is not None else None
+    if key is not None and key.is_file() and key.read_text() == cache.record_path_of(place[stage.name]).stem:
+        return True
+    return all(place[other.name].exists() for other in stages if stage.name in other.after)
 
 
 def _provenance(options: Options, keys: dict[str, str]) -> str:

@@ -1,12 +1,72 @@
-"""The stages about the scene: the capture is loaded, its Gaussians are read or fitted, held-out frames are measured."""
+"""The stages about the scene: poses are found where there are none, the capture is loaded, its Gaussians are read or
+fitted, held-out frames are measured."""
+
+import dataclasses
+import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jsecon.app.progress import Progress
-from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.app.stages import KEY_FILE, Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.errors import InputError
+from jsecon.files import write_text
 from jsecon.types import Camera, Capture, Gaussians
+
+
+def loaded(work: Work) -> list[Stage]:
+    """The capture; before it, where there are photographs or a video without poses, the poses."""
+    if work.load is not None or not _bare(work.options.capture):
+        return [load(work)]
+    found = poses(work)
+    posed = dataclasses.replace(work, options=dataclasses.replace(work.options, capture=found.leaves))
+    return [found, dataclasses.replace(load(posed), after=("poses",), files=None)]
+
+
+def _bare(capture: Path) -> bool:
+    """Whether it is a video, or a folder of photographs without a file of poses."""
+    from jsecon.data.colmap import find_model
+
+    if find_model(capture) is not None or (capture / "transforms.json").exists() or capture.suffix == ".json":
+        return False
+    from jsecon.data.motion import photographs
+    from jsecon.data.video import is_video
+
+    return is_video(capture) or len(photographs(capture)) > 0
+
+
+def poses(work: Work) -> Stage:
+    """The poses of bare photographs or of a video's frames, as a COLMAP capture in OUT/poses."""
+    from jsecon.data.motion import find_poses, photographs
+    from jsecon.data.video import VIDEO_FRAMES, is_video, write_frames
+
+    capture, out, video = work.options.capture, work.out / "poses", is_video(work.options.capture)
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        folder = record.folder
+        if video:
+            photos = write_frames(capture, folder / "frames", frames=work.options.frames, progress=progress)
+        else:
+            photos = photographs(capture)
+        found, posed = find_poses(photos, folder, where=capture, progress=progress)
+        if video:
+            shutil.rmtree(posed / "images")
+            (folder / "frames").rename(posed / "images")
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.move(posed, out)
+        write_text(out / KEY_FILE, folder.name)
+        return Outcome(found, notes=(*found.notes(), f"The poses are in {out}: COLMAP opens them."))
+
+    if video:
+        what = f"the {work.options.frames or VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
+    else:
+        what = f"{len(photographs(capture))} photographs, which have none"
+    how = f"found by structure from motion (pycolmap) for {what}"
+    given = work.given("frames") if video else {}
+    files = capture / "images" if (capture / "images").is_dir() else capture
+    return Stage("poses", how, compute, given=given, files=files, leaves=out)
 
 
 def load(work: Work) -> Stage:
@@ -98,16 +158,18 @@ def _fitted(work: Work) -> Stage:
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.fit.optimise import fit_gaussians
-        from jsecon.fit.schedule import Schedule
-        from jsecon.fit.settle import weak_frames
+        from jsecon.fit.schedule import Schedule, gaussians_for
         from jsecon.fit.start import starting_gaussians
 
         capture, state = results["load"], record.read()
         start, notes = None, ()
         if state is None:
-            start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
+            given = {"sh_degree": options.sh_degree, "start": options.start, "progress": progress}
+            start, whence = starting_gaussians(capture, **given)
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
+        pixels = capture.cameras.width * capture.cameras.height
+        most = options.gaussians_at_most or gaussians_for(pixels, steps=options.steps, minutes=minutes)
         found, losses = fit_gaussians(
             capture,
             key=jax.random.key(options.seed),
@@ -115,24 +177,22 @@ def _fitted(work: Work) -> Stage:
             seconds=None if minutes is None else 60 * minutes,
             start=start,
             state=state,
-            schedule=Schedule(growth=options.growth, at_most=options.gaussians_at_most),
+            schedule=Schedule(growth=options.growth, at_most=most),
             on_checkpoint=lambda current: record.keep(lambda: current),
             progress=progress,
         )
         if options.growth != "none":
             notes = (*notes, f"{found.count} Gaussians after {len(losses)} steps")
-        weak = ", ".join(capture.names[t] for t in weak_frames(found, capture))
-        if weak:
-            notes = (*notes, f"frames that the scene shows far worse than the others (--drop-frames auto): {weak}")
         return Outcome(found, notes=notes)
 
     left = {} if options.growth != "none" else {"densification": "the fit keeps the points that it starts from"}
     if options.sh_degree == 0:
         left["view-dependent colour"] = "SH degree 0"
     length = f"{options.steps} steps" if minutes is None else f"{minutes:g} minutes"
-    number = "" if options.growth == "none" else f", at most {options.gaussians_at_most} Gaussians"
+    most = options.gaussians_at_most
+    number = "" if most is None or options.growth == "none" else f", at most {most} Gaussians"
     how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
-    given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "seed")
+    given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "start", "seed")
     return Stage("gaussians", how, compute, after=("load",), given=given, left_out=left)
 
 
@@ -149,11 +209,18 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
 
 
 def held_out(work: Work) -> Stage:
-    """(frames held out,) PSNR in dB of the rendered colours against the photographs."""
+    """PSNR and SSIM of the frames held out, against the photographs; and which of the others stay far below them."""
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.fit.quality import evaluate_psnr
+        from jsecon.fit.quality import quality, weak
 
-        return Outcome(evaluate_psnr(results["gaussians"], results["load"], progress=progress))
+        capture, scene = results["load"], results["gaussians"]
+        fitted = quality(scene, capture, frames=np.flatnonzero(~np.asarray(capture.held_out)), progress=progress)
+        low = np.flatnonzero(weak(np.asarray(fitted.psnr)))
+        names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in low[:5])
+        more = f" and {len(low) - 5} more" if len(low) > 5 else ""
+        told = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
+        told += "something moved (--drop-frames auto leaves them out)"
+        return Outcome(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
-    return Stage("held_out", "PSNR of the rendered colours", compute, after=("load", "gaussians"))
+    return Stage("held_out", "PSNR and SSIM of the rendered colours", compute, after=("load", "gaussians"))

@@ -6,6 +6,7 @@ The stages themselves stand in `scene_stages` (load, gaussians, held_out), `mask
 
 import contextlib
 import dataclasses
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,6 +23,9 @@ from jsecon.vision.protocols import Networks
 
 CHECKPOINT_SECONDS = 20.0
 """between two records of a stage in progress: a stop loses at most this and one chunk of steps, or one tracked frame"""
+
+KEY_FILE = "made_by.txt"
+"""in a folder that a stage leaves beside its result: the name and key of that stage"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +62,11 @@ class Record:
     def __init__(self, path: Path):
         self._path, self._last = path, time.monotonic()
 
+    @property
+    def folder(self) -> Path:
+        """Where a stage that works on files may keep them: its name is the stage's and its key's."""
+        return self._path.with_suffix("")
+
     def read(self) -> Any | None:
         """What was last kept, or None. A file that cannot be read loses time and nothing else: the stage starts again,
         to the same result."""
@@ -74,6 +83,7 @@ class Record:
     def remove(self) -> None:
         """Called when the stage's result is kept."""
         self._path.unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 Results: TypeAlias = Mapping[str, Any]
@@ -99,6 +109,8 @@ class Stage:
     """what it calls beside what it imports: a segmenter, a tracker, an embedder; None where there is none."""
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """what the options alone make needless: part -> why."""
+    leaves: Path | None = None
+    """folder that it leaves for those after it, with its key in KEY_FILE; where another run left it, it runs again."""
 
     def key(self, work: Work, keys: Mapping[str, str]) -> str:
         """Digest of the source that computes it (`cache.source_digest`), of the keys of the stages that it reads, of

@@ -12,10 +12,12 @@ from jsecon.app import pictures, question, report
 from jsecon.app.pipeline import Run, peak_memory_mib
 from jsecon.app.progress import Listener
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
+from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
-from jsecon.types import LanguageField, Selection
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 
 KINDS = {"anchored": "votes", "anchored_code": "code", "one_step": "one_step", "canonical": "canonical"}
 """kind of query in metrics.json -> the method of jsecon.app.question"""
@@ -30,8 +32,7 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
         parts = [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
         title = f"Language field of {run.options.capture.resolve().name}"
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
-    if len(run.psnr):
-        listener.say(f"held-out PSNR {metrics['held_out_psnr']:.2f} dB over {len(run.psnr)} frames")
+    say_quality(run.held_out, listener)
     listener.say(
         f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
@@ -44,6 +45,21 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     return metrics
 
 
+def write_scene(gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener) -> None:
+    """The .ply of a fitted scene, in the world of the capture's files; says the figures."""
+    save_ply(out, transform_gaussians(gaussians, capture.to_source))
+    say_quality(held_out, listener)
+    listener.say(f"{gaussians.count} Gaussians  {out}")
+
+
+def say_quality(held_out: Quality, listener: Listener) -> None:
+    """How well the scene shows the frames held out; nothing where there are none."""
+    count = len(held_out.frames)
+    if count:
+        psnr, ssim = float(np.mean(held_out.psnr)), float(np.mean(held_out.ssim))
+        listener.say(f"held-out PSNR {psnr:.2f} dB, SSIM {ssim:.3f} over {count} frames")
+
+
 def run_metrics(run: Run) -> dict[str, Any]:
     """The figures of a run, for metrics.json."""
     return {
@@ -53,6 +69,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
         "frames": len(run.capture.names),
         "size": [run.capture.cameras.width, run.capture.cameras.height],
         "held_out_psnr": round(float(np.mean(run.psnr)), 3) if len(run.psnr) else None,
+        "held_out_ssim": round(float(np.mean(run.held_out.ssim)), 4) if len(run.psnr) else None,
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
         "left_out": run.left_out,
         "programs_compiled": run.programs,

@@ -5,7 +5,9 @@ from __future__ import annotations
 import collections
 import dataclasses
 import functools
+import math
 import os
+import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -23,6 +25,8 @@ Progress = Callable[[int, int], None] | None
 RIGID_TOLERANCE = 1e-3
 """largest entry of R R^T - I still taken for rounding in a text file; the rotation is then made exact"""
 
+IN_MEMORY = 1 << 30
+"""bytes of frames that are kept in memory; more are kept in a temporary file"""
 JUMP = 10.0
 """median steps between neighbouring frames' cameras from which a step is told. A reconstruction of 125 photographs that
 was wrong in five places had 11 to 20 there; when right, its largest was 2.2, and that of a walk with one cut 9.9."""
@@ -134,6 +138,14 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
+def room_for(shape: tuple[int, ...]) -> np.ndarray:
+    """Uninitialised uint8; from IN_MEMORY on in a file without a name, from which the system holds what is in use."""
+    if math.prod(shape) < IN_MEMORY:
+        return np.empty(shape, np.uint8)
+    with tempfile.TemporaryFile() as file:
+        return np.memmap(file, np.uint8, "w+", shape=shape)
+
+
 def camera_jumps(poses: Float[np.ndarray, "t 4 4"], names: Sequence[str]) -> list[str]:
     """A note where neighbouring frames' cameras (world to camera) lie more than JUMP median steps apart, else none."""
     centres = -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
@@ -195,7 +207,7 @@ def assemble(
         width, height = (max(1, round(size / downscale)) for size in (width, height))
     final = [pinholes[lens].resized(width, height) for lens in lenses]
 
-    result = np.empty((len(shots), height, width, 3), np.uint8)
+    result = room_for((len(shots), height, width, 3))
     depths = np.zeros((len(shots), height, width), np.float32) if any(shot.depth for shot in shots) else None
     maps = functools.lru_cache(maxsize=4)(undistortion_maps)
 

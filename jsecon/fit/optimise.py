@@ -8,24 +8,21 @@ import functools
 import math
 import time
 from collections.abc import Callable
-from typing import Any, TypeAlias, cast
+from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
-from jsecon.fit.corrections import Corrections, Refine, Refined, refined_further, start_refined
-from jsecon.fit.growth import compact, grown, rows_for, with_free_rows
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at
-from jsecon.fit.view import View, view_loss, views_at, views_of
+from jsecon.fit.corrections import Refine, Refined, start_refined
+from jsecon.fit.growth import compact, copies, grown, halves, opacities, rows_for, with_free_rows
+from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.step import Current, Steps, Way, on_devices
+from jsecon.fit.view import Views
 from jsecon.numerics import finite
-from jsecon.parallel import MESH_OPTIONS, host_mesh, over_rows
-from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.types import Array, Camera, Capture, Gaussians, record
+from jsecon.parallel import host_mesh
+from jsecon.types import Array, Capture, Gaussians, record
 
 
 @record
@@ -54,12 +51,6 @@ class FitState:
     """corrections of the capture's T frames, or None where nothing is refined"""
 
 
-def cameras_extent(cameras: Camera) -> float:
-    """1.1 times the largest distance of a camera's centre from their mean, world units (INRIA's `spatial_lr_scale`)."""
-    centres = jax.tree.map(lambda a: np.asarray(a, np.float64), cameras).centres
-    return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-
-
 def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
     """The views of steps first..last-1: each round of `views` steps takes all of them once, in an order of `key`'s."""
     rounds = [np.asarray(_round(key, r, views)) for r in range(first // views, -(-last // views))]
@@ -82,107 +73,27 @@ def start_state(gaussians: Gaussians, refined: int | None = None) -> FitState:
     return FitState(gaussians, zeros, zeros, zeros.opacity_logits, *numbers, corrections)
 
 
-_ADAM, _RATES, _SCHEDULE = optax.scale_by_adam(eps=1e-15), LearningRates(), Schedule()
-Current: TypeAlias = tuple[Gaussians, Gaussians, Gaussians, Array, Refined | None]
-"""the Gaussians, Adam's moments, the votes, the corrections"""
-
-
-def _step(
-    current: Current,
-    view: View,
-    number: Array,
-    step: Array,
-    taken: Array,
-    done: Array,
-    degree: Array,
-    extent: Array,
-    rates: LearningRates,
-    refine_rates: Corrections | None,
-    capacity: int,
-    mesh: Mesh | None,
-) -> tuple[Current, Array, Array]:
-    """One Adam step, the `step`-th, on one view, the `number`-th, which was `taken` so often before. Returns what is
-    current after it, the loss before it, the pairs that overflowed. Over a mesh, projection, compositing, loss and
-    update are each shared out among its devices."""
-    gaussians, *moments, votes, refined = current
-    nothing = jnp.zeros((gaussians.count, 1))
-    own = None if refined is None else jax.tree.map(lambda a: a[number], refined.now)
-    loss = functools.partial(view_loss, view=view, extent=extent, capacity=capacity, mesh=mesh)
-    by = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, nothing, own)
-    (_, (value, overflow)), (gradient, by_error, by_own) = by
-
-    def update(rows, common):
-        (gaussians, gradient, first, second), (step, rate) = rows, common
-        moments: Any = optax.ScaleByAdamState(*cast(Any, (step, first, second)))
-        change, moments = _ADAM.update(gradient, moments)
-        return jax.tree.map(lambda p, u, r: p - r * u, gaussians, change, rate), moments.mu, moments.nu
-
-    rate = rates_at(done, rates, gaussians, extent, degree)
-    after = over_rows(update, (gaussians, gradient, *moments), (step, rate), mesh)
-    if refined is not None and refine_rates is not None:
-        refined = refined_further(refined, number, by_own, taken, refine_rates)
-    after = *after, votes + by_error[:, 0], refined
-    if mesh is not None:  # as it came: one program serves every step
-        after = jax.lax.with_sharding_constraint(after, NamedSharding(mesh, PartitionSpec()))
-    return after, value, overflow
-
-
-# of one device, and over a mesh
-_step_compiled = [
-    jax.jit(_step, static_argnames=("capacity", "mesh"), compiler_options=options) for options in (None, MESH_OPTIONS)
-]
-
-
-class _Views:
-    """The frames to fit to, at the size that is wanted now, and the room that a view of them needs."""
-
-    def __init__(self, capture: Capture, refine: Refine | None, mesh: Mesh | None):
-        self.used, self.mesh, self.size, self.capacity = np.flatnonzero(~np.asarray(capture.held_out)), mesh, 0.0, {}
-        if not len(self.used):
-            raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        self.whole, self.refine = views_of(capture, self.used), refine
-        self.extent = np.asarray(cameras_extent(self.whole.camera), np.float32)
-
-    def put(self, tree: Any) -> Any:
-        """On every device."""
-        return jax.device_put(tree, None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec()))
-
-    def at(self, size: float) -> None:
-        """Takes the frames at that size."""
-        if size != self.size:
-            self.size, self.sized = size, views_at(self.whole, size)
-
-    def step(self, current: Current, view: int, step: int, done: float, degree: int, rates: LearningRates) -> tuple:
-        """`_step` on that view."""
-        shape, strips = (current[0].count, self.size), 1 if self.mesh is None else self.mesh.size
-        fresh = default_capacity(current[0].count, self.sized.camera.width, self.sized.camera.height, strips=strips)
-        capacity = self.capacity.setdefault(shape, fresh)
-        refine_rates = None if self.refine is None else self.refine.rates(done, float(self.extent))
-        numbers = *map(np.int32, (self.used[view], step, step // len(self.used))), np.float32(done), np.int32(degree)
-        own = jax.tree.map(lambda a: a[view], self.sized)
-        given = self.put((own, *numbers, self.extent, rates, refine_rates))
-        return _step_compiled[self.mesh is not None](current, *given, capacity=capacity, mesh=self.mesh)
-
-    def widen(self, current: Current, overflow: int) -> None:
-        """Gives room for `overflow` pairs more in views of this size."""
-        shape = current[0].count, self.size
-        self.capacity[shape] = enough_capacity(self.capacity[shape], np.array([overflow]))
+_RATES, _SCHEDULE = LearningRates(), Schedule()
+AHEAD = 2
+"""steps that are dispatched before one is done; each holds a scene and its moments"""
 
 
 def _chunk(
-    current: Current, views: _Views, order: np.ndarray, first: int, done: np.ndarray, degree: int, rates: LearningRates
+    current: Current, steps: Steps, order: np.ndarray, first: int, done: np.ndarray, way: Way
 ) -> tuple[Current, list]:
     """A step on each view of `order`, taken again with more room where one overflowed; and their losses."""
     while True:
         after, losses, overflow = current, [], []
         for n, view in enumerate(order):
-            after, loss, missing = views.step(after, int(view), first + n, float(done[n]), degree, rates)
+            after, loss, missing = steps.take(after, int(view), first + n, float(done[n]), way)
             losses.append(loss)
             overflow.append(missing)
+            if n >= AHEAD:
+                jax.block_until_ready(losses[n - AHEAD])
         most = int(max(jax.device_get(overflow)))
         if not most:
             return after, jax.device_get(losses)
-        views.widen(current, most)
+        steps.widen(current, most)
 
 
 def fit_gaussians(
@@ -215,7 +126,8 @@ def fit_gaussians(
     require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
     given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
     require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
-    views = _Views(capture, refine, host_mesh())
+    views, mesh = Views(capture), host_mesh()
+    taking = Steps(views, mesh)
     if start is not None:
         state = start_state(start, None if refine is None else len(capture.names))
     assert state is not None
@@ -226,7 +138,8 @@ def fit_gaussians(
         found = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
         require(own, "state", found, f"a fit of {steps} steps", "Go on with the options of its start.")
     seed = int(jax.random.bits(key))
-    current = views.put((state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined))
+    fitted = Current(state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined)
+    current = on_devices(fitted, mesh)
     while float(state.done) < 1:
         first, done = len(state.losses), float(state.done)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
@@ -234,42 +147,47 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         views.at(schedule.size(done))
         order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
-        if (current[0].count, views.size) not in views.capacity:  # compiled here, which is not the fit's time
-            jax.block_until_ready(views.step(current, int(order[0]), first, done, schedule.degree(done), rates))
+        way = Way(schedule.degree(done), schedule.growth_at(done), rates, refine)
+        taking.compile(current, int(order[0]), first, done, way)  # which is not the fit's time
         began = time.monotonic()
-        current, taken = _chunk(current, views, order, first, dones, schedule.degree(done), rates)
+        current, taken = _chunk(current, taking, order, first, dones, way)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        if not (np.isfinite(losses[-1]) and bool(_all_finite((current[0], current[4])))):
+        if not (np.isfinite(losses[-1]) and bool(_all_finite((current.gaussians, current.refined)))):
             found = f"numbers that are not finite after step {len(losses)}"
             remedy = "Check the start, the poses and the intrinsics, or lower the learning rates."
             raise InputError("fit", found, "a fit that converges", remedy)
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
-            gaussians, first_moment, second_moment, votes, refined = jax.tree.map(np.asarray, current)
-            moments = first_moment, second_moment
-            gaussians, moments = grown(gaussians, moments, votes, target, [seed, len(losses)])
-            current = views.put((gaussians, *moments, np.zeros_like(gaussians.opacity_logits), refined))
+            current = on_devices(_grown(current, schedule, target, [seed, len(losses)]), mesh)
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
-        gaussians, first_moment, second_moment, votes, refined = current
         state = FitState(
-            gaussians=gaussians,
-            first_moment=first_moment,
-            second_moment=second_moment,
-            votes=votes,
+            gaussians=current.gaussians,
+            first_moment=current.first_moment,
+            second_moment=current.second_moment,
+            votes=current.votes,
             done=np.asarray(now),
             pace=np.asarray((now - done) / count),
             seconds=np.asarray(spent),
             started=state.started,
             losses=losses,
-            refined=refined,
+            refined=current.refined,
         )
         if on_checkpoint:
             on_checkpoint(state)
         if progress:
             progress(*((len(losses), steps) if steps is not None else (round(spent), round(cast(float, seconds)))))
     return compact(state.gaussians), np.asarray(state.losses)
+
+
+def _grown(current: Current, schedule: Schedule, target: int, seed: list[int]) -> Current:
+    """With up to `target` Gaussians; the votes are counted anew."""
+    host = jax.tree.map(np.asarray, current)
+    by, divide = (opacities(host.gaussians), copies) if schedule.growth == "mcmc" else (host.votes, halves)
+    moments = host.first_moment, host.second_moment
+    gaussians, moments = grown(host.gaussians, moments, by, target, schedule.at_most, seed, divide)
+    return Current(gaussians, *moments, np.zeros_like(host.votes, shape=gaussians.count), host.refined)
 
 
 _all_finite = jax.jit(lambda tree: finite(*jax.tree.leaves(tree)))

@@ -9,24 +9,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.fit.photometric import psnr, ssim
 from jsecon.splat.render import render_rgb
-from jsecon.types import Array, Capture, Gaussians, record
+from jsecon.types import Array, Capture, Gaussians, Quality
 
 FAR_BELOW_DB = 5.0
 """below the median frame at least, for a frame to be called weak"""
 SPREADS = 5.0
 """and so many times the median distance from it"""
-
-
-@record
-class Quality:
-    """Of F frames."""
-
-    frames: Array
-    """(F,) indices into the capture"""
-    psnr: Array
-    """(F,) dB"""
-    ssim: Array
-    """(F,) in [-1, 1]"""
 
 
 @jax.jit

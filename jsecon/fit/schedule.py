@@ -20,9 +20,9 @@ class LearningRates:
     """Step sizes of Adam per group. Positions are in units of the cameras' extent. All decay log-linearly over the
     fit."""
 
-    means: Any = 1e-3
+    means: Any = 5e-4
     """at the first step, times the extent"""
-    means_last: Any = 1e-5
+    means_last: Any = 5e-6
     """at the last step, times the extent"""
     log_scales: Any = 2e-2
     quaternions: Any = 1e-2
@@ -52,12 +52,13 @@ class Schedule:
     sizes: tuple[tuple[float, float], ...] = ((0.5, 0.5), (1.0, 1.0))
     """(size of the frames, share of the fit at which it ends): smaller frames cost less and move what is large first
     (arXiv 2503.18402)"""
-    growth: Literal["votes", "none"] = "votes"
-    """Gaussians are added where the picture is wrong, or keep their number"""
+    growth: Literal["votes", "mcmc", "none"] = "votes"
+    """Gaussians are added where the picture is wrong, or by their opacity while all are moved by noise (arXiv
+    2404.09591), or keep their number"""
     at_most: int = 100_000
     """Gaussians; a start with more keeps its number"""
     grows_from: float = 0.05
-    grows_until: float = 0.6
+    grows_until: float = 0.5
     """shares of the fit between which the number of Gaussians rises evenly to `at_most`"""
     degree_every: float = 0.1
     """share of the fit after which the degree of the spherical harmonics rises by one, up to what the start holds"""
@@ -77,6 +78,10 @@ class Schedule:
         """The highest of the spherical harmonics that learns."""
         return int(done / self.degree_every) if self.degree_every > 0 else 3
 
+    def growth_at(self, done: float) -> Literal["votes", "mcmc", "none"]:
+        """What a step does for growth: votes are counted only as long as they are of use."""
+        return "none" if self.growth == "votes" and done > self.grows_until else self.growth
+
     def count(self, done: float, start: int) -> int | None:
         """Gaussians wanted, or None where none are added now."""
         if self.growth == "none" or not self.grows_from <= done <= self.grows_until or self.at_most <= start:
@@ -85,14 +90,30 @@ class Schedule:
         return round(start + share * (self.at_most - start))
 
 
-def resized(cameras: Camera, frames: np.ndarray, size: float) -> tuple[Camera, np.ndarray]:
-    """Batches of views at `size` times theirs, whole px; each pixel the mean of those that it covers."""
-    height, width = frames.shape[1:3]
-    to = max(round(height * size), 1), max(round(width * size), 1)
-    if to == (height, width):
-        return cameras, frames
-    small = np.stack([cv2.resize(frame, to[::-1], interpolation=cv2.INTER_AREA) for frame in frames])
-    x, y = np.float32(to[1] / width), np.float32(to[0] / height)
-    return Camera(
-        cameras.world_to_camera, cameras.fx * x, cameras.fy * y, cameras.cx * x, cameras.cy * y, *to[::-1]
-    ), small
+LONG_STEPS, LONG_MINUTES = 3000, 3.0
+"""from which on a fit is long"""
+MOST = 100_000
+"""Gaussians, where nothing else is asked for"""
+
+
+def gaussians_for(pixels: int, *, steps: int | None, minutes: float | None) -> int:
+    """How many Gaussians a fit to frames of so many pixels may have: one for every other pixel, in a long fit one for
+    each, at most MOST. More of them make a step slower: bonsai at 400x266 after two minutes has 28.3 dB with 50,000,
+    28.5 with 100,000, 27.8 with 200,000 (experiments/work_precision_fit.py)."""
+    long = steps >= LONG_STEPS if minutes is None and steps is not None else (minutes or 0) >= LONG_MINUTES
+    return min(pixels if long else pixels // 2, MOST)
+
+
+def resized(cameras: Camera, size: float) -> Camera:
+    """A batch of cameras whose images are `size` times theirs, in whole px."""
+    width, height = max(round(cameras.width * size), 1), max(round(cameras.height * size), 1)
+    x, y = np.float32(width / cameras.width), np.float32(height / cameras.height)
+    lens = cameras.fx * x, cameras.fy * y, cameras.cx * x, cameras.cy * y
+    return Camera(cameras.world_to_camera, *lens, width=width, height=height)
+
+
+def resized_frame(frame: np.ndarray, cameras: Camera) -> np.ndarray:
+    """A frame (h, w, 3) uint8 at the size of `cameras`: each pixel the mean of those that it covers."""
+    if frame.shape[:2] == (cameras.height, cameras.width):
+        return np.asarray(frame)
+    return cv2.resize(np.asarray(frame), (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)

@@ -16,9 +16,10 @@ from jaxtyping import Float, PRNGKeyArray
 
 from jsecon.errors import require
 from jsecon.fit.corrections import Corrections, Refine, at_rest, exponential
-from jsecon.fit.optimise import FitState, cameras_extent, fit_gaussians
+from jsecon.fit.optimise import FitState, fit_gaussians
 from jsecon.fit.quality import quality, weak
 from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.view import cameras_extent
 from jsecon.types import Array, Capture, Gaussians
 
 VISITS = 60

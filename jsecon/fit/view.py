@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Int
 
+from jsecon.errors import InputError
 from jsecon.fit.corrections import Corrections, away_from_rest, corrected_camera, exposed
 from jsecon.fit.photometric import photometric_loss
-from jsecon.fit.schedule import resized
+from jsecon.fit.schedule import resized, resized_frame
 from jsecon.parallel import over_rows
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
@@ -23,7 +23,7 @@ COVERED = 0.5
 
 @record
 class View:
-    """A view, or a batch of them with a leading axis (T,)."""
+    """One view."""
 
     camera: Camera
     frame: Array
@@ -34,31 +34,48 @@ class View:
     """(H, W) bool: what not to fit"""
 
 
-def views_of(capture: Capture, used: Int[np.ndarray, " t"]) -> View:
-    """The frames `used` of a capture, a batch; a depth that is not finite and positive is an unknown one."""
-    # NumPy: to index it is free.
-    cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[used])
-    depths = None if capture.depths is None else np.asarray(capture.depths, np.float32)[used]
-    if depths is not None:
-        depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.float32(0))
-    ignored = None if capture.ignored is None else np.asarray(capture.ignored, bool)[used]
-    return View(cameras, np.asarray(capture.frames)[used], depths, ignored)
+class Views:
+    """The frames of a capture that are not held out, read one at a time, at the size that is wanted now.
+
+    Raises InputError where every frame is held out.
+    """
+
+    def __init__(self, capture: Capture):
+        self.used = np.flatnonzero(~np.asarray(capture.held_out))
+        if not len(self.used):
+            raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
+        self._capture, self.size = capture, 1.0
+        # NumPy: to index them compiles nothing.
+        self._whole = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.used])
+        self.cameras = self._whole
+        self.extent = np.asarray(cameras_extent(self._whole), np.float32)
+
+    def at(self, size: float) -> None:
+        """Takes the frames at `size` times theirs."""
+        if size != self.size:
+            self.size, self.cameras = size, resized(self._whole, size)
+
+    def __getitem__(self, index: int) -> View:
+        """The view of the `index`-th frame used. A depth is that of one of the pixels, as the mean of two lies on
+        neither surface, and 0 where it is not finite and positive; what not to fit spreads to every pixel that it is
+        part of."""
+        capture, t, to = self._capture, self.used[index], (self.cameras.width, self.cameras.height)
+        depth = ignored = None
+        if capture.depths is not None:
+            depth = np.asarray(capture.depths[t], np.float32)
+            depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+            depth = cv2.resize(depth, to, interpolation=cv2.INTER_NEAREST_EXACT)
+        if capture.ignored is not None:
+            share = np.asarray(capture.ignored[t], np.float32)
+            ignored = cv2.resize(share, to, interpolation=cv2.INTER_AREA) > 0
+        frame = resized_frame(np.asarray(capture.frames[t]), self.cameras)
+        return View(self.cameras[index], frame, depth, ignored)
 
 
-def views_at(views: View, size: float) -> View:
-    """A batch at `size` times its size, whole px; a depth is that of one of the pixels, as the mean of two lies on
-    neither surface, and what not to fit spreads to every pixel that it is part of."""
-    cameras, frames = resized(views.camera, np.asarray(views.frame), size)
-    to = frames.shape[2], frames.shape[1]
-    if to == (views.frame.shape[2], views.frame.shape[1]):
-        return views
-    depths, ignored = views.depth, views.ignored
-    if depths is not None:
-        depths = np.stack([cv2.resize(depth, to, interpolation=cv2.INTER_NEAREST_EXACT) for depth in depths])
-    if ignored is not None:
-        share = [cv2.resize(own.astype(np.float32), to, interpolation=cv2.INTER_AREA) for own in ignored]
-        ignored = np.stack(share) > 0
-    return View(cameras, frames, depths, ignored)
+def cameras_extent(cameras: Camera) -> float:
+    """1.1 times the largest distance of a camera's centre from their mean, world units (INRIA's `spatial_lr_scale`)."""
+    centres = jax.tree.map(lambda a: np.asarray(a, np.float64), cameras).centres
+    return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
 def view_loss(
@@ -75,14 +92,15 @@ def view_loss(
     The loss is the photometric one of the rendering, seen through the view's `own` corrections where it has any, and
     DEPTH_WEIGHT times the mean of |rendered - known| / known depth over the view's pixels, zero where the depth is
     unknown or little is rendered. What not to fit has no gradient and no votes there. The gradient in `nothing` (N, 1),
-    zeros, is the votes: the weights alpha T of each Gaussian times the pixels' mean absolute error.
+    zeros, is the votes: the weights alpha T of each Gaussian times the pixels' mean absolute error; (N, 0) where they
+    are not wanted.
     """
     camera = view.camera if own is None else corrected_camera(view.camera, own.twists)
     colours = over_rows(colours_from_sh, gaussians, camera, mesh)
     # The votes are the gradient of a fourth channel that shows nothing: they cost no pass of their own.
     features = jnp.concatenate([colours, nothing], axis=1)
     rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)
-    image, fourth = rendering.features[..., :3], rendering.features[..., 3]
+    image, fourth = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)
     image = image if own is None else exposed(image, own.colours)
     target = view.frame.astype(image.dtype) / 255.0
     if view.ignored is not None:  # as it is rendered there, which is exact: SSIM's windows reach across the border

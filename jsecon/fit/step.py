@@ -1,0 +1,147 @@
+"""One step of a fit: a view's loss, its gradients, and Adam, on all devices of this process."""
+
+import dataclasses
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jsecon.fit.corrections import Refine, Refined, refined_further
+from jsecon.fit.growth import noise, pressure
+from jsecon.fit.schedule import LearningRates, rates_at
+from jsecon.fit.view import View, Views, view_loss
+from jsecon.parallel import AXIS, MESH_OPTIONS, over_rows
+from jsecon.splat.capacity import default_capacity, enough_capacity
+from jsecon.types import Array, Gaussians
+
+Growth: TypeAlias = Literal["votes", "mcmc", "none"]
+_ADAM = optax.scale_by_adam(eps=1e-15)
+
+
+class Current(NamedTuple):
+    """What a step moves."""
+
+    gaussians: Gaussians
+    first_moment: Gaussians
+    second_moment: Gaussians
+    votes: Array
+    """(N,) see FitState."""
+    refined: Refined | None
+    """the corrections of all frames, where they are refined"""
+
+
+class Way(NamedTuple):
+    """How a step goes, beside its view."""
+
+    degree: int
+    """the highest of the spherical harmonics that learns"""
+    growth: Growth
+    """what it does for growth"""
+    rates: LearningRates
+    refine: Refine | None
+
+
+def step(
+    current: Current, view: View, numbers: dict[str, Any], capacity: int, mesh: Mesh | None, growth: Growth
+) -> tuple[Current, Array, Array]:
+    """One Adam step on one view. Returns what is current after it, the loss before it, the pairs that overflowed. Over
+    a mesh, projection, compositing, loss and update are each shared out among its devices.
+
+    `numbers`: the step, the view's frame, how often that was taken before, the share of the fit that is done, the
+    degree, the extent, the rates, those of the corrections.
+    """
+    gaussians, first, second, votes, refined = current
+    nothing = jnp.zeros((gaussians.count, 1 if growth == "votes" else 0))
+    own = None if refined is None else jax.tree.map(lambda a: a[numbers["frame"]], refined.now)
+    fixed = {"view": view, "extent": numbers["extent"], "capacity": capacity, "mesh": mesh}
+
+    def loss(gaussians, nothing, own):
+        total, told = view_loss(gaussians, nothing, own, **fixed)
+        return total + pressure(gaussians) if growth == "mcmc" else total, told
+
+    by = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, nothing, own)
+    (_, (value, overflow)), (gradient, by_error, by_own) = by
+
+    def update(rows, common):
+        (gaussians, gradient, first, second), (step, rate) = rows, common
+        moments: Any = optax.ScaleByAdamState(*cast(Any, (step, first, second)))
+        change, moments = _ADAM.update(gradient, moments)
+        return jax.tree.map(lambda p, u, r: p - r * u, gaussians, change, rate), moments.mu, moments.nu
+
+    rate = rates_at(numbers["done"], numbers["rates"], gaussians, numbers["extent"], numbers["degree"])
+    rows = gaussians, gradient, first, second
+    gaussians, first, second = over_rows(update, rows, (numbers["step"], rate), mesh)
+    if growth == "mcmc":
+        means = gaussians.means + noise(gaussians, rate.means, numbers["step"])
+        gaussians = dataclasses.replace(gaussians, means=means)
+    if refined is not None:
+        refined = refined_further(refined, numbers["frame"], by_own, numbers["taken"], numbers["refine_rates"])
+    after = Current(gaussians, first, second, votes + by_error.sum(1), refined)
+    if mesh is not None:  # as it came: one program serves every step
+        after = Current(*map(jax.lax.with_sharding_constraint, after, _places(mesh)))
+    return after, value, overflow
+
+
+# of one device, and over a mesh
+step_compiled = [
+    jax.jit(step, static_argnames=("capacity", "mesh", "growth"), compiler_options=options)
+    for options in (None, MESH_OPTIONS)
+]
+
+
+def _places(mesh: Mesh) -> Current:
+    """Where a device finds what is current: all of it whole but the moments, of which it has its own rows."""
+    whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
+    return cast(Current, Current(*cast(Any, (whole, rows, rows, whole, whole))))
+
+
+def on_devices(current: Current, mesh: Mesh | None) -> Current:
+    """What is current, where the devices of a step want it."""
+    return jax.device_put(current) if mesh is None else Current(*map(jax.device_put, current, _places(mesh)))
+
+
+class Steps:
+    """Steps on the views of a capture: the programs that there are, and the room that views of a size need."""
+
+    def __init__(self, views: Views, mesh: Mesh | None):
+        self.views, self.mesh = views, mesh
+        self._capacity: dict[tuple[int, float], int] = {}
+        self._compiled: set[tuple] = set()
+
+    def _shape(self, current: Current) -> tuple[int, float]:
+        return current.gaussians.count, self.views.size
+
+    def take(self, current: Current, view: int, number: int, done: float, way: Way) -> tuple[Current, Array, Array]:
+        """`step`, the `number`-th, on that view."""
+        views, cameras, strips = self.views, self.views.cameras, 1 if self.mesh is None else self.mesh.size
+        fresh = default_capacity(current.gaussians.count, cameras.width, cameras.height, strips=strips)
+        capacity = self._capacity.setdefault(self._shape(current), fresh)
+        numbers = {
+            "step": np.int32(number),
+            "frame": np.int32(views.used[view]),
+            "taken": np.int32(number // len(views.used)),
+            "done": np.float32(done),
+            "degree": np.int32(way.degree),
+            "extent": views.extent,
+            "rates": way.rates,
+            "refine_rates": None if way.refine is None else way.refine.rates(done, float(views.extent)),
+        }
+        place = None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec())
+        given = jax.device_put((views[view], numbers), place)
+        run = step_compiled[self.mesh is not None]
+        return run(current, *given, capacity=capacity, mesh=self.mesh, growth=way.growth)
+
+    def compile(self, current: Current, view: int, number: int, done: float, way: Way) -> None:
+        """Makes the program of such a step, where there is none."""
+        program = *self._shape(current), way.growth
+        if program not in self._compiled:
+            jax.block_until_ready(self.take(current, view, number, done, way))
+            self._compiled.add(program)
+
+    def widen(self, current: Current, overflow: int) -> None:
+        """Gives room for `overflow` pairs more in views of this size."""
+        shape = self._shape(current)
+        self._capacity[shape] = enough_capacity(self._capacity[shape], np.array([overflow]))

@@ -1,0 +1,275 @@
+"""Poses of bare photographs: found up to a similarity, kept, gone on with, and refused where they can't be."""
+
+import contextlib
+import dataclasses
+import importlib.util
+import shutil
+import sqlite3
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import refused
+from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
+from PIL import Image
+
+from jsecon.app import command_line, pipeline
+from jsecon.app.options import Options
+from jsecon.app.progress import Listener
+from jsecon.app.scene_stages import loaded
+from jsecon.app.stages import KEY_FILE, Record, Work
+from jsecon.data import motion, motion_steps
+from jsecon.data.capture import load_capture
+from jsecon.data.motion import find_poses, photographs
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
+
+COUNT = 8
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos") / "walk"
+    return folder, write_photos(folder, COUNT)
+
+
+@pytest.fixture(scope="module")
+def found(photos, tmp_path_factory):
+    """What structure from motion finds, where it works, and what it told on the way."""
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("no pycolmap")
+    work, told = tmp_path_factory.mktemp("work"), []
+    motion_found, capture = find_poses(photographs(photos[0]), work, progress=lambda *at: told.append(at))
+    return motion_found, capture, work, told
+
+
+def test_poses_are_found_up_to_a_similarity(photos, found):
+    told, folder, _, _ = found
+    assert len(told.registered) == COUNT
+    assert not told.left_out
+    assert told.error_px < 0.5
+    capture = load_capture(folder, holdout=0)
+    assert capture.names == tuple(f"photo {n:02d}" for n in range(COUNT))  # names with spaces
+    assert capture.frames.shape[1:] == (HEIGHT, WIDTH, 3)
+    assert len(capture.points) == told.points > 200
+    distances, degrees = apart(np.asarray(capture.cameras.world_to_camera, np.float64), photos[1])
+    assert distances.max() < 0.005
+    assert degrees.max() < 0.3
+    np.testing.assert_allclose(capture.cameras.fx, FOCAL, rtol=0.03)
+
+
+def test_progress_counts_photographs_pairs_and_registrations(found):
+    told = found[3]
+    pairs = COUNT * (COUNT - 1) // 2
+    assert (COUNT, COUNT) in told
+    assert (pairs, pairs) in told
+    assert told[-1] == (COUNT, COUNT)
+    assert all(0 < done <= total for done, total in told)
+
+
+def test_what_was_stopped_goes_on_with_what_was_found(photos, found, tmp_path):
+    """Features and pairs of a process that was killed are not looked for again; nothing is left of what it half did."""
+    shutil.copytree(found[2], tmp_path / "work", symlinks=True)
+    told = []
+    (tmp_path / "work" / "found.json").unlink()
+    seconds = found[0].seconds
+    more, _ = find_poses(photographs(photos[0]), tmp_path / "work", progress=lambda *at: told.append(at))
+    assert all(total == COUNT for _, total in told)  # no pairs, only registrations
+    assert more.seconds["features"] < 0.5 * seconds["features"] + 0.5
+    assert more.registered == found[0].registered
+    assert more.error_px == pytest.approx(found[0].error_px, rel=0.05)
+
+
+def test_photographs_are_those_of_images_or_of_the_folder_itself(tmp_path):
+    assert photographs(tmp_path / "nowhere") == []
+    for name in ("b.JPG", "a.png", ".hidden.png", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [path.name for path in photographs(tmp_path)] == ["a.png", "b.JPG"]
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "c.webp").touch()
+    assert [path.name for path in photographs(tmp_path)] == ["c.webp"]
+
+
+def test_one_lens_for_the_photographs_of_one_camera_and_focal_length(photos, tmp_path):
+    for number, focal in enumerate((35, 35, 50, None)):
+        exif = Image.Exif()
+        if focal is not None:
+            exif[motion._MODEL], exif.get_ifd(motion._EXIF)[motion._FOCAL] = "camera", float(focal)
+        Image.new("RGB", (32, 24)).save(tmp_path / f"{number}.jpg", exif=exif)
+    assert motion._lenses(photographs(tmp_path)) == [[0, 1], [2], [3]]
+    assert motion._lenses(photographs(photos[0])) == [list(range(COUNT))]
+
+
+def test_pairs_are_the_neighbours_and_the_frames_that_look_alike(monkeypatch, tmp_path):
+    monkeypatch.setattr(motion_steps, "ALIKE", 1)
+    count, apart_by = 60, 40
+    turned = np.eye(count)
+    turned[np.arange(count - apart_by), np.arange(count - apart_by) + apart_by] = 0.9  # the walk's second round
+    monkeypatch.setattr(motion_steps, "_likeness", lambda *_: turned + turned.T)
+    images = list(range(1, count + 1))
+    pairs = motion_steps._pairs(tmp_path / "none", images)
+    assert {(1, 2), (1, 11), (1, 41), (20, 60)} <= pairs
+    assert (1, 12) not in pairs
+    assert len(motion_steps._pairs(tmp_path / "none", images[:40])) == 40 * 39 // 2
+
+
+def test_a_photograph_whose_matches_become_no_points_is_in_a_wrong_place(tmp_path):
+    """Five photographs of the same 20 things; the last one's are points of its own, but for two."""
+    count, things = 5, 20
+    rows = np.stack([np.arange(things)] * 2, axis=-1).astype(np.uint32)
+    with contextlib.closing(sqlite3.connect(tmp_path / "database.db")) as held, held:
+        held.execute("create table two_view_geometries (pair_id, rows, data)")
+        for a in range(1, count + 1):
+            for b in range(a + 1, count + 1):
+                held.execute("insert into two_view_geometries values (?, ?, ?)", (a * motion_steps.PAIR + b, 20, rows))
+
+    def image(numbers):
+        points = [
+            SimpleNamespace(point3D_id=number, has_point3D=lambda number=number: number > 0) for number in numbers
+        ]
+        return SimpleNamespace(has_pose=True, points2D=points)
+
+    right, wrong = image([*range(1, 18), 0, 0, 0]), image([1, 2, *range(101, 119)])
+    model = SimpleNamespace(images={number: right for number in range(1, count)} | {count: wrong})
+    assert motion_steps._misplaced(tmp_path / "database.db", model) == [count]
+    model.images[count] = right
+    assert motion_steps._misplaced(tmp_path / "database.db", model) == []
+
+
+def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with refused("pip install 'jsecon[sfm]'", "walk"):
+        find_poses(photographs(photos[0]), tmp_path, where=photos[0])
+    assert command_line.main(["run", str(photos[0]), "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr()
+    assert "poses            run       found by structure from motion (pycolmap) for 8 photographs" in told.out
+    assert "pip install 'jsecon[sfm]'" in told.err
+
+
+def _damaged(path):
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+def _smaller(path):
+    cv2.imwrite(str(path), np.zeros((60, 80, 3), np.uint8))
+
+
+@pytest.mark.parametrize(("spoil", "says"), [(_damaged, "breaks off"), (_smaller, "photo 03.png of 80x60")])
+def test_photographs_that_are_damaged_or_of_several_sizes_are_refused(photos, tmp_path, spoil, says):
+    folder = shutil.copytree(photos[0], tmp_path / "walk")
+    spoil(folder / "photo 03.png")
+    with refused("photo 03.png", says):
+        find_poses(photographs(folder), tmp_path / "work")
+
+
+def test_photographs_that_show_nothing_in_common_are_refused(photos, tmp_path):
+    with refused("2 photographs", "walk"):
+        find_poses(photographs(photos[0])[:2], tmp_path / "work", where=photos[0])
+    for number in range(3):
+        Image.new("RGB", (64, 48), (80 * number, 9, 9)).save(tmp_path / f"{number}.png")
+    with refused("brought together"):
+        find_poses(photographs(tmp_path), tmp_path / "work")
+
+
+def test_an_end_of_colmap_of_its_own_is_told_with_its_log(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(motion_steps, "__name__", "jsecon.data.no_such_module")
+    with refused("code 1", "log.txt", "no_such_module"):
+        find_poses(photographs(photos[0]), tmp_path)
+
+
+class Loaded(Exception):
+    """The frames are there: what comes after is not looked at."""
+
+
+class UntilLoaded(Listener):
+    """Keeps what it is told, and stops the run once the frames are there."""
+
+    def __init__(self):
+        self.planned, self.notes = {}, []
+
+    def steps(self, title, steps):
+        self.planned = {step.name: step.status for step in steps}
+
+    def note(self, text):
+        self.notes.append(text)
+        if "held out" in text:  # what load says
+            raise Loaded
+
+
+@pytest.fixture
+def at_once(found, monkeypatch):
+    """Structure from motion that takes no time: what the fixture found; how often it was asked."""
+    asked = []
+
+    def copied(photos, work, *, where, progress):
+        asked.append(where)
+        return found[0], Path(shutil.copytree(found[1], work / "capture", symlinks=True))
+
+    monkeypatch.setattr(motion, "find_poses", copied)
+    return asked
+
+
+def test_a_run_finds_the_poses_first_and_keeps_them(photos, at_once, tmp_path):
+    out, options = tmp_path / "out", Options(photos[0], holdout=4)
+
+    def again(**changes):
+        listener = UntilLoaded()
+        with pytest.raises(Loaded):
+            pipeline.run(dataclasses.replace(options, **changes), out, listener=listener)
+        return listener
+
+    first = again()
+    assert list(first.planned)[:2] == ["poses", "load"]
+    assert any("8 of 8 photographs" in note and "reprojection error 0." in note for note in first.notes)
+    assert any(note.startswith("8 frames of") and "2 of them held out" in note for note in first.notes)
+    assert {path.name for path in (out / "poses").iterdir()} == {"images", "sparse", KEY_FILE}
+    assert len(list((out / "poses" / "images").iterdir())) == COUNT
+    assert not list((out / "cache").glob("poses-*.checkpoint"))
+    second = again()
+    assert second.planned["poses"] == second.planned["load"] == "cached"
+    shutil.rmtree(out / "poses")  # nobody needs it while the frames are cached
+    assert again().planned["poses"] == "cached"
+    assert len(at_once) == 1
+    third = again(long_side=200)
+    assert third.planned["poses"] == third.planned["load"] == "run"
+    (out / "poses" / KEY_FILE).write_text("another capture's")
+    assert again(long_side=240).planned["poses"] == "run"
+    assert len(at_once) == 3
+
+
+def test_only_captures_without_poses_have_the_stage(photos, room, found, tmp_path):
+    def names(capture, load=None):
+        work = Work(Options(capture), Networks(ColourEmbedder()), tmp_path, load)
+        return [stage.name for stage in loaded(work)]
+
+    assert names(photos[0]) == ["poses", "load"]
+    for capture in (room, found[1], tmp_path):
+        assert names(capture) == ["load"]
+    assert names(photos[0], load=lambda: None) == ["load"]
+    shutil.copytree(photos[0], tmp_path / "images")
+    assert names(tmp_path) == ["poses", "load"]
+    (tmp_path / "transforms.json").write_text("{}")
+    assert names(tmp_path) == ["load"]
+
+
+def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):
+    record = Record(tmp_path / "poses-12.checkpoint.npz")
+    (record.folder / "half").mkdir(parents=True)
+    assert record.folder == tmp_path / "poses-12.checkpoint"
+    record.remove()
+    assert not record.folder.exists()
+
+
+@pytest.mark.slow
+def test_the_bonsai_is_found_as_its_poses_are_given(shared, tmp_path):
+    capture = shared / "captures" / "bonsai"
+    told, folder = find_poses(photographs(capture), tmp_path)
+    assert len(told.registered) == 125
+    assert told.error_px < 0.4
+    ours, theirs = (load_capture(path, holdout=0, long_side=32).cameras.world_to_camera for path in (folder, capture))
+    distances, degrees = apart(np.asarray(ours, np.float64), np.asarray(theirs, np.float64))
+    assert np.median(distances) < 0.005
+    assert np.median(degrees) < 0.5
