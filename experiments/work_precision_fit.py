@@ -20,7 +20,7 @@ from jsecon.data.capture import load_capture
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.quality import quality
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.start import starting_gaussians
+from jsecon.fit.start import Start, starting_gaussians
 from jsecon.process import cores, forget_programs
 
 
@@ -31,7 +31,16 @@ class Knobs:
     schedule: Schedule = dataclasses.field(default_factory=Schedule)
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     sh_degree: int = 2
+    start: Start = "auto"
     seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """What the last call was about; the cells say the rest."""
+
+    capture: str
+    long_side: int
 
 
 def _with(**changes: Any) -> Knobs:
@@ -55,6 +64,9 @@ WAYS: dict[str, Knobs] = {
     "three sizes": _with(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0))),
     "50,000 Gaussians": _with(at_most=50_000),
     "200,000 Gaussians": _with(at_most=200_000),
+    "dense start": _with(start="dense"),
+    "dense start, no growth": _with(start="dense", growth="none"),
+    "random start": _with(start="random"),
     "SH degree 0": _with(sh_degree=0),
     "SH degree 1": _with(sh_degree=1),
     "SH degree 3": _with(sh_degree=3),
@@ -65,7 +77,7 @@ WAYS: dict[str, Knobs] = {
 
 def fit(capture, knobs: Knobs, minutes: float) -> dict:
     """The figures of one fit."""
-    start, _ = starting_gaussians(capture, sh_degree=knobs.sh_degree)
+    start, _ = starting_gaussians(capture, sh_degree=knobs.sh_degree, start=knobs.start)
     states = []
     gaussians, losses = fit_gaussians(
         capture,
@@ -85,6 +97,38 @@ def fit(capture, knobs: Knobs, minutes: float) -> dict:
         "steps": len(losses),
         "seconds": states[-1][0],
     }
+
+
+def layout(cells: list[dict]) -> str:
+    """A table for each capture and size: the ways in rows, PSNR and SSIM for each number of minutes."""
+    parts = []
+    for capture, size in dict.fromkeys((cell["capture"], cell["long_side"]) for cell in cells):
+        own = [cell for cell in cells if (cell["capture"], cell["long_side"]) == (capture, size)]
+        minutes = sorted({cell["minutes"] for cell in own})
+        rows = []
+        for way in dict.fromkeys(cell["way"] for cell in own):
+            at = {cell["minutes"]: cell for cell in own if cell["way"] == way}
+            told = (f"{at[m]['psnr']:.2f} dB, {at[m]['ssim']:.3f}" if m in at else "" for m in minutes)
+            rows.append((way, *told, max(cell["gaussians"] for cell in at.values())))
+        header = (f"{capture}, long side {size} px", *(f"{m:g} min" for m in minutes), "Gaussians")
+        parts.append(results.table(header, rows))
+    return "\n\n".join(parts)
+
+
+def curves(cells: list[dict]):
+    """PSNR against minutes, a line for each way, a panel for each capture."""
+    from matplotlib.figure import Figure
+
+    captures = list(dict.fromkeys(cell["capture"] for cell in cells))
+    figure = Figure(figsize=(5.2 * len(captures), 3.6))
+    for n, capture in enumerate(captures):
+        axes = figure.add_subplot(1, len(captures), n + 1, title=capture, xlabel="minutes", ylabel="held-out PSNR, dB")
+        axes.set_xscale("log")
+        for way in dict.fromkeys(cell["way"] for cell in cells if cell["capture"] == capture):
+            found = sorted((c["minutes"], c["psnr"]) for c in cells if (c["capture"], c["way"]) == (capture, way))
+            axes.plot(*zip(*found, strict=True), marker="o", markersize=3, label=way)
+        axes.legend(fontsize=6)
+    return figure
 
 
 def main() -> None:
@@ -108,7 +152,9 @@ def main() -> None:
                 forget_programs()
                 with place.open("a") as file:
                     file.write(json.dumps(cell) + "\n")
+                cells.append(cell)
             print(json.dumps(cell), flush=True)
+    results.save(place.parent, Asked(asked.capture, asked.long_side), {"cells": cells}, layout(cells), curves(cells))
 
 
 if __name__ == "__main__":
