@@ -10,7 +10,7 @@ import pytest
 
 from jsecon.app import cache
 from jsecon.app.language_stages import codes, votes
-from jsecon.app.scene_stages import load
+from jsecon.app.scene_stages import _as_it_is as load
 from jsecon.app.stages import Outcome
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
@@ -166,9 +166,11 @@ def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
 
 
 def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeypatch):
+    names = {load: "load", codes: "codes", votes: "votes"}
+
     def digests():
         cache._imports_of_module.cache_clear()
-        return {stage: cache.source_digest(stage) for stage in (load, codes, votes)}
+        return {stage: cache.source_digest(stage) for stage in names}
 
     before, read = digests(), Path.read_text
     assert digests() == before
@@ -178,7 +180,7 @@ def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeyp
         real = cache._file_of(module)
         monkeypatch.setattr(Path, "read_bytes", lambda path: read(path).encode() + text * (path == real))
         monkeypatch.setattr(Path, "read_text", lambda path: read(path) + text.decode() * (path == real))
-        return {stage.__name__ for stage, digest in digests().items() if digest != before[stage]}
+        return {names[stage] for stage, digest in digests().items() if digest != before[stage]}
 
     assert changed("jsecon.splat.tiles", b"# more") == {"votes"}
     assert changed("jsecon.data.colmap", b"# more") == {"load"}

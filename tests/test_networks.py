@@ -219,7 +219,7 @@ def test_templates_are_for_clip():
 def test_two_sources_of_masks_are_refused(room, models, tmp_path):
     with pytest.raises(InputError, match="--masks --segmenter"):
         pipeline.run(Options(room, masks=room / "masks", segmenter=models[0]), tmp_path)
-    with pytest.raises(InputError, match="SAM model"):
+    with pytest.raises(InputError, match="SAM folders"):
         pipeline.run(Options(room, segmenter=tmp_path / "nowhere"), tmp_path)
 
 
