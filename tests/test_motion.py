@@ -61,6 +61,25 @@ def test_poses_are_found_up_to_a_similarity(photos, found):
     np.testing.assert_allclose(capture.cameras.fx, FOCAL, rtol=0.03)
 
 
+def test_a_model_that_holds_too_few_matches_is_made_all_at_once(photos, found, tmp_path, monkeypatch):
+    import pycolmap
+
+    shutil.copytree(found[2], tmp_path / "work", symlinks=True)
+    database, links = tmp_path / "work" / "database.db", tmp_path / "work" / "links"
+    nothing = pycolmap.Reconstruction()
+    assert not motion_steps._firm(database, nothing)
+    monkeypatch.setattr(motion_steps, "_one_by_one", lambda *_: (nothing, 1))
+    model, models = motion_steps._mapping(pycolmap, COUNT, database, links, lambda *_: None)
+    assert (model.num_reg_images(), models) == (COUNT, 1)
+    assert motion_steps._firm(database, model)
+    assert motion_steps._misplaced(database, model) == []
+    poses = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    found = np.stack([np.vstack([poses[name], (0, 0, 0, 1)]) for name in sorted(poses)])
+    distances, degrees = apart(found, photos[1])
+    assert distances.max() < 0.005
+    assert degrees.max() < 0.3
+
+
 def test_progress_counts_photographs_pairs_and_registrations(found):
     told = found[3]
     pairs = COUNT * (COUNT - 1) // 2
