@@ -93,8 +93,7 @@ def main(options: Options) -> None:
         clean = rgbd_capture(seed, options)
         rough = roughened(clean, seed)
         began = time.monotonic()
-        start, _ = starting_gaussians(rough, sh_degree=1)
-        better = settled(rough, start, key=jax.random.key(seed))
+        better = settled(rough, key=jax.random.key(seed))
         spent = time.monotonic() - began
         for name, capture in (("clean", clean), ("none", rough), ("both", better)):
             centimetres, degrees = poses_off(capture, clean)

@@ -82,16 +82,15 @@ def _put_right(work: Work) -> Stage:
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.fit.corrections import Refine
         from jsecon.fit.settle import settled
-        from jsecon.fit.start import starting_gaussians
 
         loaded = plain.compute(results, progress, record)
         capture, asked = loaded.value, options.refine
         if asked == "auto":
             asked = "none" if capture.depths is None else "both"
         refine = None if asked == "none" else Refine(asked in ("poses", "both"), asked in ("exposure", "both"))
-        told, start = len(capture.notes), starting_gaussians(capture, progress=progress)[0]
+        told = len(capture.notes)
         given = {"refine": refine, "drop_weak": options.drop_frames == "auto", "progress": progress}
-        better = settled(capture, start, key=jax.random.key(options.seed), **given)
+        better = settled(capture, key=jax.random.key(options.seed), **given)
         training_frames(better)
         return Outcome(better, notes=(*loaded.notes, *better.notes[told:]))
 

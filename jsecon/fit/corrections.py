@@ -51,7 +51,7 @@ class Refine:
 
     poses: bool = True
     exposure: bool = True
-    pose_rate: float = 1e-3
+    pose_rate: float = 3e-3
     """radians, and shares of the cameras' extent, at the first step"""
     colour_rate: float = 1e-2
     """of each of the affine map's numbers, at the first step"""

@@ -1,9 +1,11 @@
 """A capture put right before anything is made of it: poses, exposures, and frames that nothing explains.
 
 A probe, a short fit with corrections (corrections.py), says how far each frame is off. What comes of it is a capture
-again, its cameras where they stood and its frames as one exposure shows them, for all that follows. Frames held out
-have no part in the probe; they are aligned to it once it is frozen, each by its own pose and exposure alone, as methods
-that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
+again, its cameras where they stood and its frames as one exposure shows them, for all that follows. Points from depth
+stand where their own frame's wrong pose puts them, and hold it there: so a probe has few of them, which several frames
+must share, and after each of the first probes the next starts from points made anew with the poses found. Frames held
+out have no part in the probes; they are aligned to the last once it is frozen, each by its own pose and exposure alone,
+as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
 """
 
 import dataclasses
@@ -19,31 +21,36 @@ from jsecon.fit.corrections import Corrections, Refine, at_rest, exponential
 from jsecon.fit.optimise import FitState, fit_gaussians
 from jsecon.fit.quality import quality, weak
 from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.start import starting_gaussians
 from jsecon.fit.view import cameras_extent
 from jsecon.types import Array, Capture, Gaussians
 
-VISITS = 60
-"""of each frame by the probe"""
-ALIGNING_VISITS = 40
+VISITS, PROBES = 30, 4
+"""of each frame by a probe, and probes one after the other"""
+POINTS = 12_000
+"""that a probe starts from at most, where it has more than the capture's sparse ones"""
+ALIGNING_VISITS = 120
 """of each held-out frame by its alignment"""
-SCHEDULE = Schedule(sizes=((0.5, 0.7), (1.0, 1.0)), growth="none")
-"""of the probe"""
+SCHEDULE = Schedule(sizes=((0.5, 1.0),), growth="none")
+"""of a probe: half the frames' size, which measures as well as all of it here, in half the time"""
 _REFINE = Refine()
 _FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 
 
 def settled(
     capture: Capture,
-    start: Gaussians,
+    start: Gaussians | None = None,
     *,
     key: PRNGKeyArray,
     refine: Refine | None = _REFINE,
     drop_weak: bool = False,
     visits: int = VISITS,
+    probes: int = PROBES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Capture:
-    """The capture with its poses and exposures corrected by a probe from `start`, without the training frames that the
-    probe does not explain where `drop_weak` (`quality.weak`); its notes say what was done, and how far.
+    """The capture with its poses and exposures corrected by `probes` probes (one where no pose is refined), without the
+    training frames that the last does not explain where `drop_weak` (`quality.weak`); its notes say what was done, and
+    how far. Each starts from `start`; without, from what the capture and the poses of the probe before give.
 
     The world stays where it was: of all corrections the rigid motion that brings the training cameras nearest to where
     they were told to stand is taken back, and colours are such that the mean correction is none. A corrected frame is
@@ -53,26 +60,40 @@ def settled(
     if refine is None and not drop_weak:
         return capture
     train, out = ~np.asarray(capture.held_out), np.asarray(capture.held_out)
-    require(visits > 0, "visits", visits, "at least 1", "60 are usual.")
+    require(visits > 0, "visits", visits, "at least 1", f"{VISITS} are usual.")
+    require(probes > 0, "probes", probes, "at least 1", f"{PROBES} are usual.")
+    told, probes = capture, probes if refine is not None and refine.poses else 1
     steps, more = visits * int(train.sum()), ALIGNING_VISITS * int(out.sum()) if refine is not None else 0
-    tell = lambda done, _: None if progress is None else progress(done, steps + more)
-    probe, found = _probed(capture, start, refine, key=key, steps=steps, progress=tell)
+
+    def tell(before: int):
+        return lambda done, _: None if progress is None else progress(before + done, probes * steps + more)
+
+    def probed(number: int):
+        begun = starting_gaussians(capture, at_most=POINTS)[0] if start is None else start
+        return _probed(capture, begun, refine, key=key, steps=steps, progress=tell(number * steps))
+
+    for number in range(probes - 1):
+        assert refine is not None
+        found = probed(number)[1]
+        capture = _corrected(capture, found, dataclasses.replace(refine, exposure=False))
+    probe, found = probed(probes - 1)
     if more:
         others = dataclasses.replace(capture, held_out=train)
-        tell = lambda done, _: None if progress is None else progress(steps + done, steps + more)
-        _, aligned = _probed(others, probe, refine, key=key, steps=more, rates=_FROZEN, progress=tell)
+        _, aligned = _probed(others, probe, refine, key=key, steps=more, rates=_FROZEN, progress=tell(probes * steps))
         pick = lambda a, b: np.where(out.reshape(-1, *[1] * (a.ndim - 1)), b, a)
         found = jax.tree.map(pick, found, aligned)
     # In the probe's own world and colours.
     left = weak_frames(probe, _corrected(capture, found, refine, at_home=False)) if drop_weak else np.zeros(0, int)
     better = _corrected(capture, found, refine)
-    better = dataclasses.replace(better, notes=(*capture.notes, *_told(capture, better, found, refine)))
+    better = dataclasses.replace(better, notes=(*capture.notes, *_told(told, better, found, refine)))
     return _without(better, left)
 
 
 def _probed(capture: Capture, start: Gaussians, refine: Refine | None, **given: Any) -> tuple[Gaussians, Corrections]:
     """A short fit, and its frames' corrections: none where nothing is refined."""
     last: list[FitState] = []
+    # What is rendered of soft Gaussians lies before a surface, and depth as a teacher would push every camera back.
+    capture = capture if refine is None else dataclasses.replace(capture, depths=None)
     keep = lambda state: last.__setitem__(slice(None), [state])
     found, _ = fit_gaussians(capture, start=start, refine=refine, schedule=SCHEDULE, on_checkpoint=keep, **given)
     refined = last[0].refined
@@ -132,9 +153,9 @@ def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | 
         cosine = (np.einsum("tij,tij->t", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         far = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
-        notes.append(f"poses refined by a probe fit: {far}, {shift.max():.3g} and {turn.max():.2g} at most")
+        notes.append(f"poses refined by probe fits: {far}, {shift.max():.3g} and {turn.max():.2g} at most")
     if refine.exposure:
-        gains = np.trace(np.asarray(found.colours)[:, :, :3], axis1=1, axis2=2) / 3
+        gains = np.asarray(found.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain
         notes.append(f"exposures evened out: frames were {gains.min():.2f} to {gains.max():.2f} times as bright")
     if out.any():
         what = " and ".join(["pose"] * refine.poses + ["exposure"] * refine.exposure)

@@ -17,6 +17,8 @@ from jsecon.types import Array, Camera, Capture, Gaussians, record
 
 DEPTH_WEIGHT = 0.2
 """of the mean relative error of the depth, where a capture has any"""
+ALIKE = 0.05
+"""spread of the depths that a smaller frame's pixel takes together, as a share of their mean, up to which it has one"""
 COVERED = 0.5
 """alpha from which a pixel's rendered depth is that of something"""
 
@@ -56,20 +58,28 @@ class Views:
             self.size, self.cameras = size, resized(self._whole, size)
 
     def __getitem__(self, index: int) -> View:
-        """The view of the `index`-th frame used. A depth is that of one of the pixels, as the mean of two lies on
-        neither surface, and 0 where it is not finite and positive; what not to fit spreads to every pixel that it is
-        part of."""
+        """The view of the `index`-th frame used. A depth is 0 where it is not finite and positive, and in a smaller
+        frame where it is of several surfaces; what not to fit spreads to every pixel that it is part of."""
         capture, t, to = self._capture, self.used[index], (self.cameras.width, self.cameras.height)
         depth = ignored = None
         if capture.depths is not None:
             depth = np.asarray(capture.depths[t], np.float32)
             depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-            depth = cv2.resize(depth, to, interpolation=cv2.INTER_NEAREST_EXACT)
+            depth = depth if depth.shape == to[::-1] else _smaller_depth(depth, to)
         if capture.ignored is not None:
             share = np.asarray(capture.ignored[t], np.float32)
             ignored = cv2.resize(share, to, interpolation=cv2.INTER_AREA) > 0
         frame = resized_frame(np.asarray(capture.frames[t]), self.cameras)
         return View(self.cameras[index], frame, depth, ignored)
+
+
+def _smaller_depth(depth: np.ndarray, to: tuple[int, int]) -> np.ndarray:
+    """The mean over each pixel of a smaller frame, 0 where a part is unknown or where surfaces meet. (One
+    picked out of several stands beside the pixel's centre.)"""
+    shrink = lambda a: cv2.resize(a, to, interpolation=cv2.INTER_AREA).astype(np.float64)
+    mean, square, known = shrink(depth), shrink(depth.astype(np.float64) ** 2), shrink(np.float32(depth > 0))
+    alike = square - mean**2 <= (ALIKE * mean) ** 2
+    return np.where((known > 0.999) & alike, mean, 0).astype(np.float32)
 
 
 def cameras_extent(cameras: Camera) -> float:
