@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from jsecon.fit.quality import weak
+from jsecon.fit.quality import quality, weak
+from jsecon.fit.start import gaussians_from_points
+from jsecon.types import Camera, Capture
 
 
 def test_weak_frames_are_far_below_the_others():
@@ -17,3 +19,21 @@ def test_a_capture_of_spread_quality_has_none():
     assert not weak(np.linspace(15, 35, 30)).any()
     assert not weak(np.array([20.0])).any()
     assert weak(np.zeros(0)).shape == (0,)
+
+
+def test_large_frames_are_compared_at_the_size_asked():
+    """A grey capture seen by no Gaussian: PSNR is that of the frames' own colours, whichever size."""
+    rng = np.random.default_rng(1)
+    coarse = rng.integers(0, 256, (2, 6, 8, 3), np.uint8)
+    large = np.repeat(np.repeat(coarse, 4, axis=1), 4, axis=2)
+    count, nothing = 2, (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    lens = [np.full(count, v, np.float32) for v in (30, 30, 16, 12)]
+    cameras = Camera(np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), *lens, width=32, height=24)
+    capture = Capture(large, cameras, *nothing, np.ones(count, bool), None, np.eye(4), ("a", "b"))
+    behind = np.array([[0, 0, -5.0]], np.float32)
+    scene = gaussians_from_points(behind, np.zeros((1, 3), np.uint8))
+    expected = -10 * np.log10(((coarse / 255.0) ** 2).mean(axis=(1, 2, 3)))
+    for long_side in (None, 8, 100):
+        found = quality(scene, capture, long_side=long_side)
+        np.testing.assert_allclose(found.psnr, expected, atol=1e-4)
+    assert not np.allclose(quality(scene, capture, long_side=8).ssim, found.ssim)

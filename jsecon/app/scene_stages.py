@@ -211,10 +211,11 @@ def held_out(work: Work) -> Stage:
     """PSNR and SSIM of the frames held out, against the photographs; and which of the others stay far below them."""
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.fit.quality import quality, weak
+        from jsecon.fit.quality import GLANCE, quality, weak
 
         capture, scene = results["load"], results["gaussians"]
-        fitted = quality(scene, capture, frames=np.flatnonzero(~np.asarray(capture.held_out)), progress=progress)
+        train = np.flatnonzero(~np.asarray(capture.held_out))
+        fitted = quality(scene, capture, frames=train, long_side=GLANCE, progress=progress)
         low = np.flatnonzero(weak(np.asarray(fitted.psnr)))
         names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in low[:5])
         more = f" and {len(low) - 5} more" if len(low) > 5 else ""

@@ -8,9 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.fit.photometric import psnr, ssim
+from jsecon.fit.schedule import resized, resized_frame
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Capture, Gaussians, Quality
 
+GLANCE = 400
+"""px of the longer side that weak frames are looked for at: a thousand large ones would take half an hour"""
 FAR_BELOW_DB = 5.0
 """below the median frame at least, for a frame to be called weak"""
 SPREADS = 5.0
@@ -28,14 +31,19 @@ def quality(
     capture: Capture,
     *,
     frames: Int[np.ndarray, " f"] | None = None,
+    long_side: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Quality:
-    """PSNR and SSIM of `frames` (by default those held out) against the photographs; renderings clamped to [0, 1]."""
+    """PSNR and SSIM of `frames` (by default those held out) against the photographs; renderings clamped to [0, 1].
+    `long_side`: px that larger frames are shrunk to first."""
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
-    gaussians, values = jax.device_put(gaussians), []
+    gaussians, values, cameras = jax.device_put(gaussians), [], capture.cameras
+    if long_side is not None:
+        cameras = resized(cameras, min(1.0, long_side / max(cameras.width, cameras.height)))
     for n, t in enumerate(chosen):
-        image = render_rgb(gaussians, capture.cameras[int(t)]).features
-        values.append([float(value) for value in _compared(image, np.asarray(capture.frames[t]))])
+        image = render_rgb(gaussians, cameras[int(t)]).features
+        frame = resized_frame(np.asarray(capture.frames[t]), cameras)
+        values.append([float(value) for value in _compared(image, frame)])
         if progress:
             progress(n + 1, len(chosen))
     by_frame = np.array(values).reshape(-1, 2)

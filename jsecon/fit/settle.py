@@ -19,7 +19,7 @@ from jaxtyping import Float, PRNGKeyArray
 from jsecon.errors import require
 from jsecon.fit.corrections import Corrections, Refine, at_rest, exponential
 from jsecon.fit.optimise import FitState, fit_gaussians
-from jsecon.fit.quality import quality, weak
+from jsecon.fit.quality import GLANCE, quality, weak
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.view import cameras_extent
@@ -166,7 +166,7 @@ def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | 
 def weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
     """Indices of the training frames that a scene fitted to them does not explain (`quality.weak`)."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    return train[weak(np.asarray(quality(gaussians, capture, frames=train).psnr))]
+    return train[weak(np.asarray(quality(gaussians, capture, frames=train, long_side=GLANCE).psnr))]
 
 
 def _without(capture: Capture, left: np.ndarray) -> Capture:
