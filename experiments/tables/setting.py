@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from experiments.datasets.feature_files import load_text_features
 from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import Association, Shared, associated
+from jsecon.app.options import Options
 from jsecon.data.langsplat_files import load_features
 from jsecon.data.mask_files import load_labels
 from jsecon.data.ply import load_ply, save_ply
@@ -48,7 +49,9 @@ class Setting:
     """what methods have in common."""
 
 
-def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: int) -> Setting:
+def prepare(
+    data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: int, fitted: "Fitted" = "short"
+) -> Setting:
     """Loads a scene with its masks, tracks and texts; fits its Gaussians where neither the dataset has them (points, or
     <scene>/point_cloud.ply) nor an earlier run."""
     root = data.place(scene, seed, level)
@@ -59,7 +62,7 @@ def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: i
     masks = load_features(folder / "language_features", names, size)
     tracks = load_labels(folder / "masks", names, size, shared=True).labels.astype(np.int32)
     texts, canonical = load_text_features(folder / "text_features.json", bench.queries)
-    gaussians = gaussians_of(bench, folder, data.kept(root, scene), fit_steps)
+    gaussians = gaussians_of(bench, folder, data.kept(root, scene), fit_steps, fitted)
     cameras = jax.tree.map(jnp.asarray, capture.cameras)
     evidence = Evidence(gaussians, cameras[shown], masks.labels, masks.embeddings, masks.frame, tracks)
     return Setting(
@@ -83,7 +86,12 @@ FIT: Any = {
 """of the scenes without Gaussians: few steps, one Gaussian for each point of the start"""
 
 
-def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int) -> Gaussians:
+Fitted = Literal["short", "default", "default, twice"]
+"""how Gaussians are fitted where a scene has none: shortly (FIT), as `jsecon fit` does but to the number of its start,
+or with growth to twice that number"""
+
+
+def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int, fitted: Fitted = "short") -> Gaussians:
     """The scene's Gaussians: its points, one each and in order; or those of <folder>/point_cloud.ply; or fitted, and
     left in `kept` under a name that says to what: levels of noise share the frames, and so the fit."""
     if len(bench.points):
@@ -94,9 +102,12 @@ def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int) -> Gaus
     if given.exists():
         return load_ply(given)
     seen = hashlib.sha1(np.ascontiguousarray(bench.capture.frames).tobytes()).hexdigest()[:12]
-    file = kept / f"{bench.name}_{seen}_{steps}.ply"
+    file = kept / f"{bench.name}_{seen}_{steps}{'' if fitted == 'short' else '_' + fitted.replace(', ', '_')}.ply"
     if not file.exists():
-        start, _ = starting_gaussians(bench.capture)
-        gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **FIT)
+        start, _ = starting_gaussians(bench.capture, sh_degree=0 if fitted == "short" else Options.sh_degree)
+        way: Any = FIT
+        if fitted != "short":
+            way = {"schedule": Schedule(growth="votes", at_most=start.count * (2 if fitted == "default, twice" else 1))}
+        gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **way)
         save_ply(file, gaussians)
     return load_ply(file)
