@@ -142,8 +142,9 @@ def test_jit_and_vmap_over_texts_equal_the_loop(field):
 
 def test_regions_that_are_alike_count_as_one(field):
     embeddings = np.array(field.regions.embeddings)
-    embeddings[4] = embeddings[1]
-    twin = dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels))
+    pixels = np.array(field.regions.pixels)
+    embeddings[4], pixels[4] = embeddings[1], pixels[1]  # of two that are as well known the first is the anchor
+    twin = dataclasses.replace(field, regions=Regions(embeddings, pixels))
     alone, both = query_anchored(twin, embeddings[1], alike_threshold=None), query_anchored(twin, embeddings[1])
     np.testing.assert_allclose(alone.similarity, shares(field, [1]), atol=1e-6)
     np.testing.assert_allclose(both.similarity, shares(field, [1, 4]), atol=1e-6)

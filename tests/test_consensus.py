@@ -77,6 +77,21 @@ def test_masks_that_lie_over_each_other_have_one_vote(world, scene):
     assert np.asarray(once[0].sum(1)).max() <= VIEWS + 1e-3
 
 
+def test_a_frame_without_masks_says_nothing_or_that_nothing_belongs_together(world, scene):
+    _, _, frames, _, proposals = world
+    silent_half = [p if t % 2 else np.zeros((0, HEIGHT, WIDTH), bool) for t, p in enumerate(proposals)]
+    half = scene_of(world, silent_half)
+    views = half.all(frames)
+    for silent, heard in ((True, 0.0), (False, 1.0)):
+        membership, visible, _ = mask_signatures(views, half.count, silent=silent)
+        without = visible[:, ::2].toarray()
+        assert without.max() == heard
+        # A Gaussian agrees with itself wherever it is heard and lies whole in one mask.
+        own, looks = (np.asarray(a.multiply(a).sum(1)).ravel() for a in (membership, visible))
+        seen = looks > 0
+        assert (np.median(own[seen] / looks[seen]) > 0.9) == silent
+
+
 def test_nothing_proposed_anywhere_gives_one_thing_or_none(world):
     _, _, frames, _, _ = world
     nothing = [np.zeros((0, HEIGHT, WIDTH), bool)] * VIEWS

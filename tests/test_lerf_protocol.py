@@ -146,6 +146,15 @@ def test_localisation_by_the_mask_takes_any_of_its_inmost_pixels(scene, views, l
     assert told["loc_mask"] == pytest.approx(np.mean([row.touched for row in rows]))
 
 
+def test_localisation_by_the_box_is_spoilt_by_a_floater(scene, views, labelled):
+    """The middle of a mask's bounding box lies in the thing's; with the other group selected too, between the two."""
+    groups = members(scene)
+    for chosen, right in ((lambda query: groups[query], True), (lambda _: groups["left"] | groups["right"], False)):
+        rows, told = evaluate_point_level_rendered(scene, views, labelled[:1], lambda q, c=chosen: selection(c(q)))
+        assert told["loc_box"] == right
+        assert all(row.centred == right for row in rows)
+
+
 def test_labels_of_another_size_are_evaluated_at_their_own(scene, views, labelled):
     camera = resized(views["view_0"], 96, 80)
     mask = np.asarray(selection_mask(scene, jax.tree.map(jnp.asarray, camera), members(scene)["left"]))

@@ -292,3 +292,4 @@ def test_the_bonsai_is_found_as_its_poses_are_given(shared, tmp_path):
     distances, degrees = apart(np.asarray(ours, np.float64), np.asarray(theirs, np.float64))
     assert np.median(distances) < 0.005
     assert np.median(degrees) < 0.5
+    assert np.max(distances) < 0.01

@@ -7,12 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from small_field import make_field, unit_rows
+from small_field import field_of, make_field, unit_rows
 
 from jsecon.query.anchored import query_anchored
 from jsecon.query.direct import similarities
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD, contrasts as plain_contrasts
-from jsecon.types import Regions
+from jsecon.query.retrieval import (
+    CONTRAST_THRESHOLD,
+    RETRIEVAL_THRESHOLD,
+    contrasts as plain_contrasts,
+    evidence,
+)
+from jsecon.query.several import query_several
+from jsecon.types import Regions, Votes
 
 SIZE = 12
 contrasts = jax.jit(plain_contrasts)
@@ -174,3 +180,47 @@ def test_a_query_finds_its_region_by_the_one_or_the_other(scene, cameras):
     assert (images[:5] @ -texts[0]).max() < RETRIEVAL_THRESHOLD
     with pytest.raises(ValueError, match="contrast"):
         query_anchored(clip, texts[0], retrieval="nearest")
+
+
+def test_evidence_is_of_views_and_counts_against_the_best_known_region():
+    pixels = np.array([[400, 900, 0], [100, 100, 0], [0, 0, 0], [5000, 5000, 5000]])
+    looks = np.array([2.0, 0.5, 0.0, 3.0])
+    expected = looks / (looks + 2) / (3 / 5)
+    np.testing.assert_allclose(evidence(jnp.asarray(pixels)), expected, rtol=1e-6)
+    np.testing.assert_array_equal(evidence(jnp.zeros((3, 4), jnp.int32)), 1)
+    np.testing.assert_array_equal(evidence(jnp.asarray([[7], [7]])), 1)  # one view: nothing to tell them apart by
+
+
+def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_colour():
+    """Kitchen fronts in light and shade, their embedding mixed; slivers that are purer; a wall and a floor."""
+    rng = np.random.default_rng(2)
+    red, dark, wall, floor = unit_rows(rng, 4, 64)
+    fronts = unit(red + 0.5 * dark + 0.3 * wall)
+    slivers = [unit(red + 0.12 * row) for row in unit_rows(rng, 3, 64)]
+    embeddings = np.stack([fronts, wall, floor, *slivers]).astype(np.float32)
+    views = 20
+    pixels = np.zeros((6, views), np.int32)
+    pixels[:3] = np.array([40_000, 50_000, 30_000])[:, None]
+    for row, count in zip(pixels[3:], (2, 3, 4), strict=True):
+        row[:count] = 700
+    text, canonical = red.astype(np.float32), unit_rows(rng, 4, 64)
+    plain, _ = contrasts(embeddings, text, canonical, pixels)
+    assert int(jnp.argmax(plain)) > 2  # by the contrast alone a sliver wins
+    votes = Votes(
+        regions=np.arange(6, dtype=np.int32)[:, None],
+        weights=np.ones((6, 1), np.float32),
+        labelled=np.ones(6, np.float32),
+        total=np.ones(6, np.float32),
+        peak=np.ones(6, np.float32),
+        views=np.full(6, 3, np.int32),
+        overflow=np.zeros((), np.int32),
+        num_regions=6,
+    )
+    field = dataclasses.replace(field_of(votes, Regions(embeddings, pixels)), canonical=canonical)
+    one = query_anchored(field, jnp.asarray(text))
+    assert int(one.region) == 0
+    assert np.asarray(one.mask)[0]
+    everything = np.asarray(query_several(field, jnp.asarray(text[None]), retrieval_threshold=0.2).mask)
+    assert everything[0]
+    assert everything[3:].any()
+    assert not everything[1:3].any()

@@ -52,9 +52,9 @@ def associated(evidence: Evidence, labels: np.ndarray) -> Association:
     return Association(labels.astype(np.int32), unit(inside @ embeddings), uniform, pixels.astype(np.int32))
 
 
-def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int) -> Association:
+def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int, silent: bool = True) -> Association:
     """jsecon's own association, without tracks: the pixels of each frame go to groups of Gaussians that lie in one mask
-    in most views."""
+    in most views; `silent` as for `mask_signatures`."""
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
     masks = np.asarray(evidence.masks)
 
@@ -63,7 +63,7 @@ def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int) -> Associ
         return masks[t][None] == rows[:, None, None]
 
     scene = SceneViews(gaussians, cameras, proposals)
-    return associated(evidence, clean_masklets(consensus_masklets(frames, scene, seed=seed)))
+    return associated(evidence, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed)))
 
 
 def overlaps(labels: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:

@@ -20,7 +20,7 @@ from experiments.tables.setting import Fitted, Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.process import cores, forget_programs
 
-KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "pairs", "missing", "accuracy")
+KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "loc_box", "pairs", "missing", "accuracy")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +50,13 @@ def options_of(plan: Plan, quick: Plan) -> Plan:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="one tiny scene, a few steps: at most two minutes")
     parser.add_argument("--root", default="", help="the real dataset; without it twins are made")
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the twins and their vision")
     parser.add_argument("--out", default="", help="where the results go")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
     given = parser.parse_args()
     chosen = dataclasses.replace(quick if given.quick else plan, processes=given.processes)
+    if given.seeds:
+        chosen = dataclasses.replace(chosen, data=dataclasses.replace(chosen.data, seeds=tuple(given.seeds)))
     if given.root:
         data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)
@@ -134,14 +137,14 @@ def measure(setting: Setting, answers: Answers) -> dict:
     bench: Benchmark = setting.bench
     if not bench.frames:
         opacity = 1 / (1 + np.exp(-np.asarray(setting.evidence.gaussians.opacity_logits)))
-        _, told = evaluate_points(
+        rows, told = evaluate_points(
             answers.classes(),
             bench.point_classes,
             bench.queries,
             expected_classes=bench.pairs,
             opacities=opacity,
         )
-        return {name: told[name] for name in KEPT if name in told}
+        return {name: told[name] for name in KEPT if name in told} | {"texts": {r.query: [r.iou] for r in rows}}
     both = evaluate_at_thresholds(
         setting.evidence.gaussians,
         setting.cameras,
@@ -149,9 +152,14 @@ def measure(setting: Setting, answers: Answers) -> dict:
         lambda query: answers.select(bench.queries.index(query)),
         expected_pairs=bench.pairs,
     )
-    strict, lenient = both[ALPHA_THRESHOLD][1], both[VALA_THRESHOLD][1]
+    (rows, strict), (beside, lenient) = both[ALPHA_THRESHOLD], both[VALA_THRESHOLD]
+    texts = {
+        query: [[r.iou for r in rows if r.query == query], [r.iou for r in beside if r.query == query]]
+        for query in dict.fromkeys(r.query for r in rows)
+    }
     return {name: strict[name] for name in KEPT if name in strict} | {
         "miou_vala": lenient["miou"],
         "macc_vala": lenient["macc"],
+        "texts": texts,
         **answers.beside,
     }

@@ -27,13 +27,15 @@ BY_COSINE = {"retrieval": "cosine"}
 
 
 def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:
-    """The regions of a setting: by "tracks", by "consensus", or any other name with its `labels`."""
+    """The regions of a setting: by "tracks", by "consensus" ("outspoken": one in which a view speaks on what lies in
+    none of its masks), or any other name with its `labels`."""
     evidence = setting.evidence
     if by == "tracks":
         return setting.tracked
     if labels is not None:
         return setting.shared.get(by, lambda: associated(evidence, labels))
-    return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed))
+    silent = by != "outspoken"
+    return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed, silent=silent))
 
 
 def field_of(
@@ -44,9 +46,11 @@ def field_of(
     latent: int | str = "auto",
     uniform: bool = False,
     steps: Steps | None = None,
+    centre: float = 0.0,
 ) -> LanguageField:
     """jsecon's field of a setting, its regions those of `association`. latent=3: LangSplat's autoencoder; with `steps`
-    the paper's own path, Adam on the rendered L1 from random codes, else the votes' mode."""
+    the paper's own path, Adam on the rendered L1 from random codes, else the votes' mode. `centre` as for
+    `region_votes`."""
     evidence, shared = setting.evidence, setting.shared
     regions = association(setting, by, labels=labels)
     embeddings = jnp.asarray(regions.uniform_embeddings if uniform else regions.embeddings)
@@ -55,9 +59,9 @@ def field_of(
 
     def cast() -> Votes:
         given = evidence.gaussians, evidence.cameras, found, len(embeddings)
-        return finish_votes(region_votes(*given, by_view=True), known)
+        return finish_votes(region_votes(*given, by_view=True, centre=centre), known)
 
-    votes = shared.get(("votes", by, uniform), cast)
+    votes = shared.get(("votes", by, uniform, centre), cast)
     if latent == "auto":
         table, coder, _ = shared.get(("codes", by, uniform), lambda: region_codes(embeddings, latent=latent, key=key))
     else:
@@ -99,6 +103,7 @@ def ask_field(
     clean: bool = True,
     threshold: float | None = None,
     pieces: bool = False,
+    retrieval_threshold: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code,
     probability (of the votes; all anchored, by `retrieval`), one_step or canonical; `clean` drops outliers, `pieces`
@@ -127,6 +132,7 @@ def ask_field(
         else:
             by = "votes" if way == "all_views" else way
             options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_nearness": nearness}
+            options["retrieval_threshold"] = retrieval_threshold
             found = query_anchored(field, text, by=by, **options)
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found

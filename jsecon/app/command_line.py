@@ -46,7 +46,7 @@ class Demo:
     """which room"""
     out: Path = Path("jsecon-demo")
     """folder for all of it"""
-    steps: int = 700
+    steps: int = 550
     """of the photometric fit"""
 
 

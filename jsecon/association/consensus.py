@@ -186,16 +186,20 @@ def consensus_masklets(
     scene: SceneViews,
     *,
     agreement: float = 0.4,
+    silent: bool = True,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """labels (T, H, W) int16, -1 = none, of frames (T, H, W, 3) uint8 whose proposals `scene` holds.
 
     The Gaussians are grouped by the views' consensus (`group_by_consensus`), and the groups claim each frame's atoms
-    (`claim_atoms`). Independent of the order of the frames. `progress(done, total)` counts frames.
+    (`claim_atoms`). Independent of the order of the frames. `silent` as for `mask_signatures`. `progress(done, total)`
+    counts frames.
     """
     views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
-    owner = group_by_consensus(*mask_signatures(views, scene.count), means, agreement=agreement, seed=seed)
+    owner = group_by_consensus(
+        *mask_signatures(views, scene.count, silent=silent), means, agreement=agreement, seed=seed
+    )
     count = int(owner.max(initial=-1)) + 1
     labels = np.full(frames.shape[:3], -1, np.int16)
     for image, view in zip(labels, views):
@@ -205,13 +209,16 @@ def consensus_masklets(
     return labels
 
 
-def mask_signatures(views: list[View], count: int) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
+def mask_signatures(
+    views: list[View], count: int, *, silent: bool = True
+) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
     """(membership (N, M), visible (N, T), weights (N,)): what `group_by_consensus` asks for, of N = `count` Gaussians.
 
     A frame is heard on a Gaussian by how clearly it sees it, against the frame that sees it best: on an outline it
     leans over the neighbours. Its shares of the masks are squared and made to add up to 1, which sides with the
     majority. Masks that lie over each other share it: a frame with many levels of masks has no more say than one with
-    a single partition.
+    a single partition. Where a Gaussian lies in no mask of a frame, the frame is `silent` on it, by the share that lies
+    in none; otherwise it says that the Gaussian belongs with nothing.
     """
     shares, looks, weights, start = [], [], np.zeros(count, np.float64), 0
     for t, view in enumerate(views):
@@ -224,10 +231,11 @@ def mask_signatures(views: list[View], count: int) -> tuple[Sparse, Sparse, Floa
         share = cast.data / np.maximum(totals[cast.row] * layers, 1e-12)
         norm = np.bincount(cast.row, share**2, len(totals)) + outside**2 / layers
         share = share**2 / np.maximum(norm[cast.row], 1e-12)
+        heard = view.clarity * (np.bincount(cast.row, share, len(totals)) if silent else 1.0)
         keep = share >= NEGLIGIBLE / layers
         share = (share * np.sqrt(layers) * view.clarity[cast.row])[keep].astype(np.float32)
         shares.append((share, view.seen[cast.row[keep]], start + cast.col[keep]))
-        looks.append((view.clarity.astype(np.float32), view.seen, np.full(len(view.seen), t)))
+        looks.append((heard.astype(np.float32), view.seen, np.full(len(view.seen), t)))
         start += len(view.proposals)
     membership, visible = summed(shares, (count, start)), summed(looks, (count, len(views)))
     return membership, visible, (weights / max(len(views), 1)).astype(np.float32)

@@ -63,10 +63,12 @@ def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
     return jax.random.permutation(jax.random.fold_in(key, index), views)
 
 
-def start_state(gaussians: Gaussians, refined: int | None = None) -> FitState:
-    """The state before the first step; `refined` is the number of frames that corrections are kept of."""
+def start_state(gaussians: Gaussians, refined: int | None = None, *, at_least: int = 0) -> FitState:
+    """The state before the first step, with rows for `at_least` Gaussians; `refined` is the number of frames that
+    corrections are kept of."""
     count = np.asarray(gaussians.count)
-    gaussians = with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows_for(int(count)))
+    rows = rows_for(max(int(count), at_least))
+    gaussians = with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
     corrections = None if refined is None else start_refined(refined)
     numbers = zero, zero, zero, count, np.zeros(0, np.float32)
@@ -74,6 +76,8 @@ def start_state(gaussians: Gaussians, refined: int | None = None) -> FitState:
 
 
 _RATES, _SCHEDULE = LearningRates(), Schedule()
+AT_ONCE = 1 << 16
+"""Gaussians that a fit has rows for from its start; where more are allowed, for half of them"""
 AHEAD = 2
 """steps that are dispatched before one is done; each holds a scene and its moments"""
 
@@ -129,7 +133,9 @@ def fit_gaussians(
     views, mesh = Views(capture), host_mesh()
     taking = Steps(views, mesh)
     if start is not None:
-        state = start_state(start, None if refine is None else len(capture.names))
+        # Each doubling is one more program to compile, which takes as long as hundreds of steps over rows that are free.
+        room = 0 if schedule.growth == "none" else schedule.at_most // (1 if schedule.at_most <= AT_ONCE else 2)
+        state = start_state(start, None if refine is None else len(capture.names), at_least=room)
     assert state is not None
     given, alike = state.refined is not None, (state.refined is None) == (refine is None)
     require(alike, "state with corrections", given, f"{refine is not None}", "Go on with the options of its start.")

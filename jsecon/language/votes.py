@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, is_traced
@@ -41,6 +41,7 @@ def region_votes(
     *,
     top: int = 8,
     by_view: bool = False,
+    centre: float = 0.0,
     capacity: int | None = None,
     near: float = NEAR,
     progress: Callable[[int, int], None] | None = None,
@@ -49,6 +50,8 @@ def region_votes(
 
     Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
     is kept too (`Votes.by_view`, 4 T N bytes, twice that while it is joined), as `language.shares.with_shown` wants it.
+    A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`: at 1 a Gaussian is what its
+    centre is, at 0 what its whole footprint is.
 
     Outside a trace the views are spread over jax's local devices (a million pixels or more in all), and over processes
     that all make the same call (`jax.distributed`), and `progress(done, total)` is called after each; inside one the
@@ -66,7 +69,7 @@ def region_votes(
     size = default_capacity(count, cameras.width, cameras.height) if capacity is None else capacity
     block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
     blocks = math.ceil(max(num_regions, 1) / block)
-    static = size, near, by_view
+    static = size, near, by_view, centre
     xp = jnp if traced else np  # NumPy compiles nothing
     totals: Any = None
     kept = (np.full((count, 0), -1, np.int32), np.zeros((count, 0), gaussians.means.dtype))
@@ -83,7 +86,8 @@ def region_votes(
                 _add_view, start, _merge, gaussians, views, static=static, most=most, progress=report
             )
             if capacity is None and (missing := np.asarray(state["missing"])):
-                again = functools.partial(region_votes, top=top, by_view=by_view, near=near, progress=progress)
+                again = functools.partial(region_votes, top=top, by_view=by_view, centre=centre, near=near)
+                again = functools.partial(again, progress=progress)
                 return again(gaussians, cameras, labels, num_regions, capacity=enough_capacity(size, missing[None]))
         kept, own = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
         labelled = own if b == 0 else labelled + own
@@ -123,16 +127,22 @@ def _keep_strongest(
 
 
 def _add_view(
-    state: dict[str, Array], gaussians: Gaussians, view: tuple[Camera, Array], capacity: int, near: float, by_view: bool
+    state: dict[str, Array],
+    gaussians: Gaussians,
+    view: tuple[Camera, Array],
+    capacity: int,
+    near: float,
+    by_view: bool,
+    centre: float,
 ) -> tuple[dict[str, Array], Array | None]:
     """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted."""
     camera, labels = view
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-    return (_add_plan if is_traced((state, plan, labels)) else _add_plan_compiled)(state, plan, labels, by_view)
+    return (_add_plan if is_traced((state, plan, labels)) else _add_plan_compiled)(state, plan, labels, by_view, centre)
 
 
 def _add_plan(
-    state: dict[str, Array], plan: ViewPlan, labels: Array, by_view: bool
+    state: dict[str, Array], plan: ViewPlan, labels: Array, by_view: bool, centre: float
 ) -> tuple[dict[str, Array], Array | None]:
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, plan.width)
@@ -144,6 +154,7 @@ def _add_plan(
 
     def one_batch(carry, ids_of_tiles):
         local, names, covered = tiles[ids_of_tiles], distinct[ids_of_tiles], in_image[ids_of_tiles]
+        corners = batches.corners(ids_of_tiles, dtype)
         # how many slots this batch needs: empty slots are -2 or -1 (pixels without label)
         needed = (names >= 0).sum(1).max()
 
@@ -157,6 +168,8 @@ def _add_plan(
                 votes, total, peak = inner
                 weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
                 weight = weight * covered[:, None]
+                if centre:
+                    weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
                 cast = jnp.einsum("bcp,bps->bcs", weight, is_slot)
                 target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped
                 votes = votes.at[chunk.ids[:, :, None], target[:, None]].add(cast, mode="drop")
@@ -182,7 +195,16 @@ def _add_plan(
     }, total if by_view else None
 
 
-_add_plan_compiled = jax.jit(_add_plan, static_argnums=3, donate_argnums=0)
+_add_plan_compiled = jax.jit(_add_plan, static_argnums=(3, 4), donate_argnums=0)
+
+
+def at_centre(splats: Float[Array, "b c 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "b c pixels"]:
+    """1 in the pixel of a tile, whose upper left corner is in `corners` (B,), (B,) px, that holds the splat's centre; 0
+    elsewhere."""
+    x, y = (jnp.floor(splats[..., k] - corners[k][:, None]) for k in range(2))
+    inside = (x >= 0) & (x < tile) & (y >= 0) & (y < tile)
+    pixel = jnp.where(inside, y * tile + x, -1).astype(jnp.int32)
+    return (pixel[..., None] == lax.iota(jnp.int32, tile * tile)).astype(splats.dtype)
 
 
 def distinct_labels(tiles: Int[Array, "n p"], slots: int) -> Int[Array, "n q"]:

@@ -15,7 +15,15 @@ from jsecon.language.codes import CODE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.language.shares import SHARE_THRESHOLD, share_of
 from jsecon.query.direct import Number, UnitCodes, as_codes, similarities
-from jsecon.query.retrieval import PIECE_NEARNESS, answers, is_alike, regions_of_text, threshold_of
+from jsecon.query.retrieval import (
+    PIECE_NEARNESS,
+    anchor_of,
+    answers,
+    evidence,
+    is_alike,
+    regions_of_text,
+    threshold_of,
+)
 from jsecon.types import Array, LanguageField, Selection
 
 _THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}
@@ -47,9 +55,10 @@ def query_anchored(
     """The Gaussians of the region that answers a text's embedding (E,) best.
 
     Retrieval: the region with the largest similarity, `retrieval`: "contrast", what sets the text apart from the
-    canonical phrases against what sets the region apart from the scene (`contrasts` has the formula), or "cosine", the
-    plain one (the paper). Where the largest is below `retrieval_threshold` (default 0.12 for contrast, 0.2 for cosine)
-    nothing is selected, and Selection.region is -1; Selection.score is how much it was. Membership, `by`:
+    canonical phrases against what sets the region apart from the scene (`contrasts` has the formula), times what stands
+    behind the region's embedding (`evidence`), or "cosine", the plain one (the paper). Where that region's similarity
+    is below `retrieval_threshold` (default 0.12 for contrast, 0.2 for cosine) nothing is selected, and Selection.region
+    is -1; Selection.score is how much it was. Membership, `by`:
     "votes": the share of the region and of those that are the same thing as the text sees it, an estimate of the
         probability that a pixel of the Gaussian belongs to them (`share_of`); default threshold 0.5. The same thing
         are regions alike, by `alike_threshold`, and pieces, by `piece_nearness` where the votes know which regions
@@ -114,9 +123,10 @@ def nothing(field: LanguageField) -> Selection:
 # Apart from the members, so that fields of any number of Gaussians share the one, and a text and a pixel the other.
 def _retrieve_body(embeddings, text, canonical, pixels, overlap, least, alike, nearness, retrieval) -> Found:
     similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
-    rule = {"retrieval_threshold": least, "alike_threshold": alike, "piece_nearness": nearness}
+    standing = None if retrieval == "cosine" else evidence(pixels).astype(similarity.dtype)
+    rule = {"retrieval_threshold": least, "alike_threshold": alike, "piece_nearness": nearness, "standing": standing}
     chosen = regions_of_text(embeddings, similarity, known, overlap, several=False, **rule)
-    best = jnp.argmax(jnp.where(known, similarity, -jnp.inf))
+    best = anchor_of(similarity, known, standing)
     return Found(chosen, jnp.where(chosen[best], best, -1), jnp.where(known[best], similarity[best], 0.0))
 
 

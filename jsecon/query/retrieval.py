@@ -29,6 +29,8 @@ NEARNESS = 0.8
 """all of a kind: how far a region's similarity has come from that of the middle region to that of the best"""
 PIECE_NEARNESS = 0.5
 """a piece: nearer to the best than to the middle region"""
+LOOKS, LOOK_PX = 2.0, 400.0
+"""of a region, see `evidence`; a crop of 20 x 20 pixels shows an image encoder little"""
 PIECE_OVERLAP = 0.1
 """the least soft IoU of two regions' Gaussians where the two are pieces of one thing. In twins of two scenes (simulated
 vision, little to much noise) 106 of the 115 pieces that are near enough reach it, and 4 of 58 other regions"""
@@ -83,6 +85,20 @@ def contrasts(
     return jnp.where(known, found, 0.0), known
 
 
+def evidence(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
+    """How much stands behind each of R regions' embeddings, in (0, 1], from its pixels in T views.
+
+        n_r / (n_r + LOOKS) over its largest value,  n_r = sum_t min(pixels_rt / LOOK_PX, 1)
+
+    A sliver that few views show is of one colour, so that its embedding is purer than that of the thing that it is a
+    sliver of: what it says is worth less. 1 everywhere where no pixels are known.
+    """
+    looks = jnp.sum(jnp.minimum(jnp.asarray(pixels) / LOOK_PX, 1.0), axis=-1)
+    behind = looks / (looks + LOOKS)
+    most = jnp.max(behind, initial=0.0)
+    return jnp.where(most > 0, behind / jnp.where(most > 0, most, 1.0), 1.0)
+
+
 def answers(
     embeddings: Float[Array, "r e"],
     text: Float[Array, " e"],
@@ -116,20 +132,22 @@ def regions_of_text(
     nearness: Number = NEARNESS,
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     piece_nearness: Number | None = PIECE_NEARNESS,
+    standing: Float[Array, " r"] | None = None,
 ) -> Bool[Array, " r"]:
     """Which of R regions answer a text, from the similarity s_r of each with it (R,), where that is known (R,).
 
-    None where the largest, s_a, is below `retrieval_threshold`. Else a and every r with one of
+    a is the region with the largest s_r, times `standing` (R,) where that is given (`evidence`). None where s_a is
+    below `retrieval_threshold`. Else a and every r with one of, b the region with the largest s_r itself,
 
-        s_r >= m + nearness (s_a - m)              with `several`: of the same kind (`is_near`)
-        s_r >= m + piece_nearness (s_a - m), o_rc >= PIECE_OVERLAP     with c = a or of its kind: a piece (`is_piece`)
+        s_r >= m + nearness (s_b - m)              with `several`: of the same kind (`is_near`)
+        s_r >= m + piece_nearness (s_b - m), o_rc >= PIECE_OVERLAP     with c = a or of its kind: a piece (`is_piece`)
         cos(e_r, e_a) >= alike_threshold           the same thing seen twice (`is_alike`)
 
     with m the median of the known s, o the soft IoU of two regions' Gaussians, `overlap` (R, R), and e the embeddings
     (R, E). No pieces where `overlap` or `piece_nearness` is None, none alike where `alike_threshold` is.
     """
     scored = jnp.where(known, similarity, -jnp.inf)
-    anchor = jnp.argmax(scored)
+    anchor = anchor_of(similarity, known, standing)
     chosen = jnp.arange(embeddings.shape[0]) == anchor
     if several:
         chosen |= is_near(similarity, known, nearness)
@@ -138,6 +156,14 @@ def regions_of_text(
     if alike_threshold is not None:
         chosen |= is_alike(embeddings, anchor, alike_threshold)
     return chosen & known & (scored[anchor] >= retrieval_threshold)
+
+
+def anchor_of(
+    similarity: Float[Array, " r"], known: Bool[Array, " r"], standing: Float[Array, " r"] | None = None
+) -> Int[Array, ""]:
+    """The region that answers best, by similarity times standing; where none is positive by similarity alone."""
+    weighed = similarity if standing is None else jnp.where(similarity > 0, similarity * standing, similarity)
+    return jnp.argmax(jnp.where(known, weighed, -jnp.inf))
 
 
 def is_alike(

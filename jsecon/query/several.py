@@ -10,7 +10,7 @@ from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import Found, members, nothing
 from jsecon.query.direct import Number
-from jsecon.query.retrieval import NEARNESS, answers, regions_of_text, threshold_of
+from jsecon.query.retrieval import NEARNESS, answers, evidence, regions_of_text, threshold_of
 from jsecon.types import Array, LanguageField, Selection
 
 ROUNDING = 1e-5
@@ -54,14 +54,14 @@ def _retrieve_body(
     embeddings, canonical, pixels, overlap, wanted, unwanted, nearness, least, several, retrieval
 ) -> Found:
     count = embeddings.shape[0]
+    standing = None if retrieval == "cosine" else evidence(pixels).astype(embeddings.dtype)
 
     def answering(texts):
         chosen, closeness = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, embeddings.dtype)
         for text in texts:
             similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
-            own = regions_of_text(
-                embeddings, similarity, known, overlap, retrieval_threshold=least, several=several, nearness=nearness
-            )
+            rule = {"retrieval_threshold": least, "several": several, "nearness": nearness, "standing": standing}
+            own = regions_of_text(embeddings, similarity, known, overlap, **rule)
             chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, similarity, -jnp.inf))
         return chosen, closeness
 

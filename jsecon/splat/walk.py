@@ -158,6 +158,20 @@ def _alphas(coefficients: Array, tile: int) -> Array:
     return jnp.where(exponent >= cut, jnp.minimum(_exp2(exponent), MAX_ALPHA), 0.0)
 
 
+def _coefficients(rows: Array, corner_x: Array, corner_y: Array, exponent: Array) -> Array:
+    """(B, CHUNK, 6) for `_alphas`, of splats in the columns of `rows` (B, CHUNK, >= 5)."""
+    scale = np.sqrt(1 / np.log(2)).astype(rows.dtype)  # from natural to binary exponents
+    x, y = rows[..., 0] - corner_x, rows[..., 1] - corner_y
+    l11, l21, l22 = (rows[..., i] * scale for i in (2, 3, 4))
+    return jnp.stack([l11, l21, -(l11 * x + l21 * y), l22, -(l22 * y), exponent], axis=-1)
+
+
+def pixel_alphas(splats: Float[Array, "p 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "p pixels"]:
+    """alpha of P splats in each pixel of a tile of their own, whose upper left corners are `corners` (P,), (P,) px."""
+    exponent = make_table(splats)[:, ATTRIBUTES]
+    return _alphas(_coefficients(splats, *corners, exponent)[:, None], tile)[:, 0]
+
+
 def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
     """Along the second axis of `values` (B, CHUNK, pixels): `start` (B, pixels) combined with all values before
     each, and with all.
@@ -198,7 +212,6 @@ def walk(
     start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
     corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))
     longest = length.max()
-    scale = np.sqrt(1 / np.log(2)).astype(table.dtype)  # from natural to binary exponents
 
     def unfinished(carry):
         first, transmittance, _, _ = carry
@@ -209,10 +222,8 @@ def walk(
         index = first + lax.iota(jnp.int32, CHUNK)
         ids = lists.gaussians[jnp.minimum(start + index, lists.gaussians.shape[0] - 1)]
         rows = table[ids]
-        x, y = rows[..., 0] - corner_x, rows[..., 1] - corner_y
-        l11, l21, l22 = (rows[..., i] * scale for i in (2, 3, 4))
         exponent = jnp.where(index < length, rows[..., ATTRIBUTES], -jnp.inf)
-        coefficients = jnp.stack([l11, l21, -(l11 * x + l21 * y), l22, -(l22 * y), exponent], axis=-1)
+        coefficients = _coefficients(rows, corner_x, corner_y, exponent)
         always = first < longest
         alpha = stored(always, functools.partial(_alphas, tile=batches.tile), coefficients)
         places = jnp.where(index < length, start + index, lists.gaussians.shape[0])

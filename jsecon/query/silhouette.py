@@ -1,0 +1,248 @@
+"""Which Gaussians to take so that, rendered alone, they cover what the views say is the thing, and nothing else.
+
+A Gaussian's share (`jsecon.language.shares`) says what it is part of; a silhouette is made by many. A splat that is
+half the thing's is needed in a hole of it and spills at its rim: here each is taken or left by what the outline of the
+whole gains, in expectation, over the views.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Bool, Float
+
+from jsecon.errors import require_shape
+from jsecon.language.shares import SHARE_THRESHOLD
+from jsecon.query.masks import ALPHA_THRESHOLD
+from jsecon.splat.plan import plan_view, render_plan
+from jsecon.splat.walk import pixel_alphas, to_tiles
+from jsecon.types import Array, Camera, Gaussians
+
+LENIENT_THRESHOLD = 10 / 255
+"""the other silhouette threshold that is in use (VALA's)"""
+STRICT_WEIGHT = 2.0
+"""of the expected IoU at ALPHA_THRESHOLD, against 1 of that at LENIENT_THRESHOLD"""
+LEAST_SHARE = 0.1
+"""of a Gaussian that may be taken"""
+SWEEPS = 3
+VIEWS, LONG_SIDE = 12, 192
+"""views that are looked at, and their size, px, at most"""
+MOST = 8192
+"""Gaussians that are decided on, at most: those nearest to the threshold; the others stay with their side of it"""
+_BLOCK = 16
+"""(tile, Gaussian) pairs at a time"""
+
+
+class Footprints(NamedTuple):
+    """What C Gaussians absorb, alone, in the pixels of V views: P pairs of a tile and a Gaussian, Gaussian by Gaussian.
+
+    Tiles of all views are counted through; the last is an empty one, to which pairs beyond a Gaussian's last belong.
+    """
+
+    absorbed: Float[Array, "p 64"]
+    """-log(1 - alpha) of each of the tile's pixels: what several Gaussians absorb together is the sum."""
+    tiles: Array
+    """(P,) int32."""
+    starts: Array
+    """(C + 1,) int32 where each Gaussian's pairs begin."""
+    inside: Float[Array, "tiles 64"]
+    """expected part of the pixel that is the thing's; 0 beyond the image."""
+    outside: Float[Array, "tiles 64"]
+    """1 - inside; 0 beyond the image."""
+    base: Float[Array, "tiles 64"]
+    """what Gaussians absorb that are taken for certain."""
+
+
+def silhouette_members(
+    gaussians: Gaussians,
+    cameras: Camera,
+    share: Float[Array, " n"],
+    *,
+    threshold: float = SHARE_THRESHOLD,
+) -> Bool[Array, " n"]:
+    """(N,) bool: the Gaussians whose silhouette should fit best what `share` (N,), in [0, 1], says is the thing.
+
+    With pi_v(p) = min(sum_i w_ip s_i, 1) the part of a pixel that is the thing's, composited from the shares s
+    through the whole scene, and alpha_S(p) what the Gaussians S let nothing through of, rendered alone, it ascends
+
+        mean_v (2 E_v(0.7) + E_v(10 / 255)),  E_v(t) = sum_p pi c / (sum_p pi + sum_p (1 - pi) c),  c = 1[alpha_S > t]
+
+    E is the expected IoU but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > LEAST_SHARE
+    are taken in or left out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a
+    batch of views of the scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most. Host code
+    around compiled parts; not differentiable. Raises ValueError on a share of another length.
+    """
+    require_shape("silhouette_members", share, (gaussians.count,), "Give one share per Gaussian.")
+    share = np.asarray(share, np.float32)
+    chosen = share >= threshold
+    open_to = np.flatnonzero(share > LEAST_SHARE)
+    if not chosen.any() or not len(open_to):
+        return jnp.asarray(chosen)
+    open_to = open_to[np.argsort(np.abs(share[open_to] - threshold), kind="stable")[:MOST]]
+    open_to = open_to[np.argsort(share[open_to], kind="stable")]
+    views = _views_of(gaussians, cameras, chosen)
+    found = footprints(gaussians, views, share, open_to, chosen)
+    taken = np.zeros(len(found.starts) - 1, bool)
+    taken[: len(open_to)] = chosen[open_to]
+    chosen = chosen.copy()
+    chosen[open_to] = np.asarray(ascend(found, jnp.asarray(taken), len(views.fx), len(open_to)))[: len(open_to)]
+    return jnp.asarray(chosen)
+
+
+def _views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camera:
+    """VIEWS cameras, evenly among those into whose image most of the chosen Gaussians' centres fall, at LONG_SIDE."""
+    means = np.asarray(gaussians.means)[chosen]
+    poses = np.asarray(cameras.world_to_camera)
+    local = np.einsum("tij,nj->tni", poses[:, :3, :3], means) + poses[:, None, :3, 3]
+    depth = np.maximum(local[..., 2], 1e-6)
+    column = local[..., 0] / depth * np.asarray(cameras.fx)[:, None] + np.asarray(cameras.cx)[:, None]
+    row = local[..., 1] / depth * np.asarray(cameras.fy)[:, None] + np.asarray(cameras.cy)[:, None]
+    inside = (local[..., 2] > 0) & (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
+    count = inside.sum(1)
+    good = np.flatnonzero(count >= 0.5 * count.max())
+    picked = good[np.round(np.linspace(0, len(good) - 1, min(VIEWS, len(good)))).astype(int)]
+    size = min(LONG_SIDE / max(cameras.width, cameras.height), 1.0)
+    width, height = max(round(cameras.width * size), 1), max(round(cameras.height * size), 1)
+    x, y = width / cameras.width, height / cameras.height
+    lens = [
+        np.asarray(a, np.float32)[picked] * s
+        for a, s in zip((cameras.fx, cameras.fy, cameras.cx, cameras.cy), (x, y, x, y))
+    ]
+    return Camera(poses[picked], *(a.astype(np.float32) for a in lens), width=width, height=height)
+
+
+def footprints(
+    gaussians: Gaussians, views: Camera, share: np.ndarray, open_to: np.ndarray, chosen: np.ndarray
+) -> Footprints:
+    """What the Gaussians `open_to` (C,) absorb in `views`, padded so that texts share their programs; `chosen` (N,) of
+    the others are taken for certain."""
+    rows = _padded(len(open_to))
+    certain = chosen.copy()
+    certain[open_to] = False
+    own = _rows(gaussians, open_to, rows)
+    rest = np.flatnonzero(certain)
+    rest_of = _rows(gaussians, rest, _padded(len(rest))) if len(rest) else None
+    values, tiles, owners, inside, outside, base = [], [], [], [], [], []
+    shares = jnp.broadcast_to(jnp.asarray(share)[:, None], (len(share), 3))
+    for t in range(len(views.fx)):
+        camera = jax.tree.map(jnp.asarray, views[t])
+        image = jnp.clip(render_plan(plan_view(gaussians, camera), shares).features[..., 0], 0.0, 1.0)
+        tile = plan_view(own, camera)
+        edge, number = tile.lists.tile, len(tile.lists.lengths)
+        lengths, starts = np.asarray(tile.lists.lengths), np.asarray(tile.lists.starts)
+        of_tile = np.repeat(np.arange(number), lengths)
+        place = np.arange(len(of_tile)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + starts[of_tile]
+        ids = np.asarray(tile.lists.gaussians)[place]
+        size = _padded(len(ids))
+        pairs = (np.pad(a, (0, size - len(a))) for a in (ids, of_tile))
+        absorbed = np.asarray(_absorbed(tile.splats, *pairs, -(-views.width // edge), edge))[: len(ids)]
+        seen = absorbed.max(1, initial=0) > 0
+        values.append(absorbed[seen])
+        tiles.append(of_tile[seen] + t * number)
+        owners.append(ids[seen])
+        there = np.asarray(to_tiles(jnp.ones_like(image), edge))[:-1]
+        expected = np.asarray(to_tiles(image, edge))[:-1]
+        inside.append(expected)
+        outside.append(there - expected)
+        certainly = np.zeros_like(expected)
+        if rest_of is not None:
+            alpha = render_plan(plan_view(rest_of, camera), jnp.zeros((rest_of.count, 1), jnp.float32)).alpha
+            certainly = np.asarray(to_tiles(-jnp.log(jnp.maximum(1 - alpha, 1e-6)), edge))[:-1]
+        base.append(certainly)
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    begin = np.searchsorted(owner[order], np.arange(rows + 1)).astype(np.int32)
+    size, empty = _padded(len(order) + _BLOCK), len(views.fx) * len(inside[0])
+    fill = lambda a, value: np.concatenate([a, np.full((size - len(a), *a.shape[1:]), value, a.dtype)])
+    last = lambda parts: np.concatenate([*parts, np.zeros((1, parts[0].shape[1]), np.float32)])
+    return Footprints(
+        fill(np.concatenate(values)[order], 0.0),
+        fill(np.concatenate(tiles)[order].astype(np.int32), empty),
+        begin,
+        last(inside),
+        last(outside),
+        last(base),
+    )
+
+
+def _padded(count: int) -> int:
+    return 1 << max(count - 1, 255).bit_length()
+
+
+def _rows(gaussians: Gaussians, chosen: np.ndarray, rows: int) -> Gaussians:
+    """Only these Gaussians, then copies of the first that are not seen."""
+    place = np.concatenate([chosen, np.full(rows - len(chosen), chosen[0])])
+    taken = jax.tree.map(lambda a: np.asarray(a)[place], gaussians)
+    taken.opacity_logits[len(chosen) :] = -30.0
+    return taken
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _absorbed(splats: Array, ids: Array, tiles: Array, across: int, edge: int) -> Array:
+    corners = (tiles % across * edge).astype(splats.dtype), (tiles // across * edge).astype(splats.dtype)
+    return -jnp.log1p(-pixel_alphas(splats[ids], corners, edge))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def ascend(found: Footprints, taken: Bool[Array, " c"], views: int, count: int | Array) -> Bool[Array, " c"]:
+    """Which of C Gaussians are taken after SWEEPS sweeps over the first `count` from `taken` (C,), see
+    `silhouette_members`. Pure."""
+    found = jax.tree.map(jnp.asarray, found)
+    levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, LENIENT_THRESHOLD)], found.absorbed.dtype)
+    worth = jnp.asarray([STRICT_WEIGHT, 1.0], levels.dtype)
+    per_view = (found.inside.shape[0] - 1) // views
+    by_view = lambda image: image[:-1].reshape(views, -1).sum(1)
+    whole = by_view(found.inside)
+
+    def place(c, first):
+        pair = first + lax.iota(jnp.int32, _BLOCK)
+        own = pair < found.starts[c + 1]
+        values = jnp.where(own[:, None], lax.dynamic_slice_in_dim(found.absorbed, first, _BLOCK), 0.0)
+        return jnp.where(own, lax.dynamic_slice_in_dim(found.tiles, first, _BLOCK), found.inside.shape[0] - 1), values
+
+    def blocks(c, step, carry):
+        onward = lambda state: (state[0] + _BLOCK, step(*place(c, state[0]), state[1]))
+        return lax.while_loop(lambda state: state[0] < found.starts[c + 1], onward, (found.starts[c], carry))[1]
+
+    def add_up(c, level):
+        given = jnp.where(taken[c], 1.0, 0.0).astype(level.dtype)
+        return blocks(c, lambda tiles, values, level: level.at[tiles].add(given * values), level)
+
+    level = lax.fori_loop(0, taken.shape[0], add_up, found.base)
+    covered = [level > threshold for threshold in levels]
+    hit = jnp.stack([by_view(jnp.where(c, found.inside, 0.0)) for c in covered])  # (2, V)
+    spilt = jnp.stack([by_view(jnp.where(c, found.outside, 0.0)) for c in covered])
+    worth_of = lambda hit, spilt: (worth[:, None] * hit / jnp.maximum(whole + spilt, 1e-6)).sum()
+
+    def flip(k, state):
+        c = k % count
+        level, hit, spilt, taken = state
+        sign = jnp.where(taken[c], -1.0, 1.0).astype(level.dtype)
+
+        def change(tiles, values, carry):
+            hit, spilt = carry
+            before = level[tiles]
+            after, view = before + sign * values, jnp.minimum(tiles // per_view, views - 1)
+            inside, outside = found.inside[tiles], found.outside[tiles]
+            for n in range(2):
+                moved = (after > levels[n]).astype(level.dtype) - (before > levels[n]).astype(level.dtype)
+                hit = hit.at[n, view].add((moved * inside).sum(1))
+                spilt = spilt.at[n, view].add((moved * outside).sum(1))
+            return hit, spilt
+
+        new_hit, new_spilt = blocks(c, change, (hit, spilt))
+        better = worth_of(new_hit, new_spilt) > worth_of(hit, spilt) + 1e-7
+        move = jnp.where(better, sign, 0.0)
+        level = lax.cond(
+            better,
+            lambda level: blocks(c, lambda tiles, values, level: level.at[tiles].add(move * values), level),
+            lambda level: level,
+            level,
+        )
+        hit, spilt = jnp.where(better, new_hit, hit), jnp.where(better, new_spilt, spilt)
+        return level, hit, spilt, taken.at[c].set(taken[c] ^ better)
+
+    return lax.fori_loop(0, SWEEPS * count, flip, (level, hit, spilt, taken))[3]

@@ -1,0 +1,148 @@
+"""The ascent of the expected IoU: against a slow twin, against real renderings, and on a thing with a blurred rim."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from balls import ring_of_balls
+
+from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
+from jsecon.query.silhouette import (
+    LENIENT_THRESHOLD,
+    STRICT_WEIGHT,
+    SWEEPS,
+    Footprints,
+    _views_of,
+    ascend,
+    footprints,
+    silhouette_members,
+)
+from jsecon.splat.plan import plan_view, render_plan
+from jsecon.splat.walk import to_tiles
+
+
+@pytest.fixture(scope="module")
+def world():
+    """The balls; and the share of the largest in each Gaussian: blurred by 5 cm, in the way that votes are."""
+    gaussians, cameras, *_ = ring_of_balls()
+    away = np.linalg.norm(gaussians.means - np.float32([0.0, -0.3, 0.0]), axis=1)
+    noise = np.random.default_rng(3).normal(size=len(away)) * 0.08
+    return gaussians, cameras, np.clip(0.5 + (0.29 - away) / 0.1 + noise, 0, 1).astype(np.float32)
+
+
+def expected(gaussians, views, share, mask):
+    """mean_v (2 E_v(0.7) + E_v(10 / 255)) of renderings."""
+    value = 0.0
+    shares = jnp.broadcast_to(jnp.asarray(share)[:, None], (len(share), 3))
+    for t in range(len(views.fx)):
+        camera = jax.tree.map(jnp.asarray, views[t])
+        pi = np.clip(np.asarray(render_plan(plan_view(gaussians, camera), shares).features[..., 0]), 0, 1)
+        alpha = np.asarray(render_selection(gaussians, camera, jnp.asarray(mask)).alpha)
+        for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, LENIENT_THRESHOLD)):
+            hit = alpha > threshold
+            value += weight * (pi * hit).sum() / (pi.sum() + ((1 - pi) * hit).sum())
+    return value / len(views.fx)
+
+
+def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
+    gaussians, cameras, share = world
+    before = share >= 0.5
+    after = np.asarray(silhouette_members(gaussians, cameras, share))
+    views = _views_of(gaussians, cameras, before)
+    assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
+    assert not after[share <= 0.1].any()
+
+
+def test_footprints_add_up_to_what_a_rendering_absorbs(world):
+    gaussians, cameras, share = world
+    chosen = share >= 0.5
+    open_to = np.flatnonzero((share > 0.3) & (share < 0.9))
+    views = _views_of(gaussians, cameras, chosen)
+    found = footprints(gaussians, views, share, open_to, chosen)
+    level = np.array(found.base)
+    for c in np.flatnonzero(chosen[open_to]):
+        own = slice(found.starts[c], found.starts[c + 1])
+        np.add.at(level, found.tiles[own], found.absorbed[own])
+    tiles = (len(level) - 1) // len(views.fx)
+    for t in (0, len(views.fx) - 1):
+        camera = jax.tree.map(jnp.asarray, views[t])
+        alpha = np.asarray(to_tiles(render_selection(gaussians, camera, jnp.asarray(chosen)).alpha, 8))[:-1]
+        found_alpha, clear = 1 - np.exp(-level[t * tiles : (t + 1) * tiles]), alpha < 0.98  # rendering stops early
+        np.testing.assert_allclose(found_alpha[clear], alpha[clear], atol=2e-4)
+
+
+def made_up(seed, count=14, tiles=40, views=2):
+    rng = np.random.default_rng(seed)
+    pairs = rng.integers(0, 20, count)  # some Gaussians are seen nowhere, some fill more than one block
+    starts = np.concatenate([[0], np.cumsum(pairs)]).astype(np.int32)
+    room = starts[-1] + 16
+    absorbed = (rng.exponential(0.4, (room, 64)) * (rng.random((room, 64)) < 0.4)).astype(np.float32)
+    place = np.full(room, tiles, np.int32)
+    place[: starts[-1]] = np.concatenate([rng.permutation(tiles)[:n] for n in pairs])
+    inside = rng.random((tiles + 1, 64)).astype(np.float32) ** 2
+    there = np.ones_like(inside)
+    inside[-1] = there[-1] = 0
+    base = np.zeros_like(inside)
+    return Footprints(absorbed, place, starts, inside, there - inside, base), views, rng.random(count) < 0.5
+
+
+def slow_twin(found, views, taken):
+    """Every value from the beginning, in float64."""
+    taken, tiles = taken.copy(), (len(found.inside) - 1) // views
+
+    def value(taken):
+        level = np.array(found.base, np.float64)
+        for c in np.flatnonzero(taken):
+            own = slice(found.starts[c], found.starts[c + 1])
+            np.add.at(level, found.tiles[own], found.absorbed[own])
+        whole = 0.0
+        for v in range(views):
+            part = slice(v * tiles, (v + 1) * tiles)
+            for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, LENIENT_THRESHOLD)):
+                hit = level[part] > -np.log1p(-threshold)
+                covered, spilt = (image[part].astype(np.float64)[hit].sum() for image in (found.inside, found.outside))
+                whole += weight * covered / (found.inside[part].astype(np.float64).sum() + spilt)
+        return whole
+
+    for _ in range(SWEEPS):
+        for c in range(len(taken)):
+            other = taken.copy()
+            other[c] ^= True
+            if value(other) > value(taken) + 1e-6:
+                taken = other
+    return taken
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_equals_the_slow_twin(seed):
+    found, views, taken = made_up(seed)
+    got = np.asarray(ascend(found, jnp.asarray(taken), views, len(taken)))
+    np.testing.assert_array_equal(got, slow_twin(found, views, taken))
+
+
+def test_jit_is_eager():
+    found, views, taken = made_up(0, count=2)
+    with jax.disable_jit():
+        eager = ascend(found, jnp.asarray(taken), views, 2)
+    np.testing.assert_array_equal(eager, ascend(found, jnp.asarray(taken), views, 2))
+
+
+def test_nothing_to_choose_from_stays_nothing(world):
+    gaussians, cameras, share = world
+    assert not np.asarray(silhouette_members(gaussians, cameras, np.zeros_like(share))).any()
+    few = np.zeros_like(share)
+    few[2500] = 1.0
+    assert np.asarray(silhouette_members(gaussians, cameras, few)).sum() == 1
+
+
+def test_a_thing_that_no_camera_sees_is_left_as_it_is(world):
+    gaussians, cameras, share = world
+    behind = dataclasses.replace(gaussians, means=gaussians.means + np.float32([0, 50, 0]))
+    np.testing.assert_array_equal(silhouette_members(behind, cameras, share), share >= 0.5)
+
+
+def test_shares_of_another_scene_are_refused(world):
+    with pytest.raises(ValueError, match="silhouette_members"):
+        silhouette_members(world[0], world[1], world[2][1:])
