@@ -1,11 +1,11 @@
 """Tables 1 to 3 by the same rules for all: every method asked in every way, chosen on some seeds, reported on others.
 
     python -m experiments.fair [--tables lerf ovs3d replica] [--levels medium high] [--seeds 10 11 ...]
-                               [--quick] [--out FOLDER] [--processes N]
+                               [--choosing 0 1 ...] [--quick] [--out FOLDER] [--processes N]
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.readings`), and none may
-refuse a text. A rival's reading is the one that is best on the seeds CHOOSING, for each figure its own; ours is one for
-both figures. The figures are of the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap
+refuse a text. A rival's reading is the one that is best on the seeds `--choosing`, for each figure its own; ours is one
+for both figures. The figures are of the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap
 over (scene, seed, text) of ours against each.
 """
 
@@ -148,11 +148,12 @@ if __name__ == "__main__":
     parser.add_argument("--tables", nargs="+", default=list(TABLES), choices=TABLES)
     parser.add_argument("--levels", nargs="+", default=["medium", "high"])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(REPORTED), help="that are reported")
+    parser.add_argument("--choosing", nargs="+", type=int, default=list(CHOOSING), help="that readings are chosen on")
     parser.add_argument("--quick", action="store_true", help="one tiny scene of each, one seed: two minutes")
     parser.add_argument("--out", default="")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
     given = parser.parse_args()
-    seeds, choosing = ((1,), (0,)) if given.quick else (tuple(given.seeds), CHOOSING)
+    seeds, choosing = ((1,), (0,)) if given.quick else (tuple(given.seeds), tuple(given.choosing))
     levels = ("medium",) if given.quick else tuple(given.levels)
     place = given.out or str(results.HOME / "results" / ("quick/fair" if given.quick else "fair"))
     main(Asked(tuple(given.tables), levels, seeds, choosing, given.quick, place), given.processes)
