@@ -5,8 +5,8 @@
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.readings`), and none may
 refuse a text. A rival's reading is the one that is best on the seeds `--choosing`, for each figure its own; ours is one
-for both figures. The figures are of the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap
-over (scene, seed, text) of ours against each.
+for both figures. The figures are of the seeds that `--seeds` names, on which nothing was chosen, with a paired
+bootstrap over (scene, seed, text) of ours against each.
 """
 
 import argparse
@@ -91,12 +91,7 @@ def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str,
                 if np.mean([c[figure] for c in own if c["scene"] == s])
                 > np.mean([c[figure] for c in of(mine[figure]) if c["scene"] == s])
             ]
-            told[f"{method} {figure}"] = {
-                "row": by_figure[figure],
-                "mean": mean,
-                "behind": difference,
-                "ahead in": wins,
-            }
+            told[f"{method}, {figure}"] = {"row": by_figure[figure], "mean": mean, "ahead": difference, "wins": wins}
             way = by_figure[figure].split(": ", 1)[1]
             row += [f"{mean:.3f}", way, f"{difference[0]:+.3f} [{difference[1]:+.3f}, {difference[2]:+.3f}]"]
             row.append(", ".join(wins) if method not in OURS else "")

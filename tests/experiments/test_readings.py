@@ -1,0 +1,92 @@
+"""Every method by every reading: what a cell holds, who is compared with whom, and what a reading does to a score."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
+
+from experiments import default_fit, fair, lerf
+from experiments.tables import fill
+from experiments.tables.readings import as_share, rows_of, smoothed
+from experiments.tables.setting import prepare
+
+
+def test_a_share_is_one_half_where_the_readout_cuts():
+    similarity = np.linspace(0, 1, 101)
+    share = as_share(similarity)
+    assert (np.diff(share) > 0).all()
+    np.testing.assert_allclose(share[[0, 60, 100]], [0, 0.5, 1], atol=1e-6)
+
+
+def test_smoothing_fills_the_range_and_leaves_out_what_is_unknown():
+    rng = np.random.default_rng(0)
+    means, score = rng.normal(size=(60, 3)), rng.normal(size=60)
+    score[7] = np.nan
+    found = smoothed(means, score)
+    assert found[7] == 0
+    assert found.max() == 1
+    np.testing.assert_allclose(smoothed(means, 3 * score + 5), found, atol=1e-5)  # the scale of a score means nothing
+
+
+def cell(method, seed, value, lenient):
+    texts = {"a": [[value, value], [lenient]], "b": [[value], [lenient]]}
+    return {"scene": "s", "seed": seed, "method": method, "miou": value, "miou_vala": lenient, "texts": texts}
+
+
+def test_rivals_are_read_as_suits_each_figure_and_ours_by_one_reading():
+    cells = []
+    for seed in (0, 10):
+        cells += [cell("VALA: cosine", seed, 0.6, 0.2), cell("VALA: contrast", seed, 0.5, 0.4)]
+        cells += [cell("ours, consensus: x", seed, 0.8, 0.3), cell("ours, consensus: y", seed, 0.7, 0.5)]
+    best = fair.chosen(cells, (0,), ("miou", "miou_vala"))
+    assert best["VALA"] == {"miou": "VALA: cosine", "miou_vala": "VALA: contrast"}
+    assert set(best["ours, consensus"].values()) == {"ours, consensus: y"}
+    asked = fair.Asked(("lerf",), ("medium",), (10,), (0,), False, "")
+    text, told = fair.report("lerf", "medium", cells, asked)
+    assert told["VALA, miou"]["ahead"] == pytest.approx((0.1, 0.1, 0.1))
+    assert told["VALA, miou_vala"]["ahead"] == pytest.approx((0.1, 0.1, 0.1))
+    assert "| VALA | 0.600 | cosine | +0.100 [+0.100, +0.100] |" in text
+
+
+def test_the_interval_is_of_pairs():
+    rng = np.random.default_rng(1)
+    other = {("s", 0, f"t{k}"): float(v) for k, v in enumerate(rng.random(200))}
+    ours = {key: value + 0.02 + 0.01 * rng.normal() for key, value in other.items()}
+    mean, low, high = fair.ahead(ours, other)
+    assert 0.015 < low < mean < high < 0.025  # though the texts differ by 0.3
+
+
+def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F811
+    rows = rows_of(points=False)
+    few = ("VALA: contrast, silhouette", "ours, tracks: contrast, threshold", "ours, tracks: contrast, silhouette")
+    plan = with_gaussians(small(lerf.QUICK, folder, "readings", methods=few), "perfect")
+    plan = dataclasses.replace(plan, level="perfect")
+    cells = fill.fill(plan, rows, tell=lambda _: None)
+    assert [found["method"] for found in cells] == list(few)
+    for found in cells:
+        for figure, name in enumerate(("miou", "miou_vala")):
+            every = [value for texts in found["texts"].values() for value in texts[figure]]
+            assert len(every) == found["pairs"]
+            assert np.mean(every) == pytest.approx(found[name])
+    assert cells[2]["miou"] > 0.1
+
+
+def test_a_table_on_another_fit_keeps_its_own_cells_and_takes_those_of_the_table():
+    asked = dataclasses.replace(lerf.PLAN, out="elsewhere")
+    key = lambda plan: fill._key(plan, "ramen", 0, "medium", "VALA")
+    plans = {fitted: default_fit.plan_of(lerf.PLAN, asked, fitted) for fitted in default_fit.FITS}
+    assert key(plans["short"]) == key(lerf.PLAN)
+    assert plans["short"].out == lerf.PLAN.out
+    assert len({key(plan) for plan in plans.values()}) == 3
+    assert plans["default"].cells == "elsewhere/cells.jsonl"
+
+
+@pytest.mark.slow
+def test_a_default_fit_has_as_many_gaussians_as_its_start_or_more(folder):  # noqa: F811
+    data = dataclasses.replace(lerf.QUICK.data, twins=str(folder / "grown"))
+    counts = [
+        prepare(data, "figurines", 0, "medium", fit_steps=120, fitted=fitted).evidence.gaussians.count
+        for fitted in default_fit.FITS
+    ]
+    assert counts[1] <= counts[0] < counts[2] <= 2 * counts[0]
