@@ -137,6 +137,17 @@ def score(gaussians: Gaussians, capture: Capture, labels: np.ndarray, masks: lis
     return found
 
 
+def table_of(cells: list[dict]) -> str:
+    """A Markdown table: IoU of each object at alpha > 0.7, and the means under both readings."""
+    header = ("Gaussians", "method", "chosen by", *OBJECTS.values(), "mean, alpha > 0.7", "mean, > 10/255")
+    rows = []
+    for cell in cells:
+        mean = np.mean(cell["iou"], axis=0)
+        named = [cell[name] for name in ("scene", "method", "chooser")]
+        rows.append((*named, *(row[0] for row in cell["iou"]), float(mean[0]), float(mean[1])))
+    return results.table(header, rows)
+
+
 @dataclasses.dataclass(frozen=True)
 class Asked:
     """What the last call was about."""
@@ -167,7 +178,6 @@ def main(asked: Asked, out: Path) -> str:
             best = found.argmax(1)[:, None] == np.arange(len(cuts))
             choosers = {
                 "threshold": [share[:, k] >= 0.5 for k in range(len(cuts))],
-                "largest": [(share[:, k] >= 0.5) & best[:, k] for k in range(len(cuts))],
                 "silhouette": [
                     np.asarray(silhouette_members(gaussians, cameras, np.float32(share[:, k] * best[:, k])))
                     for k in range(len(cuts))
@@ -177,13 +187,7 @@ def main(asked: Asked, out: Path) -> str:
                 told = {"scene": scene, "method": name, "chooser": chooser}
                 cells.append(told | {"iou": score(gaussians, capture, labels, masks)})
                 print(cells[-1]["scene"], name, chooser, np.mean(cells[-1]["iou"], axis=0), flush=True)
-    header = ("Gaussians", "method", "chosen by", *OBJECTS.values(), "mean, alpha > 0.7", "mean, > 10/255")
-    rows = []
-    for cell in cells:
-        mean = np.mean(cell["iou"], axis=0)
-        row = [cell[name] for name in ("scene", "method", "chooser")]
-        rows.append((*row, *(row[0] for row in cell["iou"]), float(mean[0]), float(mean[1])))
-    table = results.table(header, rows)
+    table = table_of(cells)
     results.save(out, asked, {"cells": cells}, table)
     print(table)
     return table

@@ -79,7 +79,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     assert "ends in .ply" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("by", ["votes", "code", "one_step", "canonical"])
+@pytest.mark.parametrize("by", ["votes", "silhouette", "code", "one_step", "canonical"])
 def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, capsys, by):
     run, out = room_run
     names = list(json.loads((run.options.capture / "scene.json").read_text())["objects"].values())[:2]
@@ -91,7 +91,7 @@ def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, c
         assert answer["query"] == name
         assert answer["by"] == by
         assert repr(name) in told
-        if by == "votes":
+        if by in ("votes", "silhouette"):
             assert 0 < answer["count"] < answer["of"]
         if answer["count"]:
             chosen = load_ply(tmp_path / answer["ply"])

@@ -104,11 +104,12 @@ class Query(Asking):
     needs no text"""
     out: Path
     """folder for the answers"""
-    by: Literal["votes", "code", "one_step", "canonical"] = "votes"
-    """votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; one_step,
-    canonical: each Gaussian's code against the text"""
+    by: Literal["votes", "silhouette", "code", "one_step", "canonical"] = "votes"
+    """votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; silhouette: by
+    votes, then each taken or left by what the outline of all gains in the views; one_step, canonical: each Gaussian's
+    code against the text"""
     threshold: float | None = None
-    """on what --by measures (default: 0.5 votes, 0.9 code, 0.8 one_step, 0.5 canonical)"""
+    """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, 0.5 canonical)"""
     all: bool = False
     """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.8
     of the way from the middle region's to the best one's (by votes)"""

@@ -4,7 +4,7 @@ Read on the way from a text to its .ply, without the ground; behind each file li
 splat/transform and query/masks the engine:
 
     ask     app/question, language/field, vision/colours, query/several, query/anchored, query/retrieval
-    clean   language/shares, query/outliers
+    clean   language/shares, query/outliers, query/silhouette where it is asked for
     write   query/masks, splat/transform, data/ply
 """
 
@@ -24,18 +24,20 @@ from jaxtyping import Bool
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError, require
 from jsecon.files import write_text, written_whole
-from jsecon.language.shares import membership_probability
+from jsecon.language.shares import SHARE_THRESHOLD, membership_probability
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.masks import selection_mask
 from jsecon.query.outliers import MIN_SAMPLES, default_eps, one_component, remove_outliers
 from jsecon.query.pixel import region_at
 from jsecon.query.several import parts_of_question, query_several
+from jsecon.query.silhouette import silhouette_members
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField, Selection
 
-METHODS = ("votes", "code", "one_step", "canonical")
-"""votes, code: anchored, membership by a Gaussian's votes or its code; one_step, canonical: codes against the text"""
+METHODS = ("votes", "silhouette", "code", "one_step", "canonical")
+"""votes, code: anchored, membership by a Gaussian's votes or its code; silhouette: by votes, then one by one by the
+outline that they make; one_step, canonical: codes against the text"""
 ONE_STEP_THRESHOLD = 0.8
 """on the cosine of a Gaussian's code and the text's"""
 CANONICAL_THRESHOLD = 0.5
@@ -82,15 +84,18 @@ def ask_text(
         field = dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
     wanted, unwanted = parts_of_question(text)
     if several or unwanted or len(wanted) > 1:
-        if by != "votes":
-            raise InputError(text, f"several regions by {by}", "by votes", "Leave out --by, or ask for one thing.")
+        if by not in ("votes", "silhouette"):
+            remedy = "Leave out --by, or ask for one thing."
+            raise InputError(text, f"several regions by {by}", "by votes or silhouette", remedy)
         given: dict[str, Any] = {} if threshold is None else {"similarity_threshold": threshold}
         embedded = jax.device_put(embedder.embed_text(wanted + unwanted))
         selection = query_several(field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given)
-        return _answer(field, text, by, selection, outliers, {}, keep="all")
+        return _answer(field, text, by, _shaped(field, selection, by, threshold), outliers, {}, keep="all")
     embedding = jax.device_put(embedder.embed_text([text])[0])
-    if by in ("votes", "code"):
-        selection = query_anchored(field, embedding, by=by, similarity_threshold=threshold)
+    if by in ("votes", "silhouette", "code"):
+        membership = "code" if by == "code" else "votes"
+        selection = query_anchored(field, embedding, by=membership, similarity_threshold=threshold)
+        selection = _shaped(field, selection, by, threshold)
     else:
         from jsecon.language.codes import encode
 
@@ -127,8 +132,19 @@ def ask_pixel(
         raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
     membership = "code" if by == "code" else "votes"
     selection = query_region(field, region, by=membership, similarity_threshold=threshold)
+    by = by if by == "silhouette" else membership
+    selection = _shaped(field, selection, by, threshold)
     left = {"text encoder": "the region under the pixel is the anchor"}
-    return _answer(field, f"at {name} {x} {y}", membership, selection, outliers, left)
+    return _answer(field, f"at {name} {x} {y}", by, selection, outliers, left)
+
+
+def _shaped(field: LanguageField, selection: Selection, by: str, threshold: float | None) -> Selection:
+    """By "silhouette" the Gaussians whose outline fits the shares best in the field's views; else as it is."""
+    if by != "silhouette":
+        return selection
+    least = SHARE_THRESHOLD if threshold is None else threshold
+    mask = silhouette_members(field.gaussians, field.cameras, selection.similarity, threshold=least)
+    return dataclasses.replace(selection, mask=mask & (selection.region >= 0))
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:

@@ -133,7 +133,7 @@ def fit_gaussians(
     views, mesh = Views(capture), host_mesh()
     taking = Steps(views, mesh)
     if start is not None:
-        # Each doubling is one more program to compile, which takes as long as hundreds of steps over rows that are free.
+        # A doubling is one more program to compile, which takes as long as hundreds of steps over free rows.
         room = 0 if schedule.growth == "none" else schedule.at_most // (1 if schedule.at_most <= AT_ONCE else 2)
         state = start_state(start, None if refine is None else len(capture.names), at_least=room)
     assert state is not None
