@@ -1,10 +1,10 @@
 """One question put to a field, and its answer as files: a .ply of the Gaussians, a JSON of figures, a few masks.
 
 Read on the way from a text to its .ply, without the ground; behind each file lies more of its own room, behind
-splat/transform and query/masks the engine:
+splat/transform and query/masks the engine, behind `by="silhouette"` query/silhouette:
 
     ask     app/question, language/field, vision/colours, query/several, query/anchored, query/retrieval
-    clean   language/shares, query/outliers, query/silhouette where it is asked for
+    clean   language/shares, query/outliers
     write   query/masks, splat/transform, data/ply
 """
 
