@@ -64,12 +64,18 @@ gc.set_threshold(20_000, 20, 20)
 
 LONGEST = (
     "test_pipeline",
-    "test_tables",
+    "test_fit",
+    "test_stability",
+    "test_corrections",
     "test_rivals",
     "test_demo",
+    "test_tables",
+    "test_capacity",
     "test_readme",
+    "test_autoencoder",
     "test_render",
-    "test_stability",
+    "test_distill",
+    "test_codes",
 )
 
 

@@ -72,10 +72,11 @@ def test_several_devices_give_what_one_gives(scene, camera, channels):
         rendering = render(gaussians, camera, features, mesh=mesh)
         return (rendering.features**2).sum() + rendering.alpha.sum()
 
-    gradients = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
-    by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
-    for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+    if channels == 3:  # the geometry's, whose programs are the longest to compile
+        gradients = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
+        by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
+        for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
     alone = lambda mesh: jax.jit(jax.grad(lambda f: loss(scene, f, mesh)))(features)
     np.testing.assert_allclose(alone(None), alone(mesh), rtol=1e-4, atol=1e-4)
     # and mixed with arrays of one device afterwards
