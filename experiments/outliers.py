@@ -51,7 +51,7 @@ def made_points(count: int, seed: int = 0) -> np.ndarray:
 def cleaners(means: np.ndarray, options: Options) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     """Functions of a selection's mask (N,), by the options that they stand for."""
     ways = {"none": lambda mask: mask}
-    for keep in ("largest", "most", "all"):
+    for keep in ("largest", "all"):
         for spacings in options.spacings:
             ways[f"{keep}, {spacings:g} spacings"] = lambda mask, keep=keep, spacings=spacings: remove_outliers(
                 means, mask, keep=keep, eps=default_eps(means[mask], spacings=spacings) if mask.any() else None

@@ -85,23 +85,6 @@ def test_strays_go_and_eps_follows_the_scale(scale):
     np.testing.assert_array_equal(largest, every & (np.arange(len(points)) < 300))
 
 
-@pytest.mark.parametrize(
-    ("sizes", "kept"),
-    [
-        ((300, 100), (300,)),  # a thing and a floater
-        ((300, 280), (300, 280)),  # two things
-        ((100, *[40] * 12), (100, *[40] * 5)),  # an answer in pieces: more than half of it stays
-    ],
-)
-def test_most_of_an_answer_is_kept(sizes, kept):
-    rng = np.random.default_rng(1)
-    points = np.concatenate([rng.normal(size=(n, 3)) * 0.1 + 5 * np.float32([k, 0, 0]) for k, n in enumerate(sizes)])
-    found = remove_outliers(points, np.ones(len(points), bool), keep="most", min_samples=4, eps=0.4)
-    inside = np.bincount(np.repeat(np.arange(len(sizes)), sizes), found, len(sizes))
-    assert ((inside > 0.9 * np.array(sizes)) | (inside == 0)).all()
-    assert sorted(np.array(sizes)[inside > 0]) == sorted(kept)
-
-
 def test_only_what_was_selected_is_looked_at():
     points = two_blobs_and_strays()
     mask = np.arange(len(points)) >= 300

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from balls import ring_of_balls
 
-from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
+from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.query.silhouette import (
-    LENIENT_THRESHOLD,
     STRICT_WEIGHT,
     SWEEPS,
     Footprints,
@@ -40,7 +39,7 @@ def expected(gaussians, views, share, mask):
         camera = jax.tree.map(jnp.asarray, views[t])
         pi = np.clip(np.asarray(render_plan(plan_view(gaussians, camera), shares).features[..., 0]), 0, 1)
         alpha = np.asarray(render_selection(gaussians, camera, jnp.asarray(mask)).alpha)
-        for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, LENIENT_THRESHOLD)):
+        for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, VALA_THRESHOLD)):
             hit = alpha > threshold
             value += weight * (pi * hit).sum() / (pi.sum() + ((1 - pi) * hit).sum())
     return value / len(views.fx)
@@ -100,7 +99,7 @@ def slow_twin(found, views, taken):
         whole = 0.0
         for v in range(views):
             part = slice(v * tiles, (v + 1) * tiles)
-            for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, LENIENT_THRESHOLD)):
+            for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, VALA_THRESHOLD)):
                 hit = level[part] > -np.log1p(-threshold)
                 covered, spilt = (image[part].astype(np.float64)[hit].sum() for image in (found.inside, found.outside))
                 whole += weight * covered / (found.inside[part].astype(np.float64).sum() + spilt)

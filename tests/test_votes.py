@@ -8,6 +8,7 @@ import pytest
 from jsecon.association.atoms import cast_on_atoms
 from jsecon.language.votes import region_votes
 from jsecon.splat.capacity import plan_capacity
+from jsecon.splat.plan import plan_view
 from jsecon.splat.reference import weights_reference
 
 REGIONS = 11
@@ -53,6 +54,24 @@ def test_equals_the_oracles_weights(cast, expected):
     np.testing.assert_allclose(cast.total, total.sum(0), rtol=2e-4, atol=0.02)
     np.testing.assert_allclose(cast.peak, peak, atol=1e-4)
     np.testing.assert_array_equal(cast.views, views)
+
+
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels, cast, share):
+    found = region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True, centre=share)
+    votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
+    for t in range(4):
+        weights, splats = weights_reference(scene, cameras[t]), np.asarray(plan_view(scene, cameras[t]).splats)
+        height, width, _ = weights.shape
+        for n, (x, y) in enumerate(np.floor(splats[:, :2]).astype(int)):
+            if splats[n, 5] > 0 and 0 <= x < width and 0 <= y < height:
+                total[t, n] = weights[y, x, n]
+                if labels[t, y, x] >= 0:
+                    votes[n, labels[t, y, x]] += weights[y, x, n]
+    mixed = (1 - share) * np.asarray(cast.dense()) + share * votes
+    np.testing.assert_allclose(found.dense(), mixed, rtol=2e-4, atol=0.01)
+    np.testing.assert_allclose(found.by_view, (1 - share) * cast.by_view + share * total, rtol=2e-4, atol=0.01)
+    assert votes.max() > 0.1
 
 
 @pytest.mark.parametrize("t", [0, 1, 2])

@@ -150,6 +150,20 @@ def _lifted(weights: sparse.csr_matrix, evidence: Evidence) -> Lifted:
     return Lifted(np.where(length > 0, summed / np.where(length > 0, length, 1.0), 0.0), weights)
 
 
+def smoothed(means: Float[Array, "n 3"], score: Float[Array, " n"]) -> Float[np.ndarray, " n"]:
+    """VALA's readout of a score: the mean with that over the NEIGHBOURS nearest Gaussians, brought to 0 .. 1 over the
+    scene, 2 r - 1 clipped at 0. Where the score is NaN: 0, and nobody's neighbour."""
+    score, similarity = np.asarray(score), np.zeros(len(score), np.float32)
+    there = np.flatnonzero(np.isfinite(score))
+    if len(there):
+        points, own = np.asarray(means, np.float64)[there], score[there]
+        near = KDTree(points).query(points, k=min(NEIGHBOURS + 1, len(there)))[1].reshape(len(there), -1)[:, 1:]
+        smooth = 0.5 * (own + own[near].mean(1)) if near.shape[1] else own
+        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
+        similarity[there] = np.clip(2 * spread - 1, 0, 1)
+    return similarity
+
+
 def query_relevancy(
     features: Float[Array, "n e"],
     means: Float[Array, "n 3"],
@@ -166,14 +180,7 @@ def query_relevancy(
     relevancy, known = (
         np.asarray(a) for a in _relevancies(jnp.asarray(features), jnp.asarray(text), jnp.asarray(canonical))
     )
-    similarity = np.zeros(len(relevancy), np.float32)
-    there = np.flatnonzero(known)
-    if len(there):
-        points, own = np.asarray(means, np.float64)[there], relevancy[there]
-        near = KDTree(points).query(points, k=min(NEIGHBOURS + 1, len(there)))[1].reshape(len(there), -1)[:, 1:]
-        smooth = 0.5 * (own + own[near].mean(1)) if near.shape[1] else own
-        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
-        similarity[there] = np.clip(2 * spread - 1, 0, 1)
+    similarity = smoothed(means, np.where(known, relevancy, np.nan))
     mask = similarity > threshold
     score = jnp.asarray(relevancy.max(initial=0.0))
     return Selection(jnp.asarray(mask), jnp.asarray(similarity), jnp.asarray(-1, jnp.int32), score)

@@ -11,7 +11,6 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from experiments.rivals import lifting
 from experiments.tables.answers import Answers, Method, Steps
@@ -54,19 +53,6 @@ def scores(setting: Setting, features: Float[np.ndarray, "n e"], rule: str) -> F
     return np.where(known, found, np.nan)
 
 
-def smoothed(means: Float[np.ndarray, "n 3"], score: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """VALA's readout of any score: the mean with that over the ten nearest Gaussians, brought to 0 .. 1 over the scene,
-    2 r - 1 clipped at 0; 0 where the score is NaN."""
-    similarity, there = np.zeros(len(score), np.float32), np.flatnonzero(np.isfinite(score))
-    if len(there) > 1:
-        points, own = np.asarray(means, np.float64)[there], score[there]
-        near = KDTree(points).query(points, k=min(lifting.NEIGHBOURS + 1, len(there)))[1][:, 1:]
-        smooth = 0.5 * (own + own[near].mean(1))
-        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
-        similarity[there] = np.clip(2 * spread - 1, 0, 1)
-    return similarity
-
-
 def as_share(similarity: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """A similarity as a share: linear from 0 to 1/2 at the readout's threshold, and from there to 1."""
     cut = lifting.READOUT
@@ -80,7 +66,7 @@ def read(setting: Setting, features: Float[np.ndarray, "n e"], rule: str, choose
     table = scores(setting, features, rule)
 
     def select(k: int) -> Selection:
-        similarity = smoothed(np.asarray(gaussians.means), table[k])
+        similarity = lifting.smoothed(gaussians.means, table[k])
         mask = similarity > lifting.READOUT
         if chooser == "silhouette":
             mask = silhouette_members(gaussians, cameras, as_share(similarity))

@@ -49,8 +49,18 @@ class Setting:
     """what methods have in common."""
 
 
+FIT: Any = {
+    "schedule": Schedule(growth="none"),
+    "rates": LearningRates(means=2e-3, means_last=2e-5),
+}
+"""of the scenes without Gaussians: few steps, one Gaussian for each point of the start"""
+Fitted = Literal["short", "default", "default, twice"]
+"""how Gaussians are fitted where a scene has none: shortly (FIT), as `jsecon fit` does but to the number of its start,
+or with growth to twice that number"""
+
+
 def prepare(
-    data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: int, fitted: "Fitted" = "short"
+    data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: int, fitted: Fitted = "short"
 ) -> Setting:
     """Loads a scene with its masks, tracks and texts; fits its Gaussians where neither the dataset has them (points, or
     <scene>/point_cloud.ply) nor an earlier run."""
@@ -77,18 +87,6 @@ def prepare(
         seed,
         folder,
     )
-
-
-FIT: Any = {
-    "schedule": Schedule(growth="none"),
-    "rates": LearningRates(means=2e-3, means_last=2e-5),
-}
-"""of the scenes without Gaussians: few steps, one Gaussian for each point of the start"""
-
-
-Fitted = Literal["short", "default", "default, twice"]
-"""how Gaussians are fitted where a scene has none: shortly (FIT), as `jsecon fit` does but to the number of its start,
-or with growth to twice that number"""
 
 
 def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int, fitted: Fitted = "short") -> Gaussians:

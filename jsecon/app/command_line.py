@@ -112,7 +112,7 @@ class Query(Asking):
     """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, 0.5 canonical)"""
     all: bool = False
     """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.8
-    of the way from the middle region's to the best one's (by votes)"""
+    of the way from the middle region's to the best one's (by votes or silhouette)"""
     keep_outliers: bool = False
     """leave out the last step, DBSCAN"""
     views: Annotated[int, {"metavar": "N"}] = 3

@@ -93,8 +93,7 @@ def ask_text(
         return _answer(field, text, by, _shaped(field, selection, by, threshold), outliers, {}, keep="all")
     embedding = jax.device_put(embedder.embed_text([text])[0])
     if by in ("votes", "silhouette", "code"):
-        membership = "code" if by == "code" else "votes"
-        selection = query_anchored(field, embedding, by=membership, similarity_threshold=threshold)
+        selection = query_anchored(field, embedding, by=_membership(by), similarity_threshold=threshold)
         selection = _shaped(field, selection, by, threshold)
     else:
         from jsecon.language.codes import encode
@@ -130,12 +129,15 @@ def ask_pixel(
     if region < 0:
         remedy = "Choose another pixel or frame: report.html of the run shows the regions."
         raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
-    membership = "code" if by == "code" else "votes"
-    selection = query_region(field, region, by=membership, similarity_threshold=threshold)
-    by = by if by == "silhouette" else membership
+    by = by if by in ("silhouette", "code") else "votes"
+    selection = query_region(field, region, by=_membership(by), similarity_threshold=threshold)
     selection = _shaped(field, selection, by, threshold)
     left = {"text encoder": "the region under the pixel is the anchor"}
     return _answer(field, f"at {name} {x} {y}", by, selection, outliers, left)
+
+
+def _membership(by: str) -> str:
+    return "code" if by == "code" else "votes"
 
 
 def _shaped(field: LanguageField, selection: Selection, by: str, threshold: float | None) -> Selection:

@@ -17,11 +17,9 @@ import numpy as np
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
-from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
+from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.types import Camera, Gaussians, Selection
 
-VALA_THRESHOLD = 10 / 255
-"""VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
 LOCALISATION_WINDOW = 0.04
 """side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px of 730"""
 

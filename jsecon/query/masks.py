@@ -12,7 +12,9 @@ from jsecon.types import Array, Camera, Gaussians, Rendering
 
 ALPHA_THRESHOLD = 0.7
 """OpenGaussian's silhouette (render_lerf_by_text.py); VALA's is 10/255, which rewards faint selections"""
-_HIDDEN_LOGIT = -30.0
+VALA_THRESHOLD = 10 / 255
+"""VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
+HIDDEN_LOGIT = -30.0
 """an opacity of 1e-13, far below 1/255: culled in projection, with every number finite"""
 
 
@@ -61,4 +63,4 @@ def _alone(logits: Array, mask: Array, similarity: Array | None) -> tuple[Array,
     """Opacity logits that hide what is not selected, and what of each Gaussian is rendered: in three columns, so that
     the program that renders colours serves."""
     features = jnp.where(mask, jnp.ones_like(logits) if similarity is None else similarity, 0.0)
-    return jnp.where(mask, logits, _HIDDEN_LOGIT), jnp.broadcast_to(features[:, None], (*features.shape, 3))
+    return jnp.where(mask, logits, HIDDEN_LOGIT), jnp.broadcast_to(features[:, None], (*features.shape, 3))

@@ -34,18 +34,15 @@ def remove_outliers(
     min_samples: int = MIN_SAMPLES,
     keep: str = "largest",
 ) -> Bool[np.ndarray, " n"]:
-    """The selection `mask` without what DBSCAN calls noise and, for keep="largest" (the paper's), without the smaller
-    clusters.
+    """The selection `mask` without what DBSCAN calls noise and, for keep="largest", without the smaller clusters.
 
     means (N, 3), world units. eps: radius, world units; None takes `default_eps` of the selection. keep="all" keeps
-    every cluster (several objects of one kind); keep="most" those with at least half as many points as the largest has,
-    and the next largest until more than half of the selection is kept: no answer loses most of itself, nor one of two
-    things that it means. Returned as it came, less centres that are not finite: a selection of
+    every cluster (several objects of one kind). Returned as it came, less centres that are not finite: a selection of
     fewer than `min_samples` points, one that is a single component (no gap of eps anywhere, nothing stands apart), and
     one in which DBSCAN finds no cluster at all, as there is nothing for outliers to lie outside of. Raises ValueError
     for options out of range.
     """
-    require_one_of("remove_outliers", keep, ("largest", "most", "all"), "Use 'all' to keep several objects.")
+    require_one_of("remove_outliers", keep, ("largest", "all"), "Use 'all' to keep several objects.")
     positive, found = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(positive, "remove_outliers", found, "eps > 0 and min_samples >= 1", remedy)
@@ -61,24 +58,10 @@ def remove_outliers(
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
         return kept
-    inside = (labels >= 0) & _kept_clusters(np.bincount(labels[labels >= 0]), len(chosen), keep)[labels]
+    inside = labels == np.bincount(labels[labels >= 0]).argmax() if keep == "largest" else labels >= 0
     result = np.zeros_like(kept)
     result[chosen[inside]] = True
     return result
-
-
-def _kept_clusters(sizes: Int[np.ndarray, " c"], selected: int, keep: str) -> Bool[np.ndarray, " c"]:
-    """Which clusters are kept, by their sizes and that of the selection."""
-    order = np.argsort(-sizes, kind="stable")
-    before = np.cumsum(sizes[order]) - sizes[order]
-    first = {
-        "largest": np.arange(len(sizes)) < 1,
-        "most": (2 * sizes[order] >= sizes.max()) | (2 * before <= selected),
-        "all": np.ones(len(sizes), bool),
-    }[keep]
-    kept = np.zeros(len(sizes), bool)
-    kept[order[first]] = True
-    return kept
 
 
 def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:

@@ -15,16 +15,15 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require_shape
+from jsecon.fit.schedule import resized
 from jsecon.language.shares import SHARE_THRESHOLD
-from jsecon.query.masks import ALPHA_THRESHOLD
+from jsecon.query.masks import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import pixel_alphas, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
-LENIENT_THRESHOLD = 10 / 255
-"""the other silhouette threshold that is in use (VALA's)"""
 STRICT_WEIGHT = 2.0
-"""of the expected IoU at ALPHA_THRESHOLD, against 1 of that at LENIENT_THRESHOLD"""
+"""of the expected IoU at ALPHA_THRESHOLD, against 1 of that at VALA_THRESHOLD"""
 LEAST_SHARE = 0.1
 """of a Gaussian that may be taken"""
 SWEEPS = 3
@@ -105,13 +104,7 @@ def _views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Came
     good = np.flatnonzero(count >= 0.5 * count.max())
     picked = good[np.round(np.linspace(0, len(good) - 1, min(VIEWS, len(good)))).astype(int)]
     size = min(LONG_SIDE / max(cameras.width, cameras.height), 1.0)
-    width, height = max(round(cameras.width * size), 1), max(round(cameras.height * size), 1)
-    x, y = width / cameras.width, height / cameras.height
-    lens = [
-        np.asarray(a, np.float32)[picked] * s
-        for a, s in zip((cameras.fx, cameras.fy, cameras.cx, cameras.cy), (x, y, x, y))
-    ]
-    return Camera(poses[picked], *(a.astype(np.float32) for a in lens), width=width, height=height)
+    return resized(jax.tree.map(np.asarray, cameras)[picked], size)
 
 
 def footprints(
@@ -176,7 +169,7 @@ def _rows(gaussians: Gaussians, chosen: np.ndarray, rows: int) -> Gaussians:
     """Only these Gaussians, then copies of the first that are not seen."""
     place = np.concatenate([chosen, np.full(rows - len(chosen), chosen[0])])
     taken = jax.tree.map(lambda a: np.asarray(a)[place], gaussians)
-    taken.opacity_logits[len(chosen) :] = -30.0
+    taken.opacity_logits[len(chosen) :] = HIDDEN_LOGIT
     return taken
 
 
@@ -191,7 +184,7 @@ def ascend(found: Footprints, taken: Bool[Array, " c"], views: int, count: int |
     """Which of C Gaussians are taken after SWEEPS sweeps over the first `count` from `taken` (C,), see
     `silhouette_members`. Pure."""
     found = jax.tree.map(jnp.asarray, found)
-    levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, LENIENT_THRESHOLD)], found.absorbed.dtype)
+    levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], found.absorbed.dtype)
     worth = jnp.asarray([STRICT_WEIGHT, 1.0], levels.dtype)
     per_view = (found.inside.shape[0] - 1) // views
     by_view = lambda image: image[:-1].reshape(views, -1).sum(1)

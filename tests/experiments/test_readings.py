@@ -7,8 +7,9 @@ import pytest
 from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
 
 from experiments import default_fit, fair, lerf
+from experiments.rivals.lifting import smoothed
 from experiments.tables import fill
-from experiments.tables.readings import as_share, rows_of, smoothed
+from experiments.tables.readings import as_share, rows_of
 from experiments.tables.setting import prepare
 
 
