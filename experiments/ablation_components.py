@@ -6,7 +6,7 @@ On LERF-OVS or its twins, under the protocol of `experiments.lerf`, whose cells 
 """
 
 from experiments import lerf
-from experiments.tables import layout
+from experiments.tables import layout, published
 from experiments.tables.answers import Method
 from experiments.tables.fill import Plan, options_of
 from experiments.tables.methods import METHODS, langsplat
@@ -37,7 +37,8 @@ QUICK = lerf.beside(lerf.QUICK, "ablation_components", COMPONENTS)
 
 def main(plan: Plan) -> str:
     """The table, written."""
-    return layout.make(plan, COMPONENTS, lerf.FIGURES, notes=lerf.NOTES)
+    beside = published.table("seconGS's components", published.COMPONENTS, ("figurines",))
+    return layout.make(plan, COMPONENTS, lerf.FIGURES, notes=lerf.NOTES, published=beside)
 
 
 if __name__ == "__main__":

@@ -20,14 +20,15 @@ SHIPPED = {
 }
 """XLA's own defaults"""
 LOOPS = {"xla_backend_optimization_level": 1}
-"""for programs that are run hundreds of times: three times faster than FAST, for twice the compilation"""
+"""for programs that are run hundreds of times: three times faster than FAST, for twice the compilation. Not in files
+marked `few_steps`"""
 RUN_OFTEN = frozenset({"jit_step", "jit__step", "jit__epochs", "jit__descend", "jit__run"})
 """their names: the training loops"""
 
 ENVIRONMENT = " ".join(f"--{name}={str(value).lower()}" for name, value in FAST.items())
 """the part of XLA_FLAGS that makes all processes of a run compile fast"""
 
-_state = {"shipped": False}
+_state = {"shipped": False, "loops": True}
 
 
 @functools.cache
@@ -39,18 +40,19 @@ def install() -> None:
 
     def chosen(backend, computation, devices, options, *rest):
         name = str(computation.operation.attributes["sym_name"]).strip('"')
-        mine = SHIPPED if _state["shipped"] else LOOPS if name in RUN_OFTEN else {}
+        mine = SHIPPED if _state["shipped"] else LOOPS if name in RUN_OFTEN and _state["loops"] else {}
         options.env_option_overrides = list((mine | dict(options.env_option_overrides)).items())
         return compile_or_read(backend, computation, devices, options, *rest)
 
     compiler.compile_or_get_cached = chosen
 
 
-def choose(*, shipped: bool) -> None:
-    """Programs compiled from now on are those of a process without our flags, or fast ones. What was compiled otherwise
-    is forgotten; on disk, jax's own keys tell the two apart."""
+def choose(*, shipped: bool, loops: bool = True) -> None:
+    """Programs compiled from now on are those of a process without our flags, or fast ones, `loops` among them as
+    LOOPS says. What was compiled otherwise is forgotten; on disk, jax's own keys tell them apart."""
     import jax
 
+    _state["loops"] = loops
     if _state["shipped"] != shipped:
         _state["shipped"] = shipped
         jax.clear_caches()

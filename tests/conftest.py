@@ -95,7 +95,8 @@ def pytest_collection_modifyitems(items):
 def pytest_runtest_protocol(item, nextitem):
     """Programs are compiled as the file's mark says, those of the fixtures too; after the file they are forgotten
     before they use up the process's memory maps."""
-    compiling.choose(shipped=item.get_closest_marker("as_shipped") is not None)
+    marked = {name: item.get_closest_marker(name) is not None for name in ("as_shipped", "few_steps")}
+    compiling.choose(shipped=marked["as_shipped"], loops=not marked["few_steps"])
     done = yield
     if nextitem is None or nextitem.path != item.path:
         forget_programs()

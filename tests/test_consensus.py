@@ -72,7 +72,7 @@ def test_masks_that_lie_over_each_other_have_one_vote(world, scene):
     both = scene_of(world, twice)
     double = mask_signatures(both.all(frames), both.count)
     for a, b in ((once[0], double[0]), (once[1], double[1])):
-        a, b = (a @ a.T)[:50, :50].toarray(), (b @ b.T)[:50, :50].toarray()
+        a, b = (a[:50] @ a[:50].T).toarray(), (b[:50] @ b[:50].T).toarray()
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
     assert np.asarray(once[0].sum(1)).max() <= VIEWS + 1e-3
 

@@ -35,8 +35,9 @@ def test_gradients_are_the_twins():
     assert max(row.gradient_errors.values()) <= GRADIENT
 
 
-def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera):
-    features = np.random.default_rng(1).normal(size=(scene.count, 3)).astype(np.float32)
+@pytest.mark.parametrize("channels", [3, 16])
+def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera, channels):
+    features = np.random.default_rng(1).normal(size=(scene.count, channels)).astype(np.float32)
     one, two = (render(scene, camera, features, mesh=mesh) for mesh in (None, host_mesh()))
     np.testing.assert_array_equal(one.features, two.features)
     np.testing.assert_array_equal(one.alpha, two.alpha)

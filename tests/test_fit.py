@@ -19,6 +19,7 @@ from jsecon.parallel import host_mesh
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import Camera, Capture, Gaussians
 
+pytestmark = pytest.mark.few_steps
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
@@ -161,11 +162,11 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monke
 
         return taken
 
-    monkeypatch.setattr(one_step, "default_capacity", lambda count, width, height, strips: 32)
+    monkeypatch.setattr(one_step, "default_capacity", lambda count, width, height, strips: 64)
     monkeypatch.setattr(one_step, "step_compiled", [counted(step) for step in inner])
     gaussians, losses = fit_gaussians(capture, **given)
-    assert asked[0] == 32
-    assert asked[-1] > 32
+    assert asked[0] == 64
+    assert asked[-1] > 64
     assert asked.count(asked[-1]) == 20
     assert np.isfinite(losses).all()
     for a, b in zip(jax.tree.leaves(gaussians), jax.tree.leaves(twin), strict=True):
@@ -194,7 +195,7 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
 def test_the_votes_are_the_weights_on_the_errors(capture, start):
     """Against their definition: the gradient of sum(w e) as a feature's, one view."""
     states = []
-    voting = dataclasses.replace(WHOLE, growth="votes")
+    voting = dataclasses.replace(WHOLE, growth="votes", at_most=80)
     fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=voting, on_checkpoint=states.append)
     view = np.array([0, 1, 3, 4])[view_order(KEY, 4, 0, 1)[0]]
     camera, target = capture.cameras[view], capture.frames[view] / np.float32(255)
@@ -266,7 +267,7 @@ def test_wrong_fits_are_refused(capture, start):
         fit_gaussians(dataclasses.replace(capture, held_out=np.ones(VIEWS, bool)), steps=1, key=KEY, start=start)
     astray = dataclasses.replace(start, means=np.where(np.arange(40)[:, None] == 7, np.float32(np.nan), start.means))
     with pytest.raises(InputError, match="not finite"):
-        fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, chunk=1)
+        fit_gaussians(capture, steps=STEPS, key=KEY, start=astray, schedule=WHOLE, rates=RATES, chunk=1)
 
 
 def _odd(capture, start, kind):

@@ -55,32 +55,26 @@ def test_a_plan_says_what_it_lacks(scene, camera):
     assert int(plan_view(scene, camera, capacity=32).overflow) > 0
 
 
-@pytest.mark.as_shipped  # equal bits are a claim about the machine code
 @pytest.mark.parametrize("channels", [3, 16])
-def test_several_devices_give_what_one_gives(scene, camera, channels):
-    mesh = host_mesh()
+def test_several_devices_give_the_image_and_the_gradients_of_one(scene, camera, channels):
+    """To rounding; to the last bit as shipped: tests/test_exact.py."""
+    mesh, features = host_mesh(), features_of(scene.count, channels)
     assert mesh is not None
     assert mesh.size == 2
-    features = features_of(scene.count, channels)
-
-    # To the last bit; the gradients, which add up over the devices, to rounding.
     one, two = (render(scene, camera, features, mesh=each) for each in (None, mesh))
-    np.testing.assert_array_equal(one.features, two.features)
-    np.testing.assert_array_equal(one.alpha, two.alpha)
+    np.testing.assert_allclose(one.features, two.features, atol=1e-5)
+    # and mixed with arrays of one device afterwards
+    assert float(jnp.abs(two.features - one.features).max()) < 1e-5
 
     def loss(gaussians, features, mesh):
         rendering = render(gaussians, camera, features, mesh=mesh)
         return (rendering.features**2).sum() + rendering.alpha.sum()
 
-    if channels == 3:  # the geometry's, whose programs are the longest to compile
-        gradients = jax.jit(jax.grad(loss, argnums=(0, 1)), static_argnums=2)
-        by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
-        for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-    alone = lambda mesh: jax.jit(jax.grad(lambda f: loss(scene, f, mesh)))(features)
-    np.testing.assert_allclose(alone(None), alone(mesh), rtol=1e-4, atol=1e-4)
-    # and mixed with arrays of one device afterwards
-    assert float(jnp.abs(two.features - one.features).max()) == 0
+    argnums = (0, 1) if channels == 3 else (1,)  # the geometry's programs are the longest to compile
+    gradients = jax.jit(jax.grad(loss, argnums=argnums), static_argnums=2)
+    by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
+    for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
 def test_powers_of_two_over_their_range():

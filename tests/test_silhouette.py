@@ -10,8 +10,8 @@ from balls import ring_of_balls
 
 from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.query.silhouette import (
-    STRICT_WEIGHT,
     SWEEPS,
+    WEIGHTS,
     Footprints,
     _views_of,
     ascend,
@@ -31,15 +31,15 @@ def world():
     return gaussians, cameras, np.clip(0.5 + (0.29 - away) / 0.1 + noise, 0, 1).astype(np.float32)
 
 
-def expected(gaussians, views, share, mask):
-    """mean_v (2 E_v(0.7) + E_v(10 / 255)) of renderings."""
+def expected(gaussians, views, share, mask, weights=WEIGHTS):
+    """mean_v (a E_v(0.7) + b E_v(10 / 255)) of renderings."""
     value = 0.0
     shares = jnp.broadcast_to(jnp.asarray(share)[:, None], (len(share), 3))
     for t in range(len(views.fx)):
         camera = jax.tree.map(jnp.asarray, views[t])
         pi = np.clip(np.asarray(render_plan(plan_view(gaussians, camera), shares).features[..., 0]), 0, 1)
         alpha = np.asarray(render_selection(gaussians, camera, jnp.asarray(mask)).alpha)
-        for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, VALA_THRESHOLD)):
+        for weight, threshold in zip(weights, (ALPHA_THRESHOLD, VALA_THRESHOLD), strict=True):
             hit = alpha > threshold
             value += weight * (pi * hit).sum() / (pi.sum() + ((1 - pi) * hit).sum())
     return value / len(views.fx)
@@ -52,6 +52,9 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     views = _views_of(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
+    lenient = np.asarray(silhouette_members(gaussians, cameras, share, weights=(0.0, 1.0)))
+    at = lambda mask: expected(gaussians, views, share, mask, (0.0, 1.0))
+    assert at(lenient) > at(after) - 1e-3 > at(before)
 
 
 def test_footprints_add_up_to_what_a_rendering_absorbs(world):
@@ -87,7 +90,7 @@ def made_up(seed, count=14, tiles=40, views=2):
     return Footprints(absorbed, place, starts, inside, there - inside, base), views, rng.random(count) < 0.5
 
 
-def slow_twin(found, views, taken):
+def slow_twin(found, views, taken, weights):
     """Every value from the beginning, in float64."""
     taken, tiles = taken.copy(), (len(found.inside) - 1) // views
 
@@ -99,7 +102,7 @@ def slow_twin(found, views, taken):
         whole = 0.0
         for v in range(views):
             part = slice(v * tiles, (v + 1) * tiles)
-            for weight, threshold in ((STRICT_WEIGHT, ALPHA_THRESHOLD), (1.0, VALA_THRESHOLD)):
+            for weight, threshold in zip(weights, (ALPHA_THRESHOLD, VALA_THRESHOLD), strict=True):
                 hit = level[part] > -np.log1p(-threshold)
                 covered, spilt = (image[part].astype(np.float64)[hit].sum() for image in (found.inside, found.outside))
                 whole += weight * covered / (found.inside[part].astype(np.float64).sum() + spilt)
@@ -117,8 +120,9 @@ def slow_twin(found, views, taken):
 @pytest.mark.parametrize("seed", range(4))
 def test_equals_the_slow_twin(seed):
     found, views, taken = made_up(seed)
-    got = np.asarray(ascend(found, jnp.asarray(taken), views, len(taken)))
-    np.testing.assert_array_equal(got, slow_twin(found, views, taken))
+    weights = WEIGHTS if seed else (0.0, 1.0)
+    got = np.asarray(ascend(found, jnp.asarray(taken), views, len(taken), jnp.asarray(weights)))
+    np.testing.assert_array_equal(got, slow_twin(found, views, taken, weights))
 
 
 def test_jit_is_eager():

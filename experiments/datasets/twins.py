@@ -8,6 +8,7 @@ segmenter finds too. Without masks around the objects every method that averages
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
 from jsecon.data.synthetic.capture import captured, labelled, look_at, room_cameras, write_ids
-from jsecon.data.synthetic.room import Room, make_room
+from jsecon.data.synthetic.room import TABLE_WOOD, Part, Room, linear, make_room
 from jsecon.files import write_text, written_whole
 from jsecon.types import Camera, Capture
 
@@ -45,21 +46,46 @@ def write_lerf_twin(
     annotated_every: int = 6,
     num_objects: int = 12,
     label_pixels: int = 40,
+    kinds: bool = False,
+    camouflage: float | int = 0,
 ) -> Path:
     """A room as a scene of LERF-OVS; every `annotated_every`-th frame is labelled, with the objects of at least
-    `label_pixels` pixels there. Returns the root."""
-    room = make_room(seed, num_objects=num_objects)
+    `label_pixels` pixels there. `kinds`: a text names a shape, of which there may be several; `camouflage`: how far, 0
+    to 1, the objects' colours are brought to the table's. Returns the root."""
+    room = camouflaged(make_room(seed, num_objects=num_objects), camouflage)
     cameras = room_cameras(room, views=views, width=width, height=height)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
     out = np.arange(views) % annotated_every == 0
     capture, instances, frames = _labelled_capture(root / scene, room, cameras, names, out, label_pixels)
+    frames = [by_kind(frame, room) for frame in frames] if kinds else frames
     write_lerf_labels(root / "label" / scene, frames, image_ending=".jpg")
     pairs = sum(len(frame.objects) for frame in frames)
     queries = sorted({name for frame in frames for name in frame.objects})
     _, owners = surfaces_of(room, capture, instances)
-    objects = (*room.names, *SURROUNDINGS)
+    objects = (*(item.shape if kinds else item.name for item in room.objects), *SURROUNDINGS)
     _finish(root, scene, capture, owners, frames, seed=seed, pairs=pairs, queries=queries, objects=objects)
     return root
+
+
+def by_kind(frame: LabelledFrame, room: Room) -> LabelledFrame:
+    """The frame's label with the objects of a shape as one, under the shape's name."""
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for item in room.objects:
+        if item.name in frame.objects:
+            mask, boxes = frame.objects[item.name]
+            others = found.get(item.shape, (np.zeros_like(mask), boxes[:0]))
+            found[item.shape] = others[0] | mask, np.concatenate([others[1], boxes])
+    return dataclasses.replace(frame, objects=found)
+
+
+def camouflaged(room: Room, share: float) -> Room:
+    """The room with its objects' colours brought to the table's by a share of the way."""
+
+    def painted(part: Part) -> Part:
+        return dataclasses.replace(part, albedo=(1 - share) * part.albedo + share * linear(TABLE_WOOD))
+
+    objects = (dataclasses.replace(item, parts=tuple(map(painted, item.parts))) for item in room.objects)
+    return dataclasses.replace(room, objects=tuple(objects)) if share else room
 
 
 def write_ovs3d_twin(

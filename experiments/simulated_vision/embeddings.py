@@ -13,17 +13,25 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from experiments.simulated_vision.masks import Faults
+from experiments.simulated_vision.worlds import World
 from jsecon.errors import InputError, require
 
 PAIRWISE_COSINE = 0.74
 """mean over pairs of the 1,203 LVIS class names in CLIP ViT-B/32"""
 SPREAD = 53.0
 """a made text space's variance falls by e every so many dimensions; twice as many carry it, as in CLIP (107)"""
+WORDS = 0.8
+"""the part of what tells names apart that their words have, in the hardest world"""
+HARMONICS = 4
+"""of the noise that follows the azimuth"""
 MOST_NOISE = 4.0
 """the view noise of a tiny mask, in units of that of a mask of `reference_pixels`"""
+
+
+PLAIN = World()
 
 
 class TextSpace(NamedTuple):
@@ -50,13 +58,32 @@ def load_text_space(vectors: str | Path, names: str | Path) -> TextSpace:
     return TextSpace(tuple(texts), _unit(rows))
 
 
-def made_text_space(names: Sequence[str], *, dim: int = 512, seed: int = 0) -> TextSpace:
+def named_after(space: TextSpace, names: Sequence[str], *, near: bool, seed: int = 0) -> TextSpace:
+    """The names under vectors of a real space: of words drawn by lot, or of one word and those nearest to it.
+
+    Raises InputError where the space has too few.
+    """
+    if len(names) > len(space.names):
+        got, wanted = f"{len(space.names)} words", f"{len(names)} or more"
+        raise InputError("the text space", got, wanted, "Take a larger one.")
+    draw = np.random.default_rng([seed, 13])
+    rows = draw.permutation(len(space.names))
+    if near:
+        rows = np.argsort(-(space.vectors @ space.vectors[rows[0]]), kind="stable")
+    return TextSpace(tuple(names), space.vectors[draw.permutation(rows[: len(names)])])
+
+
+def made_text_space(names: Sequence[str], *, dim: int = 512, seed: int = 0, common: float | int = 0.0) -> TextSpace:
     """A space with CLIP's statistics: unit vectors of mean pairwise cosine 0.74, the rest falling off over about 107
-    dimensions."""
+    dimensions. `common`, from 0 to 1, brings names with words in common nearer to each other."""
     draw = np.random.default_rng([seed, 6])
     basis = np.linalg.qr(draw.standard_normal((dim, dim)))[0]
     spread = np.exp(-np.arange(dim - 1) / (2 * SPREAD))
     own = _unit(draw.standard_normal((len(names), dim - 1)) * spread)
+    if common:
+        word = lambda w: np.random.default_rng([seed, 6, zlib.crc32(w.encode())]).standard_normal(dim - 1) * spread
+        shared = _unit(np.stack([sum(_unit(word(w)) for w in name.split()) for name in names]))
+        own = _unit((1 - WORDS * common) ** 0.5 * own + (WORDS * common) ** 0.5 * shared)
     local = np.concatenate([np.full((len(names), 1), PAIRWISE_COSINE**0.5), (1 - PAIRWISE_COSINE) ** 0.5 * own], axis=1)
     return TextSpace(tuple(names), (local @ basis.T).astype(np.float32))
 
@@ -71,6 +98,9 @@ class SimulatedEmbedder:
 
     with share_k the part of its pixels that shows object k, o_k drawn once per object and v once per mask, both
     isotropic of unit length. The gap is drawn once per space: across the texts' mean, plus `gap_along` of it.
+
+    In a hard `world`, labels may be pieces of `objects` (L,), each set apart from its object's text by a direction of
+    its own; the gap's length differs by class; and v follows the views' `azimuths` (T,), radians.
     """
 
     def __init__(
@@ -82,16 +112,20 @@ class SimulatedEmbedder:
         faults: Faults,
         *,
         seed: int = 0,
+        world: World = PLAIN,
+        objects: Int[np.ndarray, " l"] | None = None,
+        azimuths: Float[np.ndarray, " t"] | None = None,
     ):
+        objects = np.arange(len(classes)) if objects is None else np.asarray(objects)
         require(
-            labels.shape == frames.shape[:3] and int(labels.max(initial=-1)) < len(classes),
+            labels.shape == frames.shape[:3] and int(labels.max(initial=-1)) < len(objects),
             "SimulatedEmbedder",
-            f"labels {labels.shape} up to {labels.max(initial=-1)}, {len(classes)} classes",
+            f"labels {labels.shape} up to {labels.max(initial=-1)}, {len(objects)} classes",
             f"labels {frames.shape[:3]} below the number of classes",
             "Give the true labels of these frames and a class per object.",
         )
         self.name, self.dim = f"simulated (seed {seed})", space.vectors.shape[1]
-        self._labels, self._faults, self._seed, self._classes = labels, faults, seed, len(classes)
+        self._labels, self._faults, self._seed, self._objects = labels, faults, seed, objects
         self._frames = {_digest(frame): t for t, frame in enumerate(frames)}
         self._words = dict(zip(space.names, space.vectors))
         draw = np.random.default_rng([seed, 7])
@@ -100,7 +134,22 @@ class SimulatedEmbedder:
         self._gap = faults.gap * _unit(across - (across @ mean) * mean) + faults.gap_along * mean
         noise = faults.object_noise * _unit(draw.standard_normal((len(classes), self.dim)))
         text = self.embed_text(list(classes)).reshape(len(classes), self.dim)
-        self._content = np.concatenate([mean[None], text + noise])  # first what shows no object
+        content = (text + noise)[objects]
+        hard = np.random.default_rng([seed, 9])
+        aside = _unit(hard.standard_normal((len(objects), self.dim)))
+        spread = 0.5 * world.gap * hard.standard_normal((len(set(classes)), 1))
+        basis = hard.standard_normal((2 * HARMONICS, self.dim))
+        turning = hard.standard_normal((len(classes) + 1, HARMONICS, 2 * HARMONICS)) @ basis
+        if len(objects) > len(classes):
+            content = content + world.parts * aside
+        if world.gap:
+            kinds = np.unique(list(classes), return_inverse=True)[1]
+            content = content + spread[kinds[objects]] * self._gap
+        self._content = np.concatenate([mean[None], content])  # first what shows no object
+        self._smooth = 0.0 if azimuths is None else world.azimuth
+        if self._smooth:
+            waves = np.stack([np.cos(azimuths), np.sin(azimuths), np.cos(2 * azimuths), np.sin(2 * azimuths)])
+            self._turning = _unit(np.einsum("khe,ht->kte", turning, waves))
         # Canonical phrases are words like any other of the space.
         words = PAIRWISE_COSINE**0.5 * mean + (1 - PAIRWISE_COSINE) ** 0.5 * _unit(draw.standard_normal((4, self.dim)))
         self.canonical = _unit(words).astype(np.float32)
@@ -123,10 +172,15 @@ class SimulatedEmbedder:
             shown = self._labels[t][mask]
             if not len(shown):
                 continue
-            shares = np.bincount(shown + 1, minlength=self._classes + 1) / len(shown)
+            shares = np.bincount(shown + 1, minlength=len(self._content)) / len(shown)
             draw = np.random.default_rng([self._seed, 8, t, zlib.crc32(np.packbits(mask).tobytes())])
             noise = min((self._faults.reference_pixels / len(shown)) ** 0.5, MOST_NOISE) * self._faults.view_noise
-            found[m] = _unit(shares @ self._content + self._gap + noise * _unit(draw.standard_normal(self.dim)))
+            apart = _unit(draw.standard_normal(self.dim))
+            if self._smooth:
+                most = int(shares.argmax()) - 1
+                smooth = self._turning[self._objects[most] if most >= 0 else -1, t]
+                apart = _unit((1 - self._smooth) ** 0.5 * apart + self._smooth**0.5 * smooth)
+            found[m] = _unit(shares @ self._content + self._gap + noise * apart)
         return found.astype(np.float32)
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:

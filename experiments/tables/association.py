@@ -1,5 +1,5 @@
-"""Masks of single frames brought together over the frames: by a tracker's ids from disk, or by consensus of the
-views."""
+"""Masks of single frames brought together over the frames: by a tracker's ids from disk, by the paper's Algorithm 1, or
+by consensus of the views."""
 
 import dataclasses
 import time
@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.rivals.evidence import Evidence
-from jsecon.association.algorithm1 import clean_masklets
+from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.consensus import consensus_masklets
+from jsecon.association.tracker import GeometricTracker
 from jsecon.association.views import SceneViews
 
 ROWS = 64
@@ -56,14 +57,23 @@ def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int, silent: b
     """jsecon's own association, without tracks: the pixels of each frame go to groups of Gaussians that lie in one mask
     in most views; `silent` as for `mask_signatures`."""
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    masks = np.asarray(evidence.masks)
-
-    def proposals(t: int) -> np.ndarray:
-        rows = np.flatnonzero(np.asarray(evidence.frame) == t)
-        return masks[t][None] == rows[:, None, None]
-
-    scene = SceneViews(gaussians, cameras, proposals)
+    scene = SceneViews(gaussians, cameras, lambda t: proposals(evidence, t))
     return associated(evidence, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed)))
+
+
+def by_algorithm1(evidence: Evidence, frames: np.ndarray, *, kappa: float) -> Association:
+    """The paper's Algorithm 1 over the masks of the frames, followed through the Gaussians; kappa: `masklets`'
+    iou_threshold."""
+    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    track = GeometricTracker(gaussians, cameras, lambda t: proposals(evidence, t))
+    labels = masklets(frames, lambda _, t: proposals(evidence, t), track, iou_threshold=kappa)
+    return associated(evidence, labels)
+
+
+def proposals(evidence: Evidence, t: int) -> np.ndarray:
+    """(M, H, W) bool: the masks of frame t."""
+    rows = np.flatnonzero(np.asarray(evidence.frame) == t)
+    return np.asarray(evidence.masks)[t][None] == rows[:, None, None]
 
 
 def overlaps(labels: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:

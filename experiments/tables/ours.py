@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.tables.answers import Answers, Method, Steps, by_selection
-from experiments.tables.association import Association, associated, by_consensus
+from experiments.tables.association import Association, associated, by_algorithm1, by_consensus
 from experiments.tables.memberships import by_lead, of_all_views
 from experiments.tables.setting import Setting
 from jsecon.language.autoencoder import train_autoencoder
@@ -27,13 +27,16 @@ BY_COSINE = {"retrieval": "cosine"}
 
 
 def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:
-    """The regions of a setting: by "tracks", by "consensus" ("outspoken": one in which a view speaks on what lies in
-    none of its masks), or any other name with its `labels`."""
+    """The regions of a setting: by "tracks", "kappa K" (the paper's Algorithm 1), "consensus" ("outspoken": in which a
+    view speaks on what lies in none of its masks), or any other name with its `labels`."""
     evidence = setting.evidence
     if by == "tracks":
         return setting.tracked
     if labels is not None:
         return setting.shared.get(by, lambda: associated(evidence, labels))
+    if by.startswith("kappa "):
+        kappa = float(by.split()[1])
+        return setting.shared.get(by, lambda: by_algorithm1(evidence, setting.frames, kappa=kappa))
     silent = by != "outspoken"
     return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed, silent=silent))
 

@@ -19,11 +19,13 @@ from experiments.tables.ours import ask_field, field_of
 from experiments.tables.setting import Setting
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.query.direct import relevancies
-from jsecon.query.silhouette import silhouette_members
+from jsecon.query.silhouette import WEIGHTS, silhouette_members
 from jsecon.types import Selection
 
 RULES = ("cosine", "relevancy", "contrast")
-CHOOSERS = ("threshold", "silhouette")
+CHOOSERS = {"threshold": None, "silhouette": WEIGHTS, "lenient silhouette": (0.0, 1.0)}
+"""a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha: of both, or of 10/255
+alone"""
 NO_REFUSAL = -1.0
 """below every similarity"""
 
@@ -68,8 +70,9 @@ def read(setting: Setting, features: Float[np.ndarray, "n e"], rule: str, choose
     def select(k: int) -> Selection:
         similarity = lifting.smoothed(gaussians.means, table[k])
         mask = similarity > lifting.READOUT
-        if chooser == "silhouette":
-            mask = silhouette_members(gaussians, cameras, as_share(similarity))
+        weights = CHOOSERS[chooser]
+        if weights:
+            mask = silhouette_members(gaussians, cameras, as_share(similarity), weights=weights)
         best = float(np.nanmax(table[k])) if np.isfinite(table[k]).any() else 0.0
         place = jnp.asarray(-1, jnp.int32)
         return Selection(jnp.asarray(mask), jnp.asarray(similarity), place, jnp.asarray(best, jnp.float32))
@@ -90,8 +93,9 @@ def own(association: str, retrieval: str, chooser: str, centre: float = 0.0) -> 
     def row(setting: Setting, steps: Steps) -> Answers:
         field = field_of(setting, by=association, centre=centre)
         options = {"retrieval": retrieval, "retrieval_threshold": NO_REFUSAL, "pieces": True}
-        answers = ask_field(setting, field, "votes", clean=chooser == "threshold", **options)
-        if chooser == "threshold":
+        weights = CHOOSERS[chooser]
+        answers = ask_field(setting, field, "votes", clean=weights is None, **options)
+        if weights is None:
             return answers
 
         def select(k: int) -> Selection | None:
@@ -99,7 +103,7 @@ def own(association: str, retrieval: str, chooser: str, centre: float = 0.0) -> 
             if found is None:
                 return None
             share = np.asarray(found.similarity, np.float32)
-            mask = silhouette_members(setting.evidence.gaussians, setting.evidence.cameras, share)
+            mask = silhouette_members(setting.evidence.gaussians, setting.evidence.cameras, share, weights=weights)
             return dataclasses.replace(found, mask=mask)
 
         return dataclasses.replace(answers, select=select)
@@ -130,7 +134,7 @@ def rows_of(points: bool) -> dict[str, Method]:
     """All rows, by name, "method: reading". Where `points` are judged, not silhouettes, there is nothing to choose for
     a text, as each point gets a class; ours then differ by how much the centre's pixel counts."""
     found: dict[str, Method] = {}
-    choosers = CHOOSERS[:1] if points else CHOOSERS
+    choosers = ["threshold"] if points else list(CHOOSERS)
     for name, train in FEATURES.items():
         found[f"{name}: as published"] = METHODS[name]
         for rule in RULES:

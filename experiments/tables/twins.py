@@ -19,11 +19,15 @@ from experiments.datasets import twins
 from experiments.datasets.benchmark import Benchmark
 from experiments.datasets.feature_files import write_features, write_text_features
 from experiments.datasets.lerf_ovs import load_lerf_ovs
+from experiments.datasets.mesh import SURROUNDINGS, surfaces_of
 from experiments.datasets.ovs3d import load_ovs3d
 from experiments.datasets.replica import load_replica
 from experiments.datasets.scannet import load_scannet
-from experiments.simulated_vision.embeddings import SimulatedEmbedder, made_text_space
+from experiments.simulated_vision.embeddings import SimulatedEmbedder, load_text_space, made_text_space, named_after
 from experiments.simulated_vision.masks import LEVELS, Faults, simulated_masks
+from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
+from jsecon.data.synthetic.raycast import trace
+from jsecon.data.synthetic.room import make_room
 from jsecon.files import write_text
 from jsecon.vision.protocols import CANONICAL
 
@@ -39,9 +43,14 @@ WRITERS = {
 }
 
 
+LVIS = "clip_vitb32_lvis.npy", "lvis_names.json"
+"""text vectors of real names, in a folder `text` beside the captures"""
+
+
 def faults_of(level: str) -> Faults:
-    """Of a named level of noise: perfect, low, medium or high."""
-    return PERFECT if level == "perfect" else LEVELS[level]
+    """Of a named level of noise: perfect, low, medium or high; what follows a "+" is `world_of`'s."""
+    noise, _ = world_of(level)
+    return PERFECT if noise == "perfect" else LEVELS[noise]
 
 
 def load(dataset: str, root: Path, scene: str, *, every: int = 1, downscale: float | None = None) -> Benchmark:
@@ -84,10 +93,20 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
     images = [cv2.imread(str(root / "truth" / bench.name / f"{name}.png"), cv2.IMREAD_UNCHANGED) for name in names]
     truth, frames = np.stack(images).astype(np.int16) - 1, np.asarray(bench.capture.frames)[shown]
     words = sorted({*told["objects"], *bench.queries})
-    space = made_text_space(words, seed=seed)
-    faults = faults_of(level)
-    masks = simulated_masks(truth, faults, seed=seed)
-    embedder = SimulatedEmbedder(frames, truth, told["objects"], space, faults, seed=seed)
+    faults, (_, world) = faults_of(level), world_of(level)
+    cameras = bench.capture.cameras[shown]
+    seen = Seen(truth, truth, np.arange(len(told["objects"])))
+    if world.parts or world.groups or world.shadow:
+        room = make_room(told["seed"], num_objects=len(told["objects"]) - len(SURROUNDINGS))
+        depths = np.stack([trace(room, cameras[t])[0] for t in range(len(shown))])
+        points, _ = surfaces_of(room, dataclasses.replace(bench.capture, cameras=cameras, depths=depths), truth)
+        table = len(room.objects) + SURROUNDINGS.index("table")
+        seen = seen_in(world, truth, points, room, table, seed=seed)
+    space = _space(words, world, seed)
+    masks = simulated_masks(seen.masks, faults, seed=seed)
+    azimuths = np.arctan2(cameras.centres[:, 1], cameras.centres[:, 0])
+    hard = {"world": world, "objects": seen.objects, "azimuths": azimuths}
+    embedder = SimulatedEmbedder(frames, seen.content, told["objects"], space, faults, seed=seed, **hard)
     folder = root / bench.name
     for name, frame, image in zip(names, frames, masks.labels, strict=True):
         here = np.unique(image[image >= 0])
@@ -97,6 +116,13 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
         twins.write_ids(folder / "masks" / f"{name}.png", (image + 1).astype(np.uint16))
     vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical])
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
+
+
+def _space(words: list[str], world: World, seed: int):
+    if not world.lvis:
+        return made_text_space(words, seed=seed, common=world.names)
+    real = load_text_space(*(results.CAPTURES.parent / "text" / name for name in LVIS))
+    return named_after(real, words, near=world.lvis == 1, seed=seed)
 
 
 @dataclasses.dataclass(frozen=True)

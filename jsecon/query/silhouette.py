@@ -22,8 +22,8 @@ from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import pixel_alphas, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
-STRICT_WEIGHT = 2.0
-"""of the expected IoU at ALPHA_THRESHOLD, against 1 of that at VALA_THRESHOLD"""
+WEIGHTS = 2.0, 1.0
+"""of the expected IoU at ALPHA_THRESHOLD and at VALA_THRESHOLD"""
 LEAST_SHARE = 0.1
 """of a Gaussian that may be taken"""
 SWEEPS = 3
@@ -61,18 +61,20 @@ def silhouette_members(
     share: Float[Array, " n"],
     *,
     threshold: float = SHARE_THRESHOLD,
+    weights: tuple[float, float] = WEIGHTS,
 ) -> Bool[Array, " n"]:
     """(N,) bool: the Gaussians whose silhouette should fit best what `share` (N,), in [0, 1], says is the thing.
 
     With pi_v(p) = min(sum_i w_ip s_i, 1) the part of a pixel that is the thing's, composited from the shares s
     through the whole scene, and alpha_S(p) what the Gaussians S let nothing through of, rendered alone, it ascends
 
-        mean_v (2 E_v(0.7) + E_v(10 / 255)),  E_v(t) = sum_p pi c / (sum_p pi + sum_p (1 - pi) c),  c = 1[alpha_S > t]
+        mean_v (a E_v(0.7) + b E_v(10 / 255)),  E_v(t) = sum_p pi c / (sum_p pi + sum_p (1 - pi) c),  c = 1[alpha_S > t]
 
-    E is the expected IoU but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > LEAST_SHARE
-    are taken in or left out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a
-    batch of views of the scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most. Host code
-    around compiled parts; not differentiable. Raises ValueError on a share of another length.
+    with `weights` (a, b); (0, 1) is for who must not touch a thing, (1, 0) for its solid core. E is the expected IoU
+    but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > LEAST_SHARE are taken in or left
+    out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a batch of views of the
+    scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most. Host code around compiled parts;
+    not differentiable. Raises ValueError on a share of another length.
     """
     require_shape("silhouette_members", share, (gaussians.count,), "Give one share per Gaussian.")
     share = np.asarray(share, np.float32)
@@ -86,8 +88,9 @@ def silhouette_members(
     found = footprints(gaussians, views, share, open_to, chosen)
     taken = np.zeros(len(found.starts) - 1, bool)
     taken[: len(open_to)] = chosen[open_to]
+    ascended = np.asarray(ascend(found, jnp.asarray(taken), len(views.fx), len(open_to), jnp.asarray(weights)))
     chosen = chosen.copy()
-    chosen[open_to] = np.asarray(ascend(found, jnp.asarray(taken), len(views.fx), len(open_to)))[: len(open_to)]
+    chosen[open_to] = ascended[: len(open_to)]
     return jnp.asarray(chosen)
 
 
@@ -180,12 +183,18 @@ def _absorbed(splats: Array, ids: Array, tiles: Array, across: int, edge: int) -
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def ascend(found: Footprints, taken: Bool[Array, " c"], views: int, count: int | Array) -> Bool[Array, " c"]:
+def ascend(
+    found: Footprints,
+    taken: Bool[Array, " c"],
+    views: int,
+    count: int | Array,
+    weights: Float[Array, " 2"] | tuple[float, float] = WEIGHTS,
+) -> Bool[Array, " c"]:
     """Which of C Gaussians are taken after SWEEPS sweeps over the first `count` from `taken` (C,), see
     `silhouette_members`. Pure."""
     found = jax.tree.map(jnp.asarray, found)
     levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], found.absorbed.dtype)
-    worth = jnp.asarray([STRICT_WEIGHT, 1.0], levels.dtype)
+    worth = jnp.asarray(weights, levels.dtype)
     per_view = (found.inside.shape[0] - 1) // views
     by_view = lambda image: image[:-1].reshape(views, -1).sum(1)
     whole = by_view(found.inside)

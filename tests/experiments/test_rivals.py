@@ -23,9 +23,6 @@ from jsecon.splat.plan import plan_view
 from jsecon.splat.project import project
 from jsecon.vision.protocols import CANONICAL
 
-# Hundreds of steps of training: as shipped they take less time than fast-compiled programs save.
-pytestmark = pytest.mark.as_shipped
-
 QUERIES = ("floor", "red ball", "blue ball", "green ball")
 TRAINED, SHOWN = np.arange(0, 24, 4), np.array([1, 10])
 

@@ -1,0 +1,176 @@
+"""Hard worlds: each switch does what it says, alike in all views, and nothing where it is off."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from experiments.test_simulated import NONE, frames, space  # noqa: F401
+
+from experiments import worlds
+from experiments.datasets.twins import by_kind, camouflaged
+from experiments.simulated_vision.embeddings import SimulatedEmbedder, made_text_space, named_after
+from experiments.simulated_vision.worlds import World, seen_in, world_of
+from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.data.synthetic.room import TABLE_WOOD, linear, make_room
+from jsecon.errors import InputError
+
+TABLE = 7
+"""the label after four objects, wall, floor and ceiling"""
+
+
+@pytest.fixture(scope="module")
+def made():
+    """(room, truth (6, 30, 40), points): every view shows the same 3D points, each at a pixel drawn anew."""
+    room, draw = make_room(3, num_objects=4), np.random.default_rng(0)
+    labels = np.repeat(np.arange(5), 240)
+    points = draw.uniform(-0.7, 0.7, (1200, 3)) * (1, 1, 0)
+    for k, item in enumerate(room.objects):
+        points[labels == k] = item.centre + draw.normal(0, item.radius / 3, (240, 3))
+    labels[labels == 4] = TABLE
+    orders = [draw.permutation(1200) for _ in range(6)]
+    truth, seen = (np.stack([rows[order] for order in orders]) for rows in (labels, points))
+    return room, truth.reshape(6, 30, 40), seen.reshape(6, 30, 40, 3), orders
+
+
+def seen(made, **switches):
+    room, truth, points, orders = made
+    found = seen_in(World(**switches), truth, points, room, TABLE, seed=1)
+    by_point = np.empty((6, 1200), int)
+    for t, order in enumerate(orders):
+        by_point[t, order] = found.masks[t].ravel()
+    return found, by_point
+
+
+def test_a_level_names_the_noise_and_the_switches():
+    assert world_of("high") == ("high", World())
+    assert world_of("medium+parts=1+gap=0.5") == ("medium", World(parts=1, gap=0.5))
+    for wrong in ("medium+sharks=1", "medium+parts=2"):
+        with pytest.raises(ValueError, match="a number from 0 to 1"):
+            world_of(wrong)
+
+
+def test_without_a_switch_what_is_seen_is_the_truth(made):
+    found, _ = seen(made)
+    np.testing.assert_array_equal(found.masks, made[1])
+    np.testing.assert_array_equal(found.content, made[1])
+
+
+def test_parts_are_the_same_points_in_all_views_that_tell_them_apart(made):
+    found, by_point = seen(made, parts=1)
+    assert (by_point == by_point[0]).all()  # the plane stands still
+    for k in range(4):
+        ids, counts = np.unique(by_point[0][240 * k : 240 * (k + 1)], return_counts=True)
+        assert set(ids) == {k, 8 + k}
+        assert counts.min() > 0.3 * 240
+        assert set(found.objects[ids]) == {k}
+    some, by_point = seen(made, parts=0.5)
+    np.testing.assert_array_equal(some.content, found.content)
+    cut = [(by_point[t][240 * k : 240 * (k + 1)] >= 8).any() for t in range(6) for k in range(4)]
+    assert 0.2 < np.mean(cut) < 0.8
+
+
+def test_groups_join_nearest_neighbours(made):
+    room = made[0]
+    _, by_point = seen(made, groups=1)
+    centres = np.stack([item.centre for item in room.objects])
+    away = np.linalg.norm(centres[:, None] - centres, axis=-1) + 9 * np.eye(4)
+    for t in range(6):
+        assert len(np.unique(by_point[t][:960])) < 4
+    a, b = np.unravel_index(away.argmin(), away.shape)
+    assert (by_point[:, 240 * a] == by_point[:, 240 * b]).all()
+
+
+def test_masks_reach_over_the_table_away_from_the_lamp(made):
+    room, truth, points, _ = made
+    found, _ = seen(made, shadow=1)
+    taken = (found.masks != truth) & (truth == TABLE)
+    assert taken.any()
+    np.testing.assert_array_equal(found.masks[~taken], truth[~taken])
+    np.testing.assert_array_equal(found.content, truth)  # an embedder sees what is there
+    for k, item in enumerate(room.objects):
+        own = points[taken & (found.masks == k)][:, :2] - item.centre[:2]
+        if len(own):
+            assert (own @ (item.centre[:2] - room.light[:2])).mean() > 0
+
+
+def embedded(frames, space, world, noise):  # noqa: F811
+    labels = np.full(frames.shape[:3], -1, np.int16)
+    for k in range(6):
+        labels[:, 4:20, 4 + 13 * k : 14 + 13 * k] = k
+    faults = dataclasses.replace(NONE, view_noise=noise, gap=1.0, gap_along=0.0)
+    turns = np.linspace(0, 2 * np.pi, len(frames), endpoint=False)
+    names = space.names[:6]
+    hard = SimulatedEmbedder(frames, labels, names, space, faults, world=world, azimuths=turns)
+    return np.stack(
+        [hard.embed_regions(frame, labels[t] == np.arange(6)[:, None, None]) for t, frame in enumerate(frames)]
+    )
+
+
+def test_noise_that_follows_the_azimuth_is_alike_in_neighbouring_views(frames, space):  # noqa: F811
+    apart = {}
+    for turning in (0.0, 1.0):
+        rows = embedded(frames, space, World(azimuth=turning), 2.0)
+        off = rows - rows.mean(0)
+        off /= np.linalg.norm(off, axis=-1, keepdims=True)
+        apart[turning] = [float((off * np.roll(off, by, axis=0)).sum(-1).mean()) for by in (1, 4)]
+    assert abs(apart[0.0][0] - apart[0.0][1]) < 0.1
+    assert apart[1.0][0] > apart[1.0][1] + 0.4
+
+
+def test_the_gap_differs_by_class_and_not_by_view(frames, space):  # noqa: F811
+    alike, apart = (embedded(frames, space, World(gap=hard), 0.0) for hard in (0.0, 1.0))
+    np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-6)
+    along = alike[0].mean(0) - space.vectors[:6].mean(0)
+    assert np.ptp(apart[0] @ along) > 3 * np.ptp(alike[0] @ along)
+
+
+def test_names_with_words_in_common_lie_near_each_other():
+    names = ("dark green mug", "light green mug", "red ball", *(f"word{i}" for i in range(200)))
+    plain, near = (made_text_space(names, common=common).vectors for common in (0.0, 1.0))
+    assert near[0] @ near[1] > near[0] @ near[2] + 0.05
+    assert abs(plain[0] @ plain[1] - plain[0] @ plain[2]) < 0.05
+    assert abs((near @ near.T).mean() - (plain @ plain.T).mean()) < 0.01
+
+
+def test_real_names_are_drawn_by_lot_or_near_each_other(space):  # noqa: F811
+    lot, near = (named_after(space, list("abcdefgh"), near=n) for n in (False, True))
+    assert lot.names == tuple("abcdefgh")
+    assert (near.vectors @ near.vectors.T).mean() > (lot.vectors @ lot.vectors.T).mean() + 0.01
+    with pytest.raises(InputError, match="9999 or more"):
+        named_after(space, ["a"] * 9999, near=True)
+
+
+def test_things_of_a_kind_are_one_answer_and_camouflage_takes_their_colours():
+    room = make_room(0)
+    a, b = next(
+        (a, b) for n, a in enumerate(room.objects) for b in room.objects[n + 1 :] if a.shape == b.shape
+    )  # every room has some
+    left, right = (np.arange(80).reshape(8, 10) % 10 == c for c in (1, 7))
+    box = np.zeros((1, 4), np.float32)
+    frame = by_kind(LabelledFrame("f", 10, 8, {a.name: (left, box), b.name: (right, box + 1)}), room)
+    assert list(frame.objects) == [a.shape]
+    np.testing.assert_array_equal(frame.objects[a.shape][0], left | right)
+    assert frame.objects[a.shape][1].shape == (2, 4)
+    assert camouflaged(room, 0) is room
+    for item in camouflaged(room, 1.0).objects:
+        for part in item.parts:
+            np.testing.assert_allclose(part.albedo, linear(TABLE_WOOD), rtol=1e-6)
+
+
+def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
+    found = worlds.worlds(worlds.FAULTS)
+    assert {fault for fault, _ in found} == {"none", "together", *worlds.FAULTS}
+    assert all(world_of(level)[0] == "medium" for level, _ in found.values())
+    asked = worlds.Asked(("ramen",), (10,), (0,), ("kinds",), False, "nowhere")
+    plan = worlds.plan_of(*worlds.worlds(asked.only)["kinds", 1.0], asked, 1)
+    assert dict(plan.data.size)["kinds"]
+    assert plan.data.seeds == (0, 10)
+    own, cells = {"VALA: as published": 0.5, "VALA: contrast, threshold": 0.4, "ours, consensus: x": 0.6}, []
+    for seed, value in ((0, 0.1), (10, 0.3)):
+        cell = {"seed": seed, "scene": "ramen"}
+        cells += [cell | {"method": m, "miou": at + value, "miou_vala": at - value} for m, at in own.items()]
+    told = worlds.of_world(cells, asked)
+    assert told["VALA"] == {"miou": pytest.approx(0.8), "miou_vala": pytest.approx(0.2)}
+    text = worlds.layout({("none", 0.0): told, ("kinds", 1.0): told | {"VALA": {"miou": 0.99, "miou_vala": 0.0}}})
+    assert "| kinds 1 | 0.990 | 0.900 | -0.090 |" in text
+    assert "behind in: kinds 1 (VALA, by 0.090)" in text
