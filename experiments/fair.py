@@ -1,7 +1,7 @@
 """Tables 1 to 3 by the same rules for all: every method asked in every way, chosen on some seeds, reported on others.
 
-    python -m experiments.fair [--tables lerf ovs3d replica] [--levels medium high] [--seeds 10 11 ...]
-                               [--choosing 0 1 ...] [--quick] [--out FOLDER] [--processes N]
+    python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
+                               [--seeds 10 11 ...] [--choosing 0 1 ...] [--quick] [--out FOLDER] [--processes N]
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.readings`), and none may
 refuse a text. A method's reading is the one that is best on the seeds `--choosing`, for each figure its own; one row of
@@ -31,6 +31,8 @@ class Asked:
     """What the command line asked for."""
 
     tables: tuple[str, ...]
+    scenes: tuple[str, ...]
+    """empty: all of a table."""
     levels: tuple[str, ...]
     seeds: tuple[int, ...]
     choosing: tuple[int, ...]
@@ -104,7 +106,7 @@ def plan_of(name: str, level: str, asked: Asked, processes: int) -> Plan:
     """All rows of a table at a level of noise, on the seeds to choose on and those to report."""
     table = TABLES[name][1 if asked.quick else 0]
     seeds = tuple(dict.fromkeys((*asked.choosing, *asked.seeds)))
-    data = dataclasses.replace(table.data, seeds=seeds)
+    data = dataclasses.replace(table.data, seeds=seeds, scenes=asked.scenes or table.data.scenes)
     place = {"out": asked.out, "cells": str(Path(asked.out) / "cells.jsonl")}
     return dataclasses.replace(
         table,
@@ -141,6 +143,7 @@ def main(asked: Asked, processes: int) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--tables", nargs="+", default=list(TABLES), choices=TABLES)
+    parser.add_argument("--scenes", nargs="+", default=[], help="of the one table asked for; default: all")
     parser.add_argument("--levels", nargs="+", default=["medium", "high"])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(REPORTED), help="that are reported")
     parser.add_argument("--choosing", nargs="+", type=int, default=list(CHOOSING), help="that readings are chosen on")
@@ -151,4 +154,4 @@ if __name__ == "__main__":
     seeds, choosing = ((1,), (0,)) if given.quick else (tuple(given.seeds), tuple(given.choosing))
     levels = ("medium",) if given.quick else tuple(given.levels)
     place = given.out or str(results.HOME / "results" / ("quick/fair" if given.quick else "fair"))
-    main(Asked(tuple(given.tables), levels, seeds, choosing, given.quick, place), given.processes)
+    main(Asked(tuple(given.tables), tuple(given.scenes), levels, seeds, choosing, given.quick, place), given.processes)

@@ -133,6 +133,8 @@ def test_random_points_lie_where_two_views_look():
     shades = [room().frames[t][tuple(pixels[t, one].astype(int)[::-1])] for t in kept if inside[t, one]]
     np.testing.assert_allclose(colors[one], np.mean(shades, axis=0), atol=1)
     np.testing.assert_array_equal(random_points(room(), 500)[0], points)
+    near = np.linalg.norm(points - points.mean(0), axis=1)
+    assert 0.1 < (near > 2 * np.median(near)).mean() < 0.5  # the background too
     with pytest.raises(InputError, match="overlap"):
         random_points(chosen([0]), 10)
 

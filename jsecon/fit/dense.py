@@ -33,6 +33,8 @@ MAX_DISPARITIES, BLOCK, STEP_COST, JUMP_COST = 256, 3, 4 * 9, 16 * 9
 summed over the window: half of what is usual, so that objects do not grow into the blank walls behind them"""
 NEAR, FAR = 0.8, 1.5
 """depths are searched from `NEAR` times the nearest sparse points in view to `FAR` times the farthest"""
+FARTHEST = 8.0
+"""of random points from what the cameras look at, in units of the farthest camera's distance"""
 
 
 class _Views(NamedTuple):
@@ -242,11 +244,13 @@ def dense_points(
 
 
 def random_points(capture: Capture, count: int) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """`count` points drawn evenly in the part of a cube that two or more of the frames see, with the mean colour of the
-    pixels they fall on: for a capture that gives no better start. The same every time.
+    """`count` points drawn at random where two or more of the frames see, with the mean colour of the pixels they fall
+    on: for a capture that gives no better start. The same every time.
 
-    The cube stands about the point nearest to all cameras' axes and reaches as far as the farthest camera. Held-out
-    frames are not looked at. Raises InputError where less than a thousandth of the cube is seen by two.
+    Evenly in mip-NeRF 360's contracted space (arXiv 2111.12077, eq. 10), whose unit ball stands about the point nearest
+    to all cameras' axes and reaches as far as the farthest camera, and which ends at FARTHEST of that: what stands
+    behind the cameras is in the background of others. Held-out frames are not looked at. Raises InputError where less
+    than a thousandth of the space is seen by two.
     """
     require(count > 0, "count", count, "positive", "100000 is usual.")
     views, draw = _views(capture), np.random.default_rng(0)
@@ -256,7 +260,10 @@ def random_points(capture: Capture, count: int) -> tuple[Float32[np.ndarray, "p 
     reach = np.linalg.norm(views.centres - focus, axis=1).max(initial=0)
     points, colors, kept, tried, batch = [], [], 0, 0, 20_000
     while kept < count and (tried < 10 * batch or kept > tried / 1000):
-        drawn = focus + reach * draw.uniform(-1, 1, (batch, 3))
+        direction, most = draw.normal(size=(batch, 3)), 2 - 1 / FARTHEST
+        contracted = most * draw.uniform(0, 1, (batch, 1)) ** (1 / 3)
+        away = np.where(contracted < 1, contracted, 1 / (2 - contracted))
+        drawn = focus + reach * away * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         pixels, _, inside = _project(views, drawn)
         pixels = np.where(inside[..., None], pixels, 0).astype(int)
         seen = inside.sum(axis=0)
