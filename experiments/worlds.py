@@ -1,7 +1,7 @@
 """Worlds that fight back: every fault that real vision has and the tables' does not, swept alone and together.
 
     python -m experiments.worlds [--scenes figurines teatime] [--seeds 10 11] [--choosing 0] [--only FAULT ...]
-                                 [--quick] [--out FOLDER] [--processes N]
+                                 [--values 1 0.5] [--quick] [--out FOLDER] [--processes N]
 
 Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as published
 and by the contrast with a threshold: the better of them in that world on the seeds `--choosing`, for each figure its
@@ -20,7 +20,7 @@ from experiments.tables.fill import Plan, fill
 from experiments.tables.readings import rows_of
 from jsecon.process import cores
 
-HALF, HARD = 0.5, 1.0
+HARD, HALF = 1.0, 0.5
 FRAMES = {"kinds": "a text names a shape", "camouflage": "objects in the table's colours"}
 """faults of the pictures or the labels, not of the vision"""
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
@@ -38,22 +38,23 @@ class Asked:
     seeds: tuple[int, ...]
     choosing: tuple[int, ...]
     only: tuple[str, ...]
+    values: tuple[float, ...]
+    """how hard"""
     quick: bool
     out: str
 
 
-def worlds(only: tuple[str, ...]) -> dict[tuple[str, float], tuple[str, dict]]:
+def worlds(only: tuple[str, ...], values: tuple[float, ...]) -> dict[tuple[str, float], tuple[str, dict]]:
     """(fault, how hard) -> (the level of a twin, options of its writer). ("none", 0) is the tables' own world,
     ("together", 1) all faults at once, of names those of LVIS."""
     found: dict[tuple[str, float], tuple[str, dict]] = {("none", 0.0): ("medium", {})}
-    each = ((fault, value) for value in (HARD, HALF) for fault in only)  # the hard ones first
-    for fault, value in each:
+    for fault, value in ((fault, value) for value in values for fault in only):
         if fault != "kinds" or value == HARD:
             if fault in FRAMES:
                 found[fault, value] = "medium", {fault: value if fault == "camouflage" else True}
             else:
                 found[fault, value] = f"medium+{fault}={value:g}", {}
-    if set(only) == set(FAULTS):
+    if set(only) == set(FAULTS) and HARD in values:
         every = "+".join(f"{field.name}=1" for field in dataclasses.fields(World) if field.name != "names")
         found["together", HARD] = f"medium+{every}", {"kinds": True, "camouflage": HARD}
     return found
@@ -128,7 +129,7 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]]):
 def main(asked: Asked, processes: int) -> str:
     """The table, written."""
     methods, found, helper = rows_of(points=False), {}, False
-    for name, (level, size) in worlds(asked.only).items():
+    for name, (level, size) in worlds(asked.only, asked.values).items():
         try:
             plan = plan_of(level, size, asked, processes)
             cells = fill(plan, methods, tell=lambda line: print(line, flush=True))
@@ -152,6 +153,7 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11], help="that are reported")
     parser.add_argument("--choosing", nargs="+", type=int, default=[0], help="that readings are chosen on")
     parser.add_argument("--only", nargs="+", default=list(FAULTS), choices=FAULTS)
+    parser.add_argument("--values", nargs="+", type=float, default=[HARD, HALF], help="how hard, 0 to 1")
     parser.add_argument("--quick", action="store_true", help="one tiny scene, two faults")
     parser.add_argument("--out", default="")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
@@ -160,4 +162,5 @@ if __name__ == "__main__":
     seeds, choosing, only = tuple(given.seeds), tuple(given.choosing), tuple(given.only)
     if given.quick:
         seeds, choosing, only = (1,), (0,), ("parts", "kinds")
-    main(Asked(tuple(given.scenes), seeds, choosing, only, given.quick, place), given.processes)
+    values = (HARD,) if given.quick else tuple(given.values)
+    main(Asked(tuple(given.scenes), seeds, choosing, only, values, given.quick, place), given.processes)

@@ -158,11 +158,11 @@ def test_things_of_a_kind_are_one_answer_and_camouflage_takes_their_colours():
 
 
 def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
-    found = worlds.worlds(worlds.FAULTS)
+    found = worlds.worlds(worlds.FAULTS, (1.0, 0.5))
     assert {fault for fault, _ in found} == {"none", "together", *worlds.FAULTS}
     assert all(world_of(level)[0] == "medium" for level, _ in found.values())
-    asked = worlds.Asked(("ramen",), (10,), (0,), ("kinds",), False, "nowhere")
-    plan = worlds.plan_of(*worlds.worlds(asked.only)["kinds", 1.0], asked, 1)
+    asked = worlds.Asked(("ramen",), (10,), (0,), ("kinds",), (1.0,), False, "nowhere")
+    plan = worlds.plan_of(*worlds.worlds(asked.only, asked.values)["kinds", 1.0], asked, 1)
     assert dict(plan.data.size)["kinds"]
     assert plan.data.seeds == (0, 10)
     own, cells = {"VALA: as published": 0.5, "VALA: contrast, threshold": 0.4, "ours, consensus: x": 0.6}, []
