@@ -21,8 +21,8 @@ from experiments.tables.readings import rows_of
 from jsecon.process import cores
 
 HARD, HALF = 1.0, 0.5
-FRAMES = {"kinds": "a text names a shape", "camouflage": "objects in the table's colours"}
-"""faults of the pictures or the labels, not of the vision"""
+FRAMES = "kinds", "camouflage"
+"""faults of the labels and of the pictures (options of the twins' writer), not of the vision"""
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
 READ = ("as published", "contrast, threshold")
 LEFT_OUT = "ours, outspoken views"
