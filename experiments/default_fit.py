@@ -56,7 +56,8 @@ def main(asked: Plan, tables: tuple[Plan, ...]) -> str:
                 cells[fitted] = fill(plan_of(table, asked, fitted), METHODS, tell=lambda line: print(line, flush=True))
         if len(cells) == len(FITS):
             parts.append(table_of(table.data.dataset, cells))
-            kept[table.data.dataset] = [cell for fitted in FITS[1:] for cell in cells[fitted]]
+            told = [cell for fitted in FITS[1:] for cell in cells[fitted]]
+            kept[table.data.dataset] = [{k: v for k, v in cell.items() if k != "texts"} for cell in told]
     text = "\n\n".join(parts)
     if parts:
         results.save(Path(asked.out), asked, kept, text)

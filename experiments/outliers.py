@@ -21,7 +21,7 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import point_miou, tracked
-from jsecon.query.outliers import EPS_SPACINGS, MIN_SAMPLES, dbscan, default_eps, remove_outliers
+from jsecon.query.outliers import EPS_SPACINGS, KEEP, MIN_SAMPLES, dbscan, default_eps, remove_outliers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ def made_points(count: int, seed: int = 0) -> np.ndarray:
 def cleaners(means: np.ndarray, options: Options) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     """Functions of a selection's mask (N,), by the options that they stand for."""
     ways = {"none": lambda mask: mask}
-    for keep in ("largest", "all"):
+    for keep in KEEP:
         for spacings in options.spacings:
             ways[f"{keep}, {spacings:g} spacings"] = lambda mask, keep=keep, spacings=spacings: remove_outliers(
                 means, mask, keep=keep, eps=default_eps(means[mask], spacings=spacings) if mask.any() else None

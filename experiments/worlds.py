@@ -4,8 +4,8 @@
                                  [--values 1 0.5] [--quick] [--out FOLDER] [--processes N]
 
 Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as published
-and by the contrast with a threshold: the better of them in that world on the seeds `--choosing`, for each figure its
-own. None may refuse a text.
+and by the contrast with a threshold (ours: of one region, of all that answer, and of their parts): the better of them
+in that world on the seeds `--choosing`, for each figure its own. None may refuse a text.
 """
 
 import argparse
@@ -24,7 +24,7 @@ HARD, HALF = 1.0, 0.5
 FRAMES = "kinds", "camouflage"
 """faults of the labels and of the pictures (options of the twins' writer), not of the vision"""
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
-READ = ("as published", "contrast, threshold")
+READ = ("as published", "contrast, threshold", "contrast, threshold, all", "contrast, threshold, parts")
 LEFT_OUT = "ours, outspoken views"
 """a row of `experiments.fair` that is an older one of ours"""
 FIGURES = ("miou", "miou_vala")

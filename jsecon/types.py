@@ -192,6 +192,18 @@ class Regions:
 
 
 @record
+class Parts:
+    """Small parts of a scene, each with what all masks that hold it say of it."""
+
+    part: Array
+    """(N,) int32 part of each Gaussian, 0 .. P-1, -1 = none."""
+    embeddings: Array
+    """(P, E) unit; zero for a part that lies in no mask."""
+    weight: Array
+    """(P,) weight of its Gaussians on masks."""
+
+
+@record
 class LanguageField:
     """Everything a query needs, in one file: the scene, its codes and votes, its regions, and where they came from."""
 
@@ -216,6 +228,8 @@ class LanguageField:
     """name of the embedder whose space the regions live in; texts must be embedded by the same."""
     provenance: str = static(default="{}")
     """JSON: version, options, inputs' digests."""
+    parts: Parts | None = None
+    """what single masks say of small parts of the scene, where the run was asked for it."""
 
 
 @record

@@ -9,10 +9,12 @@ from jsecon.association.consensus import (
     consensus_masklets,
     group_by_consensus,
     mask_signatures,
+    pieces_on_masks,
     scene_pieces,
     spread_cells,
 )
 from jsecon.association.views import SceneViews, claim_atoms
+from jsecon.language.votes import region_votes
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +92,23 @@ def test_a_frame_without_masks_says_nothing_or_that_nothing_belongs_together(wor
         own, looks = (np.asarray(a.multiply(a).sum(1)).ravel() for a in (membership, visible))
         seen = looks > 0
         assert (np.median(own[seen] / looks[seen]) > 0.9) == silent
+
+
+def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):
+    """Masks that part each frame: a Gaussian's weight on them is that of `region_votes` of the frame."""
+    gaussians, cameras, frames, _, proposals = world[:5]
+    piece, cast = pieces_on_masks(frames, scene)
+    assert cast.shape == (gaussians.count, sum(map(len, proposals)))
+    assert piece.shape == (gaussians.count,)
+    start = 0
+    for t in range(3):
+        masks = np.asarray(proposals[t])
+        labels = np.where(masks.any(0), masks.argmax(0), -1)[None]
+        votes = region_votes(gaussians, cameras[t : t + 1], labels, len(masks), top=len(masks))
+        exact = np.asarray(votes.dense())
+        found = cast[:, start : start + len(masks)].toarray()
+        assert np.abs(found - exact).sum() < 0.03 * exact.sum()  # atoms leave out what is negligible
+        start += len(masks)
 
 
 def test_nothing_proposed_anywhere_gives_one_thing_or_none(world):

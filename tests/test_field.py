@@ -14,6 +14,7 @@ from jsecon.errors import InputError
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.field import load_field, save_field
 from jsecon.language.shares import with_overlap
+from jsecon.types import Parts
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,18 @@ def test_with_an_autoencoder_and_without_any_coder(field, tmp_path):
     texts = unit_rows(np.random.default_rng(1), 3, 12)
     save_field(tmp_path / "a.field", dataclasses.replace(field, autoencoder=coder))
     np.testing.assert_array_equal(load_field(tmp_path / "a.field").autoencoder.encode(texts), coder.encode(texts))
+
+
+def test_with_the_parts_of_the_scene(field, tmp_path):
+    part = np.arange(field.gaussians.count, dtype=np.int32) % 4 - 1
+    parts = Parts(part, unit_rows(np.random.default_rng(0), 3, 12), np.ones(3, np.float32))
+    whole = dataclasses.replace(field, parts=parts)
+    save_field(tmp_path / "a.field", whole)
+    assert_same(load_field(tmp_path / "a.field"), whole)
+    for wrong in ({"part": part[1:]}, {"embeddings": parts.embeddings[:, 1:]}, {"weight": np.ones(2, np.float32)}):
+        broken = dataclasses.replace(field, parts=dataclasses.replace(parts, **wrong))
+        with pytest.raises(ValueError, match=r"parts\."):
+            save_field(tmp_path / "b.field", broken)
 
 
 def test_wide_numbers_keep_their_width(field, path):

@@ -15,13 +15,13 @@ from test_pipeline import Recorder
 
 from experiments.datasets.feature_files import write_features
 from jsecon.app import command_line, networks, pipeline, stages
-from jsecon.app.language_stages import regions
+from jsecon.app.language_stages import parts, regions
 from jsecon.app.masklet_stages import masklets
 from jsecon.app.networks import GivenSpace
 from jsecon.app.options import Options
 from jsecon.app.scene_stages import gaussians, load
 from jsecon.data.capture import load_capture
-from jsecon.data.ply import save_ply
+from jsecon.data.ply import load_ply, save_ply
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
@@ -186,6 +186,11 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     found = stage.compute(results, *none)
     np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
     assert found.notes == (f"{len(rows)} embeddings in the files",)
+    of_masks = parts(work).compute({**results, "gaussians": load_ply(splat)}, *none).value
+    seen = of_masks.weight > 0
+    np.testing.assert_allclose(np.linalg.norm(of_masks.embeddings[seen], axis=1), 1, atol=1e-5)
+    assert of_masks.embeddings.shape[1] == 3
+    assert seen.sum() > len(found.value.embeddings)
     for name in capture.names:
         write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
     with pytest.raises(InputError, match="no mask of level l"):

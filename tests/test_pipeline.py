@@ -154,6 +154,28 @@ def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
             np.testing.assert_array_equal(have[key], want[key], err_msg=f"{name} {key}")
 
 
+def test_parts_of_the_scene_are_a_stage_of_their_own(room_run, tmp_path):
+    run, out = room_run
+    shutil.copytree(out, tmp_path / "out")
+    _, listener = _again(run, tmp_path / "out", parts=True)
+    assert {name for name, fresh in listener.fresh.items() if fresh} == {"parts", "field"}
+    field = load_field(tmp_path / "out" / "field.npz")
+    part, units = np.asarray(field.parts.part), np.asarray(field.parts.embeddings)
+    assert part.shape == (field.gaussians.count,)
+    assert part.max() + 1 == len(units) > field.regions.count
+    # A part looks like the region that most of what is seen of it lies in.
+    votes, own = field.votes, (np.asarray(field.votes.views) > 0) & (part >= 0)
+    weight = np.zeros((len(units), field.regions.count))
+    for regions, weights in zip(np.asarray(votes.regions)[own].T, np.asarray(votes.weights)[own].T):
+        np.add.at(weight, (part[own][regions >= 0], regions[regions >= 0]), weights[regions >= 0])
+    clear = weight.max(1) > 0.8 * np.asarray(field.parts.weight)
+    assert clear.mean() > 0.3
+    nearest = (units @ np.asarray(field.regions.embeddings).T).argmax(1)
+    assert (nearest == weight.argmax(1))[clear].mean() > 0.9
+    np.testing.assert_array_equal(field.votes.weights, run.field.votes.weights)
+    assert run.field.parts is None
+
+
 def test_frames_can_come_from_an_adapter(on_given_gaussians, tmp_path):
     given, _ = on_given_gaussians
     darker = dataclasses.replace(given.capture, frames=given.capture.frames // 2)

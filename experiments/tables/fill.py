@@ -20,6 +20,8 @@ from experiments.tables.setting import Fitted, Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.process import cores, forget_programs
 
+DIGITS = 4
+"""of the IoU of single texts and frames"""
 KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "loc_box", "pairs", "missing", "accuracy")
 
 
@@ -144,7 +146,8 @@ def measure(setting: Setting, answers: Answers) -> dict:
             expected_classes=bench.pairs,
             opacities=opacity,
         )
-        return {name: told[name] for name in KEPT if name in told} | {"texts": {r.query: [r.iou] for r in rows}}
+        texts = {row.query: [round(row.iou, DIGITS)] for row in rows}
+        return {name: told[name] for name in KEPT if name in told} | {"texts": texts}
     both = evaluate_at_thresholds(
         setting.evidence.gaussians,
         setting.cameras,
@@ -154,7 +157,7 @@ def measure(setting: Setting, answers: Answers) -> dict:
     )
     (rows, strict), (beside, lenient) = both[ALPHA_THRESHOLD], both[VALA_THRESHOLD]
     texts = {
-        query: [[r.iou for r in rows if r.query == query], [r.iou for r in beside if r.query == query]]
+        query: [[round(r.iou, DIGITS) for r in of if r.query == query] for of in (rows, beside)]
         for query in dict.fromkeys(r.query for r in rows)
     }
     return {name: strict[name] for name in KEPT if name in strict} | {

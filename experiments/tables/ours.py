@@ -7,20 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.tables.answers import Answers, Method, Steps, by_selection
-from experiments.tables.association import Association, associated, by_algorithm1, by_consensus
+from experiments.tables.association import Association, associated, by_algorithm1, by_consensus, proposals
 from experiments.tables.memberships import by_lead, of_all_views
 from experiments.tables.setting import Setting
+from jsecon.association.consensus import pieces_on_masks
+from jsecon.association.views import SceneViews
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.distill import distill_l1, distill_votes
+from jsecon.language.regions import scene_parts
 from jsecon.language.shares import finish_votes, membership_probability
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored
 from jsecon.query.classes import query_classes
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.parts import query_parts
 from jsecon.query.retrieval import PIECE_NEARNESS
-from jsecon.types import LanguageField, Regions, Selection, Votes
+from jsecon.query.several import query_several
+from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
 """the region of the largest cosine, as the paper finds it"""
@@ -97,6 +102,19 @@ def field_of(
     )
 
 
+def parts_of(setting: Setting) -> Parts:
+    """The scene's parts: pieces that lie near each other in the same masks, with the embeddings of all masks."""
+    evidence = setting.evidence
+
+    def make() -> Parts:
+        views = SceneViews(evidence.gaussians, evidence.cameras, lambda t: proposals(evidence, t))
+        rows = np.argsort(np.asarray(evidence.frame), kind="stable")
+        given = pieces_on_masks(setting.frames, views, seed=setting.seed)
+        return scene_parts(*given, np.asarray(evidence.embeddings)[rows])
+
+    return setting.shared.get("parts", make)
+
+
 def ask_field(
     setting: Setting,
     field: LanguageField,
@@ -109,8 +127,9 @@ def ask_field(
     retrieval_threshold: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code,
-    probability (of the votes; all anchored, by `retrieval`), one_step or canonical; `clean` drops outliers, `pieces`
-    joins the regions that are pieces of what the text found (not by lead)."""
+    probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that answer)
+    and parts (of them the parts that do). `clean` drops outliers, `pieces` joins the regions that are pieces of what
+    the text found (not by lead)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases = jnp.asarray(field.canonical)
@@ -118,6 +137,11 @@ def ask_field(
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
+        if way in ("all", "parts"):
+            found = query_several(field, text[None], retrieval=retrieval, retrieval_threshold=retrieval_threshold)
+            if way == "parts":
+                return query_parts(dataclasses.replace(field, parts=parts_of(setting)), found, text[None])
+            return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
         if way == "one_step":
             found = query_one_step(
                 field.codes, encode(field.autoencoder, text), 0.9 if threshold is None else threshold
@@ -140,7 +164,7 @@ def ask_field(
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
-    if way != "votes":
+    if way not in ("votes", "all", "parts"):
         return by_selection(setting, ask)
     texts = jnp.asarray(setting.texts)
     return Answers(ask, lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, every=True)[0]))

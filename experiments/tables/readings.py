@@ -28,6 +28,8 @@ CHOOSERS = {"threshold": None, "silhouette": WEIGHTS, "lenient silhouette": (0.0
 alone"""
 NO_REFUSAL = -1.0
 """below every similarity"""
+WAYS = {"votes": "", "all": ", all", "parts": ", parts"}
+"""of asking jsecon's regions: the one that answers best with its pieces, all that answer, of them the parts that do"""
 
 
 def scores(setting: Setting, features: Float[np.ndarray, "n e"], rule: str) -> Float[np.ndarray, "q n"]:
@@ -87,14 +89,14 @@ def reading(train: Callable[[Setting, Steps], Float[np.ndarray, "n e"]], rule: s
     return lambda setting, steps: read(setting, setting.shared.get(train, lambda: train(setting, steps)), rule, chooser)
 
 
-def own(association: str, retrieval: str, chooser: str, centre: float = 0.0) -> Method:
-    """jsecon's row of an association's regions."""
+def own(association: str, retrieval: str, chooser: str, centre: float = 0.0, way: str = "votes") -> Method:
+    """jsecon's row of an association's regions; `way` as for `ask_field`."""
 
     def row(setting: Setting, steps: Steps) -> Answers:
         field = field_of(setting, by=association, centre=centre)
         options = {"retrieval": retrieval, "retrieval_threshold": NO_REFUSAL, "pieces": True}
         weights = CHOOSERS[chooser]
-        answers = ask_field(setting, field, "votes", clean=weights is None, **options)
+        answers = ask_field(setting, field, way, clean=weights is None, **options)
         if weights is None:
             return answers
 
@@ -146,4 +148,7 @@ def rows_of(points: bool) -> dict[str, Method]:
                 for centre in CENTRES if points and rule == "contrast" else (0.0,):
                     told = f", centre {centre:g}" if centre else ""
                     found[f"{name}: {rule}, {chooser}{told}"] = own(association, rule, chooser, centre)
+                if association == "consensus" and rule == "contrast" and not points:
+                    for way in ("all", "parts"):
+                        found[f"{name}: {rule}, {chooser}{WAYS[way]}"] = own(association, rule, chooser, way=way)
     return found

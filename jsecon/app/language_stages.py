@@ -3,14 +3,17 @@
 Frames that are held out are read by none of them.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app.progress import Progress
 from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.errors import InputError
+from jsecon.language.regions import Embed
 from jsecon.types import LanguageField, Regions
 
 
@@ -60,6 +63,57 @@ def regions(work: Work) -> Stage:
         uses=(embedder,),
         left_out=left,
     )
+
+
+def parts(work: Work) -> Stage:
+    """Small parts of the scene, each with the embeddings of all masks of single frames that hold it."""
+    options, embedder = work.options, work.networks.embedder
+
+    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+        from jsecon.association.consensus import pieces_on_masks
+        from jsecon.association.views import SceneViews
+        from jsecon.language.regions import scene_parts
+
+        capture, scene = results["load"], results["gaussians"]
+        train = training_frames(capture)
+        frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+        masks, embed = _masks_of(work, results)
+        views = SceneViews(scene, cameras, masks)
+        piece, cast = pieces_on_masks(frames, views, seed=options.seed, progress=progress)
+        rows = np.concatenate([embed(t, masks(t)) for t in range(len(train))])
+        work.networks.close()
+        return Outcome(scene_parts(piece, cast, rows))
+
+    return Stage(
+        "parts",
+        "of the scene, by what single masks say of them",
+        compute,
+        after=("load", "gaussians", "masklets"),
+        given=work.given("seed", "level", "granularity") | {"embedder": embedder.name},
+        files=options.features,
+        uses=(embedder, work.networks.segmenter),
+    )
+
+
+def _masks_of(work: Work, results: Results) -> tuple[Callable[[int], np.ndarray], Embed]:
+    """masks (M, H, W) bool of the t-th training frame, and what embeds them: those of --features, else the proposals,
+    else the masklets that were given."""
+    options, capture = work.options, results["load"]
+    frames = np.asarray(capture.frames)[training_frames(capture)]
+    by_model: Embed = lambda t, masks: work.networks.embedder.embed_regions(frames[t], masks)
+    if options.features is not None:
+        from jsecon.data.langsplat_files import load_features
+
+        names = [capture.names[t] for t in training_frames(capture)]
+        given = load_features(options.features, names, frames.shape[1:3], level=options.level)
+        rows = lambda t: np.flatnonzero(np.asarray(given.frame) == t)
+        return lambda t: given.labels[t][None] == rows(t)[:, None, None], lambda t, masks: given.embeddings[rows(t)]
+    if options.masks is not None:
+        labels = results["masklets"]
+        return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
+    from jsecon.app.masklet_stages import proposals_of
+
+    return proposals_of(work, capture, results["gaussians"])[0], by_model
 
 
 def codes(work: Work) -> Stage:
@@ -139,4 +193,5 @@ def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:
         names=capture.names,
         embedder=embedder.name,
         provenance=provenance,
+        parts=results.get("parts"),
     )

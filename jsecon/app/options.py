@@ -92,6 +92,9 @@ class Options(SceneOptions):
     CLIP that made them (--embedder, here or of query)"""
     weighting: Literal["pixels", "uniform"] = "pixels"
     """of the views in a region's embedding"""
+    parts: bool = False
+    """embed each frame's own masks too, so that `query --all` leaves out what they took for one with its neighbour in
+    most views; takes twice as many embeddings"""
     latent: Annotated[int | Literal["auto"], {"metavar": "D", "least": 1}] = 16
     """most numbers a code may have; 3 as in the paper; auto for as few as keep the regions apart"""
     reduce: Literal["mode", "median", "mean"] = "mode"

@@ -2,6 +2,8 @@
 
     load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field, then the held-out frames measured
 
+and with --parts, after regions, the parts of the scene.
+
 Before it all, `poses` where the capture has none (data/motion, data/video).
 
 The keys of all stages are known before any runs, so all of it is told first: what will run, what is cached, what is
@@ -34,7 +36,7 @@ import numpy as np
 
 import jsecon
 from jsecon.app import cache, networks
-from jsecon.app.language_stages import codes, distil, field_of, regions, votes
+from jsecon.app.language_stages import codes, distil, field_of, parts, regions, votes
 from jsecon.app.masklet_stages import masklets
 from jsecon.app.options import Options, require_inputs, require_writable
 from jsecon.app.progress import Listener, Step
@@ -80,7 +82,8 @@ class Run:
 def stages_of(work: Work) -> list[Stage]:
     """The stages of a run in order. Mask files come before the long fit: what is wrong with them is said at once."""
     first = (masklets, gaussians) if work.options.masks is not None else (gaussians, masklets)
-    return [*loaded(work), *(stage(work) for stage in (*first, regions, codes, votes, distil, held_out))]
+    then = (regions, *((parts,) if work.options.parts else ()), codes, votes, distil, held_out)
+    return [*loaded(work), *(stage(work) for stage in (*first, *then))]
 
 
 def peak_memory_mib() -> float:

@@ -29,6 +29,7 @@ from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.masks import selection_mask
 from jsecon.query.outliers import MIN_SAMPLES, default_eps, one_component, remove_outliers
+from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.several import parts_of_question, query_several
 from jsecon.query.silhouette import silhouette_members
@@ -90,6 +91,8 @@ def ask_text(
         given: dict[str, Any] = {} if threshold is None else {"similarity_threshold": threshold}
         embedded = jax.device_put(embedder.embed_text(wanted + unwanted))
         selection = query_several(field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given)
+        if several and field.parts is not None:
+            selection = query_parts(field, selection, embedded[: len(wanted)])
         return _answer(field, text, by, _shaped(field, selection, by, threshold), outliers, {}, keep="all")
     embedding = jax.device_put(embedder.embed_text([text])[0])
     if by in ("votes", "silhouette", "code"):

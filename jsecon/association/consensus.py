@@ -18,6 +18,8 @@ from jsecon.association.views import SceneViews, View, claim_atoms
 from jsecon.errors import require
 from jsecon.vision.region_graph import renumbered
 
+PIECES = 3000
+"""of a scene, at most"""
 SKETCH = 24
 """numbers that stand for a Gaussian's masks while pieces are formed"""
 ROUNDS = 2
@@ -35,7 +37,7 @@ def group_by_consensus(
     means: Float[np.ndarray, "n 3"],
     *,
     agreement: float = 0.4,
-    pieces: int = 3000,
+    pieces: int = PIECES,
     seed: int = 0,
 ) -> Int[np.ndarray, " n"]:
     """Object (N,) of each Gaussian, 0 .. R-1, -1 = never seen.
@@ -209,6 +211,25 @@ def consensus_masklets(
     return labels
 
 
+def pieces_on_masks(
+    frames: UInt8[np.ndarray, "t h w 3"],
+    scene: SceneViews,
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Int[np.ndarray, " n"], Sparse]:
+    """(piece (N,), cast (N, M)): the `scene_pieces` of frames (T, H, W, 3) uint8, and the weight that each Gaussian
+    casts on each of the M masks of all frames, in their order: what `language.regions.scene_parts` asks for."""
+    views, means = scene.all(frames, progress), np.asarray(scene.gaussians.means, np.float32)
+    piece = scene_pieces(*mask_signatures(views, scene.count), means, pieces=PIECES, seed=seed)
+    entries, start = [], 0
+    for view in views:
+        cast = view.on_masks.tocoo()
+        entries.append((cast.data, view.seen[cast.row], start + cast.col))
+        start += len(view.proposals)
+    return piece, summed(entries, (scene.count, start))
+
+
 def mask_signatures(
     views: list[View], count: int, *, silent: bool = True
 ) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
@@ -226,7 +247,7 @@ def mask_signatures(
         weights[view.seen] += totals
         # Two things are together with the mean, over the layers of masks, of the product of their shares.
         layers = np.maximum(view.proposals.sum(0).max(initial=1.0), 1.0)
-        cast = (view.votes @ sparse.csr_matrix(view.proposals.T)).tocoo()
+        cast = view.on_masks.tocoo()
         outside = np.maximum(1.0 - np.asarray(cast.sum(1)).ravel() / np.maximum(totals * layers, 1e-12), 0.0)
         share = cast.data / np.maximum(totals[cast.row] * layers, 1e-12)
         norm = np.bincount(cast.row, share**2, len(totals)) + outside**2 / layers

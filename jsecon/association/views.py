@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from scipy import sparse
 
 from jsecon.association.atoms import SMALLEST, Sparse, cast_on_atoms, coverage, image_atoms
 from jsecon.errors import require
@@ -42,6 +43,11 @@ class View:
     def totals(self) -> np.ndarray:
         """(n,) weight that each Gaussian casts in the frame."""
         return np.asarray(self.votes.sum(1)).ravel()
+
+    @property
+    def on_masks(self) -> Sparse:
+        """(n, M) weight that each Gaussian casts on each proposal."""
+        return self.votes @ sparse.csr_matrix(self.proposals.T)
 
 
 class SceneViews:

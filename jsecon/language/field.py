@@ -4,11 +4,12 @@ The header, member `header.npy` (UTF-8 bytes), holds {"format", "version", "fiel
 `jsecon.files.packed` describes it, records by their bare names.
 """
 
+import functools
 import json
 import os
 import zipfile
-from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,11 +18,12 @@ from jsecon.errors import InputError, require
 from jsecon.files import UNREADABLE, packed, unpacked, written_whole
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
-from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT, VERSION = "jsecon-field", 1
 _RECORDS = {
-    cls.__name__: cls for cls in (LanguageField, Gaussians, Votes, Regions, Camera, Autoencoder, Rotation, Spread)
+    cls.__name__: cls
+    for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
 }
 _REMEDY = "Make the field again with `jsecon run`."
 _LETTERS = {
@@ -32,12 +34,13 @@ _LETTERS = {
     "t": ("cameras.world_to_camera", 0),
     "k": ("votes.regions", -1),
     "c": ("canonical", 0),
+    "p": ("parts.weight", 0),
 }
 """where a field's sizes are read off: array and axis"""
 _SHAPES = {
     ("n", 3): "gaussians.means gaussians.log_scales",
     ("n", 4): "gaussians.quaternions",
-    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.peak votes.views",
+    ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.peak votes.views parts.part",
     ("n", "d"): "codes",
     ("n", "k"): "votes.regions votes.weights votes.shown",
     ("r", "e"): "regions.embeddings",
@@ -46,9 +49,10 @@ _SHAPES = {
     ("t", 4, 4): "cameras.world_to_camera",
     ("t",): "cameras.fx",
     ("c", "e"): "canonical",
+    ("p", "e"): "parts.embeddings",
     (4, 4): "to_source",
 }
-_OPTIONAL = ("votes.shown", "votes.overlap")
+_OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings")
 
 
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:
@@ -106,13 +110,19 @@ def _on_device(leaf: object) -> object:
     return jax.device_put(leaf) if fits else leaf
 
 
+def _array(field: LanguageField, name: str) -> Any:
+    """An array by its dotted name; None where the field has none, or not the record that holds it."""
+    return functools.reduce(lambda part, own: None if part is None else getattr(part, own), name.split("."), field)
+
+
 def _disagreement(field: LanguageField) -> str | None:
     """What is wrong with the shapes, in words, or None."""
-    sizes = {letter: attrgetter(name)(field).shape[axis] for letter, (name, axis) in _LETTERS.items()}
+    measured = {letter: (_array(field, name), axis) for letter, (name, axis) in _LETTERS.items()}
+    sizes = {letter: array.shape[axis] for letter, (array, axis) in measured.items() if array is not None}
     for shape, names in _SHAPES.items():
         expected = tuple(sizes.get(size, size) for size in shape)
         for name in names.split():
-            array = attrgetter(name)(field)
+            array = _array(field, name)
             if not (name in _OPTIONAL and array is None) and tuple(array.shape) != expected:
                 return f"{name} of shape {tuple(array.shape)} where the others ask for {expected}"
     if field.votes.num_regions != sizes["r"]:

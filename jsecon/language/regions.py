@@ -5,9 +5,10 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from scipy import sparse
 
 from jsecon.errors import require, require_one_of, require_shape
-from jsecon.types import Regions
+from jsecon.types import Parts, Regions
 
 ALIKE_THRESHOLD = 0.95
 """on the cosine of two regions' embeddings: above it they are one thing seen twice, such as a track that broke. In demo
@@ -96,3 +97,24 @@ def pooled(
     length = np.linalg.norm(total, axis=1, keepdims=True)
     unit = np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0)
     return Regions(embeddings=unit.astype(np.float32), pixels=pixels)
+
+
+def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.ndarray, "m e"]) -> Parts:
+    """Parts of a scene from the part (N,) of each Gaussian, 0 .. P-1, -1 = none, the weight (N, M) that each casts on
+    each mask (a sparse matrix), and the masks' embeddings (M, E).
+
+        e_p = unit(sum_m w_pm phi_m),  w_pm the weight of all Gaussians of p on m
+
+    A part that lies in no mask has a zero embedding. Raises ValueError where sizes disagree.
+    """
+    fit = cast.shape == (len(part), len(embeddings))
+    found, expected = f"cast {cast.shape}", f"({len(part)} Gaussians, {len(embeddings)} masks)"
+    require(fit, "scene_parts", found, expected, "Give a row for each Gaussian and a column for each mask.")
+    own = np.flatnonzero(part >= 0)
+    count = int(part.max(initial=-1)) + 1
+    gather = sparse.csr_matrix((np.ones(len(own), np.float32), (part[own], own)), shape=(count, len(part)))
+    weight = gather @ cast
+    total = np.asarray(weight @ np.asarray(embeddings, np.float32), np.float32).reshape(count, embeddings.shape[1])
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    units = np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
+    return Parts(part.astype(np.int32), units, np.asarray(weight.sum(1), np.float32).reshape(count))

@@ -25,7 +25,7 @@ RETRIEVAL_THRESHOLD = 0.2
 """The paper's "low threshold to filter invalid prompts" on the cosine, which it does not state. In CLIP ViT-B/16 an
 image has a cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without
 CLIP's gap are far above for texts that fit."""
-NEARNESS = 0.8
+NEARNESS = 0.75
 """all of a kind: how far a region's similarity has come from that of the middle region to that of the best"""
 PIECE_NEARNESS = 0.5
 """a piece: nearer to the best than to the middle region"""
