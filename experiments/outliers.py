@@ -21,7 +21,9 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import point_miou, tracked
-from jsecon.query.outliers import EPS_SPACINGS, KEEP, MIN_SAMPLES, dbscan, default_eps, remove_outliers
+from jsecon.query.outliers import EPS_SPACINGS, MIN_SAMPLES, dbscan, default_eps, remove_outliers
+
+LARGE = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +50,21 @@ def made_points(count: int, seed: int = 0) -> np.ndarray:
     return np.concatenate([blobs, draw.uniform(0, 10, (count // 10, 3))])[draw.permutation(count)]
 
 
+def large_clusters(means: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The selection's clusters that have at least LARGE times the Gaussians of its largest: a thing that falls apart,
+    or two things of one name. Measured and not kept."""
+    chosen, result = np.flatnonzero(mask), np.zeros_like(mask)
+    if len(chosen):
+        cluster = dbscan(means[chosen], default_eps(means[chosen]), MIN_SAMPLES)
+        sizes = np.bincount(cluster[cluster >= 0], minlength=1)
+        result[chosen[(cluster >= 0) & (sizes[cluster] >= LARGE * sizes.max())]] = True
+    return result
+
+
 def cleaners(means: np.ndarray, options: Options) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
     """Functions of a selection's mask (N,), by the options that they stand for."""
     ways = {"none": lambda mask: mask}
-    for keep in KEEP:
+    for keep in ("largest", "all"):
         for spacings in options.spacings:
             ways[f"{keep}, {spacings:g} spacings"] = lambda mask, keep=keep, spacings=spacings: remove_outliers(
                 means, mask, keep=keep, eps=default_eps(means[mask], spacings=spacings) if mask.any() else None
@@ -60,6 +73,7 @@ def cleaners(means: np.ndarray, options: Options) -> dict[str, Callable[[np.ndar
             ways[f"{keep}, eps {eps} m"] = lambda mask, keep=keep, eps=eps: remove_outliers(
                 means, mask, keep=keep, eps=eps
             )
+    ways[f"at least {LARGE:g} of the largest, {EPS_SPACINGS:g} spacings"] = lambda mask: large_clusters(means, mask)
     for samples in (5, 20):
         ways[f"largest, {EPS_SPACINGS:g} spacings, min_samples {samples}"] = lambda mask, samples=samples: (
             remove_outliers(means, mask, min_samples=samples)

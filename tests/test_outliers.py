@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from sklearn.cluster import DBSCAN
 
-from jsecon.query.outliers import LARGE, dbscan, default_eps, one_component, remove_outliers
+from jsecon.query.outliers import dbscan, default_eps, one_component, remove_outliers
 
 
 def crowd(rng, count, blobs):
@@ -83,15 +83,6 @@ def test_strays_go_and_eps_follows_the_scale(scale):
     assert not every[400:].any()
     largest = remove_outliers(points, everything, keep="largest")
     np.testing.assert_array_equal(largest, every & (np.arange(len(points)) < 300))
-    np.testing.assert_array_equal(remove_outliers(points, everything, keep="large"), every)  # 100 of 300
-
-
-def test_a_cluster_is_large_by_its_part_of_the_largest():
-    points = two_blobs_and_strays()
-    few = np.arange(len(points)) < 300 + int(0.8 * LARGE * 300)
-    kept = remove_outliers(points, few, keep="large")
-    np.testing.assert_array_equal(kept, remove_outliers(points, few, keep="largest"))
-    assert remove_outliers(points, few, keep="all")[300:].any()
 
 
 def test_only_what_was_selected_is_looked_at():

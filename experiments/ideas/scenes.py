@@ -21,6 +21,7 @@ from scipy import sparse
 from experiments import replica_apartment_0, results
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace, load_text_space, made_text_space
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
+from jsecon.app.command_line import Demo
 from jsecon.app.demo import demo
 from jsecon.app.progress import Listener
 from jsecon.language.field import load_field
@@ -101,7 +102,7 @@ class Sight:
 def demo_scene(folder: Path, seed: int) -> Scene:
     """The demo room of `seed`, as `jsecon demo --seed SEED --out FOLDER` leaves it; made where it is missing."""
     if not (folder / "field.npz").exists():
-        demo(folder, seed=seed, listener=Listener())
+        demo(folder, seed=seed, steps=Demo.steps, listener=Listener())
     field = load_field(folder / "field.npz")
     told = json.loads((folder / "capture" / "scene.json").read_text())
     voting = np.array([name not in told["held_out"] for name in field.names])

@@ -24,9 +24,6 @@ EPS_SPACINGS = 6.0
 the gaps that weakly textured parts leave between splats, far below the distance between objects"""
 MIN_SAMPLES = 10
 """neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings"""
-LARGE = 0.25
-"""of the largest cluster's Gaussians: a cluster with so many is as likely a part of the answer as a mistake"""
-KEEP = ("largest", "large", "all")
 
 
 def remove_outliers(
@@ -37,16 +34,15 @@ def remove_outliers(
     min_samples: int = MIN_SAMPLES,
     keep: str = "largest",
 ) -> Bool[np.ndarray, " n"]:
-    """The selection `mask` without what DBSCAN calls noise and without smaller clusters.
+    """The selection `mask` without what DBSCAN calls noise and, for keep="largest", without the smaller clusters.
 
-    means (N, 3), world units. eps: radius, world units; None takes `default_eps` of the selection. Kept is, by `keep`,
-    the "largest" cluster alone (the paper), "large" ones, of at least LARGE times its Gaussians (a thing that falls
-    apart where the scene has gaps, two things of one name), or "all" (several objects of one kind). Returned as it
-    came, less centres that are not finite: a selection of fewer than `min_samples` points, one that is a single
-    component (no gap of eps anywhere, nothing stands apart), and one in which DBSCAN finds no cluster at all, as there
-    is nothing for outliers to lie outside of. Raises ValueError for options out of range.
+    means (N, 3), world units. eps: radius, world units; None takes `default_eps` of the selection. keep="all" keeps
+    every cluster (several objects of one kind). Returned as it came, less centres that are not finite: a selection of
+    fewer than `min_samples` points, one that is a single component (no gap of eps anywhere, nothing stands apart), and
+    one in which DBSCAN finds no cluster at all, as there is nothing for outliers to lie outside of. Raises ValueError
+    for options out of range.
     """
-    require_one_of("remove_outliers", keep, KEEP, "Use 'all' to keep several objects.")
+    require_one_of("remove_outliers", keep, ("largest", "all"), "Use 'all' to keep several objects.")
     positive, found = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(positive, "remove_outliers", found, "eps > 0 and min_samples >= 1", remedy)
@@ -62,9 +58,7 @@ def remove_outliers(
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
         return kept
-    sizes = np.bincount(labels[labels >= 0])
-    large = sizes >= (LARGE * sizes.max() if keep == "large" else 0)
-    inside = labels == sizes.argmax() if keep == "largest" else (labels >= 0) & large[labels]
+    inside = labels == np.bincount(labels[labels >= 0]).argmax() if keep == "largest" else labels >= 0
     result = np.zeros_like(kept)
     result[chosen[inside]] = True
     return result
