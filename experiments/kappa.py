@@ -6,7 +6,6 @@ Twins of LERF at medium noise; the field is asked as ours is, by the contrast an
 stand the ids that a simulated tracker left on disk, and consensus.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
 
@@ -14,9 +13,8 @@ import numpy as np
 
 from experiments import lerf, results
 from experiments.tables.answers import Method
-from experiments.tables.fill import fill
+from experiments.tables.fill import fill, place_of, twins_asked
 from experiments.tables.readings import own
-from jsecon.process import cores
 
 KAPPAS = 0.1, 0.3, 0.5, 0.7, 0.9
 ROWS: dict[str, Method] = {f"kappa {k}": own(f"kappa {k}", "contrast", "threshold") for k in KAPPAS}
@@ -51,13 +49,6 @@ def main(asked: Asked, processes: int) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=["figurines", "teatime"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11])
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, one seed")
-    parser.add_argument("--out", default="")
-    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
-    given = parser.parse_args()
-    place = given.out or str(results.HOME / "results" / ("quick/kappa" if given.quick else "kappa"))
+    given = twins_asked("kappa", "one tiny scene, one seed").parse_args()
     seeds = (0,) if given.quick else tuple(given.seeds)
-    main(Asked(tuple(given.scenes), seeds, given.quick, place), given.processes)
+    main(Asked(tuple(given.scenes), seeds, given.quick, place_of(given, "kappa")), given.processes)

@@ -8,7 +8,6 @@ rendered alone, covers at least half of its pixels in a labelled frame. found: o
 frame shows, how many are held; right: of all objects that are held, how many are of the kind.
 """
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
@@ -21,11 +20,10 @@ import numpy as np
 from experiments import lerf, results
 from experiments.datasets.mesh import SURROUNDINGS
 from experiments.tables.answers import Answers, Method, Steps
-from experiments.tables.fill import fill
+from experiments.tables.fill import fill, place_of, twins_asked
 from experiments.tables.readings import rows_of
 from experiments.tables.setting import Setting
 from jsecon.evaluate.lerf import resized
-from jsecon.process import cores
 from jsecon.query.masks import selection_mask
 from jsecon.types import Selection
 
@@ -119,14 +117,8 @@ def main(asked: Asked, processes: int) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=["figurines", "teatime"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11])
+    parser = twins_asked("kinds", "one tiny scene, one seed")
     parser.add_argument("--levels", nargs="+", default=["perfect", "medium"])
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, one seed")
-    parser.add_argument("--out", default="")
-    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
     given = parser.parse_args()
-    place = given.out or str(results.HOME / "results" / ("quick/kinds" if given.quick else "kinds"))
     seeds, levels = ((0,), ("medium",)) if given.quick else (tuple(given.seeds), tuple(given.levels))
-    main(Asked(tuple(given.scenes), seeds, levels, given.quick, place), given.processes)
+    main(Asked(tuple(given.scenes), seeds, levels, given.quick, place_of(given, "kinds")), given.processes)

@@ -8,7 +8,6 @@ and by the contrast with a threshold (ours: of one region, of all that answer, a
 in that world on the seeds `--choosing`, for each figure its own. None may refuse a text.
 """
 
-import argparse
 import dataclasses
 from pathlib import Path
 
@@ -16,9 +15,8 @@ import numpy as np
 
 from experiments import fair, lerf, results
 from experiments.simulated_vision.worlds import World
-from experiments.tables.fill import Plan, fill
+from experiments.tables.fill import Plan, fill, place_of, twins_asked
 from experiments.tables.readings import rows_of
-from jsecon.process import cores
 
 HARD, HALF = 1.0, 0.5
 FRAMES = "kinds", "camouflage"
@@ -148,19 +146,14 @@ def main(asked: Asked, processes: int) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", nargs="+", default=["figurines", "teatime"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11], help="that are reported")
+    parser = twins_asked("worlds", "one tiny scene, two faults")
     parser.add_argument("--choosing", nargs="+", type=int, default=[0], help="that readings are chosen on")
     parser.add_argument("--only", nargs="+", default=list(FAULTS), choices=FAULTS)
     parser.add_argument("--values", nargs="+", type=float, default=[HARD, HALF], help="how hard, 0 to 1")
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, two faults")
-    parser.add_argument("--out", default="")
-    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
     given = parser.parse_args()
-    place = given.out or str(results.HOME / "results" / ("quick/worlds" if given.quick else "worlds"))
     seeds, choosing, only = tuple(given.seeds), tuple(given.choosing), tuple(given.only)
     if given.quick:
         seeds, choosing, only = (1,), (0,), ("parts", "kinds")
     values = (HARD,) if given.quick else tuple(given.values)
+    place = place_of(given, "worlds")
     main(Asked(tuple(given.scenes), seeds, choosing, only, values, given.quick, place), given.processes)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments import results
 from experiments.cells import alone, append_cell, helped, read_cells
 from experiments.datasets.benchmark import Benchmark
 from experiments.protocols.points import evaluate_points
@@ -63,6 +64,22 @@ def options_of(plan: Plan, quick: Plan) -> Plan:
         data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)
     return dataclasses.replace(chosen, out=given.out, cells="") if given.out else chosen
+
+
+def twins_asked(name: str, quick: str) -> argparse.ArgumentParser:
+    """Options of experiments that report a few scenes and seeds of twins; OUT is results/`name`, or quick/`name`."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", nargs="+", default=["figurines", "teatime"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11], help="that are reported")
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--out", default="", help=f"where the results go (default: results/{name})")
+    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
+    return parser
+
+
+def place_of(given: argparse.Namespace, name: str) -> str:
+    """The folder of the results that `twins_asked` asked for."""
+    return given.out or str(results.HOME / "results" / (f"quick/{name}" if given.quick else name))
 
 
 def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:
