@@ -1,29 +1,33 @@
 """Tables 1 to 3 by the same rules for all: every method asked in every way, chosen on some seeds, reported on others.
 
     python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
-                               [--seeds 10 11 ...] [--choosing 0 1 ...] [--quick] [--out FOLDER] [--processes N]
+                               [--seeds 10 11 ...] [--choosing 0 ...] [--methods NAME ...] [--quick] [--out FOLDER]
+                               [--processes N]
 
-Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.readings`), and none may
-refuse a text. A method's reading is the one that is best on the seeds `--choosing`, for each figure its own; one row of
-ours, "one reading", takes the same for both. The figures are of the seeds that `--seeds` names, on which nothing was
-chosen, with a paired bootstrap over (scene, seed, text) of ours against each.
+Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.rows`), and none may refuse a
+text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
+own; one row of ours, "one reading", takes the same for both. Those readings alone, and the published one, are then
+measured on the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap over (scene, seed,
+text) of ours against each.
 """
 
 import argparse
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from experiments import lerf, ovs3d, replica, results
+from experiments.cells import read_cells
 from experiments.tables.fill import Plan, fill
-from experiments.tables.readings import rows_of
+from experiments.tables.rows import rows_of
 from jsecon.process import cores
 
-CHOOSING, REPORTED = (0, 1, 2), (10, 11, 12, 13, 14)
+CHOOSING, REPORTED = (0,), (10, 11, 12, 13, 14)
 TABLES = {"lerf": (lerf.PLAN, lerf.QUICK), "ovs3d": (ovs3d.PLAN, ovs3d.QUICK), "replica": (replica.PLAN, replica.QUICK)}
 RESAMPLED = 2000
-MINE, ONE_READING = "ours, consensus", "ours, consensus, one reading"
+MINE, ONE_READING, PUBLISHED = "ours, consensus", "ours, consensus, one reading", "as published"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +40,8 @@ class Asked:
     levels: tuple[str, ...]
     seeds: tuple[int, ...]
     choosing: tuple[int, ...]
+    methods: tuple[str, ...]
+    """empty: all."""
     quick: bool
     out: str
 
@@ -74,68 +80,96 @@ def chosen(cells: list[dict], seeds: tuple[int, ...], figures: tuple[str, ...]) 
 
 def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str, dict]:
     """A Markdown table of one table and level, and its figures."""
-    figures = ("miou",) if name == "replica" else ("miou", "miou_vala")
-    best = chosen(cells, asked.choosing, figures)
+    figures = figures_of(name)
+    best = chosen([cell for cell in cells if cell["level"] == level], asked.choosing, figures)
     held = [cell for cell in cells if cell["seed"] in asked.seeds]
     of = lambda row: [cell for cell in held if cell["method"] == row]
+    mean = lambda own, figure: by_scene(own, figure, lambda values: float(np.mean(values)))
     rows, told = [], {}
-    mine = best[MINE]
     for method, by_figure in best.items():
         row = [method]
         for n, figure in enumerate(figures):
-            own = of(by_figure[figure])
-            scenes = sorted({cell["scene"] for cell in own})
-            mean = float(np.mean([np.mean([c[figure] for c in own if c["scene"] == s]) for s in scenes]))
-            difference = ahead(by_text(of(mine[figure]), n), by_text(own, n))
-            wins = [
-                s
-                for s in scenes
-                if np.mean([c[figure] for c in own if c["scene"] == s])
-                > np.mean([c[figure] for c in of(mine[figure]) if c["scene"] == s])
-            ]
-            told[f"{method}, {figure}"] = {"row": by_figure[figure], "mean": mean, "ahead": difference, "wins": wins}
-            way = by_figure[figure].split(": ", 1)[1]
-            row += [f"{mean:.3f}", way, f"{difference[0]:+.3f} [{difference[1]:+.3f}, {difference[2]:+.3f}]"]
+            own, mine = of(by_figure[figure]), of(best[MINE][figure])
+            difference = ahead(by_text(mine, n), by_text(own, n))
+            values, ours = mean(own, figure), mean(mine, figure)
+            wins = [scene for scene, value in values.items() if value > ours[scene]]
+            published = mean(of(f"{method}: {PUBLISHED}"), figure)
+            told[f"{method}, {figure}"] = {
+                "row": by_figure[figure],
+                "mean": float(np.mean(list(values.values()))),
+                "published": float(np.mean(list(published.values()))) if published else None,
+                "ahead": difference,
+                "wins": wins,
+            }
+            here = told[f"{method}, {figure}"]
+            row += [f"{here['published']:.3f}" if published else "", f"{here['mean']:.3f}"]
+            row.append(by_figure[figure].split(": ", 1)[1])
+            row.append(f"{difference[0]:+.3f} [{difference[1]:+.3f}, {difference[2]:+.3f}]")
             row.append("" if method.startswith("ours") else ", ".join(wins))
         rows.append(tuple(row))
-    columns = [c for f in figures for c in (f, "read by", "ours, consensus ahead by [95 %]", "ahead of it in")]
+    columns = [c for f in figures for c in (f"{f} as published", f, "read by", f"{MINE} ahead by [95 %]", "behind in")]
     return results.table((f"{name}, {level}", *columns), rows), told
 
 
-def plan_of(name: str, level: str, asked: Asked, processes: int) -> Plan:
-    """All rows of a table at a level of noise, on the seeds to choose on and those to report."""
+def by_scene(cells: list[dict], figure: str, fold: Callable[[list[float]], float]) -> dict[str, float]:
+    """A figure of each scene, folded over its seeds."""
+    scenes = sorted({cell["scene"] for cell in cells})
+    return {scene: fold([cell[figure] for cell in cells if cell["scene"] == scene]) for scene in scenes}
+
+
+def figures_of(table: str) -> tuple[str, ...]:
+    """What of a table's cells is compared: at the points there is one figure."""
+    return ("miou",) if table == "replica" else ("miou", "miou_vala")
+
+
+def plan_of(name: str, level: str, asked: Asked, processes: int, seeds: tuple[int, ...], rows: list[str]) -> Plan:
+    """Some rows of a table at a level of noise, on some seeds."""
     table = TABLES[name][1 if asked.quick else 0]
-    seeds = tuple(dict.fromkeys((*asked.choosing, *asked.seeds)))
     data = dataclasses.replace(table.data, seeds=seeds, scenes=asked.scenes or table.data.scenes)
     place = {"out": asked.out, "cells": str(Path(asked.out) / "cells.jsonl")}
     return dataclasses.replace(
-        table,
-        data=data,
-        methods=tuple(rows_of(name == "replica")),
-        level=level,
-        sweep=(),
-        processes=processes,
-        **place,
+        table, data=data, methods=tuple(rows), level=level, sweep=(), processes=processes, **place
     )
+
+
+def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict] | None:
+    """All rows on the seeds to choose on, and of the seeds to report the rows that were best there. None in a helper,
+    which has no table to write."""
+    methods = rows_of(name == "replica")
+    rows = [row for row in methods if not asked.methods or row.split(": ")[0] in asked.methods]
+    tell = lambda line: print(line, flush=True)
+    try:
+        cells = fill(plan_of(name, level, asked, processes, asked.choosing, rows), methods, tell=tell)
+    except SystemExit:
+        known = read_cells(Path(asked.out) / "cells.jsonl").values()
+        wanted = plan_of(name, level, asked, processes, asked.choosing, rows).data
+        place = lambda cell: (cell["scene"], cell["seed"], cell["level"], cell["method"])
+        cells = {place(cell): cell for cell in known}
+        every = [(scene, seed, level, row) for scene in wanted.scenes for seed in wanted.seeds for row in rows]
+        if any(one not in cells for one in every):
+            return None  # what another process is at
+        cells = [cells[one] for one in every]
+    best = {row for ways in chosen(cells, asked.choosing, figures_of(name)).values() for row in ways.values()}
+    kept = [row for row in rows if row in best or row.endswith(f": {PUBLISHED}")]
+    try:
+        return cells + fill(plan_of(name, level, asked, processes, asked.seeds, kept), methods, tell=tell)
+    except SystemExit:
+        return None
 
 
 def main(asked: Asked, processes: int) -> str:
     """The tables, written."""
-    parts, kept, helper = [], {}, False
+    parts, kept = [], {}
     for name in asked.tables:
-        methods = rows_of(name == "replica")
         for level in asked.levels:
-            try:
-                cells = fill(plan_of(name, level, asked, processes), methods, tell=lambda line: print(line, flush=True))
-            except SystemExit:  # of a helper, which has no table to write
-                helper = True
-                continue
-            text, told = report(name, level, cells, asked)
-            parts.append(text)
-            kept[f"{name} {level}"] = told
-            print(text, flush=True)
+            cells = cells_of(name, level, asked, processes)
+            if cells is not None:
+                text, told = report(name, level, cells, asked)
+                parts.append(text)
+                kept[f"{name} {level}"] = told
+                print(text, flush=True)
     text = "\n\n".join(parts)
-    if not helper:
+    if processes:
         results.save(Path(asked.out), asked, kept, text)
     return text
 
@@ -147,6 +181,7 @@ if __name__ == "__main__":
     parser.add_argument("--levels", nargs="+", default=["medium", "high"])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(REPORTED), help="that are reported")
     parser.add_argument("--choosing", nargs="+", type=int, default=list(CHOOSING), help="that readings are chosen on")
+    parser.add_argument("--methods", nargs="+", default=[], help="that are compared, ours among them; default: all")
     parser.add_argument("--quick", action="store_true", help="one tiny scene of each, one seed: two minutes")
     parser.add_argument("--out", default="")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
@@ -154,4 +189,14 @@ if __name__ == "__main__":
     seeds, choosing = ((1,), (0,)) if given.quick else (tuple(given.seeds), tuple(given.choosing))
     levels = ("medium",) if given.quick else tuple(given.levels)
     place = given.out or str(results.HOME / "results" / ("quick/fair" if given.quick else "fair"))
-    main(Asked(tuple(given.tables), tuple(given.scenes), levels, seeds, choosing, given.quick, place), given.processes)
+    asked = Asked(
+        tuple(given.tables),
+        tuple(given.scenes),
+        levels,
+        seeds,
+        choosing,
+        tuple(given.methods),
+        given.quick,
+        place,
+    )
+    main(asked, given.processes)

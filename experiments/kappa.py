@@ -14,7 +14,7 @@ import numpy as np
 from experiments import lerf, results
 from experiments.tables.answers import Method
 from experiments.tables.fill import fill, place_of, twins_asked
-from experiments.tables.readings import own
+from experiments.tables.rows import own
 
 KAPPAS = 0.1, 0.3, 0.5, 0.7, 0.9
 ROWS: dict[str, Method] = {f"kappa {k}": own(f"kappa {k}", "contrast", "threshold") for k in KAPPAS}

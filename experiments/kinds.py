@@ -21,7 +21,7 @@ from experiments import lerf, results
 from experiments.datasets.mesh import SURROUNDINGS
 from experiments.tables.answers import Answers, Method, Steps
 from experiments.tables.fill import fill, place_of, twins_asked
-from experiments.tables.readings import rows_of
+from experiments.tables.rows import rows_of
 from experiments.tables.setting import Setting
 from jsecon.evaluate.lerf import resized
 from jsecon.query.masks import selection_mask

@@ -16,7 +16,7 @@ import numpy as np
 from experiments import fair, lerf, results
 from experiments.simulated_vision.worlds import World
 from experiments.tables.fill import Plan, fill, place_of, twins_asked
-from experiments.tables.readings import rows_of
+from experiments.tables.rows import rows_of
 
 HARD, HALF = 1.0, 0.5
 FRAMES = "kinds", "camouflage"

@@ -140,6 +140,7 @@ def query_gaussian_grouping(
     canonical: Float[Array, "c e"],
     *,
     nearly: float = NEARLY,
+    similarity: Float[np.ndarray, " k"] | None = None,
 ) -> Selection:
     """The Gaussians of the ids that lie in the first view's masks of the text.
 
@@ -147,21 +148,25 @@ def query_gaussian_grouping(
     relevant one's: a class may have several things, and 1 takes one of them. Without any nothing is selected, which is
     what becomes of everything that the first view does not show. Ids: those with more than 0.7 of their region there
     inside the masks. Gaussians: the kept ids' probability together above 0.3. Selection.region is the row in the
-    evidence of the most relevant mask, score its relevancy.
+    evidence of the most relevant mask, score its relevancy. `similarity` (K,) of the first view's masks with the text,
+    where given, takes the relevancy's place, and then none is too little.
     """
     here = np.flatnonzero(np.asarray(evidence.frame) == 0)
     nothing = jnp.zeros(evidence.gaussians.count)
     if not len(here):
         return Selection(nothing > 0, nothing, jnp.asarray(-1, jnp.int32), jnp.zeros(()))
-    first_view = jnp.asarray(evidence.embeddings)[here]
-    relevancy, _ = _relevancies(first_view, jnp.asarray(text), jnp.asarray(canonical))
+    if similarity is None:
+        least, first_view = RELEVANT, jnp.asarray(evidence.embeddings)[here]
+        relevancy, _ = _relevancies(first_view, jnp.asarray(text), jnp.asarray(canonical))
+    else:
+        least, relevancy = -np.inf, jnp.asarray(similarity)
     best = int(jnp.argmax(relevancy))
-    if not relevancy[best] >= RELEVANT:
+    if not relevancy[best] >= least:
         return Selection(nothing > 0, nothing, jnp.asarray(-1, jnp.int32), relevancy[best])
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
     plan = plan_view(gaussians, cameras[0])
     predicted = np.asarray(model.probabilities(render_plan(plan, model.identity).features)).argmax(-1)
-    meant = np.asarray(relevancy) >= max(RELEVANT, nearly * float(relevancy[best]))
+    meant = np.asarray(relevancy) >= max(least, nearly * float(relevancy[best]))
     mask = np.isin(np.asarray(evidence.masks[0]), here[meant])
     classes = len(model.bias)
     sizes, inside = (np.bincount(ids.reshape(-1), minlength=classes) for ids in (predicted, predicted[mask]))

@@ -9,6 +9,7 @@ Occam's, gated in each view.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -54,10 +55,11 @@ def train_occam(evidence: Evidence) -> Lifted:
     return _lifted(_centres(evidence, lambda weight: weight > 0), evidence)
 
 
-def train_vala(evidence: Evidence) -> Lifted:
-    """VALA: gated in each view; its cosine median of the streamed views has the normalised weighted mean as its closed
-    form, and is taken as that. Then Gaussians of little weight are dropped."""
-    weights = _centres(evidence, gate)
+def train_vala(evidence: Evidence, **gate_of: float) -> Lifted:
+    """VALA: gated in each view by `gate`, whose keywords `gate_of` holds; its cosine median of the streamed views has
+    the normalised weighted mean as its closed form, and is taken as that. Then Gaussians of little weight are
+    dropped."""
+    weights = _centres(evidence, functools.partial(gate, **gate_of))
     total = np.asarray(weights.sum(1)).ravel()
     seen = total[total > 0]
     kept = total >= max(1e-5, PRUNED_BELOW * float(np.median(seen)) if len(seen) else 0.0)
@@ -83,15 +85,17 @@ def train_backprojection(evidence: Evidence) -> Lifted:
     return _lifted(_sparse(blocks, evidence), evidence)
 
 
-def gate(weight: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def gate(
+    weight: Float[np.ndarray, " n"], *, mass: float = MASS, least: float = LEAST_WEIGHT, quantile: float = QUANTILE
+) -> Bool[np.ndarray, " n"]:
     """VALA's gate of one view: which of the weights at the centres' pixels count."""
     order = np.argsort(-weight, kind="stable")
     before = np.cumsum(weight[order]) - weight[order]
     kept = np.zeros(len(weight), bool)
-    kept[order[before < MASS * weight.sum()]] = True
+    kept[order[before < mass * weight.sum()]] = True
     visible = weight[weight > 0]
-    high = np.quantile(visible, QUANTILE) if len(visible) else 0.0
-    return kept & (weight >= LEAST_WEIGHT) & ((weight >= high) | (weight > SURE))
+    high = np.quantile(visible, quantile) if len(visible) else 0.0
+    return kept & (weight >= least) & ((weight >= high) | (weight > SURE))
 
 
 @jax.jit

@@ -53,12 +53,15 @@ def associated(evidence: Evidence, labels: np.ndarray) -> Association:
     return Association(labels.astype(np.int32), unit(inside @ embeddings), uniform, pixels.astype(np.int32))
 
 
-def by_consensus(evidence: Evidence, frames: np.ndarray, *, seed: int, silent: bool = True) -> Association:
+def by_consensus(
+    evidence: Evidence, frames: np.ndarray, *, seed: int, silent: bool = True, centre: float = 0.0, **how: Any
+) -> Association:
     """jsecon's own association, without tracks: the pixels of each frame go to groups of Gaussians that lie in one mask
-    in most views; `silent` as for `mask_signatures`."""
+    in most views; `silent` as for `mask_signatures`, `centre` as for `SceneViews`, `how` as for
+    `consensus_masklets`."""
     gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    scene = SceneViews(gaussians, cameras, lambda t: proposals(evidence, t))
-    return associated(evidence, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed)))
+    scene = SceneViews(gaussians, cameras, lambda t: proposals(evidence, t), centre=centre)
+    return associated(evidence, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed, **how)))
 
 
 def by_algorithm1(evidence: Evidence, frames: np.ndarray, *, kappa: float) -> Association:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,13 @@ from jaxtyping import Float
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
-from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
+from experiments.rivals.gaussian_grouping import (
+    GaussianGrouping,
+    query_gaussian_grouping,
+    train_gaussian_grouping,
+)
 from experiments.rivals.langsplat import LangSplat, train_langsplat
-from experiments.rivals.opengaussian import Schedule, train_opengaussian
+from experiments.rivals.opengaussian import OpenGaussian, Schedule, train_opengaussian
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.ours import asked, paper
 from experiments.tables.setting import Setting
@@ -43,29 +48,42 @@ def langsplat_of(setting: Setting, evidence: Evidence, steps: Steps) -> LangSpla
 
 def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
     """Tracked ids; a text is found in the first view or not at all."""
-    rates = dict(zip(("identity_rate", "classifier_rate"), steps.grouping_rates))
-    # A classifier's outputs in multiples of 32, and one for no id: settings share their compiled programs.
-    key, classes = jax.random.key(setting.seed), 1 + 32 * -(-(int(setting.evidence.tracks.max()) + 1) // 32)
-    model, _ = train_gaussian_grouping(setting.evidence, key=key, steps=steps.grouping, classes=classes, **rates)
+    model = gaussian_grouping_of(setting, steps)
     canonical = jnp.asarray(setting.canonical)
     ask = lambda k: query_gaussian_grouping(model, setting.evidence, jnp.asarray(setting.texts[k]), canonical)
     return by_selection(setting, ask)
 
 
+def gaussian_grouping_of(setting: Setting, steps: Steps) -> GaussianGrouping:
+    """Gaussian Grouping trained on the tracker's ids."""
+    rates = dict(zip(("identity_rate", "classifier_rate"), steps.grouping_rates))
+    # A classifier's outputs in multiples of 32, and one for no id: settings share their compiled programs.
+    key, classes = jax.random.key(setting.seed), 1 + 32 * -(-(int(setting.evidence.tracks.max()) + 1) // 32)
+    return train_gaussian_grouping(setting.evidence, key=key, steps=steps.grouping, classes=classes, **rates)[0]
+
+
 def opengaussian(setting: Setting, steps: Steps) -> Answers:
     """Instance features and a codebook; the most similar leaf."""
+    return by_leaves(setting, opengaussian_of(setting, steps))
+
+
+def opengaussian_of(setting: Setting, steps: Steps, **codebook: Any) -> OpenGaussian:
+    """OpenGaussian trained, its codebook's `roots`, `leaves` and `position_weight` as for LERF or as given."""
     views = len(setting.names)
     schedule = Schedule(
         steps.instance,
         steps.coarse,
         steps.fine,
-        steps.roots,
-        steps.leaves,
+        **{"roots": steps.roots, "leaves": steps.leaves, **codebook},
         min_views=max(2, min(5, views // 4)),
         rate=steps.opengaussian_rate,
         coarse_rate=steps.opengaussian_rate / 10,
     )
-    model, _ = train_opengaussian(setting.evidence, key=jax.random.key(setting.seed), schedule=schedule)
+    return train_opengaussian(setting.evidence, key=jax.random.key(setting.seed), schedule=schedule)[0]
+
+
+def by_leaves(setting: Setting, model: OpenGaussian) -> Answers:
+    """A trained OpenGaussian asked as its authors ask it."""
     gaussians = setting.evidence.gaussians
 
     def ask(k: int) -> Selection:

@@ -31,9 +31,21 @@ BY_COSINE = {"retrieval": "cosine"}
 """the region of the largest cosine, as the paper finds it"""
 
 
-def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) -> Association:
+AGREEMENT = 0.4
+"""of views, jsecon's default"""
+
+
+def association(
+    setting: Setting,
+    by: str,
+    *,
+    labels: np.ndarray | None = None,
+    centre: float = 0.0,
+    agreement: float = AGREEMENT,
+) -> Association:
     """The regions of a setting: by "tracks", "kappa K" (the paper's Algorithm 1), "consensus" ("outspoken": in which a
-    view speaks on what lies in none of its masks), or any other name with its `labels`."""
+    view speaks on what lies in none of its masks), or any other name with its `labels`. `centre` and `agreement` are
+    those of a consensus."""
     evidence = setting.evidence
     if by == "tracks":
         return setting.tracked
@@ -42,8 +54,9 @@ def association(setting: Setting, by: str, *, labels: np.ndarray | None = None) 
     if by.startswith("kappa "):
         kappa = float(by.split()[1])
         return setting.shared.get(by, lambda: by_algorithm1(evidence, setting.frames, kappa=kappa))
-    silent = by != "outspoken"
-    return setting.shared.get(by, lambda: by_consensus(evidence, setting.frames, seed=setting.seed, silent=silent))
+    how = {"silent": by != "outspoken", "centre": centre, "agreement": agreement}
+    make = lambda: by_consensus(evidence, setting.frames, seed=setting.seed, **how)
+    return setting.shared.get((by, centre, agreement), make)
 
 
 def field_of(
@@ -55,12 +68,13 @@ def field_of(
     uniform: bool = False,
     steps: Steps | None = None,
     centre: float = 0.0,
+    agreement: float = AGREEMENT,
 ) -> LanguageField:
     """jsecon's field of a setting, its regions those of `association`. latent=3: LangSplat's autoencoder; with `steps`
     the paper's own path, Adam on the rendered L1 from random codes, else the votes' mode. `centre` as for
-    `region_votes`."""
+    `region_votes` and, with `agreement`, for `association`."""
     evidence, shared = setting.evidence, setting.shared
-    regions = association(setting, by, labels=labels)
+    regions = association(setting, by, labels=labels, centre=centre, agreement=agreement)
     embeddings = jnp.asarray(regions.uniform_embeddings if uniform else regions.embeddings)
     found, key = jnp.asarray(regions.labels), jax.random.key(setting.seed)
     known = Regions(np.asarray(embeddings), regions.pixels)
@@ -69,9 +83,11 @@ def field_of(
         given = evidence.gaussians, evidence.cameras, found, len(embeddings)
         return finish_votes(region_votes(*given, by_view=True, centre=centre), known)
 
-    votes = shared.get(("votes", by, uniform, centre), cast)
+    votes = shared.get(("votes", by, uniform, centre, agreement), cast)
     if latent == "auto":
-        table, coder, _ = shared.get(("codes", by, uniform), lambda: region_codes(embeddings, latent=latent, key=key))
+        table, coder, _ = shared.get(
+            ("codes", by, uniform, centre, agreement), lambda: region_codes(embeddings, latent=latent, key=key)
+        )
     else:
         epochs = None if steps is None else steps.epochs
         coder = train_autoencoder(embeddings, latent=latent, key=key, epochs=epochs)

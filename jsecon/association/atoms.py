@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy import sparse
 
-from jsecon.language.votes import distinct_labels
+from jsecon.language.votes import at_centre, distinct_labels
 from jsecon.splat.fusion import stored
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
@@ -77,9 +77,15 @@ def label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int)
 
 
 def cast_on_atoms(
-    gaussians: Gaussians, camera: Camera, atoms: Int32[np.ndarray, "h w"], *, negligible: float = 0.005
+    gaussians: Gaussians,
+    camera: Camera,
+    atoms: Int32[np.ndarray, "h w"],
+    *,
+    negligible: float = 0.005,
+    centre: float = 0.0,
 ) -> Sparse:
-    """(N, A) sum of alpha T of each Gaussian over each atom's pixels, without what is a `negligible` share of its row.
+    """(N, A) sum of alpha T of each Gaussian over each atom's pixels, without what is a `negligible` share of its row;
+    `centre` as for `region_votes`.
 
     `region_votes` of one view, where regions are many and a Gaussian sees few of them: every pair of a tile and a
     Gaussian keeps its own sums over the tile's atoms, and a dense (N, A) never exists. One program for any number of
@@ -93,7 +99,7 @@ def cast_on_atoms(
     distinct = np.asarray(_distinct_atoms(atoms, lists.tile))
     entries = []
     for first in range(0, max(int((distinct >= 0).sum(1).max()), 1), _SLOTS):
-        cast = np.asarray(_cast_by_pair(plan, atoms, first))[places]
+        cast = np.asarray(_cast_by_pair(plan, atoms, first, centre))[places]
         pair, slot = np.nonzero(cast)
         entries.append((cast[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
     cast = summed(entries, (gaussians.count, int(atoms.max()) + 1))
@@ -108,8 +114,8 @@ def _distinct_atoms(atoms: Array, tile: int) -> Array:
     return distinct_labels(to_tiles(atoms + 1, tile) - 1, _SLOTS)
 
 
-@jax.jit
-def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int) -> Array:
+@functools.partial(jax.jit, static_argnums=3)
+def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: float) -> Array:
     """(pairs, _SLOTS) what each pair of the tiles' lists, in their order, casts on its tile's distinct atoms `first`,
     `first` + 1, ..."""
     splats, lists = plan.splats, plan.lists
@@ -120,9 +126,12 @@ def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int) -> Array:
 
     def one_batch(cast, ids_of_tiles):
         is_slot = tiles[ids_of_tiles][:, :, None] == slots[ids_of_tiles][:, None, :]
+        corners = batches.corners(ids_of_tiles, splats.dtype)
 
         def body(transmittance, cast, chunk):
             weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            if centre:
+                weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
             own = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype))
             return transmittance, cast.at[chunk.places].set(own, mode="drop")
 

@@ -54,7 +54,8 @@ class SceneViews:
     """The views of one scene, each computed once.
 
     gaussians: the scene. cameras: batch of T, one per frame. proposals: a function of a frame's index, called in
-    several threads, or a sequence with one entry per frame, giving masks (M, H, W) bool; they may overlap.
+    several threads, or a sequence with one entry per frame, giving masks (M, H, W) bool; they may overlap. `centre` as
+    for `region_votes`: above 0 where the answer is judged at the Gaussians' centres.
     """
 
     def __init__(
@@ -64,10 +65,11 @@ class SceneViews:
         proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
         *,
         atoms_per_frame: int = 256,
+        centre: float = 0.0,
     ):
         require(atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use 200 for small frames.")
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
-        self.atoms_per_frame = atoms_per_frame
+        self.atoms_per_frame, self.centre = atoms_per_frame, centre
         self.propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: list[View] = []
         self.shared = np.zeros((0, 0), np.float32)
@@ -92,7 +94,7 @@ class SceneViews:
             views, pool = [], ThreadPoolExecutor(cores())
             try:
                 for t, (atoms, within) in enumerate(pool.map(self._cut, frames, range(len(frames)))):
-                    cast = cast_on_atoms(self.gaussians, self.cameras[t], atoms)
+                    cast = cast_on_atoms(self.gaussians, self.cameras[t], atoms, centre=self.centre)
                     seen = np.flatnonzero(np.diff(cast.indptr))
                     views.append(View(atoms, seen, cast[seen], within, np.ones(len(seen), np.float32)))
                     if progress is not None:

@@ -9,7 +9,8 @@ from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
 from experiments import default_fit, fair, lerf
 from experiments.rivals.lifting import smoothed
 from experiments.tables import fill
-from experiments.tables.readings import as_share, rows_of
+from experiments.tables.readings import as_share
+from experiments.tables.rows import rows_of
 from experiments.tables.setting import prepare
 
 
@@ -32,23 +33,24 @@ def test_smoothing_fills_the_range_and_leaves_out_what_is_unknown():
 
 def cell(method, seed, value, lenient):
     texts = {"a": [[value, value], [lenient]], "b": [[value], [lenient]]}
-    return {"scene": "s", "seed": seed, "method": method, "miou": value, "miou_vala": lenient, "texts": texts}
+    return {"scene": "s", "seed": seed, "level": "medium", "method": method, "miou": value, "miou_vala": lenient, "texts": texts}
 
 
 def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading():
     cells = []
     for seed in (0, 10):
         cells += [cell("VALA: cosine", seed, 0.6, 0.2), cell("VALA: contrast", seed, 0.5, 0.4)]
+        cells.append(cell("VALA: as published", seed, 0.4, 0.1))
         cells += [cell("ours, consensus: x", seed, 0.8, 0.3), cell("ours, consensus: y", seed, 0.7, 0.5)]
     best = fair.chosen(cells, (0,), ("miou", "miou_vala"))
     assert best["VALA"] == {"miou": "VALA: cosine", "miou_vala": "VALA: contrast"}
     assert best["ours, consensus"] == {"miou": "ours, consensus: x", "miou_vala": "ours, consensus: y"}
     assert set(best[fair.ONE_READING].values()) == {"ours, consensus: y"}
-    asked = fair.Asked(("lerf",), (), ("medium",), (10,), (0,), False, "")
+    asked = fair.Asked(("lerf",), (), ("medium",), (10,), (0,), (), False, "")
     text, told = fair.report("lerf", "medium", cells, asked)
     assert told["VALA, miou"]["ahead"] == pytest.approx((0.2, 0.2, 0.2))
     assert told["VALA, miou_vala"]["ahead"] == pytest.approx((0.1, 0.1, 0.1))
-    assert "| VALA | 0.600 | cosine | +0.200 [+0.200, +0.200] |" in text
+    assert "| VALA | 0.400 | 0.600 | cosine | +0.200 [+0.200, +0.200] |" in text
 
 
 def test_the_interval_is_of_pairs():
