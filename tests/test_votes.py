@@ -83,6 +83,10 @@ def test_votes_on_atoms_are_those_of_the_view(scene, cameras, labels, expected, 
     np.testing.assert_allclose(got, same.dense(), rtol=1e-5, atol=1e-6)
     few = cast_on_atoms(scene, camera, atoms, negligible=0.3).toarray()
     np.testing.assert_array_equal(few, np.where(got > 0.3 * got.sum(1, keepdims=True), got, 0.0))
+    middle = cast_on_atoms(scene, camera, atoms, negligible=0.0, centre=1.0).toarray()
+    at_centre = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1, centre=1.0)
+    np.testing.assert_allclose(middle, at_centre.dense(), rtol=1e-5, atol=1e-6)
+    assert (middle > 0).sum(1).max() == 1
 
 
 def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels):

@@ -78,7 +78,7 @@ def parts(work: Work) -> Stage:
         train = training_frames(capture)
         frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
         masks, embed = _masks_of(work, results)
-        views = SceneViews(scene, cameras, masks)
+        views = SceneViews(scene, cameras, masks, centre=options.centre)
         piece, cast = pieces_on_masks(frames, views, seed=options.seed, progress=progress)
         rows = np.concatenate([embed(t, masks(t)) for t in range(len(train))])
         work.networks.close()
@@ -89,7 +89,7 @@ def parts(work: Work) -> Stage:
         "of the scene, by what single masks say of them",
         compute,
         after=("load", "gaussians", "masklets"),
-        given=work.given("seed", "level", "granularity") | {"embedder": embedder.name},
+        given=work.given("seed", "level", "granularity", "centre") | {"embedder": embedder.name},
         files=options.features,
         uses=(embedder, work.networks.segmenter),
     )
@@ -144,8 +144,8 @@ def votes(work: Work) -> Stage:
 
         capture, scene, labels = results["load"], results["gaussians"], results["masklets"]
         cameras = capture.cameras[training_frames(capture)]
-        count, top = int(labels.max()) + 1, work.options.top
-        cast = region_votes(scene, cameras, labels, count, top=top, by_view=True, progress=progress)
+        count, how = int(labels.max()) + 1, work.given("top", "centre")
+        cast = region_votes(scene, cameras, labels, count, by_view=True, progress=progress, **how)
         unseen = int((np.asarray(cast.views) == 0).sum())
         left = {"unseen Gaussians": f"{unseen} of {scene.count} that no frame sees get no code"} if unseen else {}
         return Outcome(cast, left)
@@ -155,7 +155,7 @@ def votes(work: Work) -> Stage:
         f"the {work.options.top} strongest regions of each Gaussian",
         compute,
         after=("load", "gaussians", "masklets"),
-        given=work.given("top"),
+        given=work.given("top", "centre"),
     )
 
 

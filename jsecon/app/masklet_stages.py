@@ -66,7 +66,7 @@ def _found(work: Work) -> Stage:
     else:
         how, given = f"{options.granularity} proposals by colour and texture", work.given("granularity")
     if options.associated_by == "consensus":
-        how, given = f"{how}, what the views agree on", given | work.given("agreement", "seed")
+        how, given = f"{how}, what the views agree on", given | work.given("agreement", "seed", "centre")
     else:
         by = "through the Gaussians" if options.tracker is None else f"by the SAM 2 of {options.tracker.name}"
         how, given = f"{how}, followed {by}", given | work.given("iou_threshold")
@@ -158,7 +158,7 @@ def associated(
     options, train = work.options, training_frames(capture)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
     if options.associated_by == "consensus":
-        scene = SceneViews(gaussians, cameras, proposals)
+        scene = SceneViews(gaussians, cameras, proposals, centre=options.centre)
         labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
         return clean_masklets(labels)
     tracker = work.networks.tracker or GeometricTracker(gaussians, cameras, proposals)

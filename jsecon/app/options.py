@@ -101,6 +101,8 @@ class Options(SceneOptions):
     """from a Gaussian's votes to its code"""
     top: Annotated[int, {"metavar": "N", "least": 1}] = 8
     """regions whose votes a Gaussian keeps"""
+    centre: Annotated[float, {"metavar": "W", "least": 0.0}] = 0.0
+    """how far a Gaussian is what the pixel of its centre shows, not all that it covers: 1 where the answer is points"""
 
     @property
     def associated_by(self) -> Literal["consensus", "tracking"]:
@@ -124,6 +126,8 @@ def require_inputs(options: Options) -> None:
     if not 0 < options.agreement <= 1:
         given, remedy = str(options.agreement), "Leave it out, or use 0.3 to 0.6."
         raise InputError("--agreement", given, "a share above 0 and at most 1", remedy)
+    if options.centre > 1:
+        raise InputError("--centre", str(options.centre), "0 to 1", "Use 1 for the pixel of the centre alone.")
 
 
 def require_writable(folder: Path) -> None:

@@ -33,7 +33,15 @@ def test_smoothing_fills_the_range_and_leaves_out_what_is_unknown():
 
 def cell(method, seed, value, lenient):
     texts = {"a": [[value, value], [lenient]], "b": [[value], [lenient]]}
-    return {"scene": "s", "seed": seed, "level": "medium", "method": method, "miou": value, "miou_vala": lenient, "texts": texts}
+    return {
+        "scene": "s",
+        "seed": seed,
+        "level": "medium",
+        "method": method,
+        "miou": value,
+        "miou_vala": lenient,
+        "texts": texts,
+    }
 
 
 def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading():
