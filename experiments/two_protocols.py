@@ -26,29 +26,14 @@ from experiments.tables.fill import Plan, options_of
 from experiments.tables.methods import RECOMMENDED, by_features, langsplat_of
 from experiments.tables.ours import ask_field, field_of
 from experiments.tables.setting import Setting
-from jsecon.data.langsplat_files import load_features
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.evaluate.lerf import resized
 from jsecon.language.distill import distill_votes
 from jsecon.splat.render import render
 from jsecon.types import Array
 
-LEVELS = ("l", "s", "m")
-"""of LangSplat's masks; the first is the one that the points are asked by"""
 Map = tuple[Array, Callable[[Array], Array]]
 """a feature of each Gaussian, and what makes embeddings of its rendered image"""
-
-
-def levels_of(setting: Setting) -> list[Evidence]:
-    """The evidence of each level. One whose masks another has is left out: a twin has one level, written for all."""
-    evidence = setting.evidence
-    found, size = [evidence], evidence.masks.shape[1:]
-    for level in LEVELS[1:]:
-        masks = load_features(setting.folder / "language_features", setting.names, size, level=level)
-        if not any(np.array_equal(masks.labels, other.masks) for other in found):
-            own = {"masks": masks.labels, "embeddings": masks.embeddings, "frame": masks.frame}
-            found.append(dataclasses.replace(evidence, **own))
-    return found
 
 
 def in_the_image(setting: Setting, maps: Sequence[Map]) -> dict[str, float]:
@@ -73,7 +58,7 @@ def in_the_image(setting: Setting, maps: Sequence[Map]) -> dict[str, float]:
 
 def langsplat(setting: Setting, steps: Steps) -> Answers:
     """LangSplat-m; its codes are rendered, then decoded pixel by pixel. An autoencoder per level."""
-    models = [langsplat_of(setting, evidence, steps) for evidence in levels_of(setting)]
+    models = [langsplat_of(setting, evidence, steps) for evidence in setting.levels]
     answers = by_features(setting, models[0].features(), relevancy=False)
     return dataclasses.replace(answers, beside=in_the_image(setting, [(m.codes, m.decode) for m in models]))
 
@@ -84,7 +69,7 @@ def _as_they_are(image: Array) -> Array:
 
 def _lifted(train: Callable[[Evidence], lifting.Lifted]) -> Method:
     def method(setting: Setting, steps: Steps) -> Answers:
-        fields = [jnp.asarray(train(evidence).features) for evidence in levels_of(setting)]
+        fields = [jnp.asarray(train(evidence).features) for evidence in setting.levels]
         answers = by_features(setting, fields[0], relevancy=True)
         return dataclasses.replace(answers, beside=in_the_image(setting, [(f, _as_they_are) for f in fields]))
 

@@ -3,9 +3,10 @@
     python -m experiments.worlds [--scenes figurines teatime] [--seeds 10 11] [--choosing 0] [--only FAULT ...]
                                  [--values 1 0.5] [--quick] [--out FOLDER] [--processes N]
 
-Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as published
-and by the contrast with a threshold (ours: of one region, of all that answer, and of their parts): the better of them
-in that world on the seeds `--choosing`, for each figure its own. None may refuse a text.
+Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as its paper
+does (by the relevancy) and by the contrast with a threshold or the ascent for > 10/255 (ours: of one region, of all
+that answer, and of their parts): the best in that world on the seeds `--choosing`, for each figure its own. None may
+refuse a text.
 """
 
 import dataclasses
@@ -16,13 +17,14 @@ import numpy as np
 from experiments import fair, lerf, results
 from experiments.simulated_vision.worlds import World
 from experiments.tables.fill import Plan, fill, place_of, twins_asked
-from experiments.tables.rows import rows_of
+from experiments.tables.rows import TRAINED, rows_of
 
 HARD, HALF = 1.0, 0.5
 FRAMES = "kinds", "camouflage"
 """faults of the labels and of the pictures (options of the twins' writer), not of the vision"""
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
-READ = ("as published", "contrast, threshold", "contrast, threshold, all", "contrast, threshold, parts")
+READ = ("relevancy, threshold", *(f"contrast, threshold{way}" for way in ("", ", all", ", parts")))
+READ += tuple(f"contrast, lenient silhouette{way}" for way in ("", ", parts"))
 LEFT_OUT = "ours, outspoken views"
 """a row of `experiments.fair` that is an older one of ours"""
 FIGURES = ("miou", "miou_vala")
@@ -69,7 +71,9 @@ def plan_of(level: str, size: dict, asked: Asked, processes: int) -> Plan:
         table,
         data=dataclasses.replace(data, seeds=seeds, scenes=scenes, size=options),
         methods=tuple(
-            row for row in rows_of(points=False) if row.split(": ")[1] in READ and not row.startswith(LEFT_OUT)
+            row
+            for row in rows_of(points=False)
+            if row.split(": ")[1] in READ and not row.startswith((LEFT_OUT, *TRAINED))
         ),
         level=level,
         sweep=(),

@@ -14,10 +14,11 @@ from jsecon.vision.protocols import CANONICAL
 
 
 def write_features(
-    folder: Path, name: str, labels: Int[np.ndarray, "h w"], embeddings: Float[np.ndarray, "m e"]
+    folder: Path, name: str, labels: Int[np.ndarray, "*levels h w"], embeddings: Float[np.ndarray, "m e"]
 ) -> None:
-    """Writes one frame's masks (ids 0 .. M-1, -1 = none) to all four levels, with their embeddings."""
-    levels = np.repeat(labels[None].astype(np.float32), len(LEVELS), axis=0)
+    """Writes one frame's masks (ids 0 .. M-1, -1 = none) with their embeddings: of the four levels default, s, m and l,
+    or the same for all."""
+    levels = np.broadcast_to(labels, (len(LEVELS), *labels.shape[-2:])).astype(np.float32)
     for ending, array in (("_s", levels), ("_f", embeddings.astype(np.float32))):
         with written_whole(folder / f"{name}{ending}.npy") as temporary:
             np.save(temporary, array)

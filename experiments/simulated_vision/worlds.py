@@ -35,6 +35,9 @@ class World:
     """names with words in common lie near each other: the words' part of what tells names apart, in 0.8."""
     lvis: float = 0.0
     """texts are vectors of LVIS names as CLIP has them: below 1 of any names, at 1 of names near each other."""
+    levels: float = 0.0
+    """share of an object's views in which masks overlap in three levels: its two sides, itself, and it with its nearest
+    neighbour. In the others the three are alike."""
 
 
 class Seen(NamedTuple):
@@ -46,6 +49,9 @@ class Seen(NamedTuple):
     """(T, H, W) int16 what the pixels show: pieces of objects, -1 = none."""
     objects: np.ndarray
     """(L,) the object of each piece."""
+    small: np.ndarray | None = None
+    large: np.ndarray | None = None
+    """(T, H, W) int16 the masks of a smaller and of a larger level, where there are three."""
 
 
 def world_of(level: str) -> tuple[str, World]:
@@ -73,26 +79,42 @@ def seen_in(
     order; `table` is the label of its table."""
     count, labels = len(room.objects), int(truth.max()) + 1
     masks, content, objects = truth.astype(np.int16), truth.astype(np.int16), np.arange(labels)
-    if world.parts:
+    if world.parts or world.levels:
         content, objects = _halved(truth, points, count, seed)
-        draw = np.random.default_rng([seed, 11])
-        apart = draw.random((len(truth), count + 1)) < world.parts
-        apart[:, count] = False  # what is no object
-        views = np.arange(len(truth))[:, None, None]
-        masks = np.where(apart[views, np.where((truth >= 0) & (truth < count), truth, count)], content, masks)
+    if world.parts:
+        masks = _cut(masks, truth, content, count, world.parts, np.random.default_rng([seed, 11]))
     if world.shadow:
         masks = _with_shadows(world.shadow, masks, truth, points, room, table)
     if world.groups:
-        draw = np.random.default_rng([seed, 12])
-        centres = np.stack([item.centre for item in room.objects])
-        away = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + 1e9 * np.eye(count)
-        single = np.where(masks >= labels, objects[np.maximum(masks, 0)], masks)
-        for t, together in enumerate(draw.random((len(truth), count)) < world.groups):
-            for k in np.flatnonzero(together):
-                near = int(away[k].argmin())
-                if (single[t] == k).any() and (single[t] == near).any():
-                    masks[t][(single[t] == k) | (single[t] == near)] = min(k, near)
-    return Seen(masks, content, objects)
+        masks = _joined(masks, objects, room, world.groups, np.random.default_rng([seed, 12]))
+    if not world.levels:
+        return Seen(masks, content, objects)
+    small = _cut(masks, truth, content, count, world.levels, np.random.default_rng([seed, 14]))
+    large = _joined(masks, objects, room, world.levels, np.random.default_rng([seed, 15]))
+    return Seen(masks, content, objects, small, large)
+
+
+def _cut(masks, truth, content, count, share, draw):
+    """Masks whose objects, the first `count` labels, are their pieces, in a share of their views."""
+    apart = draw.random((len(truth), count + 1)) < share
+    apart[:, count] = False  # what is no object
+    views = np.arange(len(truth))[:, None, None]
+    return np.where(apart[views, np.where((truth >= 0) & (truth < count), truth, count)], content, masks)
+
+
+def _joined(masks, objects, room, share, draw):
+    """Masks in which objects and their nearest neighbours are one, in a share of their views."""
+    count, labels = len(room.objects), len(objects)
+    joined = masks.copy()
+    centres = np.stack([item.centre for item in room.objects])
+    away = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + 1e9 * np.eye(count)
+    single = np.where(masks >= 0, objects[np.clip(masks, 0, labels - 1)], masks)
+    for t, together in enumerate(draw.random((len(masks), count)) < share):
+        for k in np.flatnonzero(together):
+            near = int(away[k].argmin())
+            if (single[t] == k).any() and (single[t] == near).any():
+                joined[t][(single[t] == k) | (single[t] == near)] = min(k, near)
+    return joined
 
 
 def _halved(truth, points, count, seed):

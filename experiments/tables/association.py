@@ -3,7 +3,7 @@ by consensus of the views."""
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ from jsecon.association.algorithm1 import clean_masklets, masklets
 from jsecon.association.consensus import consensus_masklets
 from jsecon.association.tracker import GeometricTracker
 from jsecon.association.views import SceneViews
+from jsecon.types import Camera, Gaussians
 
 ROWS = 64
 """regions are counted in multiples of this, the last without pixels and embedding: scenes share compiled programs"""
@@ -37,46 +38,54 @@ class Association:
     """(R, T) int32."""
 
 
-def associated(evidence: Evidence, labels: np.ndarray) -> Association:
-    """The regions of `labels` (T, H, W): a mask counts for a region by the pixels that both hold, in the views where
-    masks hold at least `COVERED` of the region's pixels. A region that is hardly in any mask has no embedding."""
-    inside = overlaps(labels, np.asarray(evidence.masks), len(evidence.embeddings))
+def associated(levels: Sequence[Evidence], labels: np.ndarray) -> Association:
+    """The regions of `labels` (T, H, W): a mask, of whichever level, counts for a region by the pixels that both hold,
+    in the views where masks hold at least `COVERED` of the region's pixels. A region that is hardly in any mask has no
+    embedding."""
+    inside = np.concatenate([overlaps(labels, np.asarray(e.masks), len(e.embeddings)) for e in levels], axis=1)
     inside = np.pad(inside, ((0, -len(inside) % ROWS), (0, 0)))
-    frame, views = np.asarray(evidence.frame), range(len(labels))
+    frame, embeddings = (np.concatenate([np.asarray(getattr(e, k)) for e in levels]) for k in ("frame", "embeddings"))
     pixels = np.stack([np.bincount(image[image >= 0], minlength=len(inside)) for image in labels], axis=1)
-    covered = np.stack([inside[:, frame == t].sum(1) for t in views], axis=1)
-    covered = np.where(covered >= COVERED * pixels, covered, 0)
+    covered = np.stack([inside[:, frame == t].sum(1) for t in range(len(labels))], axis=1)
+    covered = np.where(covered >= COVERED * pixels * len(levels), covered, 0)
     inside = np.where(covered[:, frame] > 0, inside, 0)
     share = inside / np.maximum(covered[:, frame], 1)
-    embeddings = np.asarray(evidence.embeddings)
     uniform = unit(share @ embeddings)
     return Association(labels.astype(np.int32), unit(inside @ embeddings), uniform, pixels.astype(np.int32))
 
 
 def by_consensus(
-    evidence: Evidence, frames: np.ndarray, *, seed: int, silent: bool = True, centre: float = 0.0, **how: Any
+    levels: Sequence[Evidence],
+    frames: np.ndarray,
+    *,
+    seed: int,
+    silent: bool = True,
+    centre: float = 0.0,
+    **how: Any,
 ) -> Association:
     """jsecon's own association, without tracks: the pixels of each frame go to groups of Gaussians that lie in one mask
     in most views; `silent` as for `mask_signatures`, `centre` as for `SceneViews`, `how` as for
     `consensus_masklets`."""
-    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    scene = SceneViews(gaussians, cameras, lambda t: proposals(evidence, t), centre=centre)
-    return associated(evidence, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed, **how)))
+    scene = SceneViews(*_scene(levels), lambda t: proposals(levels, t), centre=centre)
+    return associated(levels, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed, **how)))
 
 
-def by_algorithm1(evidence: Evidence, frames: np.ndarray, *, kappa: float) -> Association:
+def by_algorithm1(levels: Sequence[Evidence], frames: np.ndarray, *, kappa: float) -> Association:
     """The paper's Algorithm 1 over the masks of the frames, followed through the Gaussians; kappa: `masklets`'
     iou_threshold."""
-    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    track = GeometricTracker(gaussians, cameras, lambda t: proposals(evidence, t))
-    labels = masklets(frames, lambda _, t: proposals(evidence, t), track, iou_threshold=kappa)
-    return associated(evidence, labels)
+    track = GeometricTracker(*_scene(levels), lambda t: proposals(levels, t))
+    labels = masklets(frames, lambda _, t: proposals(levels, t), track, iou_threshold=kappa)
+    return associated(levels, labels)
 
 
-def proposals(evidence: Evidence, t: int) -> np.ndarray:
-    """(M, H, W) bool: the masks of frame t."""
-    rows = np.flatnonzero(np.asarray(evidence.frame) == t)
-    return np.asarray(evidence.masks)[t][None] == rows[:, None, None]
+def _scene(levels: Sequence[Evidence]) -> tuple[Gaussians, Camera]:
+    return jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
+
+
+def proposals(levels: Sequence[Evidence], t: int) -> np.ndarray:
+    """(M, H, W) bool: the masks of frame t, level by level."""
+    rows = [np.flatnonzero(np.asarray(e.frame) == t) for e in levels]
+    return np.concatenate([np.asarray(e.masks)[t][None] == own[:, None, None] for e, own in zip(levels, rows)])
 
 
 def overlaps(labels: np.ndarray, masks: np.ndarray, count: int) -> np.ndarray:

@@ -46,16 +46,15 @@ def association(
     """The regions of a setting: by "tracks", "kappa K" (the paper's Algorithm 1), "consensus" ("outspoken": in which a
     view speaks on what lies in none of its masks), or any other name with its `labels`. `centre` and `agreement` are
     those of a consensus."""
-    evidence = setting.evidence
     if by == "tracks":
         return setting.tracked
     if labels is not None:
-        return setting.shared.get(by, lambda: associated(evidence, labels))
+        return setting.shared.get(by, lambda: associated(setting.levels, labels))
     if by.startswith("kappa "):
         kappa = float(by.split()[1])
-        return setting.shared.get(by, lambda: by_algorithm1(evidence, setting.frames, kappa=kappa))
+        return setting.shared.get(by, lambda: by_algorithm1(setting.levels, setting.frames, kappa=kappa))
     how = {"silent": by != "outspoken", "centre": centre, "agreement": agreement}
-    make = lambda: by_consensus(evidence, setting.frames, seed=setting.seed, **how)
+    make = lambda: by_consensus(setting.levels, setting.frames, seed=setting.seed, **how)
     return setting.shared.get((by, centre, agreement), make)
 
 
@@ -120,13 +119,13 @@ def field_of(
 
 def parts_of(setting: Setting) -> Parts:
     """The scene's parts: pieces that lie near each other in the same masks, with the embeddings of all masks."""
-    evidence = setting.evidence
+    evidence, levels = setting.evidence, setting.levels
 
     def make() -> Parts:
-        views = SceneViews(evidence.gaussians, evidence.cameras, lambda t: proposals(evidence, t))
-        rows = np.argsort(np.asarray(evidence.frame), kind="stable")
+        views = SceneViews(evidence.gaussians, evidence.cameras, lambda t: proposals(levels, t))
+        frame, rows = (np.concatenate([np.asarray(getattr(e, k)) for e in levels]) for k in ("frame", "embeddings"))
         given = pieces_on_masks(setting.frames, views, seed=setting.seed)
-        return scene_parts(*given, np.asarray(evidence.embeddings)[rows])
+        return scene_parts(*given, rows[np.argsort(frame, kind="stable")])
 
     return setting.shared.get("parts", make)
 

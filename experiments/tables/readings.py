@@ -6,12 +6,14 @@ answer "nothing": the protocols have no such answer.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from experiments.rivals import lifting
+from experiments.rivals.evidence import Evidence
 from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
 from jsecon.numerics import cosine_matrix, normalize
@@ -25,11 +27,13 @@ CHOOSERS = {"threshold": None, "silhouette": WEIGHTS, "lenient silhouette": (0.0
 alone"""
 
 
-def scores(setting: Setting, features: Float[np.ndarray, "n e"], rule: str) -> Float[np.ndarray, "q n"]:
+def scores(
+    setting: Setting, features: Float[np.ndarray, "n e"], rule: str, evidence: Evidence | None = None
+) -> Float[np.ndarray, "q n"]:
     """How far each Gaussian answers each text by a rule; NaN where its feature is unknown.
 
-    The contrast is jsecon's of regions, asked of Gaussians: the mean that is taken out of them is that of the frames'
-    masks, weighted by their pixels.
+    The contrast is jsecon's of regions, asked of Gaussians: the mean that is taken out of them is that of the masks of
+    the `evidence` (default: the setting's), weighted by their pixels.
     """
     features, texts = jnp.asarray(features), jnp.asarray(setting.texts)
     known = np.asarray(jnp.any(features != 0, axis=1))
@@ -38,7 +42,7 @@ def scores(setting: Setting, features: Float[np.ndarray, "n e"], rule: str) -> F
     elif rule == "relevancy":
         found = np.stack([np.asarray(relevancies(features, t, jnp.asarray(setting.canonical))[0]) for t in texts])
     else:
-        evidence = setting.evidence
+        evidence = setting.evidence if evidence is None else evidence
         masks = np.asarray(evidence.masks)
         pixels = np.bincount(masks[masks >= 0], minlength=len(evidence.embeddings))
         units = np.asarray(normalize(jnp.asarray(evidence.embeddings)))
@@ -65,17 +69,21 @@ def chosen_by(setting: Setting, chooser: str, found: Selection, share: Float[np.
     return dataclasses.replace(found, mask=jnp.asarray(mask))
 
 
-def read(setting: Setting, features: Float[np.ndarray, "n e"], rule: str, chooser: str) -> Answers:
-    """A method's features, asked by a rule; classes are the best text's."""
-    means, table = setting.evidence.gaussians.means, scores(setting, features, rule)
+def read(setting: Setting, features: Sequence[Float[np.ndarray, "n e"]], rule: str, chooser: str) -> Answers:
+    """A method's features of each level of masks, or of one, asked by a rule: a text takes the level that answers it
+    best, as LangSplat does. Classes are the best text's."""
+    means, levels = setting.evidence.gaussians.means, setting.levels
+    tables = np.stack([scores(setting, own, rule, levels[n]) for n, own in enumerate(features)])
+    filled = np.where(np.isfinite(tables), tables, -np.inf)
+    level = filled.max(2).argmax(0)
 
     def select(k: int) -> Selection:
-        similarity = lifting.smoothed(means, table[k])
-        best = float(np.nanmax(table[k])) if np.isfinite(table[k]).any() else 0.0
+        score, best = tables[level[k], k], float(filled[:, k].max())
+        similarity = lifting.smoothed(means, score)
         place, mask = jnp.asarray(-1, jnp.int32), jnp.asarray(similarity > lifting.READOUT)
-        found = Selection(mask, jnp.asarray(similarity), place, jnp.asarray(best, jnp.float32))
-        return chosen_by(setting, chooser, found, as_share(similarity))
+        best = jnp.asarray(best if np.isfinite(best) else 0.0, jnp.float32)
+        return chosen_by(setting, chooser, Selection(mask, jnp.asarray(similarity), place, best), as_share(similarity))
 
-    unknown = ~np.isfinite(table).any(0)
-    labels = np.where(unknown, -1, np.argmax(np.where(np.isfinite(table), table, -np.inf), axis=0))
+    most = filled.max(0)
+    labels = np.where(np.isfinite(most).any(0), np.argmax(most, axis=0), -1)
     return Answers(select, lambda: labels)

@@ -1,7 +1,7 @@
 """All rows of the fair tables, "method: reading": every method as published, and by the readings of `tables.readings`.
 
-What a method trains is trained once a setting and read often. Rivals whose papers or code give constants for other data
-than LERF have a row for each.
+What a method trains is trained once a setting and read often. Rivals whose papers give constants for other data than
+LERF have a row for each.
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ _PROBABILITY = 0.3
 
 
 def reading(key: Any, features: Callable[[Setting, Steps], Any], rule: str, chooser: str) -> Method:
-    """The row of features that are made once a setting, by `key`."""
+    """The row of features, of each level or of one, that are made once a setting, by `key`."""
     return lambda setting, steps: read(
         setting, setting.shared.get(key, lambda: features(setting, steps)), rule, chooser
     )
@@ -97,14 +97,14 @@ def _chosen(setting: Setting, answers: Answers, chooser: str, cut: float | None)
 
 
 def _langsplat(setting: Setting, steps: Steps) -> Any:
-    return langsplat_of(setting, setting.evidence, steps).features()
+    return [langsplat_of(setting, setting.evidence, steps).features()]
 
 
 def _langsplat_row(rule: str, chooser: str) -> Method:
     if rule:
         return reading("LangSplat-m", _langsplat, rule, chooser)
     published = lambda setting, steps: setting.shared.get("LangSplat-m", lambda: _langsplat(setting, steps))
-    return lambda setting, steps: by_features(setting, published(setting, steps), relevancy=False)
+    return lambda setting, steps: by_features(setting, published(setting, steps)[0], relevancy=False)
 
 
 def _opengaussian_row(codebook: str, rule: str, chooser: str) -> Method:
@@ -113,7 +113,7 @@ def _opengaussian_row(codebook: str, rule: str, chooser: str) -> Method:
         model = setting.shared.get(f"OpenGaussian {codebook}", make)
         if not rule:
             return by_leaves(setting, model)
-        return read(setting, np.asarray(model.leaf_features)[np.asarray(model.leaf_of)], rule, chooser)
+        return read(setting, [np.asarray(model.leaf_features)[np.asarray(model.leaf_of)]], rule, chooser)
 
     return row
 
@@ -146,8 +146,8 @@ def _paper_row(retrieval: str, threshold: float, chooser: str) -> Method:
     return row
 
 
-def _gated(gate: str) -> Callable[[Setting, Steps], Any]:
-    return lambda setting, steps: lifting.train_vala(setting.evidence, **GATES[gate]).features
+def _lifted(train: Callable[..., lifting.Lifted], **how: float) -> Callable[[Setting, Steps], Any]:
+    return lambda setting, steps: [train(evidence, **how).features for evidence in setting.levels]
 
 
 def rows_of(points: bool) -> dict[str, Method]:
@@ -157,11 +157,9 @@ def rows_of(points: bool) -> dict[str, Method]:
     every = tuple((rule, chooser) for rule in RULES for chooser in choosers)
     few = tuple((rule, "threshold") for rule in RULES) + (() if points else _ASCENTS)
     lifted = {
-        "Occam's LGS": {"": lambda setting, steps: lifting.train_occam(setting.evidence).features},
-        "weighted back-projection": {
-            "": lambda setting, steps: lifting.train_backprojection(setting.evidence).features
-        },
-        "VALA": {gate: _gated(gate) for gate in (GATES if points else ("",))},
+        "Occam's LGS": {"": _lifted(lifting.train_occam)},
+        "weighted back-projection": {"": _lifted(lifting.train_backprojection)},
+        "VALA": {gate: _lifted(lifting.train_vala, **GATES[gate]) for gate in (GATES if points else ("",))},
     }
     found: dict[str, Method] = {}
     for name, ways in lifted.items():

@@ -32,6 +32,8 @@ class Setting:
     evidence: Evidence
     frames: np.ndarray
     """(T, H, W, 3) uint8 of the evidence's views."""
+    levels: tuple[Evidence, ...]
+    """the evidence of each of LangSplat's levels of masks that differ, first the one above: a plain twin has one."""
     tracked: Association
     """regions by the tracker's ids."""
     texts: np.ndarray
@@ -75,11 +77,13 @@ def prepare(
     gaussians = gaussians_of(bench, folder, data.kept(root, scene), fit_steps, fitted)
     cameras = jax.tree.map(jnp.asarray, capture.cameras)
     evidence = Evidence(gaussians, cameras[shown], masks.labels, masks.embeddings, masks.frame, tracks)
+    levels = levels_of(evidence, folder, names)
     return Setting(
         bench,
         evidence,
         np.asarray(capture.frames)[shown],
-        associated(evidence, tracks),
+        levels,
+        associated(levels, tracks),
         texts,
         canonical,
         {name: capture.cameras[t] for t, name in enumerate(capture.names)},
@@ -87,6 +91,18 @@ def prepare(
         seed,
         folder,
     )
+
+
+def levels_of(evidence: Evidence, folder: Path, names: tuple[str, ...]) -> tuple[Evidence, ...]:
+    """The evidence of each level of the masks in `folder`, first the one given, the largest. One whose masks another
+    has is left out: a twin has one level, written for all."""
+    found, size = [evidence], evidence.masks.shape[1:]
+    for level in ("s", "m"):
+        masks = load_features(folder / "language_features", names, size, level=level)
+        if not any(np.array_equal(masks.labels, other.masks) for other in found):
+            own = {"masks": masks.labels, "embeddings": masks.embeddings, "frame": masks.frame}
+            found.append(dataclasses.replace(evidence, **own))
+    return tuple(found)
 
 
 def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int, fitted: Fitted = "short") -> Gaussians:

@@ -24,8 +24,9 @@ from experiments.datasets.ovs3d import load_ovs3d
 from experiments.datasets.replica import load_replica
 from experiments.datasets.scannet import load_scannet
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, load_text_space, made_text_space, named_after
-from experiments.simulated_vision.masks import LEVELS, Faults, simulated_masks
+from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
+from jsecon.data.mask_files import LEVELS
 from jsecon.data.synthetic.raycast import trace
 from jsecon.data.synthetic.room import make_room
 from jsecon.files import write_text
@@ -50,7 +51,7 @@ LVIS = "clip_vitb32_lvis.npy", "lvis_names.json"
 def faults_of(level: str) -> Faults:
     """Of a named level of noise: perfect, low, medium or high; what follows a "+" is `world_of`'s."""
     noise, _ = world_of(level)
-    return PERFECT if noise == "perfect" else LEVELS[noise]
+    return PERFECT if noise == "perfect" else NOISE[noise]
 
 
 def load(dataset: str, root: Path, scene: str, *, every: int = 1, downscale: float | None = None) -> Benchmark:
@@ -96,7 +97,7 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
     faults, (_, world) = faults_of(level), world_of(level)
     cameras = bench.capture.cameras[shown]
     seen = Seen(truth, truth, np.arange(len(told["objects"])))
-    if world.parts or world.groups or world.shadow:
+    if world.parts or world.groups or world.shadow or world.levels:
         room = make_room(told["seed"], num_objects=len(told["objects"]) - len(SURROUNDINGS))
         depths = np.stack([trace(room, cameras[t])[0] for t in range(len(shown))])
         points, _ = surfaces_of(room, dataclasses.replace(bench.capture, cameras=cameras, depths=depths), truth)
@@ -104,16 +105,25 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
         seen = seen_in(world, truth, points, room, table, seed=seed)
     space = _space(words, world, seed)
     masks = simulated_masks(seen.masks, faults, seed=seed)
+    levels = [masks] * len(LEVELS)
+    if seen.small is not None and seen.large is not None:
+        small, large = (simulated_masks(m, faults, seed=seed + 1000 * k) for k, m in ((1, seen.small), (2, seen.large)))
+        levels = [masks, small, masks, large]
     azimuths = np.arctan2(cameras.centres[:, 1], cameras.centres[:, 0])
     hard = {"world": world, "objects": seen.objects, "azimuths": azimuths}
     embedder = SimulatedEmbedder(frames, seen.content, told["objects"], space, faults, seed=seed, **hard)
     folder = root / bench.name
-    for name, frame, image in zip(names, frames, masks.labels, strict=True):
-        here = np.unique(image[image >= 0])
-        rows = embedder.embed_regions(frame, image[None] == here[:, None, None])
-        local = np.searchsorted(here, image)
-        write_features(folder / "language_features", name, np.where(image >= 0, local, -1), rows)
-        twins.write_ids(folder / "masks" / f"{name}.png", (image + 1).astype(np.uint16))
+    for t, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        found, rows, first = [], [], {}
+        for level in levels:
+            if id(level) not in first:
+                image = level.labels[t]
+                here = np.unique(image[image >= 0])
+                first[id(level)] = np.where(image >= 0, sum(map(len, rows)) + np.searchsorted(here, image), -1)
+                rows.append(embedder.embed_regions(frame, image[None] == here[:, None, None]))
+            found.append(first[id(level)])
+        write_features(folder / "language_features", name, np.stack(found), np.concatenate(rows))
+        twins.write_ids(folder / "masks" / f"{name}.png", (masks.labels[t] + 1).astype(np.uint16))
     vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical])
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
 

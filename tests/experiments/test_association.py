@@ -30,7 +30,8 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     embeddings = np.eye(3, 4, dtype=np.float32)
     one = np.ones(2, np.float32)
     cameras = Camera(np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)), one, one, one, one, 5, 2)
-    found = associated(Evidence(scene, cameras, masks, embeddings, np.array([0, 0, 1]), labels), labels)
+    evidence = Evidence(scene, cameras, masks, embeddings, np.array([0, 0, 1]), labels)
+    found = associated([evidence], labels)
     assert found.embeddings.shape == (ROWS, 4)
     np.testing.assert_array_equal(found.pixels[:3], [[5, 5], [5, 0], [0, 5]])
     np.testing.assert_allclose(found.embeddings[0], unit(np.array([5.0, 0, 3, 0])), atol=1e-6)
@@ -38,6 +39,12 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     assert not found.embeddings[1:].any()
     assert not found.uniform_embeddings[1:].any()
     assert not found.pixels[3:].any()
+    upper = dataclasses.replace(
+        evidence, masks=np.where(masks == 0, 0, -1), embeddings=-embeddings[:1], frame=np.zeros(1)
+    )
+    both = associated([evidence, upper], labels)
+    np.testing.assert_allclose(both.embeddings[0], unit(np.array([0.0, 0, 3, 0])), atol=1e-6)  # 5 - 5 in view 0
+    assert not both.embeddings[1].any()  # two of ten pixels of the two levels
 
 
 def test_consensus_and_algorithm_1_find_the_balls_that_no_tracker_followed():
@@ -46,7 +53,7 @@ def test_consensus_and_algorithm_1_find_the_balls_that_no_tracker_followed():
     units = np.eye(4, 8, dtype=np.float32)
     evidence = evidence_of_tracks(gaussians, cameras[views], truth[views], np.tile(units, (len(views), 1, 1)))
     shuffled = dataclasses.replace(evidence, tracks=np.full_like(evidence.tracks, -1))
-    for found in (by_consensus(shuffled, frames[views], seed=0), by_algorithm1(shuffled, frames[views], kappa=0.5)):
+    for found in (by_consensus([shuffled], frames[views], seed=0), by_algorithm1([shuffled], frames[views], kappa=0.5)):
         for ball in (1, 2, 3):
             region = int((found.embeddings @ units[ball]).argmax())
             own, true = found.labels == region, truth[views] == ball

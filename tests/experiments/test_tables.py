@@ -23,7 +23,7 @@ from experiments.cells import read_cells
 from experiments.datasets.replica import REPLICA_SCENES
 from experiments.tables import fill, layout, published, twins
 from experiments.tables.methods import METHODS, RECOMMENDED
-from experiments.tables.setting import prepare
+from experiments.tables.setting import levels_of, prepare
 from jsecon.data.langsplat_files import load_features
 from jsecon.data.mask_files import LEVELS
 from jsecon.data.ply import load_ply, save_ply
@@ -167,13 +167,13 @@ def test_protocols(folder):
 def test_levels_that_are_alike_are_learnt_once(folder, tmp_path):
     plan = with_gaussians(small(lerf.QUICK, folder, "levels"), "perfect")
     setting = prepare(plan.data, "figurines", 0, "perfect", fit_steps=20)
-    assert len(two_protocols.levels_of(setting)) == 1  # a twin's
+    assert len(setting.levels) == 1  # a twin's
     shutil.copytree(setting.folder / "language_features", tmp_path / "language_features")
     for file in tmp_path.glob("language_features/*_s.npy"):
         masks = np.load(file)
         masks[LEVELS.index("s")][masks[0] == 0] = -1
         np.save(file, masks)
-    large, smaller = two_protocols.levels_of(dataclasses.replace(setting, folder=tmp_path))
+    large, smaller = levels_of(setting.evidence, tmp_path, setting.names)
     np.testing.assert_array_equal(large.masks, setting.evidence.masks)
     assert len(smaller.embeddings) == len(large.embeddings) - len(setting.names)  # the first mask of each frame
 

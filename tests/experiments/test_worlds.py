@@ -86,6 +86,20 @@ def test_groups_join_nearest_neighbours(made):
     assert (by_point[:, 240 * a] == by_point[:, 240 * b]).all()
 
 
+def test_three_levels_overlap_and_are_alike_where_the_switch_spares_them(made):
+    truth = made[1]
+    found, _ = seen(made, levels=1)
+    np.testing.assert_array_equal(found.masks, truth)
+    parts, _ = seen(made, parts=1)
+    np.testing.assert_array_equal(found.small, parts.masks)
+    joined, _ = seen(made, groups=1)
+    assert len(np.unique(found.large)) < len(np.unique(truth))
+    np.testing.assert_array_equal(found.large, joined.masks)
+    some, _ = seen(made, levels=0.5)
+    assert 0 < (some.small != truth).mean() < (found.small != truth).mean()
+    assert seen(made)[0].small is None
+
+
 def test_masks_reach_over_the_table_away_from_the_lamp(made):
     room, truth, points, _ = made
     found, _ = seen(made, shadow=1)
