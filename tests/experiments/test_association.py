@@ -40,7 +40,7 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     assert not found.uniform_embeddings[1:].any()
     assert not found.pixels[3:].any()
     upper = dataclasses.replace(
-        evidence, masks=np.where(masks == 0, 0, -1), embeddings=-embeddings[:1], frame=np.zeros(1)
+        evidence, masks=np.where(masks == 0, 0, -1), embeddings=-embeddings[:1], frame=np.zeros(1, int)
     )
     both = associated([evidence, upper], labels)
     np.testing.assert_allclose(both.embeddings[0], unit(np.array([0.0, 0, 3, 0])), atol=1e-6)  # 5 - 5 in view 0
