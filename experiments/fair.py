@@ -12,6 +12,7 @@ text) of ours against each.
 """
 
 import argparse
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,6 @@ from pathlib import Path
 import numpy as np
 
 from experiments import lerf, ovs3d, replica, results
-from experiments.cells import read_cells
 from experiments.tables.fill import Plan, fill
 from experiments.tables.rows import rows_of
 from jsecon.process import cores
@@ -56,8 +56,8 @@ def by_text(cells: list[dict], figure: int) -> dict[tuple, float]:
 
 
 def ahead(ours: dict[tuple, float], other: dict[tuple, float]) -> tuple[float, float, float]:
-    """Mean of ours - other over (scene, seed, text), and its 95 % interval by the paired bootstrap."""
-    apart = np.array([value - other[key] for key, value in sorted(ours.items())])
+    """Mean of ours - other over (scene, seed, text) of both, and its 95 % interval by the paired bootstrap."""
+    apart = np.array([value - other[key] for key, value in sorted(ours.items()) if key in other])
     drawn = np.random.default_rng(0).integers(len(apart), size=(RESAMPLED, len(apart)))
     low, high = np.quantile(apart[drawn].mean(1), (0.025, 0.975))
     return float(apart.mean()), float(low), float(high)
@@ -132,29 +132,19 @@ def plan_of(name: str, level: str, asked: Asked, processes: int, seeds: tuple[in
     )
 
 
-def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict] | None:
-    """All rows on the seeds to choose on, and of the seeds to report the rows that were best there. None in a helper,
-    which has no table to write."""
+def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
+    """All rows on the seeds to choose on, and of the seeds to report the rows that were best there. Raises SystemExit
+    in a helper, which has no table to write."""
     methods = rows_of(name == "replica")
     rows = [row for row in methods if not asked.methods or row.split(": ")[0] in asked.methods]
     tell = lambda line: print(line, flush=True)
-    try:
-        cells = fill(plan_of(name, level, asked, processes, asked.choosing, rows), methods, tell=tell)
-    except SystemExit:
-        known = read_cells(Path(asked.out) / "cells.jsonl").values()
-        wanted = plan_of(name, level, asked, processes, asked.choosing, rows).data
-        place = lambda cell: (cell["scene"], cell["seed"], cell["level"], cell["method"])
-        cells = {place(cell): cell for cell in known}
-        every = [(scene, seed, level, row) for scene in wanted.scenes for seed in wanted.seeds for row in rows]
-        if any(one not in cells for one in every):
-            return None  # what another process is at
-        cells = [cells[one] for one in every]
+    plan = plan_of(name, level, asked, processes, asked.choosing, rows)
+    with contextlib.suppress(SystemExit):  # of a helper: what it was for is there
+        fill(plan, methods, tell=tell)
+    cells = fill(dataclasses.replace(plan, processes=1), methods, tell=tell)
     best = {row for ways in chosen(cells, asked.choosing, figures_of(name)).values() for row in ways.values()}
     kept = [row for row in rows if row in best or row.endswith(f": {PUBLISHED}")]
-    try:
-        return cells + fill(plan_of(name, level, asked, processes, asked.seeds, kept), methods, tell=tell)
-    except SystemExit:
-        return None
+    return cells + fill(plan_of(name, level, asked, processes, asked.seeds, kept), methods, tell=tell)
 
 
 def main(asked: Asked, processes: int) -> str:
@@ -162,9 +152,8 @@ def main(asked: Asked, processes: int) -> str:
     parts, kept = [], {}
     for name in asked.tables:
         for level in asked.levels:
-            cells = cells_of(name, level, asked, processes)
-            if cells is not None:
-                text, told = report(name, level, cells, asked)
+            with contextlib.suppress(SystemExit):
+                text, told = report(name, level, cells_of(name, level, asked, processes), asked)
                 parts.append(text)
                 kept[f"{name} {level}"] = told
                 print(text, flush=True)

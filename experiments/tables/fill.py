@@ -44,8 +44,8 @@ class Plan:
     """the file of the cells; empty: OUT/cells.jsonl. Tables of the same data have rows in common: one file spares the
     second its training."""
     processes: int = 1
-    """that share the settings, each on cores of its own. 0: this one is one of them, which computes what it finds free
-    and ends; 1: this one computes all, with all cores."""
+    """that share the settings, each on cores of its own. 0: this one is one of them, which computes what it finds free,
+    waits for the others, and ends; 1: this one computes all, with all cores."""
 
 
 def options_of(plan: Plan, quick: Plan) -> Plan:
@@ -98,8 +98,9 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
     known = read_cells(_file(plan))
     todo = [where for where in wanted if not known.keys() >= set(keys[where].values())]
     if plan.processes == 0:
-        for where in todo:
-            _complete(plan, methods, where, keys[where], tell, wait=False)
+        for wait in (False, True):  # what is free, then what others left undone: all is there at the end
+            for where in todo:
+                _complete(plan, methods, where, keys[where], tell, wait=wait)
         raise SystemExit(0)
     if min(plan.processes, len(todo)) > 1:
         helped(min(plan.processes, len(todo)))
