@@ -13,10 +13,10 @@ from jsecon.query.silhouette import (
     SWEEPS,
     WEIGHTS,
     Footprints,
-    _views_of,
     ascend,
     footprints,
     silhouette_members,
+    views_of,
 )
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import to_tiles
@@ -49,7 +49,7 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     gaussians, cameras, share = world
     before = share >= 0.5
     after = np.asarray(silhouette_members(gaussians, cameras, share))
-    views = _views_of(gaussians, cameras, before)
+    views = views_of(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
     lenient = np.asarray(silhouette_members(gaussians, cameras, share, weights=(0.0, 1.0)))
@@ -61,7 +61,7 @@ def test_footprints_add_up_to_what_a_rendering_absorbs(world):
     gaussians, cameras, share = world
     chosen = share >= 0.5
     open_to = np.flatnonzero((share > 0.3) & (share < 0.9))
-    views = _views_of(gaussians, cameras, chosen)
+    views = views_of(gaussians, cameras, chosen)
     found = footprints(gaussians, views, share, open_to, chosen)
     level = np.array(found.base)
     for c in np.flatnonzero(chosen[open_to]):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from experiments.tables.setting import Setting
-from jsecon.types import Selection
+from jsecon.types import Gaussians, Selection
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +55,8 @@ class Answers:
     """() -> (N,) the query that fits each Gaussian best, -1 = none: for datasets whose truth is at the points."""
     beside: dict[str, float] = dataclasses.field(default_factory=dict)
     """figures under another protocol, to stand beside the table's."""
+    gaussians: Gaussians | None = None
+    """that are selected from, where they are not the setting's."""
 
 
 Method = Callable[[Setting, Steps], Answers]

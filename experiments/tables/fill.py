@@ -167,7 +167,7 @@ def measure(setting: Setting, answers: Answers) -> dict:
         texts = {row.query: [round(row.iou, DIGITS)] for row in rows}
         return {name: told[name] for name in KEPT if name in told} | {"texts": texts}
     both = evaluate_at_thresholds(
-        setting.evidence.gaussians,
+        answers.gaussians or setting.evidence.gaussians,
         setting.cameras,
         bench.frames,
         lambda query: answers.select(bench.queries.index(query)),

@@ -84,7 +84,7 @@ def silhouette_members(
         return jnp.asarray(chosen)
     open_to = open_to[np.argsort(np.abs(share[open_to] - threshold), kind="stable")[:MOST]]
     open_to = open_to[np.argsort(share[open_to], kind="stable")]
-    views = _views_of(gaussians, cameras, chosen)
+    views = views_of(gaussians, cameras, chosen)
     found = footprints(gaussians, views, share, open_to, chosen)
     taken = np.zeros(len(found.starts) - 1, bool)
     taken[: len(open_to)] = chosen[open_to]
@@ -94,7 +94,7 @@ def silhouette_members(
     return jnp.asarray(chosen)
 
 
-def _views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camera:
+def views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camera:
     """VIEWS cameras, evenly among those into whose image most of the chosen Gaussians' centres fall, at LONG_SIDE."""
     means = np.asarray(gaussians.means)[chosen]
     poses = np.asarray(cameras.world_to_camera)

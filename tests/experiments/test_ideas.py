@@ -3,17 +3,25 @@
 import dataclasses
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from balls import ring_of_balls
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 from small_field import REGIONS, make_field, true_regions
 
 from experiments import ablations, autoencoder, beyond, outliers, retrieval, thresholds
 from experiments.ideas import scenes
+from experiments.ideas.cover import CORE, core_and_cover
 from experiments.ideas.state import State, agree, point_miou
+from experiments.ideas.straddlers import across, split
 from experiments.simulated_vision.embeddings import made_text_space
 from experiments.simulated_vision.masks import SimulatedMasks
+from jsecon.query.masks import render_selection
+from jsecon.query.silhouette import LEAST_SHARE
+from jsecon.types import Gaussians
 
 
 @pytest.fixture
@@ -192,3 +200,51 @@ def test_every_rule_of_retrieval_is_asked_for_what_is_there_and_what_is_not(fiel
         assert refused == sorted(refused)
         assert refused[-1] > 0
         assert own[0]["mIoU"] >= own[-1]["mIoU"]
+
+
+def test_a_straddler_is_cut_where_the_border_runs(cameras):
+    """One long Gaussian, of which what lies at x > 0.05 is the region in every view."""
+    one = Gaussians(
+        np.float32([[0.0, 0.0, 0.0]]),
+        np.log(np.float32([[0.3, 0.1, 0.1]])),
+        np.float32([[1.0, 0, 0, 0]]),
+        np.float32([2.0]),
+        np.zeros((1, 1, 3), np.float32),
+    )
+    labels = np.full((4, 40, 48), -1, np.int16)
+    rows, columns = np.mgrid[:40, :48] + 0.5
+    for t in range(4):  # the pixel's ray, cut with the plane through the middle that faces the camera
+        pose = np.asarray(cameras.world_to_camera[t], np.float64)
+        rays = np.stack([(columns - 25.5) / 45, (rows - 19.0) / 43, np.ones_like(rows)], -1)
+        places = (rays * pose[2, 3] - pose[:3, 3]) @ pose[:3, :3]
+        labels[t] = np.where(places[..., 0] > 0.05, 0, -1)
+    first, share, total = np.zeros(1, int), np.array([0.43]), np.array([50.0])  # Phi(-0.05 / 0.3)
+    lean = across(one, cameras, labels, first)[0]
+    assert lean[0] > 0.9 * np.linalg.norm(lean)
+    found = split(one, cameras, labels, first, share, total)
+    assert found.count == 2
+    inner, outer = np.asarray(found.means)
+    assert inner[0] > 0.05 > outer[0]
+    np.testing.assert_allclose(0.43 * inner + 0.57 * outer, 0, atol=0.02)  # mass and its centre stay
+    assert np.exp(np.asarray(found.log_scales)).max() < 0.25
+    whole = np.full(2, True)
+    before, after = (
+        np.asarray(render_selection(g, jax.tree.map(jnp.asarray, cameras[0]), jnp.asarray(whole[: g.count])).alpha)
+        for g in (one, found)
+    )
+    assert after.sum() == pytest.approx(before.sum(), rel=0.1)
+    assert split(one, cameras, labels, first, np.array([0.95]), total).count == 1
+    assert split(one, cameras, labels, first, share, np.array([1.0])).count == 1
+
+
+def test_a_cover_grows_from_the_core_and_spills_little():
+    gaussians, cameras, *_ = ring_of_balls()
+    away = np.linalg.norm(gaussians.means - np.float32([0.0, -0.3, 0.0]), axis=1)
+    noise = np.random.default_rng(3).normal(size=len(away)) * 0.2
+    share = np.clip(0.5 + (0.29 - away) / 0.1 + noise, 0, 1).astype(np.float32)
+    found = np.asarray(core_and_cover(gaussians, cameras, share))
+    assert found[share >= CORE].all()
+    assert not found[share <= LEAST_SHARE].any()
+    assert found.sum() > (share >= CORE).sum()
+    nobody = np.asarray(core_and_cover(gaussians, cameras, np.minimum(share, 0.5)))
+    assert not nobody.any()  # no core to grow from
