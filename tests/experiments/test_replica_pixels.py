@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from experiments.test_bonsai_outlines import seen_by
 from small_field import REGIONS, make_field
 
@@ -35,3 +36,15 @@ def test_the_pixel_finds_what_the_best_region_does(scene, cameras):
         assert {len(rows) for rows in found.values()} == {len(truth) - 1}
         means = {way: np.mean([row[0] for row in rows]) for way, rows in found.items()}
         assert means["best region"] >= means["pixel"] > 0.1
+
+
+def test_a_region_is_as_steady_as_single_masks_are_like_it():
+    labels = np.full((3, 4, 4), -1)
+    labels[0, :2], labels[1, :1], labels[2, 2:] = 5, 5, 6
+    masks = [labels[t][None] == np.array([5, -1])[:, None, None] for t in range(3)]
+    masks[1] = np.ones((1, 4, 4), bool)
+    assert replica_pixels.steadiness(labels, 5, masks.__getitem__) == pytest.approx((1 + 0.25) / 2)
+    assert replica_pixels.steadiness(labels, 7, masks.__getitem__) == 0
+    cell = lambda steady, value: {"things": {"1": {"steady": steady, "pixel": value}}}
+    cells = dict(enumerate((cell(0.2, "a"), cell(0.5, "b"), cell(0.4, "c"), cell(0.9, "d"))))
+    assert replica_pixels.steadiest(cells)["1"]["pixel"] == "b"  # of the first three
