@@ -40,6 +40,7 @@ def cell(method, seed, value, lenient):
         "method": method,
         "miou": value,
         "miou_vala": lenient,
+        "macc": 1.0,
         "texts": texts,
     }
 
@@ -58,7 +59,7 @@ def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading()
     text, told = fair.report("lerf", "medium", cells, asked)
     assert told["VALA, miou"]["ahead"] == pytest.approx((0.2, 0.2, 0.2))
     assert told["VALA, miou_vala"]["ahead"] == pytest.approx((0.1, 0.1, 0.1))
-    assert "| VALA | 0.400 | 0.600 | cosine | +0.200 [+0.200, +0.200] |" in text
+    assert "| VALA | 0.400 | 0.600 | 1.000 | cosine | +0.200 [+0.200, +0.200] |" in text
 
 
 def test_the_interval_is_of_pairs():
