@@ -30,6 +30,7 @@ from jsecon.query.direct import (
     query_one_step as query_one_step,
     unit_codes as unit_codes,
 )
+from jsecon.query.lift import lift as lift
 from jsecon.query.masks import selection_mask as selection_mask
 from jsecon.query.outliers import remove_outliers as remove_outliers
 from jsecon.query.pixel import region_at as region_at

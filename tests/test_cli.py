@@ -120,6 +120,30 @@ def test_query_at_a_pixel_selects_the_object_under_it(room_run, room, tmp_path):
     assert answer["region"] == np.flatnonzero(np.unique(masks_of_all(room)) == largest)[0] - 1
 
 
+def test_query_by_what_is_outlined(room_run, room, tmp_path):
+    """The largest object by its masks in two frames, and by a box around one of them."""
+    run, out = room_run
+    names = run.capture.names[1:3]
+    images = [cv2.imread(str(room / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED) for name in names]
+    largest = np.bincount(images[0][images[0] > 0]).argmax()
+    for name, image in zip(names, images):
+        cv2.imwrite(str(tmp_path / f"thing {name}.png"), 255 * (image == largest).astype(np.uint8))
+    rows, columns = np.nonzero(images[0] == largest)
+    files = [item for name in names for item in (name, tmp_path / f"thing {name}.png")]
+    box = [columns.min(), rows.min(), columns.max(), rows.max()]
+    assert _run("query", out / "field.npz", "--mask", *files, "--box", names[0][-3:], *box, "--out", tmp_path) == 0
+    region = np.flatnonzero(np.unique(masks_of_all(room)) == largest)[0] - 1
+    answers = [json.loads(file.read_text()) for file in sorted(tmp_path.glob("*.json"))]
+    assert len(answers) == 2
+    for answer in answers:
+        assert answer["by"] == "outline"
+        assert answer["region"] == region
+        assert answer["count"] > 0
+    small = np.zeros((50, 160), np.uint8)
+    cv2.imwrite(str(tmp_path / "small.png"), small)
+    assert _run("query", out / "field.npz", "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
+
+
 def masks_of_all(room):
     return np.concatenate(
         [cv2.imread(str(p), cv2.IMREAD_UNCHANGED).ravel() for p in sorted((room / "masks").glob("*.png"))]
@@ -312,26 +336,30 @@ def test_the_capture_itself_as_the_output_folder(capture, capsys):
     _refused(capsys, "run", capture, "--out", capture, says=["own folder"])
 
 
-def test_a_text_that_is_not_understood_leaves_nothing_half_done(room_run, tmp_path, capsys):
-    _refused(
-        capsys,
-        "query",
-        room_run[1] / "field.npz",
-        "red ball",
-        "the meaning of life",
-        "--out",
-        tmp_path / "answers",
-        says=["meaning of life"],
-    )
-    assert list((tmp_path / "answers").iterdir()) == []
+def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_path, capsys):
+    field, out = room_run[1] / "field.npz", tmp_path / "answers"
+    texts = ["red ball", "the meaning of life", "zzz"]
+    assert _run("query", field, *texts, "--out", out) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jsecon: ")]
+    assert ["meaning of life" in line for line in told] == [True, False]
+    assert "zzz" in told[1]
+    assert [file.name for file in out.glob("*.json")] == ["red-ball.json"]
+    _refused(capsys, "query", field, "zzz", "--out", tmp_path / "none", says=["zzz"])
+    assert list((tmp_path / "none").iterdir()) == []
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
         (["--at", "nowhere", 3, 3], "nowhere"),
-        (["--at", 0, 160, 3], "159"),
-        (["--at", 0, "left", 3], "left"),
+        (["--at", "#0", 160, 3], "159"),
+        (["--at", "#0", "left", 3], "left"),
+        (["--at", "", 3, 3], "no such frame"),
+        (["--at", "#99", 3, 3], "a place, #0 to #"),
+        (["--mask", "#0", "a.png", "#1"], "FRAME PNG, in pairs"),
+        (["--mask", "#0", "nowhere.png"], "no readable image"),
+        (["--box", "#0", 3, 3, "x", 9], "whole numbers"),
+        (["--box", "#0", 500, 3, 600, 9], "pixels of a frame of 160x120"),
         ([], "nothing to find"),
     ],
 )

@@ -381,7 +381,7 @@ WATCHER = """
 import inspect, json, sys, threading
 from pathlib import Path
 import jsecon
-from jsecon.app import cache, pipeline, question
+from jsecon.app import answers, cache, pipeline, question
 from jsecon.app.options import Options
 from jsecon.app.stages import Stage
 from jsecon.language.field import load_field
@@ -430,7 +430,7 @@ on_the_way += ran_since() + [file for told in ran.values() for file in told["ran
 field = load_field(Path(sys.argv[2]) / "out/field.npz")
 answer = question.ask_text(field, ColourEmbedder(), "red")
 assert answer.mask.any()
-question.write_answer(field, answer, Path(sys.argv[2]), question.masks_of(field, answer, 1))
+answers.write_answer(field, answer, Path(sys.argv[2]), answers.masks_of(field, answer, 1))
 told = {"stages": ran, "run": on_the_way, "query": ran_since()}
 (Path(sys.argv[2]) / "ran.json").write_text(json.dumps(told))
 """

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from small_field import make_field, shares, unit_rows
 
-from jsecon.app.question import ask_text, write_answer
+from jsecon.app.answers import write_answer
+from jsecon.app.question import ask_text
 from jsecon.errors import InputError
 from jsecon.query.anchored import query_anchored
 from jsecon.query.retrieval import regions_of_text

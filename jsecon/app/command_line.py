@@ -90,9 +90,9 @@ class Asking:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Query(Asking):
-    """the Gaussians that a text names, or that lie under a pixel
+    """the Gaussians that a text names, that lie under a pixel, or that somebody outlined
 
-    For each text, or for a pixel, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's own
+    For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's own
     world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames that
     show it best, and answers.html with the pictures.
     """
@@ -100,8 +100,14 @@ class Query(Asking):
     texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
     """what to find: "red mug" "dark green bottle" "mug or bowl but not handle" ..."""
     at: Annotated[list[list[str]] | None, {"action": "append", "nargs": 3, "metavar": ("FRAME", "X", "Y")}] = None
-    """what lies under pixel (column X, row Y) of a frame, by its name or number, in the frames as the run used them;
-    needs no text"""
+    """what lies under pixel (column X, row Y) of a frame, in the frames as the run used them; needs no text. A frame is
+    named by its name, the end of it, or its place, #10"""
+    mask: Annotated[list[list[str]] | None, {"action": "append", "nargs": "+", "metavar": ("FRAME", "PNG")}] = None
+    """what a mask outlines in a frame, or one thing in several: FRAME PNG FRAME PNG; black is outside"""
+    box: Annotated[
+        list[list[str]] | None, {"action": "append", "nargs": 5, "metavar": ("FRAME", "X0", "Y0", "X1", "Y1")}
+    ] = None
+    """what lies in a box of a frame: the regions that are seen there by more than half"""
     out: Path
     """folder for the answers"""
     by: Literal["votes", "silhouette", "code", "one_step", "canonical"] = "votes"
@@ -111,7 +117,7 @@ class Query(Asking):
     threshold: float | None = None
     """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, 0.5 canonical)"""
     all: bool = False
-    """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.8
+    """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.75
     of the way from the middle region's to the best one's (by votes or silhouette)"""
     keep_outliers: bool = False
     """leave out the last step, DBSCAN"""
@@ -215,17 +221,37 @@ def _query(asked: Query) -> None:
     from jsecon.app.summary import write_answers
     from jsecon.language.field import load_field
 
-    if not asked.texts and not asked.at:
+    if not (asked.texts or asked.at or asked.mask or asked.box):
         remedy = 'For example: jsecon query field.npz "red mug" --out answers'
-        raise InputError("query", "nothing to find", "a TEXT, or --at FRAME X Y", remedy)
-    pixels = [(frame, _whole("X", x), _whole("Y", y)) for frame, x, y in asked.at or ()]
+        raise InputError("query", "nothing to find", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
+    pixels = [(frame, *_whole("--at", x, y)) for frame, x, y in asked.at or ()]
+    boxes = [(frame, *_whole("--box", *ends)) for frame, *ends in asked.box or ()]
+    for given in asked.mask or ():
+        if len(given) % 2:
+            remedy = "For example: --mask frame_00012 mug.png"
+            raise InputError("--mask", " ".join(given), "FRAME PNG, in pairs", remedy)
     require_writable(asked.out)
     field = load_field(asked.field)
     embedder = _embedder(field, asked) if asked.texts else None
-    how = {"by": asked.by, "threshold": asked.threshold, "outliers": not asked.keep_outliers}
-    answers = [question.ask_text(field, embedder, text, several=asked.all, **how) for text in asked.texts]
-    answers += [question.ask_pixel(field, frame, x, y, **how) for frame, x, y in pixels]
-    write_answers(field, answers, asked.out, Console(), views=asked.views)
+    asking = question.questions_of(
+        field,
+        embedder,
+        texts=asked.texts,
+        pixels=pixels,
+        masks=asked.mask or (),
+        boxes=boxes,
+        several=asked.all,
+        by=asked.by,
+        threshold=asked.threshold,
+        outliers=not asked.keep_outliers,
+    )
+    answers, refused = question.asked_each(asking)
+    if answers:
+        write_answers(field, answers, asked.out, Console(), views=asked.views)
+    for error in refused[:-1]:
+        print(f"jsecon: {error}", file=sys.stderr)
+    if refused:
+        raise refused[-1]
 
 
 def _eval(asked: Eval) -> None:
@@ -256,10 +282,11 @@ def _embedder(field: Any, asked: Asking) -> Any:
     return networks.embedder_of_field(field, asked.embedder, templates=asked.template or ("{}",))
 
 
-def _whole(name: str, text: str) -> int:
-    if not text.isdecimal():
-        raise InputError(f"--at {name}", text, "a whole number of pixels", "For example: --at frame_00012 310 145")
-    return int(text)
+def _whole(option: str, *texts: str) -> list[int]:
+    for text in texts:
+        if not text.isdecimal():
+            raise InputError(option, text, "whole numbers of pixels", "For example: --at frame_00012 310 145")
+    return [int(text) for text in texts]
 
 
 _VERBS: dict[str, tuple[Any, type]] = {

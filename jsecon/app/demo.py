@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jsecon.app import networks, pictures, pipeline, question, report, summary
+from jsecon.app import answers, networks, pictures, pipeline, question, report, summary
 from jsecon.app.options import Options, require_writable
 from jsecon.app.pipeline import Run
 from jsecon.app.progress import Listener
@@ -99,7 +99,7 @@ def _queries(field: LanguageField, embedder: Any, labels: list[LabelledFrame], o
     for text in sorted({name for frame in labels for name in frame.objects}):
         try:
             answer = question.ask_text(field, embedder, text)
-            told[text] = question.write_answer(field, answer, out, question.masks_of(field, answer, views=2))
+            told[text] = answers.write_answer(field, answer, out, answers.masks_of(field, answer, views=2))
         except InputError as error:
             told[text] = {"count": 0, "score": 0.0, "region": None, "left_out": {}, "not_understood": str(error)}
     return told

@@ -1,17 +1,17 @@
-"""One question put to a field, and its answer as files: a .ply of the Gaussians, a JSON of figures, a few masks.
+"""One question put to a field: a text, a pixel, or what somebody outlined. Its answer becomes files in app/answers.
 
 Read on the way from a text to its .ply, without the ground; behind each file lies more of its own room, behind
 splat/transform and query/masks the engine, behind `by="silhouette"` query/silhouette:
 
     ask     app/question, language/field, vision/colours, query/several, query/anchored, query/retrieval
     clean   language/shares, query/outliers
-    write   query/masks, splat/transform, data/ply
+    write   app/answers, query/masks, splat/transform, data/ply
 """
 
 import dataclasses
-import json
+import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.data.ply import save_ply
 from jsecon.errors import InputError, require
-from jsecon.files import write_text, written_whole
-from jsecon.language.shares import SHARE_THRESHOLD, membership_probability
+from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.direct import query_canonical, query_one_step
-from jsecon.query.masks import selection_mask
+from jsecon.query.lift import box_mask, lift
 from jsecon.query.outliers import MIN_SAMPLES, default_eps, one_component, remove_outliers
 from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.several import parts_of_question, query_several
 from jsecon.query.silhouette import silhouette_members
-from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Gaussians, LanguageField, Selection
+from jsecon.types import LanguageField, Selection
 
 METHODS = ("votes", "silhouette", "code", "one_step", "canonical")
 """votes, code: anchored, membership by a Gaussian's votes or its code; silhouette: by votes, then one by one by the
@@ -51,7 +48,7 @@ class Answer:
 
     question: str
     by: str
-    """one of METHODS."""
+    """one of METHODS, or "outline"."""
     selection: Selection
     """as the query gave it."""
     mask: np.ndarray
@@ -63,6 +60,51 @@ class Answer:
     def dropped(self) -> int:
         """Gaussians dropped as outliers."""
         return int(np.asarray(self.selection.mask).sum() - self.mask.sum())
+
+
+def questions_of(
+    field: LanguageField,
+    embedder: Any,
+    *,
+    texts: Sequence[str] = (),
+    pixels: Sequence[tuple[Any, ...]] = (),
+    masks: Sequence[Sequence[str]] = (),
+    boxes: Sequence[tuple[Any, ...]] = (),
+    several: bool = False,
+    by: str = "votes",
+    threshold: float | None = None,
+    outliers: bool = True,
+) -> list[Callable[[], "Answer"]]:
+    """What the command line asks of a field, each to be called: texts, pixels (frame, column, row), outlines (frame,
+    file, frame, file, ... of one thing), boxes (frame, left, upper, right, lower end)."""
+    shape: dict[str, Any] = {"threshold": threshold, "outliers": outliers}
+    how = shape | {"by": by}
+    found: list[Callable[[], Answer]] = []
+    found += [functools.partial(ask_text, field, embedder, text, several=several, **how) for text in texts]
+    found += [functools.partial(ask_pixel, field, *pixel, **how) for pixel in pixels]
+
+    def outlined(pairs: Sequence[str]) -> Answer:
+        files = dict(zip(pairs[::2], map(Path, pairs[1::2])))
+        outlines = {frame: read_mask(file, field) for frame, file in files.items()}
+        return ask_outline(field, Path(pairs[1]).stem, outlines, **shape)
+
+    def boxed(frame: str, *ends: int) -> Answer:
+        name = f"box {frame} {' '.join(map(str, ends))}"
+        return ask_outline(field, name, {frame: box_mask(field, *ends)}, **shape)
+
+    found += [functools.partial(outlined, pairs) for pairs in masks]
+    return found + [functools.partial(boxed, *box) for box in boxes]
+
+
+def asked_each(questions: Sequence[Callable[[], "Answer"]]) -> tuple[list["Answer"], list[InputError]]:
+    """The answers, and why the other questions have none: one that cannot be understood does not stop the rest."""
+    answers, refused = [], []
+    for ask in questions:
+        try:
+            answers.append(ask())
+        except InputError as error:
+            refused.append(error)
+    return answers, refused
 
 
 def ask_text(
@@ -139,6 +181,39 @@ def ask_pixel(
     return _answer(field, f"at {name} {x} {y}", by, selection, outliers, left)
 
 
+def ask_outline(
+    field: LanguageField,
+    name: str,
+    outlines: Mapping[Any, np.ndarray],
+    *,
+    threshold: float | None = None,
+    outliers: bool = True,
+) -> Answer:
+    """The Gaussians of one thing, outlined in one frame or several: frame -> mask (H, W), or what `box_mask` made.
+
+    Raises InputError as `jsecon.query.lift.lift` does.
+    """
+    frames = [frame_index(field, frame) for frame in outlines]
+    least = SHARE_THRESHOLD if threshold is None else threshold
+    selection = lift(field, np.stack([np.asarray(m).astype(int) for m in outlines.values()]), frames, threshold=least)
+    left = {"text encoder": "the outline says what is meant"}
+    return _answer(field, name, "outline", selection, outliers, left)
+
+
+def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
+    """(H, W) bool of an image file, at the size of the field's frames: what is not black. Raises InputError where it is
+    no image, or one of another shape."""
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    size = field.cameras.width, field.cameras.height
+    if image is None:
+        raise InputError(file, "no readable image", "a mask as an image", "Write it as a PNG, black outside.")
+    mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
+    if abs(mask.shape[1] * size[1] - mask.shape[0] * size[0]) > max(size) + max(mask.shape):
+        found, wanted = f"{mask.shape[1]}x{mask.shape[0]}", f"{size[0]}x{size[1]}, or the same shape at another size"
+        raise InputError(file, found, wanted, "Outline the frame as the run used it.")
+    return np.asarray(cv2.resize(np.asarray(mask), size, interpolation=cv2.INTER_NEAREST)) > 0
+
+
 def _membership(by: str) -> str:
     return "code" if by == "code" else "votes"
 
@@ -153,14 +228,24 @@ def _shaped(field: LanguageField, selection: Selection, by: str, threshold: floa
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:
-    """A frame's index from its index or its name. Raises InputError for one that the field does not have."""
-    for name in (str(frame), Path(str(frame)).stem):
-        if name in field.names:
-            return field.names.index(name)
-    if str(frame).isdecimal() and int(frame) < len(field.names):
-        return int(frame)
-    known = f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})"
-    raise InputError(f"frame {frame}", "no such frame in the field", known, "Held-out frames are not in the field.")
+    """A frame's index: from its name, from the end of a name that no other name has, or from its place, an integer or
+    "#10". Raises InputError for one that the field does not have."""
+    if isinstance(frame, str):
+        for name in (frame, Path(frame).stem):
+            if name in field.names:
+                return field.names.index(name)
+        ends = [t for t, name in enumerate(field.names) if frame and name.endswith(frame)]
+        if len(ends) == 1:
+            return ends[0]
+        if len(ends) > 1:
+            found, wanted = f"{len(ends)} frames that end so", f"one, such as {field.names[ends[0]]}"
+            raise InputError(f"frame {frame}", found, wanted, "Give more of the name.")
+    place = int(str(frame).lstrip("#")) if re.fullmatch(r"#\d+", str(frame)) or isinstance(frame, int) else -1
+    if 0 <= place < len(field.names):
+        return place
+    last = len(field.names) - 1
+    known = f"a name ({field.names[0]} ... {field.names[-1]}), the end of one, or a place, #0 to #{last}"
+    raise InputError(f"frame {frame}", "no such frame in the field", known, "report.html of the run shows the frames.")
 
 
 def _answer(
@@ -183,85 +268,3 @@ def _answer(
     else:
         mask = remove_outliers(means, mask, keep=keep)
     return Answer(question, by, selection, mask, left)
-
-
-def selected(gaussians: Gaussians, mask: np.ndarray) -> Gaussians:
-    """The selected Gaussians alone."""
-    return jax.tree.map(lambda a: np.asarray(a)[np.asarray(mask)], gaussians)
-
-
-def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
-    """The `count` frames that show the selection best: by the region's pixels, or by the Gaussians' centres in view."""
-    region = int(answer.selection.region)
-    if region >= 0:
-        seen = np.asarray(field.regions.pixels)[region]
-    else:
-        means = np.asarray(field.gaussians.means)[answer.mask]
-        pose = np.asarray(field.cameras.world_to_camera)
-        local = np.einsum("tij,nj->tni", pose[:, :3, :3], means) + pose[:, None, :3, 3]
-        z = np.where(local[..., 2] > 0, local[..., 2], np.nan)
-        u = np.asarray(field.cameras.fx)[:, None] * local[..., 0] / z + np.asarray(field.cameras.cx)[:, None]
-        v = np.asarray(field.cameras.fy)[:, None] * local[..., 1] / z + np.asarray(field.cameras.cy)[:, None]
-        seen = ((u >= 0) & (u < field.cameras.width) & (v >= 0) & (v < field.cameras.height)).sum(1)
-    order = np.argsort(-seen, kind="stable")[:count]
-    return [int(t) for t in order if seen[t] > 0]
-
-
-def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[str, Any]:
-    """What there is to say about an answer: count, score, region, and the place of the Gaussians `chosen`."""
-    means = np.asarray(chosen.means, np.float64)
-    place = sure = None
-    if len(means):
-        box = {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()}
-        place = {"centroid": means.mean(0).round(6).tolist(), "bounding_box": box}
-    region = int(answer.selection.region)
-    if answer.by == "votes" and len(means):
-        probability = np.asarray(membership_probability(answer.selection.similarity, field.votes))[answer.mask]
-        sure = {"mean": round(float(probability.mean()), 4), "tenth": round(float(np.quantile(probability, 0.1)), 4)}
-    return {
-        "query": answer.question,
-        "by": answer.by,
-        "count": len(means),
-        "of": field.gaussians.count,
-        "score": round(float(answer.selection.score), 6),
-        "region": region if region >= 0 else None,
-        "probability": sure,
-        "outliers_dropped": answer.dropped,
-        "place": place,
-        "left_out": answer.left_out,
-    }
-
-
-def write_answer(
-    field: LanguageField, answer: Answer, out: Path, masks: Mapping[int, Bool[np.ndarray, "h w"]]
-) -> dict[str, Any]:
-    """Writes OUT/<slug>.ply, .json, and <slug>-<frame>.png of `masks` (by frame, see `masks_of`); returns the figures.
-
-    The .ply is in the capture files' own world, in INRIA's layout. An empty selection leaves out the .ply and the
-    masks.
-    """
-    slug = slug_of(answer.question)
-    chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
-    told = _figures(field, answer, chosen) | {"ply": None, "masks": {}}
-    if answer.mask.any():
-        told["ply"] = f"{slug}.ply"
-        save_ply(out / told["ply"], chosen)
-        for t, mask in masks.items():
-            told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
-            with written_whole(out / told["masks"][field.names[t]]) as temporary:
-                cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
-    write_text(out / f"{slug}.json", json.dumps(told, indent=2) + "\n")
-    return told
-
-
-def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:
-    """frame -> (H, W) bool of the `views` best frames: where the selected Gaussians alone have an alpha above 0.7."""
-    gaussians, mask = jax.device_put((field.gaussians, answer.mask))
-    cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
-    frames = best_frames(field, answer, views)
-    return {t: np.asarray(selection_mask(gaussians, cameras[t], mask)) for t in frames}
-
-
-def slug_of(question: str) -> str:
-    """A file name without spaces or signs."""
-    return re.sub(r"[^\w]+", "-", question.lower()).strip("-")[:80] or "query"

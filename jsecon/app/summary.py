@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jsecon.app import pictures, question, report
+from jsecon.app import answers as answers_of, pictures, question, report
 from jsecon.app.pipeline import Run, peak_memory_mib
 from jsecon.app.progress import Listener
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
@@ -83,8 +83,8 @@ def write_answers(
     """The files of each answer, OUT/answers.html, and a line each."""
     renderer, parts = pictures.Renderer(field.gaussians, field.cameras), []
     for n, item in enumerate(answers):
-        shown = question.masks_of(field, item, max(views, 1))
-        told = question.write_answer(field, item, out, {t: shown[t] for t in list(shown)[:views]})
+        shown = answers_of.masks_of(field, item, max(views, 1))
+        told = answers_of.write_answer(field, item, out, {t: shown[t] for t in list(shown)[:views]})
         if told["place"]:
             place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
         elif told["region"] is None and item.by in ("votes", "code"):

@@ -1,0 +1,102 @@
+"""An answer as files: a .ply of the Gaussians, a JSON of figures, a few masks."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from jsecon.app.question import Answer
+from jsecon.data.ply import save_ply
+from jsecon.files import write_text, written_whole
+from jsecon.language.shares import membership_probability
+from jsecon.query.masks import selection_mask
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Gaussians, LanguageField
+
+
+def selected(gaussians: Gaussians, mask: np.ndarray) -> Gaussians:
+    """The selected Gaussians alone."""
+    return jax.tree.map(lambda a: np.asarray(a)[np.asarray(mask)], gaussians)
+
+
+def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
+    """The `count` frames that show the selection best: by the region's pixels, or by the Gaussians' centres in view."""
+    region = int(answer.selection.region)
+    if region >= 0:
+        seen = np.asarray(field.regions.pixels)[region]
+    else:
+        means = np.asarray(field.gaussians.means)[answer.mask]
+        pose = np.asarray(field.cameras.world_to_camera)
+        local = np.einsum("tij,nj->tni", pose[:, :3, :3], means) + pose[:, None, :3, 3]
+        z = np.where(local[..., 2] > 0, local[..., 2], np.nan)
+        u = np.asarray(field.cameras.fx)[:, None] * local[..., 0] / z + np.asarray(field.cameras.cx)[:, None]
+        v = np.asarray(field.cameras.fy)[:, None] * local[..., 1] / z + np.asarray(field.cameras.cy)[:, None]
+        seen = ((u >= 0) & (u < field.cameras.width) & (v >= 0) & (v < field.cameras.height)).sum(1)
+    order = np.argsort(-seen, kind="stable")[:count]
+    return [int(t) for t in order if seen[t] > 0]
+
+
+def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[str, Any]:
+    """What there is to say about an answer: count, score, region, and the place of the Gaussians `chosen`."""
+    means = np.asarray(chosen.means, np.float64)
+    place = sure = None
+    if len(means):
+        box = {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()}
+        place = {"centroid": means.mean(0).round(6).tolist(), "bounding_box": box}
+    region = int(answer.selection.region)
+    if answer.by == "votes" and len(means):
+        probability = np.asarray(membership_probability(answer.selection.similarity, field.votes))[answer.mask]
+        sure = {"mean": round(float(probability.mean()), 4), "tenth": round(float(np.quantile(probability, 0.1)), 4)}
+    return {
+        "query": answer.question,
+        "by": answer.by,
+        "count": len(means),
+        "of": field.gaussians.count,
+        "score": round(float(answer.selection.score), 6),
+        "region": region if region >= 0 else None,
+        "probability": sure,
+        "outliers_dropped": answer.dropped,
+        "place": place,
+        "left_out": answer.left_out,
+    }
+
+
+def write_answer(
+    field: LanguageField, answer: Answer, out: Path, masks: Mapping[int, Bool[np.ndarray, "h w"]]
+) -> dict[str, Any]:
+    """Writes OUT/<slug>.ply, .json, and <slug>-<frame>.png of `masks` (by frame, see `masks_of`); returns the figures.
+
+    The .ply is in the capture files' own world, in INRIA's layout. An empty selection leaves out the .ply and the
+    masks.
+    """
+    slug = slug_of(answer.question)
+    chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
+    told = _figures(field, answer, chosen) | {"ply": None, "masks": {}}
+    if answer.mask.any():
+        told["ply"] = f"{slug}.ply"
+        save_ply(out / told["ply"], chosen)
+        for t, mask in masks.items():
+            told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
+            with written_whole(out / told["masks"][field.names[t]]) as temporary:
+                cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
+    write_text(out / f"{slug}.json", json.dumps(told, indent=2) + "\n")
+    return told
+
+
+def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:
+    """frame -> (H, W) bool of the `views` best frames: where the selected Gaussians alone have an alpha above 0.7."""
+    gaussians, mask = jax.device_put((field.gaussians, answer.mask))
+    cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
+    frames = best_frames(field, answer, views)
+    return {t: np.asarray(selection_mask(gaussians, cameras[t], mask)) for t in frames}
+
+
+def slug_of(question: str) -> str:
+    """A file name without spaces or signs."""
+    return re.sub(r"[^\w]+", "-", question.lower()).strip("-")[:80] or "query"

@@ -1,0 +1,103 @@
+"""What somebody outlined in one frame or several, as Gaussians: a mask or a box in place of a text.
+
+Gaussians that the frames see are told by the outline itself, through their rendering weights; those that they do not,
+the far side of a mug, by the field's regions, which all views made.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jsecon.errors import InputError, require
+from jsecon.language.shares import SHARE_THRESHOLD, share_of, vote_shares
+from jsecon.language.votes import region_votes
+from jsecon.types import LanguageField, Selection
+
+OUTSIDE, INSIDE, UNKNOWN = 0, 1, 2
+"""what a pixel of an outline says: of a box only the outside is known"""
+PRIOR_PX = 4.0
+"""weight, px, that the regions' word has against what the outline says of a Gaussian"""
+
+
+def lift(
+    field: LanguageField,
+    masks: Bool[np.ndarray, "k h w"] | Int[np.ndarray, "k h w"],
+    frames: Sequence[int | str],
+    *,
+    threshold: float = SHARE_THRESHOLD,
+) -> Selection:
+    """The Gaussians of one thing that is outlined in K frames of a field.
+
+    masks (K, H, W): bool, or integers of OUTSIDE, INSIDE and UNKNOWN; frames: the index or name of each, also of one
+    held out. With a_n and b_n the weight of Gaussian n on pixels inside and outside of them (`region_votes`), and p_n
+    its share of the regions that lie in the masks by at least half of what the frames see of them, the share is
+
+        (a_n + PRIOR_PX p_n) / (a_n + b_n + PRIOR_PX)
+
+    and Gaussians of at least `threshold` are selected. Where the field has no region there, the outline alone decides.
+    Selection.region is the region that lies in the masks with the most of its weight, or -1; score its part inside.
+    Host code around compiled parts. Raises InputError for a frame that the field does not have, masks of another size,
+    and masks with nothing inside.
+    """
+    index = [_frame(field, frame) for frame in frames]
+    size = field.cameras.height, field.cameras.width
+    masks = np.asarray(masks).astype(np.int32)
+    fit = (
+        masks.shape == (len(index), *size) and bool(np.isin(masks, (OUTSIDE, INSIDE, UNKNOWN)).all()) and len(index) > 0
+    )
+    remedy = f"Give one mask per frame, {size[1]} wide and {size[0]} high, of the frames as the run used them."
+    require(fit, "masks", f"{masks.shape} with {len(index)} frames", f"({len(index)}, {size[0]}, {size[1]})", remedy)
+    if not (masks != OUTSIDE).any():
+        raise InputError("masks", "no pixel inside", "an outline of a thing", "Mark the thing's pixels.")
+    gaussians, cameras = jax.tree.map(jnp.asarray, (field.gaussians, field.cameras))
+    cast = region_votes(gaussians, cameras[np.asarray(index)], jnp.asarray(masks), UNKNOWN + 1, top=UNKNOWN + 1)
+    weight = np.asarray(cast.dense())
+    outside, inside, unknown = weight[:, OUTSIDE], weight[:, INSIDE], weight[:, UNKNOWN]
+    within = _regions_within(field, inside + unknown, outside)
+    chosen = within >= 0.5
+    known = np.asarray(share_of(field.votes, jnp.asarray(chosen)).share) if chosen.any() else 0.0
+    share = (inside + PRIOR_PX * known) / (inside + outside + PRIOR_PX)
+    if not chosen.any():
+        share = np.where(inside + outside > 0, inside / np.maximum(inside + outside, 1e-9), 0.0)
+    best = int(within.argmax()) if len(within) else -1
+    found = best if best >= 0 and chosen[best] else -1
+    score = float(within[best]) if best >= 0 else 0.0
+    sound = np.isfinite(share)
+    mask = sound & (share >= threshold)
+    similarity = np.where(sound, share, 0.0).astype(np.float32)
+    return Selection(
+        jnp.asarray(mask), jnp.asarray(similarity), jnp.asarray(found, jnp.int32), jnp.asarray(score, jnp.float32)
+    )
+
+
+def box_mask(field: LanguageField, x0: int, y0: int, x1: int, y1: int) -> Int[np.ndarray, "h w"]:
+    """(H, W) OUTSIDE and UNKNOWN of a box, columns x0 to x1 and rows y0 to y1, both ends within. Raises InputError for
+    a box without a pixel of the frame."""
+    mask = np.full((field.cameras.height, field.cameras.width), OUTSIDE, np.int32)
+    mask[max(y0, 0) : max(y1 + 1, 0), max(x0, 0) : max(x1 + 1, 0)] = UNKNOWN
+    if not mask.any():
+        size = f"{field.cameras.width}x{field.cameras.height}"
+        remedy = "Give its left, upper, right and lower end, in the frames as the run used them."
+        raise InputError("box", f"{x0} {y0} {x1} {y1}", f"pixels of a frame of {size}", remedy)
+    return mask
+
+
+def _regions_within(field: LanguageField, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """(R,) part of each region's weight in the frames that lies inside."""
+    regions = np.asarray(field.votes.regions)
+    share = np.where(regions >= 0, np.nan_to_num(np.asarray(vote_shares(field.votes))), 0.0)
+    place, totals = np.maximum(regions, 0).ravel(), []
+    for weight in (inside, outside):
+        totals.append(np.bincount(place, (share * weight[:, None]).ravel(), field.regions.count))
+    return totals[0] / np.maximum(totals[0] + totals[1], 1e-9)
+
+
+def _frame(field: LanguageField, frame: int | str) -> int:
+    known = field.names.index(frame) if frame in field.names else frame
+    if not isinstance(known, int | np.integer) or not 0 <= known < len(field.names):
+        names = f"0 to {len(field.names) - 1}, or a name ({field.names[0]} ... {field.names[-1]})"
+        raise InputError(f"frame {frame}", "no such frame in the field", names, "See LanguageField.names.")
+    return int(known)

@@ -1,0 +1,92 @@
+"""From an outline to Gaussians: what is seen follows the outline, what is not the field's regions."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import REGIONS, make_field, true_regions
+
+from jsecon.errors import InputError
+from jsecon.language.votes import region_votes
+from jsecon.query.lift import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    return make_field(scene, cameras)
+
+
+def seen(field, t):
+    gaussians, camera = jax.tree.map(jnp.asarray, (field.gaussians, field.cameras[t : t + 1]))
+    blank = jnp.zeros((1, field.cameras.height, field.cameras.width), jnp.int32)
+    return np.asarray(region_votes(gaussians, camera, blank, 1).total)
+
+
+def test_a_mask_finds_its_region_and_what_the_frame_does_not_see_of_it(field):
+    made, labels = field
+    own = true_regions(made.gaussians)
+    hidden = seen(made, 0) == 0
+    for region in range(REGIONS):
+        found = lift(made, np.where(labels[:1] < 0, UNKNOWN, labels[:1] == region), [0])
+        assert int(found.region) == region
+        assert 0.5 < float(found.score) <= 1
+        share = np.asarray(found.similarity)
+        assert share[own == region].mean() > share[own != region].mean() + 0.2
+        if (hidden & (own == region)).any():
+            assert share[hidden & (own == region)].max() > 0.3
+    several = lift(made, np.where(labels[:3] < 0, UNKNOWN, labels[:3] == 2), [made.names[0], 1, 2])
+    assert int(several.region) == 2
+
+
+def test_the_share_is_that_of_the_weights_and_the_regions_word(field):
+    made, labels = field
+    mask = labels[:1] == 1
+    found = lift(made, mask, [0])
+    gaussians, camera = jax.tree.map(jnp.asarray, (made.gaussians, made.cameras[:1]))
+    votes = np.asarray(region_votes(gaussians, camera, jnp.asarray(mask.astype(np.int32)), 2, top=2).dense())
+    low = votes[:, 1] / (votes.sum(1) + PRIOR_PX)
+    high = (votes[:, 1] + PRIOR_PX) / (votes.sum(1) + PRIOR_PX)
+    share = np.asarray(found.similarity)
+    assert (share >= low - 1e-5).all()
+    assert (share <= high + 1e-5).all()
+    np.testing.assert_array_equal(np.asarray(found.mask), share >= 0.5)
+
+
+def test_without_a_region_there_the_outline_alone_decides(field):
+    made, labels = field
+    half = (labels[:1] == 0) & (np.arange(labels.shape[2]) < 20)  # part of a region
+    found = lift(made, half, [0])
+    assert int(found.region) == -1
+    assert np.asarray(found.similarity).max() > 0.3
+    assert not np.asarray(found.similarity)[seen(made, 0) == 0].any()
+
+
+def test_of_a_box_only_the_outside_is_known(field):
+    made, labels = field
+    rows, columns = np.nonzero(labels[0] == 1)
+    box = box_mask(made, *(int(end) for end in (columns.min(), rows.min(), columns.max(), rows.max())))
+    assert set(np.unique(box)) <= {OUTSIDE, UNKNOWN}
+    assert (box[labels[0] == 1] == UNKNOWN).all()
+    found = lift(made, box[None], [0])
+    assert np.asarray(found.mask).any()
+    inside = lift(made, np.where(box == UNKNOWN, INSIDE, OUTSIDE)[None], [0])
+    assert np.asarray(inside.mask).sum() >= np.asarray(found.mask).sum()
+
+
+def test_odd_input_is_refused(field):
+    made, labels = field
+    with pytest.raises(InputError, match="no pixel inside"):
+        lift(made, np.zeros_like(labels[:1]), [0])
+    with pytest.raises(ValueError, match="of the frames as the run used them"):
+        lift(made, labels[:1, :5] == 0, [0])
+    with pytest.raises(ValueError, match="with 2 frames"):
+        lift(made, labels[:1] == 0, [0, 1])
+    for frame in (99, -1, "nowhere"):
+        with pytest.raises(InputError, match="no such frame"):
+            lift(made, labels[:1] == 0, [frame])
+    with pytest.raises(InputError, match="pixels of a frame"):
+        box_mask(made, 900, 0, 910, 5)
+    blind = dataclasses.replace(made, votes=dataclasses.replace(made.votes, weights=made.votes.weights * jnp.nan))
+    assert np.isfinite(np.asarray(lift(blind, labels[:1] == 0, [0]).similarity)).all()
