@@ -1,5 +1,6 @@
 """The table of contents: what `jsecon` holds, and where each name lives."""
 
+from jsecon.app.place import Place as Place, locate as locate
 from jsecon.association.algorithm1 import masklets as masklets
 from jsecon.backend import check_backend as check_backend
 from jsecon.data.capture import load_capture as load_capture

@@ -1,0 +1,99 @@
+"""Where an answer is, for a robot: centre, boxes and points, in metres of the capture's own world."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jsecon.app.answers import selected
+from jsecon.app.question import Answer, ask_text
+from jsecon.errors import InputError
+from jsecon.language.shares import membership_probability
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Gaussians, LanguageField
+
+STRAY = 0.02
+"""part of the Gaussians at each end of an axis that a box does not reach out for"""
+FRAME = "the capture's own world"
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """One thing in the capture's own world, in its unit (metres where the capture's is)."""
+
+    name: str
+    centroid: np.ndarray
+    """(3,) the middle of the oriented box: views from above see more of a thing's top, which pulls a mean upwards."""
+    axes: np.ndarray
+    """(3, 3) unit columns, right-handed, the longest first: the principal axes of the points."""
+    extent: np.ndarray
+    """(3,) length of the box along each axis."""
+    low: np.ndarray
+    high: np.ndarray
+    """(3,) corners of the box along the world's axes."""
+    points: np.ndarray
+    """(M, 3) centres of the Gaussians."""
+    score: float
+    """similarity of the best region with the text."""
+    probability: float
+    """mean probability of a Gaussian to belong to the answer (`membership_probability`)."""
+    frame: str = FRAME
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON; of the points their count."""
+        told = {name: getattr(self, name) for name in ("centroid", "axes", "extent", "low", "high")}
+        rounded = {name: np.round(np.asarray(value, np.float64), 6).tolist() for name, value in told.items()}
+        sure = {"score": round(self.score, 6), "probability": round(self.probability, 4)}
+        return {"name": self.name, **rounded, "points": len(self.points), **sure, "frame": self.frame}
+
+
+def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) -> Place:
+    """Where the thing is that a text names; `how` as for `jsecon.app.question.ask_text`.
+
+    `embedder`: that of the field, opened where it is not given. In the demo's five rooms, all things of which it finds,
+    the middle of the box is off by 6 mm in the median and the box along the world's axes has an IoU of 0.74 with the
+    true one (experiments/places.py). Raises InputError where nothing answers the text.
+    """
+    if embedder is None:
+        from jsecon.app.networks import embedder_of_field
+
+        embedder = embedder_of_field(field)
+    return place_of(field, ask_text(field, embedder, text, **how))
+
+
+def place_of(field: LanguageField, answer: Answer) -> Place:
+    """Where an answer is. Raises InputError where it selected nothing."""
+    if not answer.mask.any():
+        found = f"nothing selected (score {float(answer.selection.score):.3f})"
+        raise InputError(answer.question, found, "a thing in the scene", "Ask with other words, or by a pixel.")
+    chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
+    points = np.asarray(chosen.means, np.float64)
+    spread = points - points.mean(0)
+    axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    low, high = _ends(chosen, np.eye(3))
+    own_low, own_high = _ends(chosen, axes)
+    probability = membership_probability(answer.selection.similarity, field.votes)
+    return Place(
+        answer.question,
+        axes @ (0.5 * (own_low + own_high)),
+        axes,
+        own_high - own_low,
+        low,
+        high,
+        points,
+        float(answer.selection.score),
+        float(np.asarray(probability)[answer.mask].mean()),
+    )
+
+
+def _ends(chosen: Gaussians, axes: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Along each column of `axes`, from where to where the Gaussians reach, to one standard deviation, without
+    strays."""
+    turns = Rotation.from_quat(np.asarray(chosen.quaternions, np.float64), scalar_first=True).as_matrix()
+    turned = np.einsum("ij,nik->njk", axes, turns)
+    reach = np.sqrt(np.square(turned * np.exp(np.asarray(chosen.log_scales, np.float64))[:, None, :]).sum(-1))
+    along = np.asarray(chosen.means, np.float64) @ axes
+    return np.quantile(along - reach, STRAY, axis=0), np.quantile(along + reach, 1 - STRAY, axis=0)

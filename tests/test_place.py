@@ -1,0 +1,74 @@
+"""Where an answer is: boxes of known points, turned and shifted; and a text that nothing answers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_field import make_field
+
+from experiments.places import box_iou
+from jsecon.app.place import place_of
+from jsecon.app.question import Answer
+from jsecon.errors import InputError
+from jsecon.types import Selection
+
+SIZE = np.array([0.5, 0.3, 0.1])
+
+
+@pytest.fixture(scope="module")
+def answer(scene, cameras):
+    """A brick of 64 small Gaussians, turned, of which all are selected."""
+    field, _ = make_field(scene, cameras)
+    draw = np.random.default_rng(0)
+    inside = draw.uniform(-0.5, 0.5, (64, 3))
+    inside[:3] = np.eye(3) / 2  # a point on each face
+    inside[32:] = -inside[:32]
+    turn = Rotation.from_euler("zyx", [40, 25, 10], degrees=True)
+    means = turn.apply(inside * SIZE) + np.array([1.0, 2.0, 3.0])
+    gaussians = dataclasses.replace(
+        field.gaussians, means=means.astype(np.float32), log_scales=np.full((64, 3), np.log(1e-3), np.float32)
+    )
+    every, share = np.ones(64, bool), np.ones(64, np.float32)
+    selection = Selection(every, share, np.int32(0), np.float32(0.7))
+    return dataclasses.replace(field, gaussians=gaussians), Answer("brick", "votes", selection, every, {}), turn, means
+
+
+def test_the_oriented_box_is_that_of_the_brick(answer):
+    field, asked, turn, means = answer
+    place = place_of(field, asked)
+    np.testing.assert_allclose(place.centroid, [1, 2, 3], atol=0.02)
+    np.testing.assert_allclose(place.extent, SIZE, rtol=0.25)
+    np.testing.assert_allclose(place.axes.T @ place.axes, np.eye(3), atol=1e-6)
+    assert np.linalg.det(place.axes) == pytest.approx(1)
+    assert np.abs(np.diagonal(place.axes.T @ turn.as_matrix())).min() > 0.9
+    assert (place.low >= means.min(0) - 0.01).all()
+    assert (place.high <= means.max(0) + 0.01).all()
+    assert len(place.points) == 64
+    told = place.as_dict()
+    assert told["points"] == 64
+    assert told["frame"] == "the capture's own world"
+    assert told["extent"] == pytest.approx(list(place.extent), abs=1e-5)
+
+
+def test_it_is_in_the_world_of_the_capture(answer):
+    field, asked, *_ = answer
+    here = place_of(field, asked)
+    to_source = np.diag([2.0, 2.0, 2.0, 1.0])
+    to_source[:3, 3] = [5, 0, 0]
+    there = place_of(dataclasses.replace(field, to_source=to_source), asked)
+    np.testing.assert_allclose(there.centroid, 2 * here.centroid + [5, 0, 0], rtol=1e-4)
+    np.testing.assert_allclose(there.extent, 2 * here.extent, rtol=1e-3)
+
+
+def test_what_selects_nothing_has_no_place(answer):
+    field, asked, *_ = answer
+    with pytest.raises(InputError, match="nothing selected"):
+        place_of(field, dataclasses.replace(asked, mask=np.zeros(64, bool)))
+
+
+def test_boxes_overlap_as_they_should():
+    unit = np.array([[0.0, 0, 0], [1, 1, 1]])
+    assert box_iou(unit, unit) == 1
+    assert box_iou(unit, unit + np.array([0.5, 0, 0])) == pytest.approx(1 / 3)
+    assert box_iou(unit, unit + 2) == 0
