@@ -35,12 +35,12 @@ from scipy.spatial import cKDTree
 from experiments import replica_apartment_0, results
 from experiments.cells import append_cell, read_cells
 from jsecon.app import cache
-from jsecon.app.command_line import Demo
 from jsecon.app.demo import demo
 from jsecon.app.masklet_stages import associated, proposals_of
 from jsecon.app.options import Options as RunOptions
 from jsecon.app.progress import Listener
 from jsecon.app.stages import Work, training_frames
+from jsecon.app.verbs import Demo
 from jsecon.data.capture import load_capture
 from jsecon.language.field import load_field
 from jsecon.types import Capture, Gaussians

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments import results
-from jsecon.app.command_line import Demo
 from jsecon.app.demo import demo
 from jsecon.app.networks import embedder_of_field
 from jsecon.app.place import locate
 from jsecon.app.progress import Listener
+from jsecon.app.verbs import Demo
 from jsecon.data.synthetic.raycast import trace
 from jsecon.data.synthetic.room import Room, make_room
 from jsecon.errors import InputError

@@ -21,9 +21,9 @@ from scipy import sparse
 from experiments import replica_apartment_0, results
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace, load_text_space, made_text_space
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
-from jsecon.app.command_line import Demo
 from jsecon.app.demo import demo
 from jsecon.app.progress import Listener
+from jsecon.app.verbs import Demo
 from jsecon.language.field import load_field
 from jsecon.language.votes import region_votes
 from jsecon.types import Camera, Gaussians

@@ -3,14 +3,16 @@
 import argparse
 import dataclasses
 import inspect
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import jsecon
 from jsecon.app.arguments import add_arguments, parsed
-from jsecon.app.options import Folder, Options, SceneOptions, require_writable
+from jsecon.app.options import Options, SceneOptions, require_writable
+from jsecon.app.verbs import Asking, Demo, Eval, Fit, Models, Query, Run, Serve
 from jsecon.errors import InputError
 
 EPILOG = """
@@ -31,127 +33,6 @@ examples
 A run that is stopped goes on where it stopped when the same command is given again.
 """
 RUN_GROUPS = {"downscale": "frames and scene", "masks": "masks", "segmenter": "models", "weighting": "field"}
-
-
-@dataclasses.dataclass(frozen=True)
-class Demo:
-    """make a room, build its field, query it and write a report
-
-    Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on it
-    what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is used.
-    Ends with report.html, metrics.json, field.npz and a .ply for each query. One to two minutes on two cores.
-    """
-
-    seed: int = 0
-    """which room"""
-    out: Path = Path("jsecon-demo")
-    """folder for all of it"""
-    steps: int = 550
-    """of the photometric fit"""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Run(Options):
-    """build the language field of a capture
-
-    From frames to a language field: poses (found where the capture has none), Gaussians (fitted, or given as a .ply),
-    masklets (found in the frames and brought together, or given as masks), one embedding per region, codes distilled
-    into the Gaussians. Prints its stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
-    """
-
-    out: Path
-    """folder for the field, the report and the cache"""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(SceneOptions):
-    """fit Gaussians to a capture, and no more
-
-    From posed frames to a scene of 3D Gaussians as a .ply (INRIA layout, in the capture's own world; SuperSplat opens
-    it), with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the same name without the ending,
-    from which it goes on when it was stopped, and `jsecon run` into that folder too.
-    """
-
-    out: Annotated[Path, {"metavar": "PLY"}]
-    """the .ply file to write"""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Asking:
-    """What `jsecon query` and `jsecon eval` take."""
-
-    field: Annotated[Path, {"positional": True}]
-    """field.npz of a run"""
-    embedder: Folder = None
-    """the CLIP model folder that the field was made with (default: where the run had it)"""
-    template: Annotated[list[str] | None, {"action": "append", "metavar": "PHRASE"}] = None
-    """CLIP: a phrase for the text, such as "a photo of a {}."; several are averaged (default: the bare text)"""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Asking):
-    """the Gaussians that a text names, that lie under a pixel, or that somebody outlined
-
-    For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's own
-    world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames that
-    show it best, and answers.html with the pictures.
-    """
-
-    texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
-    """what to find: "red mug" "dark green bottle" "mug or bowl but not handle" ..."""
-    at: Annotated[list[list[str]] | None, {"action": "append", "nargs": 3, "metavar": ("FRAME", "X", "Y")}] = None
-    """what lies under pixel (column X, row Y) of a frame, in the frames as the run used them; needs no text. A frame is
-    named by its name, the end of it, or its place, #10"""
-    mask: Annotated[list[list[str]] | None, {"action": "append", "nargs": "+", "metavar": ("FRAME", "PNG")}] = None
-    """what a mask outlines in a frame, or one thing in several: FRAME PNG FRAME PNG; black is outside"""
-    box: Annotated[
-        list[list[str]] | None, {"action": "append", "nargs": 5, "metavar": ("FRAME", "X0", "Y0", "X1", "Y1")}
-    ] = None
-    """what lies in a box of a frame: the regions that are seen there by more than half"""
-    out: Path
-    """folder for the answers"""
-    by: Literal["votes", "silhouette", "code", "one_step", "canonical"] = "votes"
-    """votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; silhouette: by
-    votes, then each taken or left by what the outline of all gains in the views; one_step, canonical: each Gaussian's
-    code against the text"""
-    threshold: float | None = None
-    """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, 0.5 canonical)"""
-    all: bool = False
-    """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.75
-    of the way from the middle region's to the best one's (by votes or silhouette)"""
-    keep_outliers: bool = False
-    """leave out the last step, DBSCAN"""
-    views: Annotated[int, {"metavar": "N"}] = 3
-    """masks to write per query"""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Eval(Asking):
-    """measure a field against labels
-
-    Point-level rendered protocol on LERF-style labels (one .json per frame): the selected Gaussians alone are rendered,
-    alpha > 0.7, against each labelled mask; a missing prediction counts as 0. Prints mIoU, mAcc@0.25 and localisation
-    accuracy of each kind of query, and writes OUT/evaluation.json with every pair.
-    """
-
-    labels: Annotated[Path, {"metavar": "DIR"}]
-    """folder of LERF label files (frame.json)"""
-    out: Path | None = None
-    """folder for evaluation.json (default: the field's)"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Models:
-    """look into a folder of models
-
-    check DIR: what models a folder holds, each graph's inputs and outputs, what it can be used for, what is missing,
-    and where such exports are published. Exit code 2 where nothing in it can be used.
-    """
-
-    action: Annotated[str, {"positional": True, "choices": ("check",), "metavar": "check"}]
-    """tell what a model folder holds"""
-    folder: Annotated[Path, {"positional": True, "metavar": "DIR"}]
-    """folder with .onnx files"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -265,6 +146,15 @@ def _eval(asked: Eval) -> None:
     write_evaluation(field, _embedder(field, asked), asked.labels, out, Console())
 
 
+def _serve(asked: Serve) -> None:
+    from jsecon.app.progress import Console
+    from jsecon.app.server import serve
+
+    token = asked.token or os.environ.get("JSECON_TOKEN", "")
+    files = [Path(file) for file in asked.fields]
+    serve(files, host=asked.host, port=asked.port, token=token, embedder=asked.embedder, say=Console().say)
+
+
 def _models(asked: Models) -> None:
     from jsecon.app.models import examine, report_lines, require_usable
     from jsecon.app.progress import Console
@@ -295,5 +185,6 @@ _VERBS: dict[str, tuple[Any, type]] = {
     "fit": (_fit, Fit),
     "query": (_query, Query),
     "eval": (_eval, Eval),
+    "serve": (_serve, Serve),
     "models": (_models, Models),
 }
