@@ -26,7 +26,7 @@ from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.lift import box_mask, lift
-from jsecon.query.outliers import MIN_SAMPLES, default_eps, one_component, remove_outliers
+from jsecon.query.outliers import outliers_removed
 from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.several import parts_of_question, query_several
@@ -257,14 +257,10 @@ def _answer(
     left: dict[str, str],
     keep: str = "largest",
 ) -> Answer:
-    mask, means = np.asarray(selection.mask), np.asarray(field.gaussians.means)
-    points = means[mask].astype(np.float64)
-    if not outliers:
-        left = left | {"DBSCAN": "not asked for"}
-    elif len(points) < MIN_SAMPLES:
-        left = left | {"DBSCAN": f"fewer than {MIN_SAMPLES} Gaussians are selected"}
-    elif np.isfinite(points).all() and one_component(points, default_eps(points)):
-        left = left | {"DBSCAN": "the selection is one component"}
+    mask = np.asarray(selection.mask)
+    if outliers:
+        mask, why = outliers_removed(field.gaussians.means, mask, keep=keep)
+        left = left | ({"DBSCAN": why} if why else {})
     else:
-        mask = remove_outliers(means, mask, keep=keep)
+        left = left | {"DBSCAN": "not asked for"}
     return Answer(question, by, selection, mask, left)

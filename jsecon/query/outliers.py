@@ -46,22 +46,34 @@ def remove_outliers(
     positive, found = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
     remedy = "Leave eps out to have it follow the selection's spacing."
     require(positive, "remove_outliers", found, "eps > 0 and min_samples >= 1", remedy)
+    return outliers_removed(means, mask, eps=eps, min_samples=min_samples, keep=keep)[0]
+
+
+def outliers_removed(
+    means: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    *,
+    eps: float | None = None,
+    min_samples: int = MIN_SAMPLES,
+    keep: str = "largest",
+) -> tuple[Bool[np.ndarray, " n"], str]:
+    """What `remove_outliers` returns, and why DBSCAN was not needed, or ""."""
     means = np.asarray(means)
     kept = np.asarray(mask) & np.isfinite(means).all(axis=1)
     chosen = np.flatnonzero(kept)
     if len(chosen) < min_samples:
-        return kept
+        return kept, f"fewer than {min_samples} Gaussians are selected"
     points = means[chosen].astype(np.float64)
     eps = default_eps(points) if eps is None else eps
     if one_component(points, eps):
-        return kept
+        return kept, "the selection is one component"
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
-        return kept
+        return kept, ""
     inside = labels == np.bincount(labels[labels >= 0]).argmax() if keep == "largest" else labels >= 0
     result = np.zeros_like(kept)
     result[chosen[inside]] = True
-    return result
+    return result, ""
 
 
 def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
