@@ -36,9 +36,9 @@ def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, mon
             exec(compile(block, "README.md", "exec"), names)
     lines = told.getvalue().splitlines()
     assert re.match(r"[1-9]\d* of \d+ Gaussians, region \d+, score 0\.\d+", lines[0]), lines
-    assert len(lines) == 6
-    assert sum(ast.literal_eval(lines[1].partition("}")[0] + "}").values()) > 0
-    assert "left out: 0" in lines[2]
+    assert len(lines) == 7
+    assert sum(ast.literal_eval(lines[2].partition("}")[0] + "}").values()) > 0
+    assert "left out: 0" in lines[3]
 
 
 def test_every_command_line_is_one_that_the_program_takes():
