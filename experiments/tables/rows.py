@@ -25,6 +25,9 @@ from experiments.tables.methods import (
 from experiments.tables.ours import ask_field, field_of
 from experiments.tables.readings import CHOOSERS, RULES, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
+from jsecon.language.shares import SHARE_THRESHOLD
+from jsecon.query.neighbours import evened, nearest
+from jsecon.query.outliers import remove_outliers
 from jsecon.types import Selection
 
 NO_REFUSAL = -1.0
@@ -40,6 +43,13 @@ CENTRES: dict[str, dict[str, float]] = {
     ", centre, agreement 0.6": {"centre": 1.0, "agreement": 0.6},
 }
 """how much the pixel of a Gaussian's centre counts, where points are judged, and how far views must then agree"""
+EVENED: dict[str, dict[str, Any]] = {
+    ", evened": {"even": True},
+    ", centre": {"centre": 1.0},
+    ", half centre, evened": {"centre": 0.5, "even": True},
+    ", centre, evened": {"centre": 1.0, "even": True},
+}
+"""where silhouettes are judged: the same, and shares evened out over neighbours"""
 GATES: dict[str, dict[str, float]] = {
     "": {},
     "ScanNet's gate, ": {"mass": 0.9, "least": 0.01},
@@ -71,16 +81,36 @@ def reading(key: Any, features: Callable[[Setting, Steps], Any], rule: str, choo
     )
 
 
-def own(association: str, retrieval: str, chooser: str, way: str = "votes", **regions: float) -> Method:
-    """jsecon's row of an association's regions, which `regions` are the options of; `way` as for `ask_field`."""
+def own(
+    association: str, retrieval: str, chooser: str, way: str = "votes", even: bool = False, **regions: float
+) -> Method:
+    """jsecon's row of an association's regions, which `regions` are the options of; `way` as for `ask_field`; `even`:
+    shares are evened out over neighbours before they are cut."""
 
     def row(setting: Setting, steps: Steps) -> Answers:
         field = field_of(setting, by=association, **regions)
         options = {"retrieval": retrieval, "retrieval_threshold": NO_REFUSAL, "pieces": True}
-        answers = ask_field(setting, field, way, clean=chooser == "threshold", **options)
+        answers = ask_field(setting, field, way, clean=chooser == "threshold" and not even, **options)
+        answers = _evened(setting, answers, clean=chooser == "threshold") if even else answers
         return _chosen(setting, answers, chooser, None)
 
     return row
+
+
+def _evened(setting: Setting, answers: Answers, *, clean: bool) -> Answers:
+    means = np.asarray(setting.evidence.gaussians.means)
+    near = jnp.asarray(setting.shared.get("neighbours", lambda: nearest(means)))
+
+    def select(k: int) -> Selection | None:
+        found = answers.select(k)
+        if found is None:
+            return None
+        share = evened(jnp.asarray(found.similarity, jnp.float32), near)
+        mask = np.asarray(share >= SHARE_THRESHOLD)
+        mask = remove_outliers(means, mask) if clean else mask
+        return dataclasses.replace(found, mask=jnp.asarray(mask), similarity=share)
+
+    return dataclasses.replace(answers, select=select)
 
 
 def _chosen(setting: Setting, answers: Answers, chooser: str, cut: float | None) -> Answers:
@@ -176,6 +206,8 @@ def rows_of(points: bool) -> dict[str, Method]:
                 if association == "consensus" and rule == "contrast" and not points:
                     for way in ("all", "parts"):
                         found[f"{name}: {rule}, {chooser}{WAYS[way]}"] = own(association, rule, chooser, way=way)
+                    for told, options in EVENED.items():
+                        found[f"{name}: {rule}, {chooser}{told}"] = own(association, rule, chooser, **options)
     for rule, chooser in (("", "threshold"), *few):
         told = f"{rule}, {chooser}" if rule else "as published"
         found[f"LangSplat-m: {told}"] = _langsplat_row(rule, chooser)
