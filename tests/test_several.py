@@ -11,6 +11,7 @@ from jsecon.app.answers import write_answer
 from jsecon.app.question import ask_text
 from jsecon.errors import InputError
 from jsecon.query.anchored import query_anchored
+from jsecon.query.neighbours import evened, nearest
 from jsecon.query.retrieval import regions_of_text
 from jsecon.query.several import parts_of_question, query_several
 from jsecon.types import Regions
@@ -132,3 +133,21 @@ def test_a_field_without_phrases_takes_those_of_who_reads_the_text(field):
         got, expected, other = (ask_text(f, words, "chair", by=by, outliers=False) for f in (bare, full, field))
         assert float(got.selection.score) == float(expected.selection.score) != float(other.selection.score)
         np.testing.assert_array_equal(got.mask, expected.mask)
+
+
+def test_shares_are_evened_out_over_neighbours_where_that_is_asked_for(field):
+    class Words:
+        canonical = np.zeros((0, 12), np.float32)
+
+        def embed_text(self, texts):
+            return np.asarray(field.regions.embeddings)[[0] * len(texts)]
+
+    near = nearest(field.gaussians.means)
+    for several in (False, True):
+        plain, even = (
+            ask_text(field, Words(), "a", several=several, near=given, outliers=False) for given in (None, near)
+        )
+        share = np.asarray(evened(plain.selection.similarity, near))
+        np.testing.assert_allclose(even.selection.similarity, share, rtol=1e-6)
+        np.testing.assert_array_equal(even.mask, share >= 0.5)
+    assert (even.mask != plain.mask).any()

@@ -122,6 +122,7 @@ def _query(asked: Query) -> None:
         masks=asked.mask or (),
         boxes=boxes,
         several=asked.all,
+        even=asked.even,
         by=asked.by,
         threshold=asked.threshold,
         outliers=not asked.keep_outliers,

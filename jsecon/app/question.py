@@ -19,13 +19,14 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.lift import box_mask, lift
+from jsecon.query.neighbours import evened, nearest
 from jsecon.query.outliers import outliers_removed
 from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
@@ -71,6 +72,7 @@ def questions_of(
     masks: Sequence[Sequence[str]] = (),
     boxes: Sequence[tuple[Any, ...]] = (),
     several: bool = False,
+    even: bool = False,
     by: str = "votes",
     threshold: float | None = None,
     outliers: bool = True,
@@ -78,7 +80,7 @@ def questions_of(
     """What the command line asks of a field, each to be called: texts, pixels (frame, column, row), outlines (frame,
     file, frame, file, ... of one thing), boxes (frame, left, upper, right, lower end)."""
     shape: dict[str, Any] = {"threshold": threshold, "outliers": outliers}
-    how = shape | {"by": by}
+    how = shape | {"by": by, "near": nearest(field.gaussians.means) if even else None}
     found: list[Callable[[], Answer]] = []
     found += [functools.partial(ask_text, field, embedder, text, several=several, **how) for text in texts]
     found += [functools.partial(ask_pixel, field, *pixel, **how) for pixel in pixels]
@@ -116,8 +118,10 @@ def ask_text(
     threshold: float | None = None,
     outliers: bool = True,
     several: bool = False,
+    near: Int[np.ndarray, "n k"] | None = None,
 ) -> Answer:
     """The Gaussians that a text names; with `several`, of all regions that answer it (`query_several` has the rule).
+    With `near` (N, K), the `nearest` of each Gaussian, shares of votes are evened out over them before they are cut.
 
     A text may be composite: `"red mug" or "bowl" but not "handle"`. Raises InputError where the embedder has no words
     for a part, and for several regions or a composite text by anything but votes.
@@ -135,11 +139,11 @@ def ask_text(
         selection = query_several(field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given)
         if several and field.parts is not None:
             selection = query_parts(field, selection, embedded[: len(wanted)])
-        return _answer(field, text, by, _shaped(field, selection, by, threshold), outliers, {}, keep="all")
+        return _answer(field, text, by, _shaped(field, selection, by, threshold, near), outliers, {}, keep="all")
     embedding = jax.device_put(embedder.embed_text([text])[0])
     if by in ("votes", "silhouette", "code"):
         selection = query_anchored(field, embedding, by=_membership(by), similarity_threshold=threshold)
-        selection = _shaped(field, selection, by, threshold)
+        selection = _shaped(field, selection, by, threshold, near)
     else:
         from jsecon.language.codes import encode
 
@@ -163,8 +167,10 @@ def ask_pixel(
     by: str = "votes",
     threshold: float | None = None,
     outliers: bool = True,
+    near: Int[np.ndarray, "n k"] | None = None,
 ) -> Answer:
     """The Gaussians of what lies under pixel (column x, row y) of a frame (its index or name); no text is embedded.
+    `near` as for `ask_text`.
 
     Raises InputError for a frame or pixel that the field does not have, and where no region lies there.
     """
@@ -176,7 +182,7 @@ def ask_pixel(
         raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
     by = by if by in ("silhouette", "code") else "votes"
     selection = query_region(field, region, by=_membership(by), similarity_threshold=threshold)
-    selection = _shaped(field, selection, by, threshold)
+    selection = _shaped(field, selection, by, threshold, near)
     left = {"text encoder": "the region under the pixel is the anchor"}
     return _answer(field, f"at {name} {x} {y}", by, selection, outliers, left)
 
@@ -218,11 +224,18 @@ def _membership(by: str) -> str:
     return "code" if by == "code" else "votes"
 
 
-def _shaped(field: LanguageField, selection: Selection, by: str, threshold: float | None) -> Selection:
-    """By "silhouette" the Gaussians whose outline fits the shares best in the field's views; else as it is."""
+def _shaped(
+    field: LanguageField, selection: Selection, by: str, threshold: float | None, near: np.ndarray | None
+) -> Selection:
+    """By votes as it is, by "silhouette" the Gaussians whose outline fits the shares best in the field's views; with
+    `near` the shares are evened out over these neighbours first."""
+    least = SHARE_THRESHOLD if threshold is None else threshold
+    if near is not None and by in ("votes", "silhouette"):
+        share = evened(jnp.asarray(selection.similarity), jnp.asarray(near))
+        inside = (share >= least) & (selection.region >= 0)
+        selection = dataclasses.replace(selection, mask=inside, similarity=share)
     if by != "silhouette":
         return selection
-    least = SHARE_THRESHOLD if threshold is None else threshold
     mask = silhouette_members(field.gaussians, field.cameras, selection.similarity, threshold=least)
     return dataclasses.replace(selection, mask=mask & (selection.region >= 0))
 

@@ -93,6 +93,8 @@ class Query(Asking):
     all: bool = False
     """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.75
     of the way from the middle region's to the best one's (by votes or silhouette)"""
+    even: bool = False
+    """even the votes out over each Gaussian's ten neighbours before they are cut: sharper rims where masks are noisy"""
     keep_outliers: bool = False
     """leave out the last step, DBSCAN"""
     views: Annotated[int, {"metavar": "N"}] = 3
