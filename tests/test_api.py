@@ -112,8 +112,8 @@ CORE_LINES, ALL_LINES = 7_000 + 1_680, 16_500 + 3_000
 and how many: fitting photographs 1,350 (steps on all devices, schedule and growth 400, the dense start 300, poses,
 exposures, depth and masks 450, quality 60, SSIM over a mesh 85, colours 30), and with it structure from motion and
 videos 570, `jsecon fit` and its options 230. Parts of the scene, which tell apart what masks took for one, 150, and
-their stage 50. Weights at the centre alone 20. Shares evened out over neighbours 80. What somebody outlined 100, and its
-questions and options 130. Places 110. The server 420."""
+their stage 50. Weights at the centre alone 20. Shares evened out over neighbours 80. What somebody outlined 100, its
+options 130. Places 110. The server 420."""
 
 
 def test_the_library_stays_within_its_budget_of_lines():
