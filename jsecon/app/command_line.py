@@ -12,7 +12,7 @@ from typing import Any
 import jsecon
 from jsecon.app.arguments import add_arguments, parsed
 from jsecon.app.options import Options, SceneOptions, require_writable
-from jsecon.app.verbs import Asking, Demo, Eval, Fit, Models, Query, Run, Serve
+from jsecon.app.verbs import Asking, Demo, Eval, Fit, Models, Query, Run, Serve, View
 from jsecon.errors import InputError
 
 EPILOG = """
@@ -130,10 +130,32 @@ def _query(asked: Query) -> None:
     answers, refused = question.asked_each(asking)
     if answers:
         write_answers(field, answers, asked.out, Console(), views=asked.views)
+    _tell(refused)
+
+
+def _tell(refused: Sequence[InputError]) -> None:
+    """Raises the last of the errors, the others told."""
     for error in refused[:-1]:
         print(f"jsecon: {error}", file=sys.stderr)
     if refused:
         raise refused[-1]
+
+
+def _view(asked: View) -> None:
+    from jsecon.app import question
+    from jsecon.app.progress import Console
+    from jsecon.app.splat_page import write_page
+    from jsecon.language.field import load_field
+
+    if asked.export.suffix != ".html":
+        raise InputError("--export", str(asked.export), "a file that ends in .html", "For example: --export page.html")
+    require_writable(asked.export.parent)
+    field = load_field(asked.field)
+    embedder = _embedder(field, asked) if asked.texts else None
+    answers, refused = question.asked_each(question.questions_of(field, embedder, texts=asked.texts))
+    size = write_page(field, answers, asked.export, title=asked.field.resolve().parent.name)
+    Console().say(f"{field.gaussians.count} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {asked.export}")
+    _tell(refused)
 
 
 def _eval(asked: Eval) -> None:
@@ -185,6 +207,7 @@ _VERBS: dict[str, tuple[Any, type]] = {
     "run": (_run, Run),
     "fit": (_fit, Fit),
     "query": (_query, Query),
+    "view": (_view, View),
     "eval": (_eval, Eval),
     "serve": (_serve, Serve),
     "models": (_models, Models),

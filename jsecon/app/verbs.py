@@ -102,6 +102,20 @@ class Query(Asking):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class View(Asking):
+    """a page that shows a field and its answers
+
+    One HTML file that opens by double click, without a server or internet: the Gaussians, to turn and come near; each
+    text lights up what it selects; a click lights up the region under it. Its link keeps what is seen.
+    """
+
+    texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
+    """what can be lit up"""
+    export: Annotated[Path, {"metavar": "HTML"}]
+    """the page to write"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(Asking):
     """measure a field against labels
 
