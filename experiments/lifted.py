@@ -89,7 +89,7 @@ def main(options: Options) -> str:
         print(rows[-1], flush=True)
     rows.append(("all", *(float(np.mean(every[way])) for way in WAYS)))
     text = results.table(("room", *WAYS), rows)
-    text += f"\\n\\nmIoU at alpha > 0.7 in the other labelled views. A lift takes {np.median(every['seconds']):.2f} s."
+    text += f"\n\nmIoU at alpha > 0.7 in the other labelled views. A lift takes {np.median(every['seconds']):.2f} s."
     results.save(Path(options.out), options, dict(zip(WAYS, rows[-1][1:])), text)
     print(text)
     return text
