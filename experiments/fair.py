@@ -24,7 +24,7 @@ from experiments.tables.fill import Plan, fill
 from experiments.tables.rows import rows_of
 from jsecon.process import cores
 
-CHOOSING, REPORTED = (0,), (10, 11, 12, 13, 14)
+CHOOSING, REPORTED = (0, 1, 2), (10, 11, 12, 13, 14)
 TABLES = {"lerf": (lerf.PLAN, lerf.QUICK), "ovs3d": (ovs3d.PLAN, ovs3d.QUICK), "replica": (replica.PLAN, replica.QUICK)}
 RESAMPLED = 2000
 BESIDE = "macc", "loc_box"
