@@ -39,11 +39,12 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     assert not found.embeddings[1:].any()
     assert not found.uniform_embeddings[1:].any()
     assert not found.pixels[3:].any()
-    upper = dataclasses.replace(
-        evidence, masks=np.where(masks == 0, 0, -1), embeddings=-embeddings[:1], frame=np.zeros(1, int)
-    )
+    once = np.array([0])
+    upper = dataclasses.replace(evidence, masks=np.where(masks == 0, 0, -1), embeddings=np.eye(4)[3:], frame=once)
     both = associated([evidence, upper], labels)
-    np.testing.assert_allclose(both.embeddings[0], unit(np.array([0.0, 0, 3, 0])), atol=1e-6)  # 5 - 5 in view 0
+    np.testing.assert_allclose(
+        both.embeddings[0], unit(np.array([5.0, 0, 0, 5])), atol=1e-6
+    )  # not the 3 of 10 in view 1
     assert not both.embeddings[1].any()  # two of ten pixels of the two levels
 
 
