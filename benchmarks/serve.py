@@ -34,7 +34,7 @@ from jsecon.types import LanguageField
 
 TOKEN = "measured"
 WORDS = ["red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "white", "black", "grey"]
-SHADES = ["light", "dark", "pale", "deep", "bright", "very", "light", "very", "dark"]
+SHADES = ["light", "dark", "pale", "deep", "bright"]
 
 
 def copied(field: LanguageField, copies: int) -> LanguageField:
@@ -73,7 +73,7 @@ def request(port: int, verb: str, path: str, body: bytes | None = None, token: s
     return told
 
 
-def load(port: int, clients: int, seconds: float, process: subprocess.Popen) -> dict:
+def load(port: int, clients: int, seconds: float) -> dict:
     """Latencies of clients that ask at once for `seconds`."""
     times, wrong, until = [], collections.Counter(), time.perf_counter() + seconds
 
@@ -163,7 +163,7 @@ def main() -> None:
                     raise SystemExit("the server did not start")
             print(f"ready after {time.perf_counter() - began:.1f} s, {memory(process):.0f} MiB")
             try:
-                told = load(port, given.clients, given.seconds, process)
+                told = load(port, given.clients, given.seconds)
                 print({k: round(v, 1) if isinstance(v, float) else v for k, v in told.items()})
                 before = memory(process)
                 connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)

@@ -7,7 +7,6 @@ there; each is lifted from one frame, or from three, and judged in the others (a
 `jsecon.query.lift` was chosen on rooms 0 and 1.
 """
 
-import argparse
 import dataclasses
 import time
 from pathlib import Path
@@ -17,15 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results
-from experiments.places import Options as Places
-from jsecon.app.demo import demo
+from experiments.places import Options as Places, asked_for, fields_of
 from jsecon.app.networks import embedder_of_field
-from jsecon.app.progress import Listener
 from jsecon.app.question import ask_outline, ask_text
-from jsecon.app.verbs import Demo
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.evaluate.metrics import iou
-from jsecon.language.field import load_field
 from jsecon.query.masks import selection_mask
 from jsecon.types import LanguageField
 
@@ -73,14 +68,11 @@ def judged(field: LanguageField, labels: list[LabelledFrame], answers: dict[str,
     return found
 
 
-def main(options: Options) -> str:
+def main(options: Places) -> str:
     """The table, written."""
     rows, every = [], {way: [] for way in (*WAYS, "seconds")}
-    for seed in options.seeds:
-        folder = Path(options.rooms) / str(seed)
-        if not (folder / "field.npz").exists():
-            demo(folder, seed=seed, steps=Demo.steps, listener=Listener())
-        field, labels = load_field(folder / "field.npz"), load_lerf_labels(folder / "capture" / "label")
+    for seed, folder, field in fields_of(options):
+        labels = load_lerf_labels(folder / "capture" / "label")
         embedder = embedder_of_field(field)
         names = sorted({name for frame in labels for name in frame.objects})
         found = judged(field, labels, {name: ask_text(field, embedder, name).mask for name in names})
@@ -96,8 +88,4 @@ def main(options: Options) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("rooms", nargs="?", default=Options.rooms)
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
-    given = parser.parse_args()
-    main(Options(given.rooms, tuple(given.seeds)))
+    main(asked_for(Options))

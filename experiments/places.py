@@ -9,6 +9,7 @@ by ray casting.
 
 import argparse
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from jsecon.data.synthetic.raycast import trace
 from jsecon.data.synthetic.room import Room, make_room
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
-from jsecon.types import Camera
+from jsecon.types import Camera, LanguageField
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,14 +61,28 @@ def box_iou(a: np.ndarray, b: np.ndarray) -> float:
     return both / (volume(a) + volume(b) - both)
 
 
-def main(options: Options) -> str:
-    """The table, written."""
-    rows = []
+def fields_of(options: Options) -> Iterator[tuple[int, Path, LanguageField]]:
+    """Seed, folder and field of each room, made where it is missing."""
     for seed in options.seeds:
         folder = Path(options.rooms) / str(seed)
         if not (folder / "field.npz").exists():
             demo(folder, seed=seed, steps=Demo.steps, listener=Listener())
-        field = load_field(folder / "field.npz")
+        yield seed, folder, load_field(folder / "field.npz")
+
+
+def asked_for(kind: type[Options]) -> Options:
+    """The options of the command line."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("rooms", nargs="?", default=kind.rooms)
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(kind.seeds))
+    given = parser.parse_args()
+    return kind(given.rooms, tuple(given.seeds))
+
+
+def main(options: Options) -> str:
+    """The table, written."""
+    rows = []
+    for seed, _, field in fields_of(options):
         embedder = embedder_of_field(field)
         for name, box in true_boxes(make_room(seed), field.cameras).items():
             try:
@@ -89,8 +104,4 @@ def main(options: Options) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("rooms", nargs="?", default=Options.rooms)
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
-    given = parser.parse_args()
-    main(Options(given.rooms, tuple(given.seeds)))
+    main(asked_for(Options))

@@ -39,8 +39,8 @@ from jsecon.splat.transform import transform_gaussians
 from jsecon.types import LanguageField
 
 REMEDY = 'pip install "jsecon[serve]"'
-KEPT = 256
-"""answers, each a mask of N bits"""
+KEPT = 64
+"""answers, of five bytes a Gaussian each"""
 
 
 class Scene:

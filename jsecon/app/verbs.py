@@ -52,7 +52,7 @@ class Fit(SceneOptions):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Asking:
-    """What `jsecon query` and `jsecon eval` take."""
+    """What `jsecon query`, `view` and `eval` take."""
 
     field: Annotated[Path, {"positional": True}]
     """field.npz of a run"""
@@ -89,7 +89,8 @@ class Query(Asking):
     votes, then each taken or left by what the outline of all gains in the views; one_step, canonical: each Gaussian's
     code against the text"""
     threshold: float | None = None
-    """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, 0.5 canonical)"""
+    """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, too high
+    for CLIP, 0.5 canonical)"""
     all: bool = False
     """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.75
     of the way from the middle region's to the best one's (by votes or silhouette)"""

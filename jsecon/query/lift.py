@@ -39,8 +39,8 @@ def lift(
 
     and Gaussians of at least `threshold` are selected. Where the field has no region there, the outline alone decides.
     Selection.region is the region that lies in the masks with the most of its weight, or -1; score its part inside.
-    Host code around compiled parts. Raises InputError for a frame that the field does not have, masks of another size,
-    and masks with nothing inside.
+    Host code around compiled parts. Raises InputError for a frame that the field does not have and for masks with
+    nothing inside, ValueError for masks of another size.
     """
     index = [_frame(field, frame) for frame in frames]
     size = field.cameras.height, field.cameras.width
