@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -63,6 +65,14 @@ def test_quaternions_are_right_at_every_angle(angles):
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     np.testing.assert_allclose(back, rotation, atol=1e-12)
+
+
+def test_numpy_arrays_stay_such_and_compile_nothing(scene):
+    matrix = _similarity()
+    for name, of_jax in vars(transform_gaussians(jax.tree.map(jnp.asarray, scene), matrix)).items():
+        own = getattr(transform_gaussians(scene, matrix), name)
+        assert isinstance(own, np.ndarray)
+        np.testing.assert_allclose(own, of_jax, rtol=2e-5, atol=2e-6)
 
 
 def test_the_identity_changes_nothing(scene):

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from jsecon.app.question import Answer
 from jsecon.data.ply import save_ply
 from jsecon.files import write_text, written_whole
-from jsecon.language.shares import membership_probability
+from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField
@@ -51,7 +51,7 @@ def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[st
         place = {"centroid": means.mean(0).round(6).tolist(), "bounding_box": box}
     region = int(answer.selection.region)
     if answer.by == "votes" and len(means):
-        probability = np.asarray(membership_probability(answer.selection.similarity, field.votes))[answer.mask]
+        probability = probability_inside(answer.selection.similarity, field.votes, answer.mask)
         sure = {"mean": round(float(probability.mean()), 4), "tenth": round(float(np.quantile(probability, 0.1)), 4)}
     return {
         "query": answer.question,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.app.answers import selected
 from jsecon.app.question import Answer, ask_text
 from jsecon.errors import InputError
-from jsecon.language.shares import membership_probability
+from jsecon.language.shares import probability_inside
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians, LanguageField
 
@@ -38,7 +38,7 @@ class Place:
     score: float
     """similarity of the best region with the text."""
     probability: float
-    """mean probability of a Gaussian to belong to the answer (`membership_probability`)."""
+    """mean probability of a Gaussian to belong to the answer (`probability_inside`)."""
     frame: str = FRAME
 
     def as_dict(self) -> dict[str, Any]:
@@ -68,14 +68,14 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     if not answer.mask.any():
         found = f"nothing selected (score {float(answer.selection.score):.3f})"
         raise InputError(answer.question, found, "a thing in the scene", "Ask with other words, or by a pixel.")
-    chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
+    plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # colours have no place
+    chosen = transform_gaussians(selected(plain, answer.mask), field.to_source)
     points = np.asarray(chosen.means, np.float64)
     spread = points - points.mean(0)
     axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     low, high = _ends(chosen, np.eye(3))
     own_low, own_high = _ends(chosen, axes)
-    probability = membership_probability(answer.selection.similarity, field.votes)
     return Place(
         answer.question,
         axes @ (0.5 * (own_low + own_high)),
@@ -85,7 +85,7 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
         high,
         points,
         float(answer.selection.score),
-        float(np.asarray(probability)[answer.mask].mean()),
+        float(probability_inside(answer.selection.similarity, field.votes, answer.mask).mean()),
     )
 
 

@@ -52,6 +52,7 @@ class Scene:
         self._gaussians = jax.device_put(field.gaussians)
         self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
         self._answer = functools.lru_cache(KEPT)(self._ask)
+        self._figures = functools.lru_cache(KEPT * KEPT)(self._tell)
 
     def _ask(self, text: str, pixel: tuple | None, by: str, threshold: float | None, several: bool) -> Answer:
         if pixel is not None:
@@ -62,6 +63,18 @@ class Scene:
         """The answer to a text, or to a pixel (frame, column, row); those asked last are kept."""
         with self._alone:
             return self._answer(text, pixel, by, threshold, several)
+
+    def _tell(self, *question: Any) -> dict[str, Any]:
+        answer = self._answer(*question)
+        told = {"question": answer.question, "field": self.name, "count": int(answer.mask.sum())}
+        region = int(answer.selection.region)
+        told |= {"region": region if region >= 0 else None, "score": round(float(answer.selection.score), 6)}
+        return told | {"place": place_of(self.field, answer).as_dict() if answer.mask.any() else None}
+
+    def tell(self, text: str, pixel: tuple | None = None, by="votes", threshold=None, several=False) -> dict[str, Any]:
+        """What and where the answer is, as plain numbers; kept for longer than the answer."""
+        with self._alone:
+            return self._figures(text, pixel, by, threshold, several)
 
     def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
         """A frame's name and the selection there as a PNG; of no frame the one that shows most of it."""
@@ -170,14 +183,7 @@ def application(scenes: dict[str, Scene], *, token: str = "", limits: Limits = L
         asked = await body(request)
         scene, question = scene_of(asked), question_of(asked)
 
-        def work() -> dict:
-            answer = scene.ask(**question)
-            told = {"question": answer.question, "field": scene.name, "count": int(answer.mask.sum())}
-            region = int(answer.selection.region)
-            told |= {"region": region if region >= 0 else None, "score": round(float(answer.selection.score), 6)}
-            return told | {"place": place_of(scene.field, answer).as_dict() if answer.mask.any() else None}
-
-        return JSONResponse(await computed(work))
+        return JSONResponse(await computed(functools.partial(scene.tell, **question)))
 
     async def regions(request: Request) -> Response:
         scene = scene_of(from_url(request))

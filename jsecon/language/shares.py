@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
@@ -198,6 +199,14 @@ def membership_probability(
     same answer. Pure; under jit and vmap.
     """
     return _probability(jnp.asarray(share), jnp.asarray(votes.views), jnp.asarray(votes.total), correlation)
+
+
+def probability_inside(share: Float[Array, " n"], votes: Votes, mask: Bool[Array, " n"]) -> Float[np.ndarray, " m"]:
+    """`membership_probability` of the M Gaussians of `mask` (N,) alone. Host code; a few sizes are compiled for."""
+    chosen = np.flatnonzero(np.asarray(mask))
+    rows = np.resize(chosen, 1 << max(len(chosen) - 1, 0).bit_length()) if len(chosen) else np.zeros(1, int)
+    picked = (np.asarray(a)[rows] for a in (share, votes.views, votes.total))
+    return np.asarray(_probability(*picked, CORRELATION))[: len(chosen)]
 
 
 @jax.jit

@@ -15,7 +15,8 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     """The Gaussians in the world that `similarity` (4, 4) leads to: x' = s R x + t, with R a rotation and s > 0.
 
     Positions, sizes, orientations and the spherical harmonics all follow, so a camera that is carried along sees the
-    same image. The identity returns the Gaussians as they are. Raises ValueError for a matrix that is no similarity.
+    same image. NumPy arrays stay such, and the identity returns the Gaussians as they are. Raises ValueError for a
+    matrix that is no similarity.
     """
     matrix = np.asarray(similarity, np.float64)
     if np.array_equal(matrix, np.eye(4)):
@@ -26,14 +27,14 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     similar = bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1]))
     expected, remedy = "a rotation, one positive scale and a shift", "Leave out shear, mirrors and unequal scales."
     require(similar, "similarity", matrix.tolist(), expected, remedy)
-    dtype = gaussians.means.dtype
-    means = jnp.asarray(gaussians.means) @ jnp.asarray(scale * rotation.T, dtype) + jnp.asarray(matrix[:3, 3], dtype)
+    xp, dtype = gaussians.means.__array_namespace__(), gaussians.means.dtype
+    cast = lambda array: xp.asarray(array, dtype)
     return Gaussians(
-        means=means,
-        log_scales=jnp.asarray(gaussians.log_scales) + jnp.asarray(np.log(scale), dtype),
-        quaternions=_product(jnp.asarray(quaternion_of(rotation), dtype), jnp.asarray(gaussians.quaternions)),
+        means=gaussians.means @ cast(scale * rotation.T) + cast(matrix[:3, 3]),
+        log_scales=gaussians.log_scales + cast(np.log(scale)),
+        quaternions=gaussians.quaternions @ cast(_product_matrix(quaternion_of(rotation))),
         opacity_logits=gaussians.opacity_logits,
-        sh=jnp.einsum("kl,nlc->nkc", jnp.asarray(_sh_rotation(rotation, gaussians.sh.shape[1]), dtype), gaussians.sh),
+        sh=cast(_sh_rotation(rotation, gaussians.sh.shape[1])) @ gaussians.sh,
     )
 
 
@@ -74,10 +75,10 @@ def quaternion_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     return np.linalg.eigh(symmetric)[1][:, -1]
 
 
-def _product(q: Array, r: Array) -> Array:
-    """Hamilton product of one quaternion (4,) with many (N, 4): first r, then q."""
+def _product_matrix(q: np.ndarray) -> np.ndarray:
+    """(4, 4) M of a quaternion (4,): r M is the Hamilton product q r, which turns by r first, then by q."""
     w, x, y, z = q
-    return r @ jnp.stack([jnp.stack(row) for row in ((w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))])
+    return np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
 
 
 def _sh_rotation(rotation: np.ndarray, bands: int) -> np.ndarray:
