@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from experiments.tables.setting import Setting
-from jsecon.types import Gaussians, Selection
+from jsecon.types import Array, Gaussians, Selection
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +57,15 @@ class Answers:
     """figures under another protocol, to stand beside the table's."""
     gaussians: Gaussians | None = None
     """that are selected from, where they are not the setting's."""
+    features: Array | None = None
+    """(N, F) what was learnt of each Gaussian, for pictures."""
 
 
 Method = Callable[[Setting, Steps], Answers]
 """trains on a setting"""
 
 
-def by_selection(setting: Setting, select: Callable[[int], Selection | None]) -> Answers:
+def by_selection(setting: Setting, select: Callable[[int], Selection | None], features: Array | None = None) -> Answers:
     """Answers of `select`; a Gaussian's class is, of the queries that select it, the one of the highest score."""
 
     def classes() -> np.ndarray:
@@ -77,4 +79,4 @@ def by_selection(setting: Setting, select: Callable[[int], Selection | None]) ->
                 best[better], found[better] = float(answer.score), k
         return found
 
-    return Answers(select, classes)
+    return Answers(select, classes, features=features)

@@ -48,15 +48,15 @@ class Plan:
     waits for the others, and ends; 1: this one computes all, with all cores."""
 
 
-def options_of(plan: Plan, quick: Plan) -> Plan:
-    """The plan that the command line asks for."""
+def options_of(plan: Plan, quick: Plan, words: list[str] | None = None) -> Plan:
+    """The plan that the command line, or `words` of it, asks for."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="one tiny scene, a few steps: at most two minutes")
     parser.add_argument("--root", default="", help="the real dataset; without it twins are made")
     parser.add_argument("--seeds", type=int, nargs="+", help="of the twins and their vision")
     parser.add_argument("--out", default="", help="where the results go")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
-    given = parser.parse_args()
+    given = parser.parse_args(words)
     chosen = dataclasses.replace(quick if given.quick else plan, processes=given.processes)
     if given.seeds:
         chosen = dataclasses.replace(chosen, data=dataclasses.replace(chosen.data, seeds=tuple(given.seeds)))

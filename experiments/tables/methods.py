@@ -32,7 +32,7 @@ def by_features(setting: Setting, features: Float[Array, "n e"], *, relevancy: b
     by_text = lambda k: select_text(labels, cosines, k)
     means = setting.evidence.gaussians.means
     read = lambda k: lifting.query_relevancy(features, means, texts[k], jnp.asarray(setting.canonical))
-    return Answers(read if relevancy else by_text, lambda: np.asarray(labels))
+    return Answers(read if relevancy else by_text, lambda: np.asarray(labels), features=features)
 
 
 def langsplat(setting: Setting, steps: Steps) -> Answers:
@@ -51,7 +51,7 @@ def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
     model = gaussian_grouping_of(setting, steps)
     canonical = jnp.asarray(setting.canonical)
     ask = lambda k: query_gaussian_grouping(model, setting.evidence, jnp.asarray(setting.texts[k]), canonical)
-    return by_selection(setting, ask)
+    return by_selection(setting, ask, model.identity)
 
 
 def gaussian_grouping_of(setting: Setting, steps: Steps) -> GaussianGrouping:
@@ -96,7 +96,7 @@ def by_leaves(setting: Setting, model: OpenGaussian) -> Answers:
         labels, _ = most_similar_text(model.leaf_features, jnp.asarray(setting.texts))
         return np.asarray(labels)[np.asarray(model.leaf_of)]
 
-    return Answers(ask, classes)
+    return Answers(ask, classes, features=model.features)
 
 
 def _lifted(train: Callable) -> Callable[[Setting, Steps], Answers]:

@@ -180,9 +180,10 @@ def ask_field(
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
     if way not in ("votes", "all", "parts"):
-        return by_selection(setting, ask)
+        return by_selection(setting, ask, field.codes)
     texts = jnp.asarray(setting.texts)
-    return Answers(ask, lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, every=True)[0]))
+    classes = lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, every=True)[0])
+    return Answers(ask, classes, features=field.codes)
 
 
 def asked(way: str, *, retrieval: str = "contrast", clean: bool = True, pieces: bool = False, **options) -> Method:

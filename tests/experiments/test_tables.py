@@ -179,12 +179,13 @@ def test_levels_that_are_alike_are_learnt_once(folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_qualitative(folder):
-    qualitative.main(small(qualitative.QUICK, folder, "qualitative", methods=CHEAP))
+@pytest.mark.parametrize("table", ["lerf", "replica"])
+def test_qualitative(folder, table):
+    qualitative.main(small(qualitative.plans(table)[1], folder, "qualitative", methods=CHEAP))
     metrics, text = read(folder, "qualitative")
     assert 1 <= len(metrics["iou"]) <= qualitative.TEXTS
-    assert "a twin in LERF-OVS's layout" in text
-    assert {*qualitative.QUICK.methods, *qualitative.PLAN.methods} <= set(METHODS)
+    assert f"a twin in the layout of {table}" in text
+    assert set(qualitative.QUICK_METHODS) <= set(METHODS)
 
 
 def test_vision_on_disk_is_what_was_simulated(folder):
