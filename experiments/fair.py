@@ -1,14 +1,14 @@
 """Tables 1 to 3 by the same rules for all: every method asked in every way, chosen on some seeds, reported on others.
 
     python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
-                               [--seeds 10 11 ...] [--choosing 0 ...] [--methods NAME ...] [--quick] [--out FOLDER]
-                               [--processes N]
+                               [--seeds 10 11 ...] [--choosing 0 ...] [--seeds-trained ...] [--choosing-trained ...]
+                               [--methods NAME ...] [--quick] [--out FOLDER] [--processes N]
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.rows`), and none may refuse a
 text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
 own; one row of ours, "one reading", takes the same for both. Those readings alone, and the published one, are then
 measured on the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap over (scene, seed,
-text) of ours against each.
+text) of ours against each. Methods that train take minutes a setting: they may be given fewer seeds.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments import lerf, ovs3d, replica, results
 from experiments.tables.fill import Plan, fill
-from experiments.tables.rows import rows_of
+from experiments.tables.rows import TRAINED, rows_of
 from jsecon.process import cores
 
 CHOOSING, REPORTED = (0, 1, 2), (10, 11, 12, 13, 14)
@@ -43,6 +43,9 @@ class Asked:
     levels: tuple[str, ...]
     seeds: tuple[int, ...]
     choosing: tuple[int, ...]
+    seeds_trained: tuple[int, ...]
+    """of `seeds`, those that the methods which train are reported on."""
+    choosing_trained: tuple[int, ...]
     methods: tuple[str, ...]
     """empty: all."""
     quick: bool
@@ -92,7 +95,9 @@ def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str,
     for method, by_figure in best.items():
         row = [method]
         for n, figure in enumerate(figures):
-            own, mine = of(by_figure[figure]), of(best[MINE][figure])
+            own = of(by_figure[figure])
+            seeds = sorted({cell["seed"] for cell in own})
+            mine = [cell for cell in of(best[MINE][figure]) if cell["seed"] in seeds]
             difference = ahead(by_text(mine, n), by_text(own, n))
             values, ours = mean(own, figure), mean(mine, figure)
             wins = [scene for scene, value in values.items() if value > ours[scene]]
@@ -102,6 +107,7 @@ def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str,
                 "mean": float(np.mean(list(values.values()))),
                 "published": float(np.mean(list(published.values()))) if published else None,
                 "ahead": difference,
+                "seeds": seeds,
                 "wins": wins,
             }
             here = told[f"{method}, {figure}"]
@@ -144,19 +150,29 @@ def plan_of(name: str, level: str, asked: Asked, processes: int, seeds: tuple[in
 
 
 def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
-    """All rows on the seeds to choose on, and of the seeds to report the rows that were best there. Raises SystemExit
-    in a helper, which has no table to write."""
+    """All rows on the seeds to choose on, and of the seeds to report the rows that were best there."""
     methods = rows_of(name == "replica")
     rows = [row for row in methods if not asked.methods or row.split(": ")[0] in asked.methods]
     rows = [row for row in rows if not asked.quick or row.split(": ")[1] in QUICK_READ]
-    tell = lambda line: print(line, flush=True)
-    plan = plan_of(name, level, asked, processes, asked.choosing, rows)
-    with contextlib.suppress(SystemExit):  # of a helper: what it was for is there
-        fill(plan, methods, tell=tell)
-    cells = fill(dataclasses.replace(plan, processes=1), methods, tell=tell)
-    best = {row for ways in chosen(cells, asked.choosing, figures_of(name)).values() for row in ways.values()}
-    kept = [row for row in rows if row in best or row.endswith(f": {PUBLISHED}")]
-    return cells + fill(plan_of(name, level, asked, processes, asked.seeds, kept), methods, tell=tell)
+
+    def filled(rows: list[str], seeds: tuple[int, ...]) -> list[dict]:
+        plan = plan_of(name, level, asked, processes, seeds, rows)
+        tell = lambda line: print(line, flush=True)
+        with contextlib.suppress(SystemExit):  # of a helper: what it was for is there
+            fill(plan, methods, tell=tell)
+        return fill(dataclasses.replace(plan, processes=1), methods, tell=tell)
+
+    cells: list[dict] = []
+    for trains in (False, True):
+        own = [row for row in rows if (row.split(": ")[0] in TRAINED) == trains]
+        if not own:
+            continue
+        choosing = filled(own, asked.choosing_trained if trains else asked.choosing)
+        seeds = tuple(cell["seed"] for cell in choosing)
+        best = {row for ways in chosen(choosing, seeds, figures_of(name)).values() for row in ways.values()}
+        kept = [row for row in own if row in best or row.endswith(f": {PUBLISHED}")]
+        cells += choosing + filled(kept, asked.seeds_trained if trains else asked.seeds)
+    return cells
 
 
 def main(asked: Asked, processes: int) -> str:
@@ -164,10 +180,10 @@ def main(asked: Asked, processes: int) -> str:
     parts, kept = [], {}
     for name in asked.tables:
         for level in asked.levels:
-            with contextlib.suppress(SystemExit):
-                text, told = report(name, level, cells_of(name, level, asked, processes), asked)
+            cells = cells_of(name, level, asked, processes)
+            if processes:  # not a helper
+                text, kept[f"{name} {level}"] = report(name, level, cells, asked)
                 parts.append(text)
-                kept[f"{name} {level}"] = told
                 print(text, flush=True)
     text = "\n\n".join(parts)
     if processes:
@@ -182,6 +198,8 @@ if __name__ == "__main__":
     parser.add_argument("--levels", nargs="+", default=["medium", "high"])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(REPORTED), help="that are reported")
     parser.add_argument("--choosing", nargs="+", type=int, default=list(CHOOSING), help="that readings are chosen on")
+    parser.add_argument("--seeds-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
+    parser.add_argument("--choosing-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
     parser.add_argument("--methods", nargs="+", default=[], help="that are compared, ours among them; default: all")
     parser.add_argument("--quick", action="store_true", help="one tiny scene of each, one seed: two minutes")
     parser.add_argument("--out", default="")
@@ -196,6 +214,8 @@ if __name__ == "__main__":
         levels,
         seeds,
         choosing,
+        tuple(given.seeds_trained or seeds),
+        tuple(given.choosing_trained or choosing),
         tuple(given.methods),
         given.quick,
         place,
