@@ -105,5 +105,5 @@ def dense(gaussians, camera, features, cotangent):
     with jax.enable_x64(True):
         arguments = jax.tree.map(jnp.asarray, (gaussians, camera, features, cotangent))
         # Compiled without optimisation: several times as soon ready, and it runs but a few times.
-        run = _compiled(dense_image, xla_backend_optimization_level=0, xla_cpu_use_fusion_emitters=False)
+        run = _compiled(dense_image, xla_backend_optimization_level=0)
         return jax.tree.map(np.asarray, run(*arguments))
