@@ -4,6 +4,7 @@ from jsecon.app.place import Place as Place, locate as locate
 from jsecon.association.algorithm1 import masklets as masklets
 from jsecon.backend import check_backend as check_backend
 from jsecon.data.capture import load_capture as load_capture
+from jsecon.data.gaussian_files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
 from jsecon.data.ply import load_ply as load_ply, save_ply as save_ply
 from jsecon.errors import InputError as InputError
 from jsecon.evaluate.metrics import (

@@ -76,7 +76,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     expected = transform_gaussians(run.field.gaussians, run.capture.to_source)
     np.testing.assert_allclose(scene.means, expected.means, atol=1e-5)
     assert _run(*asked[:3], tmp_path / "scene.sog") == 2
-    assert "ends in .ply" in capsys.readouterr().err
+    assert "expected .ply or .spz or .glb" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("by", ["votes", "silhouette", "code", "one_step", "canonical"])

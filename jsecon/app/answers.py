@@ -1,4 +1,4 @@
-"""An answer as files: a .ply of the Gaussians, a JSON of figures, a few masks."""
+"""An answer as files: one of the Gaussians, a JSON of figures, a few masks."""
 
 import json
 import re
@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from jsecon.app.question import Answer
-from jsecon.data.ply import save_ply
+from jsecon.app.splat_page import NOWHERE, regions_of
+from jsecon.data.gaussian_files import save_gaussians
 from jsecon.files import write_text, written_whole
 from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
@@ -68,25 +69,37 @@ def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[st
 
 
 def write_answer(
-    field: LanguageField, answer: Answer, out: Path, masks: Mapping[int, Bool[np.ndarray, "h w"]]
+    field: LanguageField,
+    answer: Answer,
+    out: Path,
+    masks: Mapping[int, Bool[np.ndarray, "h w"]],
+    *,
+    ending: str = "ply",
 ) -> dict[str, Any]:
-    """Writes OUT/<slug>.ply, .json, and <slug>-<frame>.png of `masks` (by frame, see `masks_of`); returns the figures.
-
-    The .ply is in the capture files' own world, in INRIA's layout. An empty selection leaves out the .ply and the
-    masks.
+    """Writes OUT/<slug>.ply (or .spz, .glb: `ending`), .json, and <slug>-<frame>.png of `masks` (by frame, see
+    `masks_of`); returns the figures. An empty selection leaves out the Gaussians and the masks.
     """
     slug = slug_of(answer.question)
     chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
-    told = _figures(field, answer, chosen) | {"ply": None, "masks": {}}
+    told = _figures(field, answer, chosen) | {ending: None, "masks": {}}
     if answer.mask.any():
-        told["ply"] = f"{slug}.ply"
-        save_ply(out / told["ply"], chosen)
+        told[ending] = f"{slug}.{ending}"
+        save_part(field, out / told[ending], answer.mask)
         for t, mask in masks.items():
             told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
             with written_whole(out / told["masks"][field.names[t]]) as temporary:
                 cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
     write_text(out / f"{slug}.json", json.dumps(told, indent=2) + "\n")
     return told
+
+
+def save_part(field: LanguageField, file: Path, mask: Bool[np.ndarray, " n"] | None = None) -> None:
+    """Writes the Gaussians, or the masked ones, in the capture files' own world; with their codes and regions where the
+    file is a .glb."""
+    mask = np.ones(field.gaussians.count, bool) if mask is None else mask
+    regions = regions_of(field)[mask]
+    chosen = transform_gaussians(selected(field.gaussians, mask), field.to_source)
+    save_gaussians(file, chosen, codes=np.asarray(field.codes)[mask], regions=np.where(regions == NOWHERE, -1, regions))
 
 
 def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:

@@ -12,7 +12,7 @@ from typing import Any
 import jsecon
 from jsecon.app.arguments import add_arguments, parsed
 from jsecon.app.options import Options, SceneOptions, require_writable
-from jsecon.app.verbs import Asking, Demo, Eval, Fit, Models, Query, Run, Serve, View
+from jsecon.app.verbs import Asking, Demo, Eval, Export, Fit, Models, Query, Run, Serve, View
 from jsecon.errors import InputError
 
 EPILOG = """
@@ -25,6 +25,7 @@ examples
   jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
   jsecon query my_field/field.npz "red mug" "dark green bottle" --out answers
   jsecon query my_field/field.npz --at frame_00012 310 145 --out answers
+  jsecon export my_field/field.npz --out scene.glb      the whole scene for other programs, codes included
   jsecon eval my_field/field.npz --labels my_capture/label --out evaluation
   jsecon run my_capture --out my_field --segmenter sam --embedder clip
                                                         with SAM and CLIP from model folders
@@ -88,9 +89,9 @@ def _fit(asked: Fit) -> None:
     from jsecon.app import pipeline
     from jsecon.app.progress import Console
     from jsecon.app.summary import write_scene
+    from jsecon.data.gaussian_files import require_written
 
-    if asked.out.suffix != ".ply":
-        raise InputError("--out", str(asked.out), "a file that ends in .ply", "For example: --out scene.ply")
+    require_written(asked.out)
     console = Console()
     options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(SceneOptions)})
     write_scene(*pipeline.fit(options, asked.out.with_suffix(""), listener=console), asked.out, console)
@@ -100,6 +101,7 @@ def _query(asked: Query) -> None:
     from jsecon.app import question
     from jsecon.app.progress import Console
     from jsecon.app.summary import write_answers
+    from jsecon.data.gaussian_files import require_written
     from jsecon.language.field import load_field
 
     if not (asked.texts or asked.at or asked.mask or asked.box):
@@ -112,6 +114,7 @@ def _query(asked: Query) -> None:
             remedy = "For example: --mask frame_00012 mug.png"
             raise InputError("--mask", " ".join(given), "FRAME PNG, in pairs", remedy)
     require_writable(asked.out)
+    require_written(asked.out / f"answer.{asked.format}")
     field = load_field(asked.field)
     embedder = _embedder(field, asked) if asked.texts else None
     asking = question.questions_of(
@@ -129,7 +132,7 @@ def _query(asked: Query) -> None:
     )
     answers, refused = question.asked_each(asking)
     if answers:
-        write_answers(field, answers, asked.out, Console(), views=asked.views)
+        write_answers(field, answers, asked.out, Console(), views=asked.views, ending=asked.format)
     _tell(refused)
 
 
@@ -139,6 +142,18 @@ def _tell(refused: Sequence[InputError]) -> None:
         print(f"jsecon: {error}", file=sys.stderr)
     if refused:
         raise refused[-1]
+
+
+def _export(asked: Export) -> None:
+    from jsecon.app.answers import save_part
+    from jsecon.app.progress import Console
+    from jsecon.data.gaussian_files import require_written
+    from jsecon.language.field import load_field
+
+    require_written(asked.out)
+    field = load_field(asked.field)
+    save_part(field, asked.out)
+    Console().say(f"{field.gaussians.count} Gaussians, {asked.out.stat().st_size / 2**20:.1f} MiB  {asked.out}")
 
 
 def _view(asked: View) -> None:
@@ -207,6 +222,7 @@ _VERBS: dict[str, tuple[Any, type]] = {
     "run": (_run, Run),
     "fit": (_fit, Fit),
     "query": (_query, Query),
+    "export": (_export, Export),
     "view": (_view, View),
     "eval": (_eval, Eval),
     "serve": (_serve, Serve),

@@ -133,23 +133,32 @@ def _checked(capture: Capture, size: str) -> Outcome:
 
 
 def gaussians(work: Work) -> Stage:
-    """The scene's Gaussians: of a .ply in the capture's world, or fitted to the training frames."""
+    """The scene's Gaussians: of a file in the capture's world, or fitted to the training frames."""
     return _fitted(work) if work.options.gaussians is None else _read(work)
 
 
 def _read(work: Work) -> Stage:
     path = work.options.gaussians
     assert path is not None
+    trained = path.parent / "dataparser_transforms.json"
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.data.ply import load_ply
+        from jsecon.data.gaussian_files import load_gaussians
+        from jsecon.data.nerfstudio import trained_to_source
+        from jsecon.splat.transform import transform_gaussians
 
-        capture, found = results["load"], load_ply(path)
+        capture, found, notes = results["load"], load_gaussians(path), ()
+        if trained.is_file():
+            found = transform_gaussians(found, np.linalg.inv(capture.to_source) @ trained_to_source(trained))
+            notes = (f"The Gaussians were carried back from nerfstudio's world by {trained.name}.",)
         check_overlap(found, capture.cameras[training_frames(capture)], str(path))
-        return Outcome(found)
+        return Outcome(found, notes=notes)
 
+    given = {"trained": trained.read_text(errors="replace")} if trained.is_file() else {}
     left = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
-    return Stage("gaussians", f"read from {path.name}", compute, after=("load",), files=path, left_out=left)
+    return Stage(
+        "gaussians", f"read from {path.name}", compute, after=("load",), given=given, files=path, left_out=left
+    )
 
 
 def _fitted(work: Work) -> Stage:
@@ -203,7 +212,7 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
     share = float(jnp.mean(seen.sum(0) >= 2)) if gaussians.count else 0.0
     if share < least:
         found = f"{share:.1%} of {gaussians.count} points in the view of two or more of the {len(seen)} frames"
-        remedy = "Check that the poses belong to these frames, and the .ply to this capture."
+        remedy = "Check that the poses belong to these frames, and the Gaussians to this capture."
         raise InputError(where, found, "views that overlap, and a scene in the world of their poses", remedy)
 
 

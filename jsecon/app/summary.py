@@ -11,8 +11,8 @@ import numpy as np
 from jsecon.app import answers as answers_of, pictures, question, report
 from jsecon.app.pipeline import Run, peak_memory_mib
 from jsecon.app.progress import Listener
+from jsecon.data.gaussian_files import save_gaussians
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
-from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
@@ -46,8 +46,8 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
 
 
 def write_scene(gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener) -> None:
-    """The .ply of a fitted scene, in the world of the capture's files; says the figures."""
-    save_ply(out, transform_gaussians(gaussians, capture.to_source))
+    """The file of a fitted scene, in the world of the capture's files; says the figures."""
+    save_gaussians(out, transform_gaussians(gaussians, capture.to_source))
     say_quality(held_out, listener)
     listener.say(f"{gaussians.count} Gaussians  {out}")
 
@@ -78,13 +78,20 @@ def run_metrics(run: Run) -> dict[str, Any]:
 
 
 def write_answers(
-    field: LanguageField, answers: Sequence[question.Answer], out: Path, listener: Listener, *, views: int
+    field: LanguageField,
+    answers: Sequence[question.Answer],
+    out: Path,
+    listener: Listener,
+    *,
+    views: int,
+    ending: str = "ply",
 ) -> None:
     """The files of each answer, OUT/answers.html, and a line each."""
     renderer, parts = pictures.Renderer(field.gaussians, field.cameras), []
     for n, item in enumerate(answers):
         shown = answers_of.masks_of(field, item, max(views, 1))
-        told = answers_of.write_answer(field, item, out, {t: shown[t] for t in list(shown)[:views]})
+        masks = {t: shown[t] for t in list(shown)[:views]}
+        told = answers_of.write_answer(field, item, out, masks, ending=ending)
         if told["place"]:
             place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
         elif told["region"] is None and item.by in ("votes", "code"):

@@ -41,13 +41,13 @@ class Run(Options):
 class Fit(SceneOptions):
     """fit Gaussians to a capture, and no more
 
-    From posed frames to a scene of 3D Gaussians as a .ply (INRIA layout, in the capture's own world; SuperSplat opens
-    it), with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the same name without the ending,
-    from which it goes on when it was stopped, and `jsecon run` into that folder too.
+    From posed frames to a scene of 3D Gaussians in the capture's own world, as a .ply (INRIA's layout; SuperSplat opens
+    it), .spz (extra formats) or .glb, with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the
+    same name without the ending, from which it goes on when it was stopped, and `jsecon run` into that folder too.
     """
 
-    out: Annotated[Path, {"metavar": "PLY"}]
-    """the .ply file to write"""
+    out: Annotated[Path, {"metavar": "FILE"}]
+    """the .ply, .spz or .glb to write"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,9 +66,9 @@ class Asking:
 class Query(Asking):
     """the Gaussians that a text names, that lie under a pixel, or that somebody outlined
 
-    For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA layout, in the capture's own
-    world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames that
-    show it best, and answers.html with the pictures.
+    For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA's layout, in the capture's
+    own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames
+    that show it best, and answers.html with the pictures.
     """
 
     texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
@@ -100,6 +100,23 @@ class Query(Asking):
     """leave out the last step, DBSCAN"""
     views: Annotated[int, {"metavar": "N"}] = 3
     """masks to write per query"""
+    format: Literal["ply", "spz", "glb"] = "ply"
+    """of the selected Gaussians; glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds their codes and
+    regions too"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export:
+    """write the whole scene of a field for other programs
+
+    As .ply (INRIA's layout), .spz (extra formats) or .glb, in the capture's own world. The .glb is glTF with Khronos'
+    KHR_gaussian_splatting, y up, and holds each Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
+    """
+
+    field: Annotated[Path, {"positional": True}]
+    """field.npz of a run"""
+    out: Annotated[Path, {"metavar": "FILE"}]
+    """the .ply, .spz or .glb to write"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

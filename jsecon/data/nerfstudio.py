@@ -67,6 +67,20 @@ def read_nerfstudio(file: Path) -> Posed:
     return Posed(shots, file, *points, to_source=to_source, notes=tuple(notes))
 
 
+def trained_to_source(file: Path) -> Float[np.ndarray, "4 4"]:
+    """From the world that nerfstudio trained and exported Gaussians in to the source's, before any applied_transform:
+    the inverse of a dataparser_transforms.json, trained = scale * (transform source).
+
+    Raises InputError where the file is damaged or holds no similarity.
+    """
+    told = _parse(file)
+    matrix = _matrix(file, _key(file, told, "transform", "the file", list), "transform")
+    scale = _number(file, told, "scale", 1.0)
+    if not scale > 0:
+        raise _bad(file, f"scale = {scale}", "a number above 0", "Copy it again from the folder of the training.")
+    return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ rigid(matrix, file, "the trained world"))
+
+
 def _bad(file: Path, found: str, expected: str, remedy: str = _REMEDY) -> InputError:
     return InputError(file, found, expected, remedy)
 

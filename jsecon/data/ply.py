@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -66,6 +67,12 @@ def load_ply(path: str | Path) -> Gaussians:
         "opacity_logits": _columns(vertices, _OPACITY)[:, 0],
         "sh": np.concatenate([first, others], axis=1),
     }
+    return sound(path, arrays)
+
+
+def sound(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
+    """The Gaussians of a file's float32 arrays, by their fields. Raises InputError on numbers that are not finite (but
+    infinite opacity logits, opacities of exactly 0 or 1, are kept), and on zero quaternions."""
     clean = "Remove these Gaussians (SuperSplat drops them on loading), or train again."
     for name, array in arrays.items():
         wrong = np.isnan(array) if name == "opacity_logits" else ~np.isfinite(array)

@@ -86,7 +86,7 @@ def read_vertices(path: Path) -> np.ndarray:
     data, form, elements, offset = opened(path)
     names = [element.name for element in elements]
     if "chunk" in names or any(name == "packed_position" for element in elements for name, _ in element.fields):
-        remedy = "Export it from SuperSplat as an uncompressed PLY, or convert it with splat-transform."
+        remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
         raise bad_ply(path, "a compressed .ply (SuperSplat's packed chunks)", "an uncompressed .ply", remedy)
     if "vertex" not in names:
         raise bad_ply(path, f"elements {', '.join(names) or 'none'}", "an element vertex")

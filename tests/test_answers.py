@@ -1,0 +1,71 @@
+"""Answers and whole fields as files of every format, from the command line, against the field that they come from."""
+
+import json
+
+import numpy as np
+import pytest
+from small_field import REGIONS, make_field
+from test_gltf import read_glb
+
+from jsecon.app import command_line
+from jsecon.app.splat_page import NOWHERE, regions_of
+from jsecon.data.gaussian_files import load_gaussians
+from jsecon.language.field import save_field
+
+
+@pytest.fixture(scope="module")
+def saved(scene, cameras, tmp_path_factory):
+    """A small field whose source lies 2 units to the side of its world, and its file."""
+    import dataclasses
+
+    moved = np.eye(4)
+    moved[0, 3] = 2
+    field = dataclasses.replace(make_field(scene, cameras)[0], to_source=moved)
+    file = tmp_path_factory.mktemp("field") / "field.npz"
+    save_field(file, field)
+    return field, file
+
+
+def run(*arguments) -> int:
+    return command_line.main([str(argument) for argument in arguments])
+
+
+def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
+    field, file = saved
+    means = np.add(field.gaussians.means, [2, 0, 0])
+    for ending in ("ply", "spz"):
+        assert run("export", file, "--out", tmp_path / f"scene.{ending}") == 0
+        np.testing.assert_allclose(load_gaussians(tmp_path / f"scene.{ending}").means, means, atol=2**-16)
+    assert run("export", file, "--out", tmp_path / "scene.glb") == 0
+    assert f"{len(means)} Gaussians" in capsys.readouterr().out
+    _, found = read_glb(tmp_path / "scene.glb")
+    np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
+    codes = np.concatenate([found[name] for name in found if name.startswith("_CODE")], axis=1)
+    np.testing.assert_array_equal(codes, field.codes)
+    regions = regions_of(field)
+    np.testing.assert_array_equal(found["_REGION"][:, 0], np.where(regions == NOWHERE, -1, regions))
+    assert set(range(REGIONS)) <= set(found["_REGION"][:, 0].astype(int))
+
+
+@pytest.mark.parametrize("ending", ["ply", "spz", "glb"])
+def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
+    field, file = saved
+    size = field.cameras.width, field.cameras.height
+    asked = "query", file, "--box", "#0", 0, 0, *size, "--out", tmp_path, "--format", ending, "--views", 1
+    assert run(*asked) == 0
+    told = json.loads(next(tmp_path.glob("*.json")).read_text())
+    assert told["count"] > 0
+    chosen = tmp_path / told[ending]
+    if ending == "glb":
+        assert len(read_glb(chosen)[1]["_REGION"]) == told["count"]
+    else:
+        means = np.asarray(load_gaussians(chosen).means, np.float64)
+        np.testing.assert_allclose(means.mean(0), told["place"]["centroid"], atol=1e-4)
+    assert {path.suffix for path in tmp_path.iterdir()} == {f".{ending}", ".json", ".png", ".html"}
+
+
+def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp_path, capsys):
+    assert run("export", tmp_path / "none.npz", "--out", tmp_path / "scene.sog") == 2
+    told = capsys.readouterr().err
+    assert "scene.sog" in told
+    assert "npx @playcanvas/splat-transform" in told

@@ -1,0 +1,193 @@
+"""Gaussians of other programs' files, against files packed byte by byte here: each number within its format's step."""
+
+import contextlib
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import splat_files
+from capture_files import refused
+from scipy.spatial.transform import Rotation
+from splat_files import RUB, opacity, scene
+
+from jsecon.data import gaussian_files
+from jsecon.data.gaussian_files import load_gaussians, save_gaussians
+from jsecon.data.ply import save_ply
+from jsecon.errors import InputError
+from jsecon.splat.render import render_rgb
+from jsecon.types import Camera, Gaussians
+
+SCENE = scene(600, 4)
+PLAIN = scene(600, 1)
+FILES = {
+    "a.compressed.ply": (splat_files.compressed_ply, SCENE),
+    "two.spz": (lambda arrays: splat_files.spz(arrays, 2), SCENE),
+    "three.spz": (lambda arrays: splat_files.spz(arrays, 3, fraction=16), SCENE),
+    "four.spz": (lambda arrays: splat_files.spz(arrays, 4), SCENE),
+    "a.sog": (splat_files.sog, PLAIN),
+    "a.splat": (splat_files.splat, PLAIN),
+}
+STEPS = {  # of places, sizes (logarithm), opacities, constant and other harmonics; least cosine of an axis
+    "a.compressed.ply": (8 / 1023, 7 / 1023, 1 / 255, 1.2 / 255 / 0.28, 1 / 32, 0.99999),
+    "two.spz": (2**-12, 1 / 16, 1 / 255, 1 / 255 / 0.15, 1 / 128, 0.97),
+    "three.spz": (2**-16, 1 / 16, 1 / 255, 1 / 255 / 0.15, 1 / 128, 0.99999),
+    "four.spz": (2**-12, 1 / 16, 1 / 255, 1 / 255 / 0.15, 1 / 128, 0.99999),
+    "a.sog": (6 * 3.2 / 65535, 7 / 255, 1 / 255, 3.4 / 255, 0, 0.9998),
+    "a.splat": (1e-6, 1e-5, 1 / 255, 1 / 255 / 0.28, 0, 0.9998),
+}
+
+
+def gaussians(arrays: dict) -> Gaussians:
+    return Gaussians(**{name: array.astype(np.float32) for name, array in arrays.items()})
+
+
+def image(scene: Gaussians) -> np.ndarray:
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, 3] = -1, -1, 9
+    camera = Camera(pose, *(np.float32(v) for v in (60, 60, 40, 30)), width=80, height=60)
+    return np.asarray(jax.jit(render_rgb)(scene, camera).features)
+
+
+def psnr(a: Gaussians, b: Gaussians) -> float:
+    return float(-10 * np.log10(np.mean((image(a) - image(b)) ** 2)))
+
+
+def compare(found: Gaussians, given: dict, steps: tuple) -> None:
+    """Each number within half a step, and a little of float32."""
+    place, size, alpha, colour, rest, turn = steps
+    near = lambda a, b, step: np.testing.assert_allclose(a, b, rtol=0, atol=0.51 * step + 2e-6)
+    near(found.means, given["means"], place)
+    near(found.log_scales, given["log_scales"], size)
+    near(opacity({"opacity_logits": np.asarray(found.opacity_logits)}), opacity(given), alpha)
+    near(found.sh[:, 0], given["sh"][:, 0], colour)
+    near(found.sh[:, 1:], given["sh"][:, 1:], rest)
+    a, b = (Rotation.from_quat(np.roll(q, -1, axis=1)).as_matrix() for q in (found.quaternions, given["quaternions"]))
+    assert np.abs((a * b).sum(1)).min() > turn  # of each axis; its sign is free
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_numbers_come_back_within_the_formats_steps(tmp_path, name):
+    write, given = FILES[name]
+    (tmp_path / name).write_bytes(write(given))
+    found = load_gaussians(tmp_path / name)
+    assert found.count == 600
+    assert all(getattr(found, field.name).dtype == np.float32 for field in dataclasses.fields(found))
+    compare(found, given, STEPS[name])
+    assert psnr(found, gaussians(given)) > 35
+
+
+def test_a_spz_is_turned_from_its_makers_axes_and_back(tmp_path):
+    """Niantic's words: right, up, back, where a .ply is right, down, front: y and z change their signs."""
+    import gsply
+
+    save_gaussians(tmp_path / "a.spz", gaussians(SCENE))
+    stored = gsply.read_spz(tmp_path / "a.spz")
+    np.testing.assert_allclose(stored.means, SCENE["means"] * RUB, atol=2**-16)
+    compare(load_gaussians(tmp_path / "a.spz"), SCENE, STEPS["three.spz"])
+
+
+@pytest.mark.parametrize("basis", [1, 4, 9, 16])
+def test_a_spz_holds_harmonics_of_every_degree(tmp_path, basis):
+    given = scene(600, basis)
+    save_gaussians(tmp_path / "a.spz", gaussians(given))
+    found = load_gaussians(tmp_path / "a.spz")
+    compare(found, given, STEPS["three.spz"])
+    assert basis == 9 or psnr(found, gaussians(given)) > 35
+
+
+def test_a_spz_of_a_wide_scene_of_sure_opacities_and_of_nothing(tmp_path):
+    wide = scene(50, 1) | {"opacity_logits": np.repeat([-np.inf, np.inf], 25)}
+    wide["means"] *= 1e4
+    save_gaussians(tmp_path / "a.spz", gaussians(wide))
+    found = load_gaussians(tmp_path / "a.spz")
+    np.testing.assert_allclose(found.means, wide["means"], atol=5e4 / 2**22)
+    np.testing.assert_allclose(
+        opacity({"opacity_logits": np.asarray(found.opacity_logits)}), [0] * 25 + [1] * 25, atol=2e-6
+    )
+    save_gaussians(tmp_path / "none.spz", gaussians(scene(0, 1)))
+    assert load_gaussians(tmp_path / "none.spz").count == 0
+    wide["means"] *= 1e4
+    with refused("a.spz", "units from the origin"):
+        save_gaussians(tmp_path / "a.spz", gaussians(wide))
+
+
+def test_a_plain_ply_is_read_as_before(tmp_path):
+    given = gaussians(SCENE)
+    save_gaussians(tmp_path / "a.ply", given)
+    found = load_gaussians(tmp_path / "a.ply")
+    for field in dataclasses.fields(Gaussians):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(given, field.name))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_spoilt_files_are_refused(tmp_path, name):
+    write, given = FILES[name]
+    whole = write(given)
+    for length in [0, 1, 40, len(whole) // 2 + 1, len(whole) - 1]:
+        if name == "a.splat" and length == 0:
+            continue  # no Gaussian at all
+        (tmp_path / name).write_bytes(whole[:length])
+        with refused(name):
+            load_gaussians(tmp_path / name)
+    rng = np.random.default_rng(0)
+    for _ in range(20):  # damaged anywhere: Gaussians, or a reason, and nothing else
+        bytes_ = bytearray(whole)
+        for place in rng.integers(0, len(whole), 8):
+            bytes_[place] = rng.integers(256)
+        (tmp_path / name).write_bytes(bytes_)
+        with contextlib.suppress(InputError):
+            assert load_gaussians(tmp_path / name).count <= 600
+
+
+def test_a_compressed_ply_with_too_few_chunks(tmp_path):
+    whole = splat_files.compressed_ply(SCENE).replace(b"element chunk 3", b"element chunk 2")
+    (tmp_path / "a.ply").write_bytes(whole)
+    with refused("a.ply", "2 chunks for 600 Gaussians", "splat-transform"):
+        load_gaussians(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("scene.ksplat", "npx @playcanvas/splat-transform scene.ksplat scene.ply"),
+        ("meta.json", "npx @playcanvas/splat-transform meta.json meta.ply"),
+        ("scene.glb", "Export the scene as one of them"),
+        ("scene", "ends in nothing"),
+    ],
+)
+def test_other_formats_say_what_to_run(tmp_path, name, says):
+    (tmp_path / name).write_bytes(b"something")
+    with refused(name, says, ".spz, .sog or .splat"):
+        load_gaussians(tmp_path / name)
+
+
+def test_missing_files_endings_and_packages(tmp_path, monkeypatch):
+    for name in ("none.ply", "none.spz", "none.splat"):
+        with refused(name, "No such file"):
+            load_gaussians(tmp_path / name)
+    with refused("scene.sog", ".ply or .spz or .glb", "splat-transform"):
+        save_gaussians(tmp_path / "scene.sog", gaussians(SCENE))
+    (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, 3))
+    monkeypatch.setattr(gaussian_files.importlib.util, "find_spec", lambda name: None)
+    for act in (
+        lambda: load_gaussians(tmp_path / "a.spz"),
+        lambda: save_gaussians(tmp_path / "b.spz", gaussians(SCENE)),
+    ):
+        with refused("no package gsply", "pip install 'jsecon[formats]'"):
+            act()
+    save_ply(tmp_path / "a.ply", gaussians(SCENE))
+    assert load_gaussians(tmp_path / "a.ply").count == 600
+
+
+def test_a_splat_without_size_or_turn(tmp_path):
+    whole = bytearray(splat_files.splat(PLAIN))
+    whole[12:16] = bytes(4)
+    (tmp_path / "a.splat").write_bytes(whole)
+    with refused("1 Gaussians of 600 whose log_scales"):
+        load_gaussians(tmp_path / "a.splat")
+    whole = bytearray(splat_files.splat(PLAIN))
+    whole[28:32] = bytes([128] * 4)
+    (tmp_path / "a.splat").write_bytes(whole)
+    with refused("without rotation"):
+        load_gaussians(tmp_path / "a.splat")

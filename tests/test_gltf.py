@@ -1,0 +1,101 @@
+"""A .glb read byte by byte: the container, the extension's attributes, the axes, and what belongs to a field."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from capture_files import refused
+from splat_files import C0, opacity, scene
+from test_gaussian_files import gaussians, image
+
+from jsecon.data.gltf import save_glb
+from jsecon.splat.transform import transform_gaussians
+from jsecon.types import Gaussians
+
+COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+NAME = "KHR_gaussian_splatting"
+
+
+def read_glb(path) -> tuple[dict, dict[str, np.ndarray]]:
+    """(JSON, attribute -> array), by glTF 2.0 and apart from the writer."""
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    told = json.loads(data[20 : 20 + size])
+    behind, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert (kind, size % 4, behind % 4, 28 + size + behind) == (b"BIN\0", 0, 0, len(data))
+    assert told["buffers"] == [{"byteLength": behind}]
+    body, arrays = data[28 + size :], {}
+    for name, index in told["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = told["accessors"][index]
+        view = told["bufferViews"][accessor["bufferView"]]
+        dtype = np.dtype({5126: "<f4", 5121: "u1"}[accessor["componentType"]])
+        shape = accessor["count"], COMPONENTS[accessor["type"]]
+        assert view["byteLength"] == dtype.itemsize * shape[0] * shape[1]
+        assert view["byteOffset"] % 4 == 0
+        arrays[name] = np.frombuffer(body, dtype, shape[0] * shape[1], view["byteOffset"]).reshape(shape)
+    return told, arrays
+
+
+@pytest.mark.parametrize("basis", [1, 4, 9, 16])
+def test_attributes_are_the_extensions(tmp_path, basis):
+    given = scene(101, basis)
+    save_glb(tmp_path / "a.glb", gaussians(given | {"quaternions": 3 * given["quaternions"]}))
+    told, found = read_glb(tmp_path / "a.glb")
+    degrees = range({1: 1, 4: 2, 9: 3, 16: 4}[basis])
+    harmonics = [f"{NAME}:SH_DEGREE_{degree}_COEF_{n}" for degree in degrees for n in range(2 * degree + 1)]
+    own = [f"{NAME}:{kind}" for kind in ("ROTATION", "SCALE", "OPACITY")]
+    assert list(found) == ["POSITION", "COLOR_0", *own, *harmonics]
+    assert told["extensionsUsed"] == [NAME]
+    primitive = told["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"] == {NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    np.testing.assert_allclose(found["POSITION"], given["means"] * [-1, -1, 1], atol=1e-6)
+    bounds = told["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(bounds["min"], found["POSITION"].min(0))
+    np.testing.assert_array_equal(bounds["max"], found["POSITION"].max(0))
+    np.testing.assert_allclose(found[own[1]], np.exp(given["log_scales"]), rtol=1e-5)
+    np.testing.assert_allclose(found[own[2]][:, 0], opacity(given), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found[own[0]], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(found[harmonics[0]], given["sh"][:, 0], atol=1e-6)
+    assert told["accessors"][primitive["attributes"]["COLOR_0"]]["normalized"] is True
+    linear = found["COLOR_0"][:, :3] / 255.0
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(shown, np.clip(0.5 + C0 * given["sh"][:, 0], 0, 1), atol=0.03)
+    np.testing.assert_allclose(found["COLOR_0"][:, 3] / 255, opacity(given), atol=0.002)
+
+
+def test_what_it_holds_shows_the_same_image(tmp_path):
+    """Back from the file's axes by hand: turns and harmonics have followed the places."""
+    given = gaussians(scene(600, 16))
+    save_glb(tmp_path / "a.glb", given)
+    _, found = read_glb(tmp_path / "a.glb")
+    rotation, scale, alpha = (found[f"{NAME}:{kind}"] for kind in ("ROTATION", "SCALE", "OPACITY"))
+    harmonics = [array for name, array in found.items() if ":SH_" in name]
+    logits = np.log(alpha / (1 - alpha))[:, 0]
+    stored = Gaussians(
+        found["POSITION"], np.log(scale), np.roll(rotation, 1, axis=1), logits, np.stack(harmonics, axis=1)
+    )
+    turned = transform_gaussians(stored, np.diag([-1.0, -1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(image(turned), image(given), atol=2e-4)
+
+
+@pytest.mark.parametrize("size", [1, 4, 6, 16])
+def test_codes_and_regions_are_the_applications(tmp_path, size):
+    rng = np.random.default_rng(size)
+    codes, regions = rng.normal(size=(30, size)).astype(np.float32), rng.integers(-1, 300, 30)
+    save_glb(tmp_path / "a.glb", gaussians(scene(30, 1)), codes=codes, regions=regions)
+    _, found = read_glb(tmp_path / "a.glb")
+    parts = [found[f"_CODE_{n}"] for n in range((size + 3) // 4)]
+    np.testing.assert_array_equal(np.concatenate(parts, axis=1), codes)
+    np.testing.assert_array_equal(found["_REGION"][:, 0], regions)
+    assert len(found) == 6 + len(parts) + 1
+
+
+def test_nothing_to_write_and_nowhere_to_write_it(tmp_path):
+    with refused("a.glb", "no Gaussians"):
+        save_glb(tmp_path / "a.glb", gaussians(scene(0, 1)))
+    (tmp_path / "file").write_text("in the way")
+    with refused("a.glb", "a folder"):
+        save_glb(tmp_path / "file" / "a.glb", gaussians(scene(3, 1)))
