@@ -19,8 +19,8 @@ class SceneOptions:
     """What the Gaussians of a capture depend on."""
 
     capture: Annotated[Path, {"positional": True}]
-    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
-    photographs or a video, whose poses are then found (extra sfm)"""
+    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); of ScanNet, TUM,
+    ARKitScenes, Polycam or Record3D; of photographs, or a video, whose poses are then found (extra sfm)"""
     downscale: Annotated[float | None, {"metavar": "K", "least": 1}] = None
     """make frames K times smaller (default: so that the longer side is at most --long-side)"""
     long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400

@@ -28,8 +28,10 @@ def loaded(work: Work) -> list[Stage]:
 def _bare(capture: Path) -> bool:
     """Whether it is a video, or a folder of photographs without a file of poses."""
     from jsecon.data.colmap import find_model
+    from jsecon.data.rgbd import find_rgbd
 
-    if find_model(capture) is not None or (capture / "transforms.json").exists() or capture.suffix == ".json":
+    posed = find_model(capture) is not None or find_rgbd(capture) is not None
+    if posed or (capture / "transforms.json").exists() or capture.suffix == ".json":
         return False
     from jsecon.data.motion import photographs
     from jsecon.data.video import is_video

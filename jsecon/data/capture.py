@@ -9,6 +9,7 @@ from scipy.optimize import nnls
 from jsecon.data.colmap import find_model, read_colmap
 from jsecon.data.frames import Posed, Progress, assemble, check_options
 from jsecon.data.nerfstudio import read_nerfstudio
+from jsecon.data.rgbd import find_rgbd
 from jsecon.errors import InputError
 from jsecon.types import Camera, Capture
 
@@ -24,8 +25,8 @@ def load_capture(
     holdout: int | None = 8,
     progress: Progress = None,
 ) -> Capture:
-    """Loads a capture folder: COLMAP (sparse/0 and images/), or nerfstudio / instant-ngp (transforms.json; also that
-    file itself, under any name).
+    """Loads a capture folder: COLMAP (sparse/0 and images/), nerfstudio / instant-ngp (transforms.json; also that file
+    itself, under any name), or one of `find_rgbd`: ScanNet, TUM, ARKitScenes, Polycam, Record3D.
 
     Frames come in name order. `downscale` (>= 1) divides width and height; where it is None, the longer side is brought
     to `long_side` px at most (None: kept). `frames`: at most so many, evenly spaced. `holdout` = k holds out the frames
@@ -45,8 +46,10 @@ def _posed(path: Path) -> Posed:
     file = path / "transforms.json" if path.is_dir() else path
     if file.is_file() and file.suffix == ".json":
         return read_nerfstudio(file)
-    found = "nothing there" if not path.exists() else "a file" if path.is_file() else "neither of them"
-    wanted = "a folder with sparse/0 (COLMAP) and images, or with transforms.json"
+    if (read := find_rgbd(path)) is not None:
+        return read(path)
+    found = "nothing there" if not path.exists() else "a file" if path.is_file() else "none of them"
+    wanted = "a folder with sparse/0 (COLMAP) and images, with transforms.json, or of a known depth camera or phone"
     remedy = "Give the capture's own folder; a transforms file of another name can be given itself."
     raise InputError(path, found, wanted, remedy)
 

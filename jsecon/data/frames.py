@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.data.images import image_size, read_depth, read_image
-from jsecon.data.lens import Lens, undistorted, undistortion_maps
+from jsecon.data.lens import Lens, seen_through, undistorted, undistortion_maps
 from jsecon.errors import InputError
 from jsecon.types import Camera, Capture
 
@@ -37,7 +38,7 @@ class Shot:
     """One image file and where it was taken."""
 
     name: str
-    """path as the capture names it, with "/": frames are ordered by it."""
+    """path as the capture names it, with "/": frames are ordered by it, and by the numbers in it (9 before 10)."""
     image: Path
     lens: Lens
     """of the image; rescaled where the file has another size of the same aspect."""
@@ -46,6 +47,8 @@ class Shot:
     depth: Path | None = None
     depth_unit: float = 0.001
     """world units of one count in the depth file."""
+    depth_lens: Lens | None = None
+    """of the depth map, a pinhole at the same place; None: the image's, at the map's size."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +80,15 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     left, _, right = np.linalg.svd(rotation)
     result = pose.copy()
     result[:3, :3] = left @ right
+    return result
+
+
+def inverse_pose(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
+    """World to camera of camera to world, and back. Raises InputError as `rigid` does."""
+    pose = rigid(pose, where, name)
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
     return result
 
 
@@ -179,7 +191,7 @@ def assemble(
     where = posed.where
     if not posed.shots:
         raise InputError(where, "no frame", "at least one posed image", "Estimate the poses again.")
-    shots = sorted(posed.shots, key=lambda shot: shot.name)
+    shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
     notes = [*posed.notes, *camera_jumps(poses, names)]
@@ -219,6 +231,8 @@ def assemble(
         result[index] = _resize(image, width, height)
         if shot.depth is not None and depths is not None:
             depth = read_depth(shot.depth, shot.depth_unit)
+            if shot.depth_lens is not None:
+                depth = seen_through(depth, shot.depth_lens, lens)
             if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
                 found = f"a depth map of {depth.shape[1]}x{depth.shape[0]}"
                 wanted = f"the aspect of its image, {lens.width}x{lens.height}"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.frames import Posed, Shot, rigid
+from jsecon.data.frames import Posed, Shot, inverse_pose, rigid
 from jsecon.data.images import IMAGE_ENDINGS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
@@ -51,7 +51,7 @@ def read_nerfstudio(file: Path) -> Posed:
         if depth is not None and not depth.is_file():
             raise _bad(depth, "no such depth map", f"the depth_file_path of {name}")
         unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
-        lens, world_to_camera = _lens(file, scene, entry, name, image), _world_to_camera(file, pose, name)
+        lens, world_to_camera = _lens(file, scene, entry, name, image), inverse_pose(pose * [1, -1, -1, 1], file, name)
         shots.append(Shot(_order_name(name), image, lens, world_to_camera, depth, unit))
     first = f" (the first: {missing[0]})" if missing else ""
     if missing:
@@ -121,14 +121,6 @@ def _matrix(file: Path, rows: list, what: str) -> Float[np.ndarray, "4 4"]:
     if matrix.shape not in ((4, 4), (3, 4)):
         raise _bad(file, f"{what} of shape {matrix.shape}", "4 rows of 4 numbers")
     return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0, 0, 0, 1]]])
-
-
-def _world_to_camera(file: Path, camera_to_world: np.ndarray, name: str) -> np.ndarray:
-    pose = rigid(camera_to_world * [1, -1, -1, 1], file, name)
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return result
 
 
 def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:

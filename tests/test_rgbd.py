@@ -1,0 +1,224 @@
+"""Folders of depth cameras and phones, written here as their makers lay them out, against the capture in them."""
+
+import dataclasses
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import refused, small_capture
+from scipy.spatial.transform import Rotation
+
+from jsecon.data.capture import load_capture
+from jsecon.data.images import read_depth
+from jsecon.data.lens import Lens, seen_through
+from jsecon.errors import InputError
+from jsecon.types import Capture
+
+_RANDOM = small_capture(count=12)
+_ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
+CAPTURE = dataclasses.replace(
+    _RANDOM,
+    cameras=dataclasses.replace(_RANDOM.cameras, **_ONE),
+    depths=np.random.default_rng(1).integers(500, 6000, (12, 16, 24)).astype(np.float32) / 1000,
+)
+K = tuple(float(values[0]) for values in _ONE.values())
+SIZE = 24, 16
+
+
+def poses(axes=(1, 1, 1)) -> np.ndarray:
+    """(12, 4, 4) camera to world, with these signs of the camera's axes."""
+    return np.linalg.inv(CAPTURE.cameras.world_to_camera.astype(np.float64)) @ np.diag([*axes, 1])
+
+
+def image(path, n: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), CAPTURE.frames[n][..., ::-1])
+
+
+def depth(path, n: int, unit: float = 0.001) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.round(CAPTURE.depths[n] / unit).astype(np.uint16))
+
+
+def write_scannet(folder) -> None:
+    """JPEG is lossy: PNGs stand for them. Frame 4 was lost by the tracker."""
+    (folder / "pose").mkdir(parents=True)
+    (folder / "intrinsic").mkdir()
+    matrix = np.eye(4)
+    matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = K
+    for kind in ("color", "depth"):
+        np.savetxt(folder / "intrinsic" / f"intrinsic_{kind}.txt", matrix)
+    for n, pose in enumerate(poses()):
+        image(folder / "color" / f"{n}.png", n)
+        depth(folder / "depth" / f"{n}.png", n)
+        np.savetxt(folder / "pose" / f"{n}.txt", np.full((4, 4), -np.inf) if n == 4 else pose)
+
+
+def write_tum(folder) -> None:
+    """Poses come more often than images, at other times; image 4 has none near."""
+    times = 1305031102.17 + 0.1 * np.arange(12)
+    lines = {"rgb": ["# color images"], "depth": ["# depth maps"], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
+    for n, pose in enumerate(poses()):
+        image(folder / "rgb" / f"{times[n]:.6f}.png", n)
+        depth(folder / "depth" / f"{times[n] + 0.007:.6f}.png", n, 1 / 5000)
+        lines["rgb"].append(f"{times[n]:.6f} rgb/{times[n]:.6f}.png")
+        lines["depth"].append(f"{times[n] + 0.007:.6f} depth/{times[n] + 0.007:.6f}.png")
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        for late, numbers_then in ((0.004, numbers), (0.05, [9, 9, 9, 0, 0, 0, 1])):
+            if n != 4 or late > 0.01:
+                lines["groundtruth"].append(" ".join(map(str, [times[n] + late, *numbers_then])))
+    for name, text in lines.items():
+        (folder / f"{name}.txt").write_text("\n".join(text) + "\n")
+    (folder / "intrinsics.txt").write_text(" ".join(map(str, [K[0], K[1], K[2] - 0.5, K[3] - 0.5])))
+
+
+def write_arkitscenes(folder) -> None:
+    lines = []
+    for n, pose in enumerate(np.linalg.inv(poses())):
+        name = f"41069021_{100 + n / 10:.3f}"
+        image(folder / "lowres_wide" / f"{name}.png", n)
+        depth(folder / "lowres_depth" / f"{name}.png", n)
+        file = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(" ".join(map(str, [*SIZE, *K])))
+        if n != 4:
+            numbers = [*Rotation.from_matrix(pose[:3, :3]).as_rotvec(), *pose[:3, 3]]
+            lines.append(" ".join(map(str, [100.0012 + n / 10, *numbers])))
+    (folder / "lowres_wide.traj").write_text("\n".join(lines) + "\n")
+
+
+def write_polycam(folder) -> None:
+    frames = folder / "keyframes"
+    (frames / "corrected_cameras").mkdir(parents=True)
+    for n, pose in enumerate(poses((1, -1, -1))):
+        image(frames / "corrected_images" / f"{100 + n}.png", n)
+        depth(frames / "depth" / f"{100 + n}.png", n)
+        told = {f"t_{i}{j}": pose[i, j] for i in range(3) for j in range(4)}
+        told |= dict(zip(("fx", "fy", "cx", "cy", "width", "height"), [*K, *SIZE])) | {"blur_score": 90.1}
+        if n != 4:
+            (frames / "corrected_cameras" / f"{100 + n}.json").write_text(json.dumps(told))
+
+
+def write_record3d(folder) -> None:
+    rows = [[*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]] for pose in poses((1, -1, -1))]
+    for n in range(13):
+        image(folder / "rgb" / f"{n}.png", min(n, 11))
+    fx, fy, cx, cy = K
+    told = {"w": 24, "h": 16, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "poses": rows}
+    (folder / "metadata.json").write_text(json.dumps(told))
+
+
+FORMATS = {
+    "scannet": write_scannet,
+    "tum": write_tum,
+    "arkitscenes": write_arkitscenes,
+    "polycam": write_polycam,
+    "record3d": write_record3d,
+}
+
+
+def expected(name: str) -> list[int]:
+    return list(range(12)) if name == "record3d" else [n for n in range(12) if n != 4]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_capture_comes_back(tmp_path, name):
+    FORMATS[name](tmp_path / name)
+    found, kept = load_capture(tmp_path / name, holdout=0), expected(name)
+    np.testing.assert_array_equal(found.frames, CAPTURE.frames[kept])  # in the order of their numbers
+    np.testing.assert_allclose(found.cameras.world_to_camera, CAPTURE.cameras.world_to_camera[kept], atol=1e-5)
+    for value, field in zip(K, ("fx", "fy", "cx", "cy")):
+        np.testing.assert_allclose(getattr(found.cameras, field), value, rtol=1e-6)
+    if name == "record3d":
+        assert found.depths is None
+        assert any("depth was not read" in note for note in found.notes)
+    else:
+        np.testing.assert_allclose(found.depths, CAPTURE.depths[kept], atol=1e-4)
+    assert any("1 of 1" in note and "no pose" in note for note in found.notes)
+
+
+def test_names_stay_those_of_the_files(tmp_path):
+    write_scannet(tmp_path)
+    names = load_capture(tmp_path, holdout=0).names
+    assert names == tuple(str(n) for n in expected("scannet"))
+
+
+def test_a_depth_camera_of_its_own_is_seen_through_the_colour_camera(tmp_path):
+    """ScanNet's depth has another size, shape and focal length than its colour images."""
+    write_scannet(tmp_path)
+    matrix = np.eye(4)
+    matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = 30, 30, 20, 15
+    np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", matrix)
+    ramp = np.tile(np.arange(40, dtype=np.uint16) * 100 + 1000, (30, 1))  # rises with the ray's x / z
+    for n in range(12):
+        cv2.imwrite(str(tmp_path / "depth" / f"{n}.png"), ramp)
+    found = load_capture(tmp_path, holdout=0)
+    rays = (np.arange(24) + 0.5 - K[2]) / K[0]
+    columns = rays * 30 + 20
+    seen = np.where((columns >= 0) & (columns < 40), np.floor(columns) / 10 + 1, 0)
+    np.testing.assert_allclose(found.depths[0, 8], seen, atol=1e-5)
+    same = Lens(24, 16, *K)
+    np.testing.assert_array_equal(seen_through(CAPTURE.depths[0], same, same), CAPTURE.depths[0])
+
+
+@pytest.mark.parametrize(("camera", "fx", "bent"), [("freiburg1", 517.3, True), ("fr3", 535.4, False)])
+def test_the_benchmarks_own_cameras_are_known_by_name(tmp_path, camera, fx, bent):
+    folder = tmp_path / f"rgbd_dataset_{camera}_desk"
+    write_tum(folder)
+    (folder / "intrinsics.txt").unlink()
+    for file in (folder / "rgb").iterdir():
+        cv2.imwrite(str(file), np.zeros((480, 640, 3), np.uint8))
+    for file in (folder / "depth").iterdir():
+        cv2.imwrite(str(file), np.full((480, 640), 5000, np.uint16))
+    found = load_capture(folder, holdout=0, frames=2)
+    assert any("undistorted" in note for note in found.notes) == bent
+    if not bent:
+        np.testing.assert_allclose([found.cameras.fx[0], found.cameras.cx[0]], [fx, 320.6], rtol=1e-6)
+    assert read_depth(next((folder / "depth").iterdir()), 1 / 5000).max() == 1
+    shutil.move(folder, tmp_path / "mine")
+    with refused("intrinsics.txt", "fx fy cx cy"):
+        load_capture(tmp_path / "mine")
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "text", "says"),
+    [
+        ("scannet", "pose/3.txt", "1 2 3\n", "3.txt"),
+        ("scannet", "pose/3.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not rigid"),
+        ("scannet", "intrinsic/intrinsic_color.txt", "", "intrinsic_color.txt"),
+        ("tum", "groundtruth.txt", "1 2 three\n", "groundtruth.txt"),
+        ("tum", "groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n", "zero norm"),
+        ("tum", "rgb.txt", "1305031102.17\n", "rgb.txt"),
+        ("tum", "rgb.txt", "# nothing\n", "rgb.txt"),
+        ("tum", "intrinsics.txt", "500 500\n", "intrinsics.txt"),
+        ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
+        ("arkitscenes", "lowres_wide_intrinsics/41069021_100.000.pincam", "24 16 x\n", "pincam"),
+        ("polycam", "keyframes/corrected_cameras/101.json", "{", "101.json"),
+        ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "width"),
+        ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
+        ("record3d", "metadata.json", "[]", "metadata.json"),
+    ],
+)
+def test_damaged_files_are_told(tmp_path, name, file, text, says):
+    FORMATS[name](tmp_path)
+    (tmp_path / file).write_text(text)
+    with refused(says):
+        load_capture(tmp_path)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_files_cut_short_or_gone_never_crash(tmp_path, name):
+    FORMATS[name](tmp_path / "whole")
+    for n, file in enumerate(sorted((tmp_path / "whole").rglob("*.*"))):
+        if n % 7 or not file.is_file():
+            continue
+        data = file.read_bytes()
+        for part in (None, data[: len(data) // 2]):
+            file.unlink() if part is None else file.write_bytes(part)
+            try:
+                assert isinstance(load_capture(tmp_path / "whole"), Capture)
+            except InputError as error:
+                assert error.remedy, file  # noqa: PT017
+        file.write_bytes(data)
