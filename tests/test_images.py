@@ -1,5 +1,7 @@
 """Image files and lenses: what is read is what was stored, and damage is told."""
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -175,3 +177,21 @@ def test_lenses_that_cannot_be_undone():
         undistorted(Lens(160, 120, 1.0, 1.0, 80.0, 60.0, (-5000.0,)), "here")
     plain = Lens(160, 120, 130.0, 130.0, 80.0, 60.0, (0.0, 0.0, 0.0, 0.0))
     assert undistorted(plain, "here") == Lens(160, 120, 130.0, 130.0, 80.0, 60.0)
+
+
+def test_heic_comes_back_nearly_and_damage_and_absence_are_told(tmp_path, monkeypatch):
+    import pillow_heif
+
+    smooth = cv2.resize(FRAME[:3, :4], (136, 104), interpolation=cv2.INTER_CUBIC)
+    pillow_heif.from_bytes("RGB", (136, 104), smooth.tobytes()).save(tmp_path / "a.heic", quality=95)
+    image, transparent = read_image(tmp_path / "a.heic")
+    assert np.abs(image.astype(int) - smooth).mean() < 4
+    assert not transparent
+    assert image_size(tmp_path / "a.heic") == (136, 104)
+    data = (tmp_path / "a.heic").read_bytes()
+    (tmp_path / "cut.heic").write_bytes(data[: len(data) // 2])
+    with refused("cut.heic", "HEIC"):
+        read_image(tmp_path / "cut.heic")
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with refused("a.heic", "pip install 'jsecon[formats]'"):
+        read_image(tmp_path / "a.heic")

@@ -23,6 +23,7 @@ from jsecon.app.scene_stages import loaded
 from jsecon.app.stages import KEY_FILE, Record, Work
 from jsecon.data import motion, motion_steps
 from jsecon.data.capture import load_capture
+from jsecon.data.images import read_image
 from jsecon.data.motion import find_poses, photographs
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -272,6 +273,19 @@ def test_only_captures_without_poses_have_the_stage(photos, room, found, tmp_pat
     assert names(tmp_path) == ["poses", "load"]
     (tmp_path / "transforms.json").write_text("{}")
     assert names(tmp_path) == ["load"]
+
+
+def test_colmap_is_given_a_png_for_a_heic(photos, tmp_path):
+    import pillow_heif
+
+    image = read_image(photographs(photos[0])[0])[0]
+    shape = image.shape[1::-1]
+    pillow_heif.from_bytes("RGB", shape, image.tobytes()).save(tmp_path / "IMG_1.HEIC", quality=95)
+    assert photographs(tmp_path) == [tmp_path / "IMG_1.HEIC"]
+    motion._link(tmp_path / "IMG_1.HEIC", tmp_path / "links" / "000000.png")
+    np.testing.assert_array_equal(
+        cv2.imread(tmp_path / "links" / "000000.png")[..., ::-1], read_image(tmp_path / "IMG_1.HEIC")[0]
+    )
 
 
 def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):

@@ -10,11 +10,16 @@ import pytest
 from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
+from jsecon.app.options import Options
+from jsecon.app.scene_stages import loaded
+from jsecon.app.stages import Work
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_depth
 from jsecon.data.lens import Lens, seen_through
 from jsecon.errors import InputError
 from jsecon.types import Capture
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
 
 _RANDOM = small_capture(count=12)
 _ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
@@ -137,6 +142,13 @@ def test_the_capture_comes_back(tmp_path, name):
     else:
         np.testing.assert_allclose(found.depths, CAPTURE.depths[kept], atol=1e-4)
     assert any("1 of 1" in note and "no pose" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_run_looks_for_no_poses(tmp_path, name):
+    FORMATS[name](tmp_path / name)
+    work = Work(Options(tmp_path / name), Networks(ColourEmbedder()), tmp_path / "out")
+    assert [stage.name for stage in loaded(work)] == ["load"]
 
 
 def test_names_stay_those_of_the_files(tmp_path):

@@ -10,7 +10,6 @@ from capture_files import refused, small_capture
 from splat_files import scene
 from test_gaussian_files import gaussians
 
-from jsecon.app.networks import Networks
 from jsecon.app.options import Options
 from jsecon.app.scene_stages import gaussians as stage_of
 from jsecon.app.stages import Record, Work
@@ -18,6 +17,7 @@ from jsecon.data.gaussian_files import save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
 from jsecon.splat.transform import transform_gaussians
 from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
 
 TURN = np.array([[0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.5], [0, 0, 0, 1.0]])
 TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN

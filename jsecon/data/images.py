@@ -14,12 +14,13 @@ from PIL import Image
 from jsecon.errors import InputError
 from jsecon.files import written_whole
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".HEIC")
 """endings tried, in this order, where a capture names an image without one"""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _START_OF_SCAN = 0xDA
+_HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
 _READ_AGAIN = "Copy or export the file again."
 
 
@@ -77,6 +78,8 @@ def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
 
 def _decode(path: Path, data: bytes) -> np.ndarray:
     """Pixels as stored (BGR order, EXIF orientation ignored: poses are estimated on the stored pixels)."""
+    if data[4:12] in _HEIC:
+        return _decode_heic(path, data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -84,6 +87,19 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     if image is None:
         raise _unreadable(path, f"{len(data)} bytes that are no image")
     return image
+
+
+def _decode_heic(path: Path, data: bytes) -> np.ndarray:
+    try:
+        import pillow_heif
+    except ImportError as error:
+        remedy = "Run: pip install 'jsecon[formats]' (or export the photographs as JPEG)."
+        raise InputError(path, "a HEIC photograph", "pillow-heif, which reads them", remedy) from error
+    try:
+        image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True)
+        return np.ascontiguousarray(np.asarray(image)[..., 2::-1])
+    except (ValueError, OSError, EOFError, SyntaxError) as error:
+        raise _unreadable(path, f"a HEIC that pillow-heif refuses ({error})") from error
 
 
 def _checked_bytes(path: Path) -> bytes:

@@ -22,7 +22,7 @@ from typing import Any
 from PIL import Image
 
 from jsecon.data import motion_steps
-from jsecon.data.images import IMAGE_ENDINGS, read_image
+from jsecon.data.images import IMAGE_ENDINGS, read_image, write_image
 from jsecon.data.motion_steps import FEWEST
 from jsecon.errors import InputError
 from jsecon.files import write_text
@@ -93,7 +93,8 @@ def find_poses(
     if len(photos) < FEWEST:
         raise InputError(where, f"{len(photos)} photographs", f"at least {FEWEST}", remedy)
     size, groups = _one_size(photos, where), _lenses(photos)
-    names = [f"{number:06d}{photo.suffix.lower()}" for number, photo in enumerate(photos)]  # COLMAP's lists have spaces
+    endings = [photo.suffix.lower().replace(".heic", ".png") for photo in photos]  # COLMAP reads no HEIC
+    names = [f"{number:06d}{ending}" for number, ending in enumerate(endings)]  # COLMAP's lists have spaces
     (work / "links").mkdir(parents=True, exist_ok=True)
     for name, photo in zip(names, photos):
         _link(photo, work / "links" / name)
@@ -142,6 +143,9 @@ def _lenses(photos: Sequence[Path]) -> list[list[int]]:
 def _link(photo: Path, link: Path) -> None:
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)
+    if link.suffix.lower() != photo.suffix.lower():
+        write_image(link, read_image(photo)[0])
+        return
     try:
         link.symlink_to(photo.resolve())
     except OSError:
