@@ -100,7 +100,7 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
     _require_gsply(path)
     import gsply
 
-    remedy = "Export it again, or run: npx @playcanvas/splat-transform with it and plain.ply"
+    remedy = f"Export it again, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
     if kind == ".ply":  # gsply looks up a chunk that is not there without an error
         counts = {element.name: element.count for element in opened(path)[2]}
         if counts.get("chunk", 0) * _CHUNK < counts.get("vertex", 0):
@@ -110,11 +110,9 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
         data: Any = getattr(gsply, _GSPLY[kind])(path)
     except Exception as error:  # whatever a decoder says of damaged bytes
         raise InputError(path, f"what gsply cannot read ({error})", f"a whole {kind}", remedy) from error
-    rest = np.zeros((len(data.means), 0, 3)) if data.shN is None else data.shN
-    sh = np.concatenate([np.asarray(data.sh0)[:, None], rest], axis=1)
-    opacity_logits = np.reshape(data.opacities, -1)
+    sh = [np.asarray(data.sh0)[:, None], *([] if data.shN is None else [data.shN])]
     given = {"means": data.means, "log_scales": data.scales, "quaternions": data.quats}
-    return given | {"opacity_logits": opacity_logits, "sh": sh}
+    return given | {"opacity_logits": np.reshape(data.opacities, -1), "sh": np.concatenate(sh, axis=1)}
 
 
 def _read_splat(path: Path) -> dict[str, np.ndarray]:
@@ -145,14 +143,7 @@ def _save_spz(path: Path, gaussians: Gaussians) -> None:
     if bits < 1:
         found, wanted = f"a Gaussian {reach:.3g} units from the origin", "at most 4,000,000"
         raise InputError(path, found, wanted, "Write a .ply, or bring the scene nearer to its origin.")
-    data = gsply.GSData.from_arrays(
-        turned.means,
-        turned.log_scales,
-        turned.quaternions,
-        np.clip(turned.opacity_logits, -30, 30),
-        turned.sh[:, 0],
-        turned.sh[:, 1:],
-        format="ply",
-    )
+    shape, logits = (turned.means, turned.log_scales, turned.quaternions), np.clip(turned.opacity_logits, -30, 30)
+    data = gsply.GSData.from_arrays(*shape, logits, turned.sh[:, 0], turned.sh[:, 1:], format="ply")
     with written_whole(path) as temporary:
         gsply.write_spz(temporary, data, version=3, fractional_bits=bits)

@@ -52,31 +52,20 @@ def save_glb(
     for name, array in attributes.items():
         kind = np.dtype(np.uint8 if name == "COLOR_0" else "<f4")
         data = np.ascontiguousarray(array, kind)
-        told = {"componentType": _BYTE if kind == np.uint8 else _FLOAT, "count": len(data)}
-        told |= {"bufferView": len(views), "type": _KINDS[data.shape[1]]}
-        if name == "COLOR_0":
-            told["normalized"] = True
-        elif name == "POSITION":
-            told |= {"min": data.min(0).tolist(), "max": data.max(0).tolist()}
-        accessors.append(told)
+        accessor = {"bufferView": len(views), "count": len(data), "type": _KINDS[data.shape[1]]}
+        if name == "POSITION":
+            accessor |= {"min": data.min(0).tolist(), "max": data.max(0).tolist()}
+        number = {"componentType": _FLOAT} if kind == "<f4" else {"componentType": _BYTE, "normalized": True}
+        accessors.append(accessor | number)
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": data.nbytes, "target": _VERTICES})
         parts.append(data.tobytes())
         offset += data.nbytes
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    numbers = {name: n for n, name in enumerate(attributes)}
-    primitive = {"mode": _POINTS, "attributes": numbers, "extensions": {_NAME: splats}}
-    scene = {
-        "asset": {"version": "2.0", "generator": "jsecon"},
-        "extensionsUsed": [_NAME],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
-    }
-    text = json.dumps(scene, separators=(",", ":")).encode()
+    splats = {_NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    primitive = {"mode": _POINTS, "attributes": dict(zip(attributes, range(len(views)))), "extensions": splats}
+    told = {"asset": {"version": "2.0", "generator": "jsecon"}, "extensionsUsed": [_NAME]}
+    told |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]}
+    told |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": offset}]}
+    text = json.dumps(told, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + offset))
@@ -91,11 +80,11 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         opacity = 1 / (1 + np.exp(-turned.opacity_logits))[:, None]
     shown = np.clip(0.5 + C0 * turned.sh[:, 0], 0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # glTF's colours are linear
+    unit = turned.quaternions / np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
     return {
         "POSITION": turned.means,
         "COLOR_0": (255 * np.concatenate([linear, opacity], axis=1)).round(),
-        f"{_NAME}:ROTATION": np.roll(turned.quaternions, -1, axis=1)
-        / np.linalg.norm(turned.quaternions, axis=1, keepdims=True),
+        f"{_NAME}:ROTATION": np.roll(unit, -1, axis=1),
         f"{_NAME}:SCALE": np.exp(turned.log_scales),
         f"{_NAME}:OPACITY": opacity,
     } | {
