@@ -5,7 +5,7 @@ splat/transform and query/masks the engine, behind `by="silhouette"` query/silho
 
     ask     app/question, language/field, vision/colours, query/several, query/anchored, query/retrieval
     clean   language/shares, query/outliers
-    write   app/answers, query/masks, splat/transform, data/ply
+    write   app/answers, query/masks, splat/transform, data/gaussian_files
 """
 
 import dataclasses
