@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import json
+import zipfile
 
 import jax
 import numpy as np
@@ -145,6 +147,20 @@ def test_a_compressed_ply_with_too_few_chunks(tmp_path):
     (tmp_path / "a.ply").write_bytes(whole)
     with refused("a.ply", "2 chunks for 600 Gaussians", "splat-transform"):
         load_gaussians(tmp_path / "a.ply")
+
+
+def test_a_sog_with_a_short_codebook(tmp_path):
+    (tmp_path / "whole.sog").write_bytes(splat_files.sog(PLAIN))
+    with zipfile.ZipFile(tmp_path / "whole.sog") as whole, zipfile.ZipFile(tmp_path / "a.sog", "w") as short:
+        for name in whole.namelist():
+            data = whole.read(name)
+            if name == "meta.json":
+                told = json.loads(data)
+                told["scales"]["codebook"] = told["scales"]["codebook"][:9]
+                data = json.dumps(told)
+            short.writestr(name, data)
+    with refused("a.sog", "fewer than 256"):
+        load_gaussians(tmp_path / "a.sog")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ SuperSplat's compressed .ply, .spz and .sog are read, and .spz is written, by gs
 """
 
 import importlib.util
+import json
 import math
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -101,12 +103,16 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
     import gsply
 
     remedy = f"Export it again, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
-    if kind == ".ply":  # gsply looks up a chunk that is not there without an error
+    if kind == ".ply":  # gsply looks up a chunk that is not there without an error, as it does a .sog's codebook
         counts = {element.name: element.count for element in opened(path)[2]}
         if counts.get("chunk", 0) * _CHUNK < counts.get("vertex", 0):
             found = f"{counts.get('chunk', 0)} chunks for {counts['vertex']} Gaussians"
             raise InputError(path, f"a compressed .ply of {found}", f"a chunk for every {_CHUNK}", remedy)
     try:
+        if kind == ".sog":
+            told = json.loads(zipfile.ZipFile(path).read("meta.json")).values()
+            if any(len(part.get("codebook", [0] * 256)) < 256 for part in told if isinstance(part, dict)):
+                raise ValueError("a codebook of fewer than 256 numbers")
         data: Any = getattr(gsply, _GSPLY[kind])(path)
     except Exception as error:  # whatever a decoder says of damaged bytes
         raise InputError(path, f"what gsply cannot read ({error})", f"a whole {kind}", remedy) from error
