@@ -3,6 +3,9 @@
 from collections.abc import Iterable
 from typing import Any
 
+LONGEST = 600
+"""characters of what was found that an error quotes; of more, the beginning and the end"""
+
 
 class InputError(ValueError):
     """Bad input from outside: a file, an option, a capture. The command line prints it and exits with code 2.
@@ -11,6 +14,8 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: object, found: str, expected: str, remedy: str):
+        if len(found) > LONGEST:
+            found = f"{found[: LONGEST // 2]} ... {found[-LONGEST // 2 :]}"
         self.where, self.found, self.expected, self.remedy = str(where), found, expected, remedy
         super().__init__(f"{where}: found {found}; expected {expected}. {remedy}")
 

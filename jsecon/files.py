@@ -1,24 +1,37 @@
 """Writing files so that a final name never holds a half-written file, and trees as what a .npz holds without pickle:
-arrays, and JSON that says what they are."""
+arrays, and JSON that says what they are. Reading both without trust: no more memory is taken than the file's bytes can
+fill, and no Python object is built."""
 
 import contextlib
 import dataclasses
+import json
+import math
 import os
+import re
 import uuid
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from jsecon.errors import InputError, require
 
 UNREADABLE = (
-    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, NotImplementedError),
-    zipfile.BadZipFile,
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
+    *(ArithmeticError, zipfile.BadZipFile, zlib.error),
 )
 """what reading a damaged .npz, and `unpacked` of a damaged description, raise"""
+MOST_DEFLATED = 1032
+"""bytes that one byte of a deflated stream can stand for"""
+_HEADER = (
+    rb"['\"]descr['\"] *: *['\"]([<>|=]?[biuf]\d+)['\"]",
+    rb"['\"]fortran_order['\"] *: *(True|False)",
+    rb"['\"]shape['\"] *: *\(([\dL, ]*)\)",
+)
+"""of a .npy: what is read of its header"""
 
 
 @contextlib.contextmanager
@@ -47,6 +60,87 @@ def write_text(path: str | os.PathLike, text: str) -> None:
     """Writes `text` (UTF-8) to `path`, whole or not at all."""
     with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def parsed_json(text: str | bytes) -> Any:
+    """What a JSON text holds, whole numbers of more than 18 digits as floats. Raises ValueError."""
+    try:
+        return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 19 else float(digits))
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def read_json(path: Path, expected: str, remedy: str) -> Any:
+    """What a JSON file holds, as `parsed_json` has it. Raises InputError where it cannot be read."""
+    try:
+        return parsed_json(path.read_bytes())
+    except OSError as error:
+        raise InputError(path, error.strerror or "an error on reading", expected, remedy) from error
+    except ValueError as error:
+        raise InputError(path, f"text that is no JSON ({error})", expected, remedy) from error
+
+
+def array_layout(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype, bool]:
+    """(shape, type, whether in Fortran's order) of the .npy of `size` bytes in a stream, which is then at its numbers.
+
+    Read here, since NumPy makes room for all that a header announces, and warns of odd ones. Raises one of UNREADABLE
+    where it is no .npy of plain numbers, or the bytes are not as many as it announces.
+    """
+    magic = stream.read(8)
+    length = stream.read(2 if magic[6:7] == b"\1" else 4)
+    header = stream.read(min(int.from_bytes(length, "little"), 1 << 16))
+    found = [re.search(key, header) for key in _HEADER]
+    if not magic.startswith(b"\x93NUMPY") or None in found:
+        raise ValueError("no .npy of plain numbers")
+    kind, order, sizes = (match[1].decode() for match in found if match)
+    dtype, shape = np.dtype(kind), tuple(int(number) for number in re.findall(r"\d+", sizes))
+    left = size - len(magic) - len(length) - len(header)
+    if math.prod(shape) * dtype.itemsize != left:
+        raise ValueError(f"{left} bytes of numbers where the header announces {dtype} of shape {shape}")
+    return shape, dtype, order == "True"
+
+
+def read_array(stream: IO[bytes], size: int) -> np.ndarray:
+    """The array of the .npy of `size` bytes in a stream. Raises as `array_layout` does."""
+    shape, dtype, fortran = array_layout(stream, size)
+    array = np.empty(shape[::-1] if fortran else shape, dtype)
+    flat = array.reshape(-1).view(np.uint8)
+    for start in range(0, len(flat), 1 << 24):
+        block = flat[start : start + (1 << 24)]
+        block[:] = np.frombuffer(stream.read(len(block)), np.uint8)  # ValueError where the stream ends before
+    return array.T if fortran else array
+
+
+def map_array(path: Path, start: int = 0, size: int | None = None) -> np.ndarray:
+    """The array of a .npy in the bytes of a file from `start` on, of which the system holds what is in use. Raises as
+    `array_layout` does."""
+    with open(path, "rb") as file:
+        file.seek(start)
+        shape, dtype, fortran = array_layout(file, path.stat().st_size - start if size is None else size)
+        return np.memmap(path, dtype, "r", file.tell(), shape, "F" if fortran else "C")
+
+
+def read_arrays(path: str | os.PathLike, *, mapped: float = math.inf) -> dict[str, np.ndarray]:
+    """The arrays of a .npz by name; those of more than `mapped` bytes are mapped. Raises one of UNREADABLE where it is
+    damaged."""
+    arrays, most = {}, os.path.getsize(path)
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            stored = entry.compress_type == zipfile.ZIP_STORED
+            if entry.file_size > most * (1 if stored else MOST_DEFLATED):
+                raise ValueError(f"{entry.filename} of {entry.file_size} bytes in a file of {most}")
+            with archive.open(entry) as member:
+                if not (stored and entry.file_size > mapped):
+                    arrays[entry.filename.removesuffix(".npy")] = read_array(member, entry.file_size)
+                    continue
+                while member.read(1 << 24):  # to the end, where its checksum is compared
+                    pass
+            with open(path, "rb") as file:
+                file.seek(entry.header_offset + 26)
+                lengths = file.read(4)
+                start = file.tell() + int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
+            arrays[entry.filename.removesuffix(".npy")] = map_array(Path(path), start, entry.file_size)
+    return arrays
 
 
 def packed(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None]) -> dict:

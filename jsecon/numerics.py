@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
 from jsecon.types import Array
@@ -19,6 +20,15 @@ FRUSTUM_MARGIN = 1.3
 """x/z and y/z are clamped to this multiple of the field of view inside the Jacobian only"""
 NEAR = 0.01
 """near plane, world units (0.2 reproduces INRIA)"""
+
+
+MOST = 1e18
+"""of a coordinate, focal length or coefficient in a file: float32 holds its square"""
+
+
+def sane(*numbers: np.ndarray | tuple[float, ...] | float) -> bool:
+    """Whether all numbers are finite and none is above MOST."""
+    return all(bool((np.abs(np.asarray(own, np.float64)) <= MOST).all()) for own in numbers)
 
 
 def into_range(size: Array) -> Array:

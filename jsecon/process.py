@@ -21,17 +21,19 @@ from pathlib import Path
 # mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
 # kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
+_OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
+"""what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
 _built: dict[str, int] = {}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
-    """Sets XLA's flags (see `settings`) and keeps freed memory for the next request (glibc only). Call it before jax
-    makes its first array. What the user has set in the environment stays; without `keep_programs`, compiled programs
-    are not kept on disk."""
+    """Sets XLA's flags (see `settings`), silences OpenCV and keeps freed memory for the next request (glibc only). Call
+    it before jax makes its first array and OpenCV is imported. What the user has set in the environment stays; without
+    `keep_programs`, compiled programs are not kept on disk."""
     chosen = settings(os.environ, cores(), _cpu_features())
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
-    os.environ.update(chosen)
+    os.environ.update({name: value for name, value in _OPENCV.items() if name not in os.environ} | chosen)
     if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
         mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda parameter, value: None)
         for parameter, value in _MALLOPT.items():

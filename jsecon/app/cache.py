@@ -16,7 +16,6 @@ import json
 import os
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.files import UNREADABLE, packed, unpacked, write_text, written_whole
+from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, write_text, written_whole
 
 _TREE = "__tree__"
 MAPPED = 1 << 30
@@ -211,29 +210,11 @@ def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float)
 
 def _read(path: Path) -> tuple[Any, float]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            large = {entry.filename.removesuffix(".npy") for entry in file.zip.infolist() if entry.file_size > MAPPED}
-            arrays = {name: _mapped(path, file.zip, name) if name in large else file[name] for name in file.files}
-        description = json.loads(arrays.pop(_TREE).tobytes())
-        return unpack(description["tree"], arrays), description["seconds"]
+        arrays = read_arrays(path, mapped=MAPPED)
+        description = parsed_json(arrays.pop(_TREE).tobytes())
+        return unpack(description["tree"], arrays), float(description["seconds"])
     except UNREADABLE as error:
         raise CorruptCacheError(f"{type(error).__name__}: {error}") from error
-
-
-def _mapped(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """An array of the archive as it lies in the file, of which the system holds what is in use."""
-    with archive.open(f"{name}.npy") as file:
-        old = np.lib.format.read_magic(file) == (1, 0)
-        read = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(file)
-        header = file.tell()
-        while file.read(1 << 24):  # to the end, where its checksum is compared
-            pass
-    with open(path, "rb") as whole:
-        whole.seek(archive.getinfo(f"{name}.npy").header_offset + 26)
-        lengths = np.frombuffer(whole.read(4), "<u2")
-        offset = whole.tell() + int(lengths.sum()) + header
-    return np.memmap(path, dtype, "r", offset, shape, "F" if fortran else "C")
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:

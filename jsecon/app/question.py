@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
+from jsecon.data.images import read_stored
 from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import query_anchored, query_region
@@ -209,10 +210,7 @@ def ask_outline(
 def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
     """(H, W) bool of an image file, at the size of the field's frames: what is not black. Raises InputError where it is
     no image, or one of another shape."""
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    size = field.cameras.width, field.cameras.height
-    if image is None:
-        raise InputError(file, "no readable image", "a mask as an image", "Write it as a PNG, black outside.")
+    image, size = read_stored(Path(file)), (field.cameras.width, field.cameras.height)
     mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
     if abs(mask.shape[1] * size[1] - mask.shape[0] * size[0]) > max(size) + max(mask.shape):
         found, wanted = f"{mask.shape[1]}x{mask.shape[0]}", f"{size[0]}x{size[1]}, or the same shape at another size"

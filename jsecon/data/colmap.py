@@ -6,6 +6,7 @@ Poses are world-to-camera in OpenCV axes, and pixel centres lie at (0.5, 0.5): b
 from __future__ import annotations
 
 import itertools
+import os
 import struct
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def read_colmap(path: Path, model: Path) -> Posed:
     that are not there, and on the models that OpenCV lacks (FOV, thin prisms).
     """
     lenses, images = read_cameras(model), read_images(model)
-    missing = [name for name, _, _ in images if not (path / "images" / name).is_file()]
+    missing = [name for name, _, _ in images if not os.path.isfile(path / "images" / name)]
     if missing:
         found = f"{len(missing)} of {len(images)} images of the model missing (the first: {missing[0]})"
         remedy = "Copy them there, or take them out of the model (colmap image_deleter)."

@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 
 from jsecon.data.lens import Lens
 from jsecon.errors import InputError
+from jsecon.numerics import sane
 
 # name -> (number in the binary format, count of parameters)
 MODELS = {
@@ -68,6 +69,13 @@ class _Bytes:
         self.skip(size)
         return struct.unpack_from("<" + form, self.data, self.offset - size)
 
+    def records(self, least: int) -> range:
+        """As many as are announced next, each of at least so many bytes. Raises where the file cannot hold them."""
+        (count,) = self.take("Q")
+        if count * least > len(self.data) - self.offset:
+            raise self.cut()
+        return range(count)
+
     def skip(self, size: int) -> None:
         if size < 0 or self.offset + size > len(self.data):
             raise self.cut()
@@ -108,7 +116,7 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     focals = 1 if model in _ONE_FOCAL else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
-    if not (np.isfinite(parameters).all() and fx > 0 and fy > 0 and width > 0 and height > 0):
+    if not (sane(parameters) and fx > 0 and fy > 0 and width > 0 and height > 0):
         found = f"a camera of {width}x{height} px with parameters {parameters}"
         raise bad_model(file, found, "positive size and focal length", "Estimate the cameras again.")
     return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="FISHEYE" in model)
@@ -124,7 +132,7 @@ def read_cameras(model: Path) -> dict[int, Lens]:
     if file.suffix == ".txt":
         return dict(_records(file, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", camera))
     data, lenses = _Bytes(file), {}
-    for _ in range(data.take("Q")[0]):
+    for _ in data.records(48):
         identity, number, width, height = data.take("iiQQ")
         if number not in _BY_NUMBER:
             raise bad_model(file, f"camera model number {number}", f"one of 0 to {max(_BY_NUMBER)}", _UNDISTORT)
@@ -136,9 +144,9 @@ def read_cameras(model: Path) -> dict[int, Lens]:
 def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     """(4, 4) world-to-camera from qw qx qy qz tx ty tz."""
     quaternion = np.array(numbers[:4], np.float64)
-    length = np.linalg.norm(quaternion)
-    if not np.isfinite(numbers).all() or not length > 1e-6:
-        found = f"a pose of {name} with NaN or infinite numbers, or without rotation: {numbers}"
+    length = np.linalg.norm(quaternion) if sane(numbers) else 0.0
+    if not length > 1e-6:
+        found = f"a pose of {name} with NaN, infinite or absurd numbers, or without rotation: {numbers}"
         raise bad_model(file, found, "finite poses", "Estimate the poses again, or delete this image from the model.")
     w, x, y, z = quaternion / length
     pose = np.eye(4)
@@ -162,7 +170,7 @@ def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
     if file.suffix == ".txt":  # an image's second line holds its observations
         return _records(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", image, lines_each=2)
     data, images = _Bytes(file), []
-    for _ in range(data.take("Q")[0]):
+    for _ in data.records(73):
         _, *numbers, camera = data.take("i7di")
         name = data.name()
         images.append((name, camera, _pose(file, name, tuple(numbers))))
@@ -177,8 +185,9 @@ def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray
         points, colours = rows[:, :3], rows[:, 3:].astype(np.uint8)
     else:
         points, colours = _read_binary_points(file)
-    if not np.isfinite(points).all():
-        raise bad_model(file, "points with NaN or infinite coordinates", "finite points", "Estimate the model again.")
+    if not sane(points):
+        found = "points with NaN, infinite or absurd coordinates"
+        raise bad_model(file, found, "finite points", "Estimate the model again.")
     return points, colours
 
 
@@ -192,16 +201,14 @@ def _point(line: str) -> tuple[float, float, float, int, int, int]:
 
 def _read_binary_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     data = _Bytes(file)
-    (count,) = data.take("Q")
     fixed, raw = struct.calcsize("<Q3d3BdQ"), data.data
-    if count * fixed > len(raw):
-        raise data.cut()
+    count = len(data.records(fixed))
     # The tracks make the records differ in length: a short loop finds where each begins, NumPy reads them all.
     starts, offset, track = np.empty(count, np.int64), data.offset, struct.Struct("<Q")
     for index in range(count):
-        starts[index] = offset
         if offset + fixed > len(raw):
             raise data.cut()
+        starts[index] = offset
         offset += fixed + 8 * track.unpack_from(raw, offset + fixed - 8)[0]
     if offset > len(raw):
         raise data.cut()

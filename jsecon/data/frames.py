@@ -20,12 +20,15 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.data.images import image_size, read_depth, read_image
 from jsecon.data.lens import Lens, seen_through, undistorted, undistortion_maps
 from jsecon.errors import InputError
+from jsecon.numerics import sane
 from jsecon.types import Camera, Capture
 
 Progress = Callable[[int, int], None] | None
 RIGID_TOLERANCE = 1e-3
 """largest entry of R R^T - I still taken for rounding in a text file; the rotation is then made exact"""
 
+LEAST_FOCAL = 1e-3
+"""px: the least focal length that is one"""
 IN_MEMORY = 1 << 30
 """bytes of frames that are kept in memory; more are kept in a temporary file"""
 JUMP = 10.0
@@ -69,8 +72,8 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     """The pose with its rotation made exactly orthonormal; InputError where it is not finite or not rigid at all."""
     pose = np.asarray(pose, np.float64)
     remedy = "Estimate the poses again, or take this frame out of the capture."
-    if not np.isfinite(pose).all():
-        raise InputError(where, f"a pose of {name} with NaN or infinite numbers", "finite poses", remedy)
+    if not sane(pose):
+        raise InputError(where, f"a pose of {name} with NaN, infinite or absurd numbers", "finite poses", remedy)
     rotation = pose[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
@@ -134,6 +137,9 @@ def _true_lens(shot: Shot) -> Lens:
     """The lens at the size that the file really has (a folder of smaller images is common)."""
     width, height = image_size(shot.image)
     lens = shot.lens
+    if not sane((lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)) or min(lens.fx, lens.fy) < LEAST_FOCAL:
+        found = f"focal lengths {lens.fx:g}, {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}, distortion {lens.distortion}"
+        raise InputError(shot.image, f"a lens of {found}", "px", "Estimate the cameras again.")
     if (width, height) == (lens.width, lens.height):
         return lens
     if min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) > 1:

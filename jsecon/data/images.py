@@ -1,6 +1,5 @@
 """Image files, read whole or not at all: RGB frames, integer label images, depth maps."""
 
-import io
 import struct
 import zlib
 from collections.abc import Iterator
@@ -9,10 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
-from PIL import Image
 
 from jsecon.errors import InputError
-from jsecon.files import written_whole
+from jsecon.files import MOST_DEFLATED, UNREADABLE, map_array, written_whole
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".HEIC")
 """endings tried, in this order, where a capture names an image without one"""
@@ -22,6 +20,10 @@ _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _START_OF_SCAN = 0xDA
 _HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
 _READ_AGAIN = "Copy or export the file again."
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""of a PNG, by its colour type"""
+MOST_PIXELS = 1 << 27
+"""of an image: 134 million"""
 
 
 def _unreadable(path: Path, found: str) -> InputError:
@@ -38,6 +40,10 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
 def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
     """(type, body) of each chunk, checked: OpenCV shows a PNG that was cut short as if its rest were black."""
     offset = len(_PNG)
@@ -52,6 +58,21 @@ def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
         if kind == b"IEND":
             return
         offset = end + 4
+
+
+def _png_header(path: Path, data: bytes) -> tuple[int, int, int, int]:
+    """Width, height, bits and colour type; raises where no PNG of so many bytes can have as many pixels."""
+    kind, header = next(_png_chunks(path, data))
+    if kind != b"IHDR" or len(header) != 13 or header[9] not in _CHANNELS:
+        raise _unreadable(path, "a PNG without header")
+    width, height, bits, colour_type = struct.unpack_from(">IIBB", header)
+    _check_pixels(path, data, width, height, bits * _CHANNELS[colour_type])
+    return width, height, bits, colour_type
+
+
+def _check_pixels(path: Path, data: bytes, width: int, height: int, bits: int = 8) -> None:
+    if not 0 < width * height <= min(MOST_PIXELS, len(data) * MOST_DEFLATED * 8 / bits):
+        raise _unreadable(path, f"an image that claims {width}x{height} pixels in {len(data)} bytes")
 
 
 def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
@@ -73,6 +94,7 @@ def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
     # A thumbnail within the header has an end marker too: look behind the start of the scan only.
     if size is None or data.rfind(b"\xff\xd9") < offset:
         raise _unreadable(path, f"a JPEG that breaks off after {len(data)} bytes")
+    _check_pixels(path, data, *size)
     return size
 
 
@@ -105,6 +127,7 @@ def _decode_heic(path: Path, data: bytes) -> np.ndarray:
 def _checked_bytes(path: Path) -> bytes:
     data = _read_bytes(path)
     if data.startswith(_PNG):
+        _png_header(path, data)
         for _ in _png_chunks(path, data):
             pass
     elif data.startswith(_JPEG):
@@ -117,14 +140,17 @@ def image_size(path: str | Path) -> tuple[int, int]:
     path = Path(path)
     data = _read_bytes(path)
     if data.startswith(_PNG):
-        kind, body = next(_png_chunks(path, data))
-        if kind != b"IHDR" or len(body) != 13:
-            raise _unreadable(path, "a PNG without header")
-        return struct.unpack_from(">II", body)
+        return _png_header(path, data)[:2]
     if data.startswith(_JPEG):
         return _jpeg_size(path, data)
     height, width = _decode(path, data).shape[:2]
     return width, height
+
+
+def read_stored(path: Path) -> np.ndarray:
+    """The pixels of an image file as they are stored: (H, W), or (H, W, C) in BGR order. Raises InputError where it is
+    damaged."""
+    return _decode(path, _checked_bytes(path))
 
 
 def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
@@ -134,9 +160,9 @@ def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
     where the file is missing, empty, cut short, or no image.
     """
     path = Path(path)
-    image = _decode(path, _checked_bytes(path))
+    image = read_stored(path)
     if image.dtype == np.uint16:
-        image = ((image.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+        image = cv2.convertScaleAbs(image, alpha=255 / 65535)  # rounded to the nearest
     if image.dtype != np.uint8:
         raise InputError(path, f"pixels of type {image.dtype}", "8 or 16 bits a channel", "Convert it to PNG or JPEG.")
     if image.ndim == 2:
@@ -176,15 +202,16 @@ def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
     remedy = "Write one id per pixel as an 8 or 16 bit grey PNG (lossless, no transparency)."
     if not data.startswith(_PNG):
         raise InputError(path, "a file that is no PNG", expected, remedy)
-    (_, header), *_ = _png_chunks(path, data)
-    bits, colour_type = header[8], header[9]
-    if colour_type == 3:  # OpenCV would look up the colours; Pillow leaves the indices as they are
-        return np.asarray(Image.open(io.BytesIO(data)), np.int32), False
+    _, _, bits, colour_type = _png_header(path, data)
+    (kind, header), *others = _png_chunks(path, data)
+    if colour_type == 3:  # OpenCV would look up the colours: as grey they are the indices
+        grey = [(kind, header[:9] + b"\0" + header[10:]), *(own for own in others if own[0] in (b"IDAT", b"IEND"))]
+        data = _PNG + b"".join(_chunk(kind, body) for kind, body in grey)
     image = _decode(path, data)
-    if colour_type == 0 and image.ndim == 2:
+    if colour_type in (0, 3) and image.ndim == 2:
         step = 255 // (2**bits - 1) if bits < 8 else 1  # fewer than 8 bits come stretched to 0..255
         return image.astype(np.int32) // step, False
-    if colour_type == 2 and image.dtype == np.uint8 and image.shape[2] == 3:
+    if colour_type == 2 and image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3:
         blue, green, red = (image[..., channel].astype(np.int32) for channel in range(3))
         return red * 65536 + green * 256 + blue, True
     channels = 1 if image.ndim == 2 else image.shape[2]
@@ -201,15 +228,16 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
     remedy = "Write the depth in millimetres as a 16 bit PNG."
     if path.suffix == ".npy":
         try:
-            depth = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+            depth = map_array(path)
+        except UNREADABLE as error:
             raise InputError(path, str(error), expected, remedy) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         if depth.ndim != 2:
             raise InputError(path, f"shape {depth.shape}", expected, remedy)
     else:
-        depth = _decode(path, _checked_bytes(path))
+        depth = read_stored(path)
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise InputError(path, f"shape {depth.shape} of {depth.dtype}", expected, remedy)
-    depth = depth.astype(np.float32) * np.float32(unit)
+    with np.errstate(over="ignore"):  # infinite is unknown
+        depth = depth.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

@@ -15,6 +15,8 @@ import numpy as np
 
 from jsecon.data.mask_files import load_labels
 from jsecon.errors import InputError
+from jsecon.files import UNREADABLE, map_array
+from jsecon.numerics import sane
 
 
 class FrameMasks(NamedTuple):
@@ -45,7 +47,7 @@ def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, 
             raise InputError(file, found, wanted, "Write all frames' files with the same model.")
         found = load_labels(folder, [name], size, level=level)
         last = max(found.ids, default=-1)
-        if table.ndim != 2 or not np.isfinite(table).all() or last >= len(table):
+        if table.ndim != 2 or not sane(table) or last >= len(table):
             wanted = "a finite row for each id of the _s.npy beside it"
             there = f"an array {table.shape} for ids up to {last}"
             raise InputError(file, there, wanted, "Write both files of the frame again.")
@@ -71,10 +73,10 @@ def feature_size(folder: Path) -> int:
 
 def _read_table(file: Path) -> np.ndarray:
     try:
-        table = np.load(file, allow_pickle=False)
+        table = map_array(file)
         if table.ndim == 0:
             raise ValueError("a single number")
-    except (OSError, ValueError, EOFError) as error:
+    except UNREADABLE as error:
         wanted, remedy = "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."
         raise InputError(file, f"nothing readable ({error})", wanted, remedy) from error
     return table

@@ -72,6 +72,7 @@ def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     return pixels.reshape(-1, 2) + 0.5
 
 
+@np.errstate(all="ignore")  # what overflows is not covered
 def _covered(lens: Lens, zoom: float) -> bool:
     """Whether a pinhole lens of this zoom sees only what the distorted image holds, where its model is one to one.
 

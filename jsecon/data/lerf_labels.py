@@ -17,8 +17,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Real
 
+from jsecon.data.images import MOST_PIXELS
 from jsecon.errors import InputError, require
-from jsecon.files import write_text
+from jsecon.files import read_json, write_text
 
 _REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels have it)."
 
@@ -63,15 +64,12 @@ def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where
 
 
 def _read(file: Path) -> LabelledFrame:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise _bad(file, f"text that is no JSON ({error})", "a label file") from error
+    content = read_json(file, "a label file", _REMEDY)
     info = _get(file, content, "info", dict, "the file")
     name = Path(_get(file, info, "name", str, "info")).stem
     width, height = (_get(file, info, key, int, "info") for key in ("width", "height"))
-    if width < 1 or height < 1:
-        raise _bad(file, f"an image of {width}x{height}", "a positive size")
+    if min(width, height) < 1 or width * height > MOST_PIXELS:
+        raise _bad(file, f"an image of {width}x{height}", f"a positive size, at most {MOST_PIXELS} pixels")
     objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for index, entry in enumerate(_get(file, content, "objects", list, "the file")):
         where = f"object {index}"

@@ -17,6 +17,7 @@ from jaxtyping import Int16, Int64
 from jsecon.data.frames import Progress
 from jsecon.data.images import IMAGE_ENDINGS, read_ids
 from jsecon.errors import InputError
+from jsecon.files import UNREADABLE, map_array
 
 
 def object_folders(folder: Path) -> tuple[Path, ...]:
@@ -50,6 +51,8 @@ def read_objects(folders: Sequence[Path], name: str) -> Int64[np.ndarray, "h w"]
 LEVELS = ("default", "s", "m", "l")
 """LangSplat's levels in the order of its `_s.npy`: all of SAM's masks, subpart, part, whole"""
 MOST_REGIONS = int(np.iinfo(np.int16).max)
+MOST_IDS = 1 << 24
+"""what float32 holds without a gap, and colours of 8 bits make"""
 _SUFFIX = "_s.npy"
 
 
@@ -196,16 +199,16 @@ def read_level(path: Path, level: str | int) -> np.ndarray:
     if level not in (*LEVELS, 0, 1, 2, 3):
         raise InputError("level", repr(level), f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     try:
-        image = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, ValueError, EOFError) as error:
+        image = map_array(path)
+    except UNREADABLE as error:
         wanted = f"a .npy of shape ({len(LEVELS)}, H, W)"
         raise InputError(path, f"no whole array ({error})", wanted, "Write the masks again.") from error
-    if image.ndim != 3 or len(image) != len(LEVELS):
+    if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
         wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
         raise InputError(path, f"an array of shape {image.shape}", wanted, remedy)
     image = np.array(image[LEVELS.index(level) if isinstance(level, str) else level])
-    if image.dtype.kind == "f" and not (np.isfinite(image).all() and (image == image.round()).all()):
-        raise InputError(path, "numbers that are no integers", "ids, -1 = none", "Write the masks again.")
+    if not ((image >= -MOST_IDS) & (image < MOST_IDS) & (image == image.round())).all():
+        raise InputError(path, "numbers that are no integers or too large", "ids, -1 = none", "Write the masks again.")
     return image.astype(np.int64)
 
 

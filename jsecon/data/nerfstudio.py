@@ -5,8 +5,8 @@ camera-to-world in OpenGL camera axes (x right, y up, looking along -z): columns
 The world stays the file's own; Capture.to_source undoes what made it of the source's (applied_transform, _scale).
 """
 
-import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from jsecon.data.images import IMAGE_ENDINGS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
 from jsecon.errors import InputError
+from jsecon.files import read_json
+from jsecon.numerics import sane
 
 MILLIMETRE = 0.001
 """nerfstudio's default depth unit, metres"""
@@ -47,8 +49,9 @@ def read_nerfstudio(file: Path) -> Posed:
         if (image := _find_image(file.parent, name)) is None:
             missing.append(name)
             continue
-        depth = None if entry.get("depth_file_path") is None else file.parent / entry["depth_file_path"]
-        if depth is not None and not depth.is_file():
+        deep = entry.get("depth_file_path") is not None
+        depth = file.parent / _key(file, entry, "depth_file_path", where, str) if deep else None
+        if depth is not None and not os.path.isfile(depth):
             raise _bad(depth, "no such depth map", f"the depth_file_path of {name}")
         unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
         lens, world_to_camera = _lens(file, scene, entry, name, image), inverse_pose(pose * [1, -1, -1, 1], file, name)
@@ -86,12 +89,7 @@ def _bad(file: Path, found: str, expected: str, remedy: str = _REMEDY) -> InputE
 
 
 def _parse(file: Path) -> dict[str, Any]:
-    try:
-        scene = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise _bad(file, error.strerror or "an error on reading", "a transforms.json", "Check the path.") from error
-    except ValueError as error:
-        raise _bad(file, f"text that is no JSON ({error})", "a transforms.json") from error
+    scene = read_json(file, "a transforms.json", _REMEDY)
     if not isinstance(scene, dict):
         raise _bad(file, "JSON without keys", "an object with frames")
     return scene
@@ -107,7 +105,7 @@ def _key(file: Path, record: dict[str, Any], key: str, where: str, kind: type) -
 
 def _number(file: Path, record: dict[str, Any], key: str, default: float) -> float:
     value = record.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not sane(value):
         raise _bad(file, f"{key} = {value!r}", "a finite number")
     return float(value)
 
@@ -129,7 +127,7 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
     if "applied_transform" in scene:
         transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
     scaled = np.diag([scale, scale, scale, 1.0]) @ transform
-    if not np.isfinite(scaled).all() or abs(np.linalg.det(scaled)) < 1e-12:
+    if not sane(transform) or abs(np.linalg.det(scaled)) < 1e-12:
         raise _bad(file, "an applied_transform or applied_scale that cannot be inverted", "a similarity")
     return np.linalg.inv(scaled)
 
@@ -142,7 +140,7 @@ def _find_image(folder: Path, name: str) -> Path | None:
     """The image as named, with "\\" as a separator where a Windows program wrote the file, or with an ending added."""
     for base in dict.fromkeys((name, name.replace("\\", "/"))):
         for ending in ("", *IMAGE_ENDINGS):
-            if (candidate := folder / (base + ending)).is_file():
+            if os.path.isfile(candidate := folder / (base + ending)):
                 return candidate
     return None
 

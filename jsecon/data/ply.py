@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from jsecon.data.ply_file import bad_ply, read_vertices
 from jsecon.errors import require_shape
 from jsecon.files import written_whole
+from jsecon.numerics import sane
 from jsecon.types import Array, Gaussians
 
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -26,6 +27,7 @@ _REST_COUNTS = (0, 9, 24, 45)
 _WANTED = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what float32 does not hold is infinite, which no reader takes
 def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:
     fields = vertices.dtype.names or ()
     if len({vertices.dtype[name] for name in fields}) == 1:
@@ -125,8 +127,8 @@ def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[n
     if missing := [name for name in _POSITION if name not in names]:
         raise bad_ply(path, f"no properties {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION)
-    if not np.isfinite(points).all():
-        raise bad_ply(path, "points with NaN or infinite coordinates", "finite points")
+    if not sane(points):
+        raise bad_ply(path, "points with NaN, infinite or absurd coordinates", "finite points")
     channels = ("red", "green", "blue")
     if not all(name in names for name in channels):
         return points, np.full((len(points), 3), GREY, np.uint8)

@@ -118,6 +118,9 @@ def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: _Element) -> np.
     if len(lines) < vertex.count:
         raise bad_ply(path, f"{len(lines)} of {vertex.count} vertices: the file is cut short")
     result = np.empty(vertex.count, vertex.dtype("="))
-    for column, (name, _) in enumerate(vertex.fields):
-        result[name] = numbers[:, column]
+    for column, (name, kind) in enumerate(vertex.fields):
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite: for the caller to refuse; integers: refused here
+            result[name] = numbers[:, column]
+        if kind[0] != "f" and (result[name] != numbers[:, column]).any():
+            raise bad_ply(path, f"numbers of {name} that its type {kind} does not hold")
     return result

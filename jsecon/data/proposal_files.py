@@ -11,7 +11,6 @@ difference from the run two before.
 Decoded here: about fifty lines, which also check that the runs fill the mask, spare a compiled dependency.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.data.images import read_ids
+from jsecon.data.images import MOST_PIXELS, read_ids
 from jsecon.data.mask_files import fitted_to_frame, read_level
 from jsecon.errors import InputError
+from jsecon.files import read_json
 
 ENDINGS = (".json", "_s.npy", ".png")
 _REMEDY = "Write them with SAM's scripts/amg.py --convert-to-rle."
@@ -34,9 +34,10 @@ def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
         height, width = (int(side) for side in rle["size"])
         counts = rle["counts"]
         runs = np.asarray(_numbers(counts) if isinstance(counts, str) else counts, np.int64)
-    except (TypeError, KeyError, ValueError, IndexError) as error:
+    except (TypeError, KeyError, ValueError, IndexError, OverflowError) as error:
         raise InputError(where, f"a mask that cannot be read ({error!r})", *_RLE) from error
-    if runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width or height * width == 0:
+    fits = runs.ndim == 1 and ((runs >= 0) & (runs <= MOST_PIXELS)).all() and min(height, width) > 0
+    if not fits or height * width > MOST_PIXELS or runs.sum() != height * width:
         raise InputError(where, f"runs that fill {int(runs.sum())} of {height}x{width} pixels", *_RLE)
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
@@ -103,12 +104,12 @@ def _read(file: Path, size: tuple[int, int], level: str) -> list[np.ndarray]:
 
 def _read_json(file: Path) -> list[np.ndarray]:
     """The masks of a file of SAM's generator: a list of records, or one under "annotations" as in SA-1B."""
+    wanted = 'a list of {"segmentation": {"size", "counts"}, ...}'
+    content = read_json(file, wanted, _REMEDY)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
         records = content["annotations"] if isinstance(content, dict) else content
         coded = [record["segmentation"] for record in records]
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        wanted = 'a list of {"segmentation": {"size", "counts"}, ...}'
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(file, f"what is no list of masks ({error!r})", wanted, _REMEDY) from error
     return [decode_rle(coded[i], f"{file}, mask {i}") for i in np.argsort(-np.asarray(scores), kind="stable")]

@@ -14,8 +14,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsecon.data.images import MOST_PIXELS
 from jsecon.errors import InputError, require
-from jsecon.files import UNREADABLE, packed, unpacked, written_whole
+from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, written_whole
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
@@ -52,6 +53,8 @@ _SHAPES = {
     ("p", "e"): "parts.embeddings",
     (4, 4): "to_source",
 }
+_INDICES = {"votes.regions": "r", "parts.part": "p"}
+"""into what an array's numbers point, -1 = none"""
 _OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings")
 
 
@@ -83,17 +86,18 @@ def load_field(path: str | os.PathLike) -> LanguageField:
         found = f"{path.stat().st_size} bytes that are no complete zip archive"
         raise InputError(path, found, "a field file", changed)
     try:
-        with np.load(path, allow_pickle=False) as members:
-            if not isinstance(members, np.lib.npyio.NpzFile) or "header" not in members:
-                raise InputError(path, "a zip archive without a jsecon header", "a field file", _REMEDY)
-            header = json.loads(members["header"].tobytes().decode())
-            if not isinstance(header, dict) or header.get("format") != FORMAT:
-                raise InputError(path, "another program's header", f"format {FORMAT!r}", _REMEDY)
-            if (version := header.get("version")) != VERSION:
-                remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
-                raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
-            field = jax.tree.map(_on_device, unpacked(header["field"], members, _RECORDS.__getitem__))
+        members = read_arrays(path)
+        if "header" not in members:
+            raise InputError(path, "a zip archive without a jsecon header", "a field file", _REMEDY)
+        header = parsed_json(members["header"].tobytes())
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise InputError(path, "another program's header", f"format {FORMAT!r}", _REMEDY)
+        if (version := header.get("version")) != VERSION:
+            remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
+            raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
+        field = unpacked(header["field"], members, _RECORDS.__getitem__)
         problem = "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field)
+        field = jax.tree.map(_on_device, field)
     except InputError:
         raise
     except UNREADABLE as error:
@@ -116,7 +120,7 @@ def _array(field: LanguageField, name: str) -> Any:
 
 
 def _disagreement(field: LanguageField) -> str | None:
-    """What is wrong with the shapes, in words, or None."""
+    """What is wrong with shapes, numbers or texts, in words, or None. Raises one of UNREADABLE on no arrays at all."""
     measured = {letter: (_array(field, name), axis) for letter, (name, axis) in _LETTERS.items()}
     sizes = {letter: array.shape[axis] for letter, (array, axis) in measured.items() if array is not None}
     for shape, names in _SHAPES.items():
@@ -129,4 +133,22 @@ def _disagreement(field: LanguageField) -> str | None:
         return f"votes over {field.votes.num_regions} regions beside {sizes['r']} regions"
     if len(field.names) != sizes["t"]:
         return f"{len(field.names)} frame names beside {sizes['t']} cameras"
+    for place, leaf in jax.tree_util.tree_leaves_with_path(field):
+        name, numbers = jax.tree_util.keystr(place).lstrip("."), np.asarray(leaf)
+        if (np.isnan(numbers) if name == "gaussians.opacity_logits" else ~np.isfinite(numbers)).any():
+            return f"{name} with numbers that are not finite"
+        if name in _INDICES and not (
+            numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[_INDICES[name]])).all()
+        ):
+            return f"{name} with indices beyond {sizes[_INDICES[name]]}"
+    if not all(isinstance(text, str) for text in (*field.names, field.embedder, field.provenance)):
+        return "names, embedder or provenance that are no texts"
+    if not isinstance(parsed_json(field.provenance), dict):
+        return "a provenance that is no JSON object"
+    if not 0 < field.cameras.width * field.cameras.height <= MOST_PIXELS:
+        return f"views of {field.cameras.width}x{field.cameras.height} px"
+    if field.autoencoder is not None:
+        coded = jax.eval_shape(field.autoencoder.encode, field.canonical).shape
+        if coded[1:] != field.codes.shape[1:]:
+            return f"a coder to {coded[1:]} numbers beside codes of {field.codes.shape[1:]}"
     return None

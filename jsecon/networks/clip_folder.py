@@ -7,12 +7,13 @@ Three layouts are known:
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from jsecon.errors import InputError
+from jsecon.files import read_json
 from jsecon.networks.onnx_graph import Graph, content_digest, describe, graph_files
+from jsecon.numerics import sane
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """of RGB in 0..1, where a folder does not say"""
@@ -21,6 +22,8 @@ LAYOUTS = {
     "transformers.js": ("onnx/vision_model.onnx", "onnx/text_model.onnx"),
 }
 """layout -> its graphs of images and of texts"""
+MOST_SIDE = 4096
+"""px of an image that a network takes"""
 CONFIGS = ("visual/preprocess_cfg.json", "preprocess_cfg.json", "preprocessor_config.json", "open_clip_config.json")
 TOKENIZERS = ("textual/tokenizer.json", "tokenizer.json", "textual/vocab.json", "vocab.json")
 PUBLISHED = (
@@ -108,16 +111,16 @@ def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]
     """(mean, std, size) of a preprocess_cfg.json, preprocessor_config.json or open_clip_config.json; what a file leaves
     out is CLIP's own, or None for the size. Raises InputError where it cannot be read."""
     expected = "mean and std of three channels, and a size in px"
+    content = read_json(path, expected, "Fetch the file again.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         content = content.get("preprocess_cfg", content)
         mean = content.get("mean", content.get("image_mean", CLIP_MEAN))
         std = content.get("std", content.get("image_std", CLIP_STD))
         size = _side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
-    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+    except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
         raise InputError(path, f"what cannot be read ({error!r})", expected, "Fetch the file again.") from error
-    if len(mean) != 3 or len(std) != 3 or min(std) <= 0 or (size is not None and size < 1):
+    if len(mean) != 3 or len(std) != 3 or not sane(mean, std) or min(std) <= 0 or not 1 <= (size or 1) <= MOST_SIDE:
         raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, "Fetch the file again.")
     return mean, std, size
 

@@ -6,10 +6,11 @@ What a file holds is never assumed. A room that needs a graph says which tensors
 
 import dataclasses
 import hashlib
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import onnxruntime
@@ -28,6 +29,8 @@ _DTYPES = {
     "tensor(bool)": "bool",
 }
 _MISUSED = "This graph is of another size or kind than the one it is used as."
+MOST_NUMBERS = 1 << 26
+"""of an input: an image of 4096 x 4096 px has 2^25.6"""
 _LFS = b"version https://git-lfs"
 Size = int | str | None
 """of an axis: a number where it is fixed, the name of a symbol or None where it is free"""
@@ -84,16 +87,21 @@ class Graph:
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4
+        onnxruntime.set_default_logger_severity(4)
         if not optimise:
             options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         try:
-            self._session = onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
+            given: dict[str, Any] = {"providers": ["CPUExecutionProvider"], "enable_fallback": 0}
+            self._session = onnxruntime.InferenceSession(str(self.path), options, **given)
+            self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
+            self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
+            for tensor in self.inputs.values():
+                if math.prod(size for size in tensor.shape or () if isinstance(size, int)) > MOST_NUMBERS:
+                    raise ValueError(f"an input {tensor}")
         except Exception as error:  # ONNX Runtime's own kinds have no common base but this
             found = f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})"
             expected = "a whole ONNX graph, with its external data files beside it"
             raise InputError(self.path, found, expected, "Fetch or export the file again.") from error
-        self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
-        self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
         self._run_options = onnxruntime.RunOptions()
         self._run_options.log_severity_level = 4
 

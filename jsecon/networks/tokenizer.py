@@ -5,7 +5,6 @@ files, are not read: the text is cleaned and cut into words as open_clip does it
 """
 
 import html
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jsecon.errors import InputError
+from jsecon.files import parsed_json
 
 CONTEXT_LENGTH = 77
 """ids per text, where the graph does not fix it"""
@@ -63,7 +63,7 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parsed_json(path.read_bytes())
         if path.name == "vocab.json":
             lines = path.with_name("merges.txt").read_text(encoding="utf-8").split("\n")
             vocabulary, merges = content, [line for line in lines if line and not line.startswith("#version")]
@@ -76,11 +76,11 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
         # a merge is written "a b" by older files and ["a", "b"] by newer ones
         pairs = [(str(a), str(b)) for a, b in (m.split(" ") if isinstance(m, str) else m for m in merges)]
         return ClipTokenizer(vocabulary, pairs)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except Exception as error:  # of the package tokenizers, whose own have no other base
         expected = "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
         expected += f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}"
-        found, remedy = f"no tokenizer of CLIP's kind ({error!r})", "Fetch the file again, from a CLIP model."
-        raise InputError(path, found, expected, remedy) from error
+        found = f"no tokenizer of CLIP's kind ({type(error).__name__}: {error})"
+        raise InputError(path, found, expected, "Fetch the file again, from a CLIP model.") from error
 
 
 def word_splitter() -> Any:

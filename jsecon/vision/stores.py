@@ -13,16 +13,13 @@ SAM takes minutes per frame on a CPU; a run that is stopped in the middle of its
 
 import dataclasses
 import hashlib
-import zipfile
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.files import written_whole
+from jsecon.files import UNREADABLE, read_arrays, written_whole
 from jsecon.vision.protocols import NamedSegmenter
-
-_UNREADABLE = (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,11 +33,11 @@ class EmbeddingStore:
     def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
         """Mask key -> vector (E,) float32 of a frame. A file that cannot be read holds nothing: it only saves time."""
         try:
-            with np.load(self._path(frame), allow_pickle=False) as file:
-                keys, vectors = file["keys"], file["vectors"]
-        except _UNREADABLE:
+            stored = read_arrays(self._path(frame))
+            pairs = zip(stored["keys"], stored["vectors"], strict=True)
+            return {key.tobytes(): vector for key, vector in pairs if np.isfinite(vector).all()}
+        except UNREADABLE:
             return {}
-        return {key.tobytes(): vector for key, vector in zip(keys, vectors)}
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
         """Keeps the vectors of a frame, in place of those kept before. Raises InputError where it cannot write."""
@@ -99,11 +96,11 @@ class StoredSegmenter:
         """frame (H, W, 3) uint8 -> masks (M, H, W) bool, as the segmenter gave them."""
         path = self._folder / f"{frame_digest(self.name, frame)}.npz"
         try:
-            with np.load(path, allow_pickle=False) as file:
-                count, height, width = file["shape"].tolist()
-                pixels = np.unpackbits(file["bits"], axis=1, count=height * width)
-            return pixels.reshape(count, height, width).astype(bool)
-        except _UNREADABLE:
+            bits, pixels = read_arrays(path)["bits"], frame.shape[0] * frame.shape[1]
+            if bits.shape[1] != -(-pixels // 8):
+                raise ValueError(f"{bits.shape[1]} bytes a mask")
+            return np.unpackbits(bits, axis=1, count=pixels).reshape(-1, *frame.shape[:2]).astype(bool)
+        except UNREADABLE:
             masks = np.asarray(self._segmenter(frame, index), bool)
         bits = np.packbits(masks.reshape(len(masks), frame.shape[0] * frame.shape[1]), axis=1)
         _write(path, bits=bits, shape=np.asarray(masks.shape))

@@ -7,13 +7,13 @@ SAM 2 by what only it has: `obj_ptr_tpos_proj.onnx` and the constant `no_obj_emb
 """
 
 import dataclasses
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from jsecon.errors import InputError
+from jsecon.files import UNREADABLE, read_arrays
 from jsecon.networks.onnx_graph import Graph, content_digest, graph_files
 
 STRIDE = 16
@@ -148,9 +148,11 @@ def sam2_digest(folder: Path, *, extra: str = "") -> str:
 
 def _read_constants(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            constants = {name: stored[name].astype(np.float32) for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        with np.errstate(over="ignore"):
+            constants = {name: array.astype(np.float32) for name, array in read_arrays(path).items()}
+        if not all(np.isfinite(array).all() for array in constants.values()):
+            raise ValueError("numbers that are not finite")
+    except UNREADABLE as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else f"what cannot be read ({error})"
         raise _bad(path, found, f"the arrays {', '.join(CONSTANTS)}") from error
     return constants
