@@ -8,12 +8,13 @@ import json
 import math
 import os
 import re
+import sys
 import uuid
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -80,7 +81,7 @@ def read_json(path: Path, expected: str, remedy: str) -> Any:
         raise InputError(path, f"text that is no JSON ({error})", expected, remedy) from error
 
 
-def array_layout(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype, bool]:
+def array_layout(stream: Any, size: int) -> tuple[tuple[int, ...], np.dtype, bool]:
     """(shape, type, whether in Fortran's order) of the .npy of `size` bytes in a stream, which is then at its numbers.
 
     Read here, since NumPy makes room for all that a header announces, and warns of odd ones. Raises one of UNREADABLE
@@ -100,7 +101,7 @@ def array_layout(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtyp
     return shape, dtype, order == "True"
 
 
-def read_array(stream: IO[bytes], size: int) -> np.ndarray:
+def read_array(stream: Any, size: int) -> np.ndarray:
     """The array of the .npy of `size` bytes in a stream. Raises as `array_layout` does."""
     shape, dtype, fortran = array_layout(stream, size)
     array = np.empty(shape[::-1] if fortran else shape, dtype)
@@ -120,7 +121,7 @@ def map_array(path: Path, start: int = 0, size: int | None = None) -> np.ndarray
         return np.memmap(path, dtype, "r", file.tell(), shape, "F" if fortran else "C")
 
 
-def read_arrays(path: str | os.PathLike, *, mapped: float = math.inf) -> dict[str, np.ndarray]:
+def read_arrays(path: str | os.PathLike, *, mapped: int = sys.maxsize) -> dict[str, np.ndarray]:
     """The arrays of a .npz by name; those of more than `mapped` bytes are mapped. Raises one of UNREADABLE where it is
     damaged."""
     arrays, most = {}, os.path.getsize(path)

@@ -1,5 +1,7 @@
 """Safe maths and the named constants, each with its reason. Every guard is finite in value and gradient everywhere."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,7 @@ MOST = 1e18
 """of a coordinate, focal length or coefficient in a file: float32 holds its square"""
 
 
-def sane(*numbers: np.ndarray | tuple[float, ...] | float) -> bool:
+def sane(*numbers: Any) -> bool:
     """Whether all numbers are finite and none is above MOST."""
     return all(bool((np.abs(np.asarray(own, np.float64)) <= MOST).all()) for own in numbers)
 

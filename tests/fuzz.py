@@ -116,7 +116,9 @@ def _write_ply(path: Path, columns: dict[str, np.ndarray], form: str, more: str 
     head = ["ply", f"format {form} 1.0", "comment of mine", f"element vertex {len(table)}"]
     head += [f"property {names[kind]} {name}" for name, kind in kinds.items()]
     body = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in table).encode()
-    path.write_bytes("\n".join([*head, f"{more}end_header\n"]).encode() + (body if form == "ascii" else table.tobytes()))
+    path.write_bytes(
+        "\n".join([*head, f"{more}end_header\n"]).encode() + (body if form == "ascii" else table.tobytes())
+    )
     return path
 
 
@@ -127,9 +129,16 @@ def ply(folder: Path) -> Iterator[Case]:
         save_ply(folder / f"{count}.ply", _gaussians(count, basis))
         files.append(folder / f"{count}.ply")
     parts = _gaussians(6, 1)
-    columns = {f"{kind}{axis}": np.asarray(array)[:, n] for kind, axes, array in (
-        ("", "xyz", parts.means), ("f_dc_", "012", parts.sh[:, 0]), ("scale_", "012", parts.log_scales),
-        ("rot_", "0123", parts.quaternions)) for n, axis in enumerate(axes)}
+    columns = {
+        f"{kind}{axis}": np.asarray(array)[:, n]
+        for kind, axes, array in (
+            ("", "xyz", parts.means),
+            ("f_dc_", "012", parts.sh[:, 0]),
+            ("scale_", "012", parts.log_scales),
+            ("rot_", "0123", parts.quaternions),
+        )
+        for n, axis in enumerate(axes)
+    }
     columns |= {"opacity": np.float64(parts.opacity_logits), "red": np.arange(6, dtype=np.uint8)}
     face = "element face 0\nproperty list uchar int vertex_indices\n"
     files += [_write_ply(folder / f"{form}.ply", columns, form, face) for form in ("ascii", "binary_big_endian")]
@@ -176,14 +185,24 @@ def _whole_capture(found) -> None:
 def colmap(folder: Path) -> Iterator[Case]:
     """A model in binary, read with its images."""
     capture = small_capture(3, points=12)
-    for kind, number, more in (("pinhole", 1, ()), ("opencv", 4, (0.01, 0.002, 0.001, 0.0)), ("fisheye", 5, (0.01, 0.002, 0, 0))):
+    for kind, number, more in (
+        ("pinhole", 1, ()),
+        ("opencv", 4, (0.01, 0.002, 0.001, 0.0)),
+        ("fisheye", 5, (0.01, 0.002, 0, 0)),
+    ):
         write_colmap(capture, folder / kind)
         model = folder / kind / "sparse" / "0"
         if more:
             lens = np.array([20.0, 21.0, 11.75, 8.5, *more], "<f8")
-            cameras = b"".join(np.array([n, number], "<i4").tobytes() + np.array([24, 16], "<u8").tobytes() + lens.tobytes() for n in (1, 2))
+            cameras = b"".join(
+                np.array([n, number], "<i4").tobytes() + np.array([24, 16], "<u8").tobytes() + lens.tobytes()
+                for n in (1, 2)
+            )
             (model / "cameras.bin").write_bytes(np.array(2, "<u8").tobytes() + cameras)
-        tracks = b"".join((model / "points3D.bin").read_bytes()[8 + 51 * n : 51 + 51 * n] + np.array(2, "<u8").tobytes() + bytes(16) for n in range(12))
+        tracks = b"".join(
+            (model / "points3D.bin").read_bytes()[8 + 51 * n : 51 + 51 * n] + np.array(2, "<u8").tobytes() + bytes(16)
+            for n in range(12)
+        )
         (model / "points3D.bin").write_bytes(np.array(12, "<u8").tobytes() + tracks)
         yield Case(sorted(model.iterdir()), lambda kind=kind: load_capture(folder / kind, holdout=2), _whole_capture)
 
@@ -191,11 +210,19 @@ def colmap(folder: Path) -> Iterator[Case]:
 def colmap_text(folder: Path) -> Iterator[Case]:
     """A model in text, read with its images."""
     capture = small_capture(3, points=12)
-    lenses = {"pinhole": None, "opencv": ["1 OPENCV 24 16 20 21 11.5 8.5 0.01 0.002 0.001 0"], "radial": ["1 RADIAL_FISHEYE 48 32 40 23 16 0.01 0.001"]}
+    lenses = {
+        "pinhole": None,
+        "opencv": ["1 OPENCV 24 16 20 21 11.5 8.5 0.01 0.002 0.001 0"],
+        "radial": ["1 RADIAL_FISHEYE 48 32 40 23 16 0.01 0.001"],
+    }
     for name, lens in lenses.items():
         write_images(capture, folder / name / "images")
         write_text_model(capture, folder / name / "sparse" / "0", lens)
-        yield Case(sorted((folder / name / "sparse" / "0").iterdir()), lambda name=name: load_capture(folder / name), _whole_capture)
+        yield Case(
+            sorted((folder / name / "sparse" / "0").iterdir()),
+            lambda name=name: load_capture(folder / name),
+            _whole_capture,
+        )
 
 
 def nerfstudio(folder: Path) -> Iterator[Case]:
@@ -205,7 +232,12 @@ def nerfstudio(folder: Path) -> Iterator[Case]:
         "plain": {},
         "distorted": {"camera_model": "OPENCV", "k1": 0.01, "k2": 0.001, "p1": 0.001, "p2": 0.0},
         "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001},
-        "deep": {"ply_file_path": "cloud.ply", "applied_scale": 2.0, "applied_transform": np.eye(4)[:3].tolist(), "depth_unit_scale_factor": 0.001},
+        "deep": {
+            "ply_file_path": "cloud.ply",
+            "applied_scale": 2.0,
+            "applied_transform": np.eye(4)[:3].tolist(),
+            "depth_unit_scale_factor": 0.001,
+        },
     }.items():
         content = transforms(capture, **more)
         if name == "plain":
@@ -297,11 +329,17 @@ def masks(folder: Path) -> Iterator[Case]:
         (folder / "objects" / object).mkdir(parents=True)
         for name, image in zip(names, ids):
             (folder / "objects" / object / f"{name}.png").write_bytes(kinds["grey"]((image == int(object)) * 255))
-    yield Case(sorted((folder / "objects").rglob("*.png")), lambda: mask_files.load_labels(folder / "objects", names, (24, 36)), whole)
+    yield Case(
+        sorted((folder / "objects").rglob("*.png")),
+        lambda: mask_files.load_labels(folder / "objects", names, (24, 36)),
+        whole,
+    )
     (folder / "levels").mkdir()
     for name, image in zip(names, ids):
         np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, 24, 36)).astype(np.float32))
-    yield Case(sorted((folder / "levels").iterdir()), lambda: mask_files.load_labels(folder / "levels", names, (24, 36)), whole)
+    yield Case(
+        sorted((folder / "levels").iterdir()), lambda: mask_files.load_labels(folder / "levels", names, (24, 36)), whole
+    )
     field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
 
     def whole_outline(found: np.ndarray) -> None:
@@ -338,7 +376,9 @@ def proposals(folder: Path) -> Iterator[Case]:
     text = records(boxes)[0]["segmentation"]
     counts = {"size": [20, 30], "counts": [62, 7, 13, 7, 13, 7, 13, 7, 13, 7, 451]}
     for name, content in {
-        "a": [{"segmentation": code, "predicted_iou": 0.9, "stability_score": 0.95, "area": 50} for code in (counts, text)],
+        "a": [
+            {"segmentation": code, "predicted_iou": 0.9, "stability_score": 0.95, "area": 50} for code in (counts, text)
+        ],
         "b": {"image": {"id": 1}, "annotations": [{"segmentation": text}]},
     }.items():
         (folder / f"{name}.json").write_text(json.dumps(content))
@@ -362,9 +402,19 @@ def proposals(folder: Path) -> Iterator[Case]:
 
 def labels(folder: Path) -> Iterator[Case]:
     """LERF's labels as LangSplat has them."""
-    thing = {"category": "red mug", "group": 1, "segmentation": [[1, 2], [9, 3], [5, 9.5]], "area": 9.0, "bbox": [1, 2, 9, 9], "iscrowd": 0}
+    thing = {
+        "category": "red mug",
+        "group": 1,
+        "segmentation": [[1, 2], [9, 3], [5, 9.5]],
+        "area": 9.0,
+        "bbox": [1, 2, 9, 9],
+        "iscrowd": 0,
+    }
     for name in ("frame_1", "frame_2"):
-        content = {"info": {"name": f"{name}.jpg", "width": 30, "height": 20, "note": ""}, "objects": [thing, thing | {"bbox": [0, 0, 3, 3]}, thing | {"category": "tea"}]}
+        content = {
+            "info": {"name": f"{name}.jpg", "width": 30, "height": 20, "note": ""},
+            "objects": [thing, thing | {"bbox": [0, 0, 3, 3]}, thing | {"category": "tea"}],
+        }
         (folder / f"{name}.json").write_text(json.dumps(content))
 
     def whole(found) -> None:
@@ -384,17 +434,38 @@ def labels(folder: Path) -> Iterator[Case]:
 def _field(coder: Any = None) -> LanguageField:
     rng = np.random.default_rng(0)
     n, r, e, d, t, k, p = 12, 3, 8, 4, 2, 2, 2
-    unit = lambda *shape: (lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True))(rng.normal(size=shape)).astype(np.float32)
+    unit = lambda *shape: (lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True))(rng.normal(size=shape)).astype(
+        np.float32
+    )
     positive = lambda *shape: rng.random(shape).astype(np.float32)
     votes = Votes(
-        rng.integers(-1, r, (n, k)).astype(np.int32), positive(n, k), positive(n), positive(n) + 1, positive(n),
-        np.full(n, t, np.int32), np.int32(0), r, shown=positive(n, k), overlap=positive(r, r),
+        rng.integers(-1, r, (n, k)).astype(np.int32),
+        positive(n, k),
+        positive(n),
+        positive(n) + 1,
+        positive(n),
+        np.full(n, t, np.int32),
+        np.int32(0),
+        r,
+        shown=positive(n, k),
+        overlap=positive(r, r),
     )
     camera = Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16)
     parts = Parts((np.arange(n) % (p + 1) - 1).astype(np.int32), unit(p, e), positive(p))
     return LanguageField(
-        _gaussians(n, 4), unit(n, d), votes, Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)), unit(r, d),
-        coder, camera, unit(4, e), np.eye(4), ("a", "b"), "colours", '{"jsecon": "1", "options": {"embedder": null}}', parts,
+        _gaussians(n, 4),
+        unit(n, d),
+        votes,
+        Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)),
+        unit(r, d),
+        coder,
+        camera,
+        unit(4, e),
+        np.eye(4),
+        ("a", "b"),
+        "colours",
+        '{"jsecon": "1", "options": {"embedder": null}}',
+        parts,
     )
 
 
@@ -403,7 +474,10 @@ def _coder() -> Autoencoder:
     dense = lambda a, b: {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
     norm = {"scale": np.ones(4, np.float32), "bias": np.zeros(4, np.float32)}
     stats = {"mean": np.zeros(4, np.float32), "var": np.ones(4, np.float32)}
-    encoder = {"params": {"Dense_0": dense(8, 4), "BatchNorm_0": norm, "Dense_1": dense(4, 4)}, "batch_stats": {"BatchNorm_0": stats}}
+    encoder = {
+        "params": {"Dense_0": dense(8, 4), "BatchNorm_0": norm, "Dense_1": dense(4, 4)},
+        "batch_stats": {"BatchNorm_0": stats},
+    }
     return Autoencoder(encoder, {"params": {"Dense_0": dense(4, 4), "Dense_1": dense(4, 8)}})
 
 
@@ -417,7 +491,10 @@ def field(folder: Path) -> Iterator[Case]:
             assert np.asarray(leaf).dtype.kind in "iuf", path
             _finite(leaf)
         r = found.regions.count
-        for ids, count in ((found.votes.regions, r), (found.parts.part if found.parts else np.zeros(0, int), len(found.parts.weight) if found.parts else 0)):
+        for ids, count in (
+            (found.votes.regions, r),
+            (found.parts.part if found.parts else np.zeros(0, int), len(found.parts.weight) if found.parts else 0),
+        ):
             assert np.asarray(ids).dtype.kind in "iu"
             assert ((ids >= -1) & (ids < count)).all(), "indices of nothing"
         assert type(found.names) is tuple
@@ -432,7 +509,12 @@ def field(folder: Path) -> Iterator[Case]:
             _finite(codes)
 
     rotation = Rotation(np.eye(8, 4, dtype=np.float32))
-    for name, value in {"plain": _field(), "rotation": _field(rotation), "coder": _field(_coder()), "bare": dataclasses.replace(_field(rotation), parts=None)}.items():
+    for name, value in {
+        "plain": _field(),
+        "rotation": _field(rotation),
+        "coder": _field(_coder()),
+        "bare": dataclasses.replace(_field(rotation), parts=None),
+    }.items():
         save_field(folder / f"{name}.npz", value)
         yield Case([folder / f"{name}.npz"], lambda name=name: load_field(folder / f"{name}.npz"), whole)
 
@@ -482,7 +564,9 @@ def tokenizer(folder: Path) -> Iterator[Case]:
     """tokenizer.json, and vocab.json with merges.txt."""
     write_tokenizer(folder / "tokenizer.json")
     (folder / "vocab.json").write_text(json.dumps(vocabulary()))
-    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(" ".join(pair) for pair in clip_tokens()["merges"]))
+    (folder / "merges.txt").write_text(
+        "#version: 0.2\n" + "\n".join(" ".join(pair) for pair in clip_tokens()["merges"])
+    )
 
     def read(file: Path) -> np.ndarray:
         return load_tokenizer(file)(["a red mug's 12 handles", "", "é<end_of_text>"])
@@ -601,7 +685,9 @@ def _status(key: str) -> int:
 
 def _place(error: BaseException) -> str:
     """Where in jsecon an exception came from."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if "/jsecon/" in f.filename] or traceback.extract_tb(error.__traceback__)
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if "/jsecon/" in f.filename] or traceback.extract_tb(
+        error.__traceback__
+    )
     return f"{Path(frames[-1].filename).name}:{frames[-1].lineno} {type(error).__name__}: {str(error)[:300]}"
 
 
@@ -639,7 +725,10 @@ def _tried(case: Case, size: int, stderr) -> tuple[str, str, float, float]:
     if outcome in ("read", "refused"):
         said = Path(f"/proc/self/fd/{stderr.fileno()}").read_bytes().decode(errors="replace")
         if warned:
-            outcome, told = "a warning", f"{Path(warned[0].filename).name}:{warned[0].lineno} {str(warned[0].message)[:160]}"
+            outcome, told = (
+                "a warning",
+                f"{Path(warned[0].filename).name}:{warned[0].lineno} {str(warned[0].message)[:160]}",
+            )
         elif said:
             outcome, told = "said to stderr", said[:160]
         elif taken > allowed:
@@ -685,7 +774,9 @@ def _work(name: str, folder: Path, seed: int, numbers: range, keep: Path | None,
     os._exit(0)
 
 
-def trials(name: str, *, seed: int, numbers: range, seconds: float = math.inf, keep: Path | None = None) -> Iterator[Trial]:
+def trials(
+    name: str, *, seed: int, numbers: range, seconds: float = math.inf, keep: Path | None = None
+) -> Iterator[Trial]:
     """What came of the mutations `numbers` of a reader, as many as `seconds` allow."""
     end, at = time.monotonic() + seconds, numbers.start
     while at < numbers.stop and time.monotonic() < end:
@@ -700,7 +791,12 @@ def trials(name: str, *, seed: int, numbers: range, seconds: float = math.inf, k
                     os.close(out)
                     _work(name, folder, seed, range(at, numbers.stop), keep, into)
                 except BaseException:
-                    os.write(into, (json.dumps(dataclasses.asdict(Trial(-1, "harness", told=traceback.format_exc()))) + "\n").encode())
+                    os.write(
+                        into,
+                        (
+                            json.dumps(dataclasses.asdict(Trial(-1, "harness", told=traceback.format_exc()))) + "\n"
+                        ).encode(),
+                    )
                 os._exit(1)
             os.close(into)
             last = None
@@ -710,7 +806,11 @@ def trials(name: str, *, seed: int, numbers: range, seconds: float = math.inf, k
                 last = trial
             os.close(out)
             ended = os.waitpid(child, os.WNOHANG)
-            if ended[0] == 0 and time.monotonic() < end and (last is None or last.number < numbers.stop - 1 or last.outcome == "begun"):
+            if (
+                ended[0] == 0
+                and time.monotonic() < end
+                and (last is None or last.number < numbers.stop - 1 or last.outcome == "begun")
+            ):
                 time.sleep(0.2)
                 ended = os.waitpid(child, os.WNOHANG)
             if ended[0] == 0:
@@ -722,7 +822,13 @@ def trials(name: str, *, seed: int, numbers: range, seconds: float = math.inf, k
                 return
             if last.outcome == "begun" and time.monotonic() < end:
                 code = ended[1]
-                outcome = "too long" if ended[0] == 0 else f"crash (signal {os.WTERMSIG(code)})" if os.WIFSIGNALED(code) else f"exit {code}"
+                outcome = (
+                    "too long"
+                    if ended[0] == 0
+                    else f"crash (signal {os.WTERMSIG(code)})"
+                    if os.WIFSIGNALED(code)
+                    else f"exit {code}"
+                )
                 yield Trial(last.number, outcome, 0.0, 0.0, last.how, outcome)
             at = last.number + 1
 

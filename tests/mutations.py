@@ -16,7 +16,23 @@ import onnx
 NUMBERS = (0, -1, 1, 2**31, -(2**31), 2**32 - 1, 2**63, 2**64 - 1, float("nan"), float("inf"), 1e308, -1e308, 1e-320)
 WORDS = (*map(repr, NUMBERS), "1e400", "9" * 400, "9" * 5000, "1_0", "٣", "1,5", "0x10", "", "\0", "../x", "x" * 300)
 CODES = ("<i4", "<u4", "<i8", "<u8", "<f4", "<f8", "<u2", "u1", ">u4", ">u2", ">f4")
-ODD = (None, True, *NUMBERS, 10**400, "", "text", "a\0b", "\ud800", "x" * 5000, "../x", [], {}, [[]], [1, 2, 3], {"a": 1})
+ODD = (
+    None,
+    True,
+    *NUMBERS,
+    10**400,
+    "",
+    "text",
+    "a\0b",
+    "\ud800",
+    "x" * 5000,
+    "../x",
+    [],
+    {},
+    [[]],
+    [1, 2, 3],
+    {"a": 1},
+)
 _RAW = {"@deep list@": "[" * 100_000 + "]" * 100_000, "@deep dict@": '{"a":' * 50_000 + "1" + "}" * 50_000}
 
 
@@ -141,7 +157,24 @@ def of_json(rng, data: bytes) -> bytes:
     return text.encode()
 
 
-_TYPES = ("<f4", "<f8", ">f4", "<i4", "<i8", "<u8", "|b1", "|u1", "<c8", "|O", "|S0", "<U9", "<M8[ns]", "|V3", "<f2", "x")
+_TYPES = (
+    "<f4",
+    "<f8",
+    ">f4",
+    "<i4",
+    "<i8",
+    "<u8",
+    "|b1",
+    "|u1",
+    "<c8",
+    "|O",
+    "|S0",
+    "<U9",
+    "<M8[ns]",
+    "|V3",
+    "<f2",
+    "x",
+)
 
 
 def of_array(rng, data: bytes) -> bytes:
@@ -173,16 +206,22 @@ def of_array(rng, data: bytes) -> bytes:
                 some = rng.integers(len(flat), size=int(rng.choice([1, 1, 10])))
                 whole = array.dtype.kind in "iub" and (not np.isfinite(number) or abs(number) > 1e18)
                 with np.errstate(all="ignore"):
-                    flat[some] = (np.iinfo(array.dtype).max if array.dtype.kind != "b" else 1) if whole else np.array(
-                        number
-                    ).astype(array.dtype)
+                    flat[some] = (
+                        (np.iinfo(array.dtype).max if array.dtype.kind != "b" else 1)
+                        if whole
+                        else np.array(number).astype(array.dtype)
+                    )
             return _saved(array)
         case 2:
             with np.errstate(all="ignore"):
                 kind = ("<f8", ">f4", "<i4", "<i8", "<u8", "u1", "?", "<f2", "<c8", "S3", "<M8[s]")[rng.integers(11)]
                 return _saved(array.astype(np.dtype(kind), casting="unsafe"))
         case 3:
-            return _saved([array[:0], array[1:], array[None], array.T, array.ravel(), array[..., :1]][rng.integers(6)] if array.ndim else array[None])
+            return _saved(
+                [array[:0], array[1:], array[None], array.T, array.ravel(), array[..., :1]][rng.integers(6)]
+                if array.ndim
+                else array[None]
+            )
         case 4:
             return _saved(np.asfortranarray(array))
         case _:
@@ -267,7 +306,9 @@ def of_graph(rng, data: bytes) -> bytes:
         size = int([0, -1, 1, 2, 7, 2**31, 2**62, 2**63 - 1][rng.integers(8)])
         match rng.integers(11):
             case 0 if node and len(node.input):
-                node.input[int(rng.integers(len(node.input)))] = pick(["", "x", *(v for n in graph.node for v in n.output)])
+                node.input[int(rng.integers(len(node.input)))] = pick(
+                    ["", "x", *(v for n in graph.node for v in n.output)]
+                )
             case 1 if node:
                 node.op_type = pick(["Add", "MatMul", "Conv", "Reshape", "Gather", "Cast", "Nothing", "Loop", "Resize"])
             case 2 if weight is not None and len(weight.dims):
@@ -317,4 +358,7 @@ def damaged(rng, data: bytes, ending: str) -> tuple[str, bytes]:
     """(what was done, the bytes) of a file of this ending."""
     way = KINDS.get(ending, (of_bytes,))
     way = way[int(rng.integers(len(way)))]
-    return way.__name__, way(rng, data)
+    try:
+        return way.__name__, way(rng, data)
+    except Exception:  # damaged twice: no longer of its format
+        return of_bytes.__name__, of_bytes(rng, data)

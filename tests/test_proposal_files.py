@@ -70,7 +70,7 @@ def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[{", "no list of masks"),
+        ("[{", "no JSON"),
         ('[{"bbox": [1, 2, 3, 4]}]', "KeyError"),
         ('{"info": 1}', "KeyError"),
         ('[{"segmentation": [[1, 2, 3, 4]]}]', "mask 0"),

@@ -1,13 +1,16 @@
 """Image files, read whole or not at all: RGB frames, integer label images, depth maps."""
 
+import io
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
 
 from jsecon.errors import InputError
 from jsecon.files import MOST_DEFLATED, UNREADABLE, map_array, written_whole
@@ -20,6 +23,10 @@ _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _START_OF_SCAN = 0xDA
 _HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
 _READ_AGAIN = "Copy or export the file again."
+_PIXELS = (b"IDAT", b"IHDR", b"PLTE", b"tRNS")
+"""the chunks of a PNG that make its pixels"""
+_MODES = {"1": "L", "L": "L", "I;16": "I;16", "RGB": "RGB", "RGBA": "RGBA", "P": "RGB", "PA": "RGBA", "LA": "RGBA"}
+"""Pillow's mode of a file -> that of its pixels here"""
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """of a PNG, by its colour type"""
 MOST_PIXELS = 1 << 27
@@ -40,8 +47,10 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _chunk(kind: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+def _png(chunks: Iterable[tuple[bytes, bytes]]) -> bytes:
+    """A PNG of these chunks."""
+    parts = (struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(b, zlib.crc32(k))) for k, b in chunks)
+    return _PNG + b"".join(parts) + b"\0\0\0\0IEND\xaeB`\x82"
 
 
 def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -63,7 +72,7 @@ def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
 def _png_header(path: Path, data: bytes) -> tuple[int, int, int, int]:
     """Width, height, bits and colour type; raises where no PNG of so many bytes can have as many pixels."""
     kind, header = next(_png_chunks(path, data))
-    if kind != b"IHDR" or len(header) != 13 or header[9] not in _CHANNELS:
+    if kind != b"IHDR" or len(header) != 13 or header[9] not in _CHANNELS or header[10:12] != b"\0\0":
         raise _unreadable(path, "a PNG without header")
     width, height, bits, colour_type = struct.unpack_from(">IIBB", header)
     _check_pixels(path, data, width, height, bits * _CHANNELS[colour_type])
@@ -71,7 +80,7 @@ def _png_header(path: Path, data: bytes) -> tuple[int, int, int, int]:
 
 
 def _check_pixels(path: Path, data: bytes, width: int, height: int, bits: int = 8) -> None:
-    if not 0 < width * height <= min(MOST_PIXELS, len(data) * MOST_DEFLATED * 8 / bits):
+    if not 0 < width * height * bits <= min(MOST_PIXELS * bits, len(data) * MOST_DEFLATED * 8):
         raise _unreadable(path, f"an image that claims {width}x{height} pixels in {len(data)} bytes")
 
 
@@ -99,16 +108,28 @@ def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def _decode(path: Path, data: bytes) -> np.ndarray:
-    """Pixels as stored (BGR order, EXIF orientation ignored: poses are estimated on the stored pixels)."""
+    """Pixels as stored, grey, RGB or RGBA (EXIF orientation ignored: poses are estimated on the stored pixels).
+
+    PNG and JPEG by Pillow: the same pixels as OpenCV's, as fast, and it writes nothing to stderr. For 16 bits of colour
+    and CMYK it has no mode: those are read once more by OpenCV.
+    """
     if data[4:12] in _HEIC:
         return _decode_heic(path, data)
+    kind = PngImageFile if data.startswith(_PNG) else JpegImageFile if data.startswith(_JPEG) else None
     try:
+        if kind is not None:
+            with kind(io.BytesIO(data)) as image:
+                mode = "RGBA" if "transparency" in image.info else _MODES.get(image.mode, "RGB")
+                pixels = np.asarray(image if mode == image.mode else image.convert(mode))
+            if image.mode in _MODES and not (kind is PngImageFile and data[24] == 16 and data[25]):
+                return pixels
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise _unreadable(path, f"what OpenCV refuses ({error.err})") from error
-    if image is None:
-        raise _unreadable(path, f"{len(data)} bytes that are no image")
-    return image
+        if image is None:
+            raise ValueError(f"{len(data)} bytes that are no image")
+        order = {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+        return image if image.ndim == 2 else cv2.cvtColor(image, order[image.shape[2]])
+    except Exception as error:  # Pillow's and OpenCV's own kinds have no common base but this
+        raise _unreadable(path, f"what cannot be decoded ({error or type(error).__name__})") from error
 
 
 def _decode_heic(path: Path, data: bytes) -> np.ndarray:
@@ -119,7 +140,7 @@ def _decode_heic(path: Path, data: bytes) -> np.ndarray:
         raise InputError(path, "a HEIC photograph", "pillow-heif, which reads them", remedy) from error
     try:
         image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True)
-        return np.ascontiguousarray(np.asarray(image)[..., 2::-1])
+        return np.ascontiguousarray(np.asarray(image)[..., :3])
     except (ValueError, OSError, EOFError, SyntaxError) as error:
         raise _unreadable(path, f"a HEIC that pillow-heif refuses ({error})") from error
 
@@ -128,9 +149,8 @@ def _checked_bytes(path: Path) -> bytes:
     data = _read_bytes(path)
     if data.startswith(_PNG):
         _png_header(path, data)
-        for _ in _png_chunks(path, data):
-            pass
-    elif data.startswith(_JPEG):
+        return _png(own for own in _png_chunks(path, data) if own[0] in _PIXELS)
+    if data.startswith(_JPEG):
         _jpeg_size(path, data)
     return data
 
@@ -148,7 +168,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def read_stored(path: Path) -> np.ndarray:
-    """The pixels of an image file as they are stored: (H, W), or (H, W, C) in BGR order. Raises InputError where it is
+    """The pixels of an image file as they are stored: grey (H, W), RGB or RGBA (H, W, C). Raises InputError where it is
     damaged."""
     return _decode(path, _checked_bytes(path))
 
@@ -167,12 +187,9 @@ def read_image(path: str | Path) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
         raise InputError(path, f"pixels of type {image.dtype}", "8 or 16 bits a channel", "Convert it to PNG or JPEG.")
     if image.ndim == 2:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), False
-    if image.shape[2] == 3:
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), False
-    alpha = image[..., 3:]
-    rgb = cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)
+    rgb, alpha = image[..., :3], image[..., 3:]
     if (alpha == 255).all():
-        return rgb, False
+        return np.ascontiguousarray(rgb), False
     return ((rgb.astype(np.uint16) * alpha + 127) // 255).astype(np.uint8), True
 
 
@@ -204,15 +221,14 @@ def read_ids(path: str | Path) -> tuple[Int32[np.ndarray, "h w"], bool]:
         raise InputError(path, "a file that is no PNG", expected, remedy)
     _, _, bits, colour_type = _png_header(path, data)
     (kind, header), *others = _png_chunks(path, data)
-    if colour_type == 3:  # OpenCV would look up the colours: as grey they are the indices
-        grey = [(kind, header[:9] + b"\0" + header[10:]), *(own for own in others if own[0] in (b"IDAT", b"IEND"))]
-        data = _PNG + b"".join(_chunk(kind, body) for kind, body in grey)
-    image = _decode(path, data)
-    if colour_type in (0, 3) and image.ndim == 2:
+    if colour_type == 3:  # as grey, whose values are the indices
+        header, colour_type = header[:9] + b"\0" + header[10:], 0
+    image = _decode(path, _png([(kind, header), *(own for own in others if own[0] == b"IDAT")]))
+    if colour_type == 0 and image.ndim == 2:
         step = 255 // (2**bits - 1) if bits < 8 else 1  # fewer than 8 bits come stretched to 0..255
         return image.astype(np.int32) // step, False
     if colour_type == 2 and image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3:
-        blue, green, red = (image[..., channel].astype(np.int32) for channel in range(3))
+        red, green, blue = (image[..., channel].astype(np.int32) for channel in range(3))
         return red * 65536 + green * 256 + blue, True
     channels = 1 if image.ndim == 2 else image.shape[2]
     raise InputError(path, f"a PNG of {channels} channels, {bits} bits, colour type {colour_type}", expected, remedy)
@@ -232,7 +248,7 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         except UNREADABLE as error:
             raise InputError(path, str(error), expected, remedy) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
-        if depth.ndim != 2:
+        if depth.ndim != 2 or not depth.size:
             raise InputError(path, f"shape {depth.shape}", expected, remedy)
     else:
         depth = read_stored(path)

@@ -14,6 +14,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -132,7 +133,8 @@ def _lenses(photos: Sequence[Path]) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for number, photo in enumerate(photos):
         lens = None
-        with contextlib.suppress(OSError, SyntaxError, ValueError), Image.open(photo) as image:
+        ignored = contextlib.suppress(OSError, SyntaxError, ValueError), warnings.catch_warnings(action="ignore")
+        with ignored[0], ignored[1], Image.open(photo) as image:
             exif = image.getexif()
             inner = exif.get_ifd(_EXIF)
             lens = exif.get(_MODEL), str(inner.get(_FOCAL)), str(inner.get(_FOCAL_35))

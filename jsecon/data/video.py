@@ -65,7 +65,7 @@ def write_frames(
 
 def _decoded(video: Path) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
     """Each frame (BGR) with how many the video says that it has, at least 1."""
-    reader = cv2.VideoCapture(os.fspath(video))
+    reader = cv2.VideoCapture(os.fspath(video), cv2.CAP_FFMPEG)  # others write to stderr what is wrong
     try:
         total = max(1, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
         while True:

@@ -53,8 +53,6 @@ _SHAPES = {
     ("p", "e"): "parts.embeddings",
     (4, 4): "to_source",
 }
-_INDICES = {"votes.regions": "r", "parts.part": "p"}
-"""into what an array's numbers point, -1 = none"""
 _OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings")
 
 
@@ -96,7 +94,9 @@ def load_field(path: str | os.PathLike) -> LanguageField:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
             raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
         field = unpacked(header["field"], members, _RECORDS.__getitem__)
-        problem = "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field)
+        problem = (
+            "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field) or _oddity(field)
+        )
         field = jax.tree.map(_on_device, field)
     except InputError:
         raise
@@ -120,7 +120,7 @@ def _array(field: LanguageField, name: str) -> Any:
 
 
 def _disagreement(field: LanguageField) -> str | None:
-    """What is wrong with shapes, numbers or texts, in words, or None. Raises one of UNREADABLE on no arrays at all."""
+    """What is wrong with the shapes, in words, or None."""
     measured = {letter: (_array(field, name), axis) for letter, (name, axis) in _LETTERS.items()}
     sizes = {letter: array.shape[axis] for letter, (array, axis) in measured.items() if array is not None}
     for shape, names in _SHAPES.items():
@@ -133,14 +133,18 @@ def _disagreement(field: LanguageField) -> str | None:
         return f"votes over {field.votes.num_regions} regions beside {sizes['r']} regions"
     if len(field.names) != sizes["t"]:
         return f"{len(field.names)} frame names beside {sizes['t']} cameras"
+    return None
+
+
+def _oddity(field: LanguageField) -> str | None:
+    """What is wrong with the numbers or texts of a field whose shapes agree, in words, or None."""
+    sizes = {"votes.regions": field.regions.count, "parts.part": field.parts and len(field.parts.weight)}
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
         name, numbers = jax.tree_util.keystr(place).lstrip("."), np.asarray(leaf)
         if (np.isnan(numbers) if name == "gaussians.opacity_logits" else ~np.isfinite(numbers)).any():
             return f"{name} with numbers that are not finite"
-        if name in _INDICES and not (
-            numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[_INDICES[name]])).all()
-        ):
-            return f"{name} with indices beyond {sizes[_INDICES[name]]}"
+        if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
+            return f"{name} with numbers of none of {sizes[name]}"
     if not all(isinstance(text, str) for text in (*field.names, field.embedder, field.provenance)):
         return "names, embedder or provenance that are no texts"
     if not isinstance(parsed_json(field.provenance), dict):
