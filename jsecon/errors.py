@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 LONGEST = 600
-"""characters of what was found that an error quotes; of more, the beginning and the end"""
+"""characters of a place, and of what was found there, that an error quotes: of more, the beginning and the end"""
 
 
 class InputError(ValueError):
@@ -14,10 +14,12 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: object, found: str, expected: str, remedy: str):
-        if len(found) > LONGEST:
-            found = f"{found[: LONGEST // 2]} ... {found[-LONGEST // 2 :]}"
-        self.where, self.found, self.expected, self.remedy = str(where), found, expected, remedy
-        super().__init__(f"{where}: found {found}; expected {expected}. {remedy}")
+        self.where, self.found, self.expected, self.remedy = _quoted(str(where)), _quoted(found), expected, remedy
+        super().__init__(f"{self.where}: found {self.found}; expected {expected}. {remedy}")
+
+
+def _quoted(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
 def require(condition: bool, name: str, got: object, expected: str, remedy: str) -> None:

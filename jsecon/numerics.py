@@ -28,6 +28,7 @@ MOST = 1e18
 """of a coordinate, focal length or coefficient in a file: float32 holds its square"""
 
 
+@np.errstate(invalid="ignore")  # a signalling NaN
 def sane(*numbers: Any) -> bool:
     """Whether all numbers are finite and none is above MOST."""
     return all(bool((np.abs(np.asarray(own, np.float64)) <= MOST).all()) for own in numbers)

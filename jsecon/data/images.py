@@ -63,6 +63,8 @@ def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
             raise _unreadable(path, f"a PNG that breaks off after {len(data)} bytes")
         if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             raise _unreadable(path, f"a PNG whose chunk {kind.decode('latin1')} at byte {offset} fails its checksum")
+        if (kind == b"IHDR") != (offset == len(_PNG)):
+            raise _unreadable(path, "a PNG without header, or with two")
         yield kind, data[offset + 8 : end]
         if kind == b"IEND":
             return
@@ -71,8 +73,8 @@ def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 def _png_header(path: Path, data: bytes) -> tuple[int, int, int, int]:
     """Width, height, bits and colour type; raises where no PNG of so many bytes can have as many pixels."""
-    kind, header = next(_png_chunks(path, data))
-    if kind != b"IHDR" or len(header) != 13 or header[9] not in _CHANNELS or header[10:12] != b"\0\0":
+    header = next(_png_chunks(path, data))[1]
+    if len(header) != 13 or header[9] not in _CHANNELS or header[10:12] != b"\0\0":
         raise _unreadable(path, "a PNG without header")
     width, height, bits, colour_type = struct.unpack_from(">IIBB", header)
     _check_pixels(path, data, width, height, bits * _CHANNELS[colour_type])
@@ -117,11 +119,14 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
         return _decode_heic(path, data)
     kind = PngImageFile if data.startswith(_PNG) else JpegImageFile if data.startswith(_JPEG) else None
     try:
+        deep = kind is PngImageFile and data[24] == 16 and data[25] > 0
+        if deep:  # or libpng would say on stderr that its checksum is wrong
+            zlib.decompress(b"".join(body for name, body in _png_chunks(path, data) if name == b"IDAT"))
         if kind is not None:
             with kind(io.BytesIO(data)) as image:
                 mode = "RGBA" if "transparency" in image.info else _MODES.get(image.mode, "RGB")
                 pixels = np.asarray(image if mode == image.mode else image.convert(mode))
-            if image.mode in _MODES and not (kind is PngImageFile and data[24] == 16 and data[25]):
+            if image.mode in _MODES and not deep:
                 return pixels
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None:
@@ -152,6 +157,7 @@ def _checked_bytes(path: Path) -> bytes:
         return _png(own for own in _png_chunks(path, data) if own[0] in _PIXELS)
     if data.startswith(_JPEG):
         _jpeg_size(path, data)
+        return data.replace(b"Exif\0\0", b"unread")  # of which Pillow would warn; the pixels don't depend on it
     return data
 
 
@@ -254,6 +260,6 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         depth = read_stored(path)
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise InputError(path, f"shape {depth.shape} of {depth.dtype}", expected, remedy)
-    with np.errstate(over="ignore"):  # infinite is unknown
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite is unknown
         depth = depth.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

@@ -206,7 +206,8 @@ def read_level(path: Path, level: str | int) -> np.ndarray:
     if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
         wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
         raise InputError(path, f"an array of shape {image.shape}", wanted, remedy)
-    image = np.asarray(image[LEVELS.index(level) if isinstance(level, str) else level], np.float64)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        image = np.asarray(image[LEVELS.index(level) if isinstance(level, str) else level], np.float64)
     if not ((image >= -MOST_IDS) & (image < MOST_IDS) & (image == image.round())).all():
         raise InputError(path, "numbers that are no integers or too large", "ids, -1 = none", "Write the masks again.")
     return image.astype(np.int64)

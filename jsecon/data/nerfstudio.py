@@ -126,8 +126,8 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
     transform = np.eye(4)
     if "applied_transform" in scene:
         transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
-    scaled = np.diag([scale, scale, scale, 1.0]) @ transform
-    if not sane(transform) or abs(np.linalg.det(scaled)) < 1e-12:
+    scaled = np.diag([scale, scale, scale, 1.0]) @ (transform if sane(transform) else np.zeros((4, 4)))
+    if abs(np.linalg.det(scaled)) < 1e-12:
         raise _bad(file, "an applied_transform or applied_scale that cannot be inverted", "a similarity")
     return np.linalg.inv(scaled)
 

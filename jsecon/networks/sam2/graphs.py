@@ -148,7 +148,7 @@ def sam2_digest(folder: Path, *, extra: str = "") -> str:
 
 def _read_constants(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             constants = {name: array.astype(np.float32) for name, array in read_arrays(path).items()}
         if not all(np.isfinite(array).all() for array in constants.values()):
             raise ValueError("numbers that are not finite")
