@@ -1,10 +1,11 @@
-"""Damages files of the true format and reads them: each must be refused by an InputError, or give a result that is whole.
+"""Damages files of the true format and reads them: each is refused by an InputError, or gives a result that is whole.
 
     python -m tests.fuzz --reader field --mutations 10000 --seed 1 --keep found
 
-Each reader runs in a process of its own that may take 10 times the file and 1 GiB more memory than before, and 5 s of each
-mutation. What ends the process, or takes longer, is reported with the mutation that did it, and the next one is tried in
-a new process; so is every other exception, every warning and whatever is written to stderr.
+Each reader runs in a process of its own, which may take 10 times the file and 1 GiB more memory than before, and 5 s a
+mutation. What ends the process or never comes back is reported with the mutation that did it, and a new process goes on
+behind it. So is every other exception, every warning, and whatever is written to stderr. A seed and a number name a
+mutation: --first 1234 --mutations 1 makes it again.
 """
 
 import argparse
@@ -16,7 +17,6 @@ import os
 import re
 import resource
 import select
-import shutil
 import signal
 import sys
 import tempfile
@@ -24,642 +24,25 @@ import time
 import traceback
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-sys.path[:0] = [str(Path(__file__).parent)]
-
-from jsecon.process import prepare_process
-
-prepare_process()
-
-import cv2
 import numpy as np
-from capture_files import png, small_capture, transforms, write_images, write_text_model, write_transforms
-from clip_files import vocabulary, write_clip, write_tokenizer
-from clip_files import fixture as clip_tokens
-from mutations import damaged
-from PIL import Image
-from sam2_files import write_sam2
-from sam_files import write_sam
-from test_proposal_files import records
 
-from experiments.datasets.feature_files import write_features
-from jsecon.app import cache, question
-from jsecon.data import images, mask_files, motion, proposal_files, video
-from jsecon.data.capture import load_capture
-from jsecon.data.colmap import write_colmap
-from jsecon.data.langsplat_files import feature_size, load_features
-from jsecon.data.lerf_labels import load_lerf_labels
-from jsecon.data.ply import load_ply, load_points_ply, save_ply
 from jsecon.errors import InputError
-from jsecon.language.autoencoder import Autoencoder
-from jsecon.language.codes import Rotation
-from jsecon.language.field import load_field, save_field
-from jsecon.networks.clip import ClipEmbedder
-from jsecon.networks.sam.segmenter import SamSegmenter
-from jsecon.networks.sam2.tracker import Sam2Tracker
-from jsecon.networks.tokenizer import load_tokenizer
-from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
-from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
 
 SECONDS = 5.0
-"""that a mutation may take, of this process's own time"""
+"""that a mutation may take, on the clock and of this process's own time"""
+SILENCE = 30.0
+"""s without a word from the child after which it is ended: on a machine that others use too"""
 TIMES, MORE = 10, 1 << 30
-"""memory that it may take: so many times the file, and bytes"""
-LONGEST_MESSAGE = 2000
+"""memory that a mutation may take: so many times the file, and bytes"""
+LONGEST_MESSAGE = 2500
 """characters of an InputError: what was found is quoted, not copied"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """Files of the true format and what reads them."""
-
-    files: list[Path]
-    """to damage, one at a time."""
-    read: Callable[[], Any]
-    whole: Callable[[Any], None]
-    """raises AssertionError on a result that is not well-formed."""
-
-
-def _finite(*arrays) -> None:
-    for array in arrays:
-        assert np.isfinite(np.asarray(array)).all(), "numbers that are not finite"
-
-
-def _gaussians(count: int, basis: int) -> Gaussians:
-    rng = np.random.default_rng(count)
-    shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, basis, 3)]
-    return Gaussians(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
-
-
-def _whole_gaussians(found: Gaussians) -> None:
-    n = found.count
-    assert found.log_scales.shape == (n, 3)
-    assert found.quaternions.shape == (n, 4)
-    assert found.opacity_logits.shape == (n,)
-    assert found.sh.shape in {(n, k * k, 3) for k in (1, 2, 3, 4)}
-    _finite(found.means, found.log_scales, found.quaternions, found.sh)
-    assert not np.isnan(found.opacity_logits).any()
-    assert (np.linalg.norm(np.asarray(found.quaternions, np.float64), axis=1) > 0).all()
-
-
-def _write_ply(path: Path, columns: dict[str, np.ndarray], form: str, more: str = "") -> Path:
-    """As another program writes it: with a comment, doubles, perhaps ascii, perhaps other elements."""
-    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
-    order = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
-    kinds = {name: array.dtype.str[1:] for name, array in columns.items()}
-    table = np.empty(len(next(iter(columns.values()))), [(name, order + kind) for name, kind in kinds.items()])
-    for name, array in columns.items():
-        table[name] = array
-    head = ["ply", f"format {form} 1.0", "comment of mine", f"element vertex {len(table)}"]
-    head += [f"property {names[kind]} {name}" for name, kind in kinds.items()]
-    body = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in table).encode()
-    path.write_bytes(
-        "\n".join([*head, f"{more}end_header\n"]).encode() + (body if form == "ascii" else table.tobytes())
-    )
-    return path
-
-
-def ply(folder: Path) -> Iterator[Case]:
-    """Gaussians."""
-    files = []
-    for count, basis in ((20, 1), (9, 4), (0, 16)):
-        save_ply(folder / f"{count}.ply", _gaussians(count, basis))
-        files.append(folder / f"{count}.ply")
-    parts = _gaussians(6, 1)
-    columns = {
-        f"{kind}{axis}": np.asarray(array)[:, n]
-        for kind, axes, array in (
-            ("", "xyz", parts.means),
-            ("f_dc_", "012", parts.sh[:, 0]),
-            ("scale_", "012", parts.log_scales),
-            ("rot_", "0123", parts.quaternions),
-        )
-        for n, axis in enumerate(axes)
-    }
-    columns |= {"opacity": np.float64(parts.opacity_logits), "red": np.arange(6, dtype=np.uint8)}
-    face = "element face 0\nproperty list uchar int vertex_indices\n"
-    files += [_write_ply(folder / f"{form}.ply", columns, form, face) for form in ("ascii", "binary_big_endian")]
-    for file in files:
-        yield Case([file], lambda file=file: load_ply(file), _whole_gaussians)
-
-
-def _whole_points(found: tuple[np.ndarray, np.ndarray]) -> None:
-    points, colours = found
-    assert points.shape == colours.shape == (len(points), 3)
-    assert colours.dtype == np.uint8
-    _finite(points)
-
-
-def points(folder: Path) -> Iterator[Case]:
-    """Point clouds (.ply)."""
-    xyz, rng = {axis: np.linspace(-1, 1, 30, dtype=np.float32) for axis in "xyz"}, np.random.default_rng(0)
-    for form in ("ascii", "binary_little_endian"):
-        for kind in (np.uint8, np.uint16, np.float32, None):
-            colours = {c: rng.random(30) * 200 for c in ("red", "green", "blue")} if kind else {}
-            columns = xyz | {name: array.astype(kind) for name, array in colours.items()}
-            file = _write_ply(folder / f"{form}{len(list(folder.iterdir()))}.ply", columns, form)
-            yield Case([file], lambda file=file: load_points_ply(file), _whole_points)
-
-
-def _whole_capture(found) -> None:
-    count, height, width = found.frames.shape[:3]
-    assert found.frames.dtype == np.uint8
-    assert (found.cameras.width, found.cameras.height) == (width, height)
-    assert found.cameras.world_to_camera.shape == (count, 4, 4)
-    assert found.points.shape == found.point_colors.shape == (len(found.points), 3)
-    assert len(found.names) == len(found.held_out) == count
-    assert all(isinstance(name, str) for name in found.names)
-    _finite(found.cameras.world_to_camera, found.points, found.to_source)
-    for own in (found.cameras.fx, found.cameras.fy, found.cameras.cx, found.cameras.cy):
-        assert own.shape == (count,)
-        _finite(own)
-    assert min(found.cameras.fx.min(), found.cameras.fy.min()) > 0
-    if found.depths is not None:
-        _finite(found.depths)
-        assert (found.depths >= 0).all()
-
-
-def colmap(folder: Path) -> Iterator[Case]:
-    """A model in binary, read with its images."""
-    capture = small_capture(3, points=12)
-    for kind, number, more in (
-        ("pinhole", 1, ()),
-        ("opencv", 4, (0.01, 0.002, 0.001, 0.0)),
-        ("fisheye", 5, (0.01, 0.002, 0, 0)),
-    ):
-        write_colmap(capture, folder / kind)
-        model = folder / kind / "sparse" / "0"
-        if more:
-            lens = np.array([20.0, 21.0, 11.75, 8.5, *more], "<f8")
-            cameras = b"".join(
-                np.array([n, number], "<i4").tobytes() + np.array([24, 16], "<u8").tobytes() + lens.tobytes()
-                for n in (1, 2)
-            )
-            (model / "cameras.bin").write_bytes(np.array(2, "<u8").tobytes() + cameras)
-        tracks = b"".join(
-            (model / "points3D.bin").read_bytes()[8 + 51 * n : 51 + 51 * n] + np.array(2, "<u8").tobytes() + bytes(16)
-            for n in range(12)
-        )
-        (model / "points3D.bin").write_bytes(np.array(12, "<u8").tobytes() + tracks)
-        yield Case(sorted(model.iterdir()), lambda kind=kind: load_capture(folder / kind, holdout=2), _whole_capture)
-
-
-def colmap_text(folder: Path) -> Iterator[Case]:
-    """A model in text, read with its images."""
-    capture = small_capture(3, points=12)
-    lenses = {
-        "pinhole": None,
-        "opencv": ["1 OPENCV 24 16 20 21 11.5 8.5 0.01 0.002 0.001 0"],
-        "radial": ["1 RADIAL_FISHEYE 48 32 40 23 16 0.01 0.001"],
-    }
-    for name, lens in lenses.items():
-        write_images(capture, folder / name / "images")
-        write_text_model(capture, folder / name / "sparse" / "0", lens)
-        yield Case(
-            sorted((folder / name / "sparse" / "0").iterdir()),
-            lambda name=name: load_capture(folder / name),
-            _whole_capture,
-        )
-
-
-def nerfstudio(folder: Path) -> Iterator[Case]:
-    """transforms.json with what it names: depth maps and a cloud."""
-    capture = small_capture(3)
-    for name, more in {
-        "plain": {},
-        "distorted": {"camera_model": "OPENCV", "k1": 0.01, "k2": 0.001, "p1": 0.001, "p2": 0.0},
-        "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001},
-        "deep": {
-            "ply_file_path": "cloud.ply",
-            "applied_scale": 2.0,
-            "applied_transform": np.eye(4)[:3].tolist(),
-            "depth_unit_scale_factor": 0.001,
-        },
-    }.items():
-        content = transforms(capture, **more)
-        if name == "plain":
-            content |= {"camera_angle_x": 1.0, "camera_angle_y": 0.8}
-            for entry in content["frames"]:
-                del entry["fl_x"], entry["fl_y"]
-        (folder / name).mkdir()
-        files = [folder / name / "transforms.json"]
-        if name == "deep":
-            rng = np.random.default_rng(0)
-            for n, entry in enumerate(content["frames"]):
-                depth = rng.integers(0, 4000, (16, 24)).astype(np.uint16)
-                entry["depth_file_path"] = f"depth{n}.{'npy' if n == 1 else 'png'}"
-                file = folder / name / entry["depth_file_path"]
-                np.save(file, depth / 1000.0) if n == 1 else cv2.imwrite(str(file), depth)
-                files.append(file)
-            columns = {axis: np.linspace(-1, 1, 5, dtype=np.float32) for axis in "xyz"}
-            files.append(_write_ply(folder / name / "cloud.ply", columns, "ascii"))
-        write_transforms(capture, folder / name, content)
-        files = [files[0]] * 6 + files[1:]
-        yield Case(files, lambda name=name: load_capture(folder / name), _whole_capture)
-
-
-def image(folder: Path) -> Iterator[Case]:
-    """Photographs, depth maps and EXIF."""
-    rng = np.random.default_rng(0)
-    colour = cv2.resize(rng.integers(0, 255, (6, 9, 3), np.uint8), (90, 60))
-    alpha = np.dstack([colour, colour[..., 0]])
-    for ending in (".png", ".jpg", ".webp", ".tif", ".bmp"):
-        cv2.imwrite(str(folder / f"plain{ending}"), colour)
-    cv2.imwrite(str(folder / "deep.png"), colour.astype(np.uint16) * 257)
-    cv2.imwrite(str(folder / "alpha.png"), alpha)
-    cv2.imwrite(str(folder / "alpha.tif"), alpha)
-    cv2.imwrite(str(folder / "progressive.jpg"), colour, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
-    exif = Image.Exif()
-    exif[0x0110], exif.get_ifd(0x8769)[0x920A] = "camera", 35.0
-    Image.fromarray(colour).save(folder / "exif.jpg", exif=exif)
-
-    def read(file: Path):
-        found = images.read_image(file)
-        return found, images.image_size(file), motion._lenses([file])
-
-    def whole(found) -> None:
-        (picture, _), (width, height), groups = found
-        assert picture.dtype == np.uint8
-        assert picture.shape == (height, width, 3)
-        assert min(width, height) > 0
-        assert groups == [[0]]
-
-    for file in sorted(folder.iterdir()):
-        yield Case([file], lambda file=file: read(file), whole)
-    cv2.imwrite(str(folder / "depth.png"), rng.integers(0, 60000, (30, 40)).astype(np.uint16))
-    np.save(folder / "depth.npy", rng.random((30, 40, 1)))
-
-    def whole_depth(found) -> None:
-        assert found.ndim == 2
-        assert found.dtype == np.float32
-        _finite(found)
-        assert (found >= 0).all()
-
-    for file in (folder / "depth.png", folder / "depth.npy"):
-        yield Case([file], lambda file=file: images.read_depth(file, 0.001), whole_depth)
-
-
-def masks(folder: Path) -> Iterator[Case]:
-    """Masklets: PNGs of every kind, folders of objects, LangSplat's levels, and a mask that is asked for."""
-    ids, names = np.random.default_rng(0).integers(0, 5, (2, 12, 18)).repeat(2, 1).repeat(2, 2), ("a", "b")
-    kinds: dict[str, Callable[[np.ndarray], bytes]] = {
-        "grey": lambda ids: cv2.imencode(".png", ids.astype(np.uint8))[1].tobytes(),
-        "deep": lambda ids: cv2.imencode(".png", (ids * 9000).astype(np.uint16))[1].tobytes(),
-        "colour": lambda ids: cv2.imencode(".png", np.stack([ids, ids * 9, ids * 0], -1).astype(np.uint8))[1].tobytes(),
-        "palette": lambda ids: png(ids, bits=4, colour_type=3, palette=bytes(range(48))),
-        "bits": lambda ids: png(ids % 4, bits=2, colour_type=0),
-    }
-
-    def whole(found) -> None:
-        assert found.labels.shape == (2, 24, 36)
-        assert found.labels.dtype == np.int16
-        assert found.labels.min() >= -1
-        assert found.labels.max() < len(found.ids)
-
-    for kind, write in kinds.items():
-        (folder / kind).mkdir()
-        for name, image in zip(names, ids):
-            (folder / kind / f"{name}.png").write_bytes(write(image))
-        files = sorted((folder / kind).iterdir())
-        yield Case(files, lambda kind=kind: mask_files.load_labels(folder / kind, names, (24, 36)), whole)
-    for object in ("001", "002"):
-        (folder / "objects" / object).mkdir(parents=True)
-        for name, image in zip(names, ids):
-            (folder / "objects" / object / f"{name}.png").write_bytes(kinds["grey"]((image == int(object)) * 255))
-    yield Case(
-        sorted((folder / "objects").rglob("*.png")),
-        lambda: mask_files.load_labels(folder / "objects", names, (24, 36)),
-        whole,
-    )
-    (folder / "levels").mkdir()
-    for name, image in zip(names, ids):
-        np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, 24, 36)).astype(np.float32))
-    yield Case(
-        sorted((folder / "levels").iterdir()), lambda: mask_files.load_labels(folder / "levels", names, (24, 36)), whole
-    )
-    field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
-
-    def whole_outline(found: np.ndarray) -> None:
-        assert found.shape == (24, 36)
-        assert found.dtype == bool
-
-    for kind in ("grey", "colour", "bits"):
-        file = folder / kind / "a.png"
-        yield Case([file], lambda file=file: question.read_mask(file, field), whole_outline)
-
-
-def langsplat(folder: Path) -> Iterator[Case]:
-    """LangSplat's _s.npy with _f.npy."""
-    rng = np.random.default_rng(0)
-    for name in ("a", "b"):
-        write_features(folder, name, rng.integers(-1, 3, (12, 16)), rng.normal(size=(3, 5)))
-
-    def whole(found) -> None:
-        masks, size = found
-        assert masks.labels.shape == (2, 12, 16)
-        assert masks.embeddings.shape == (len(masks.frame), size if len(masks.frame) else masks.embeddings.shape[1])
-        assert masks.embeddings.dtype == np.float32
-        _finite(masks.embeddings)
-        assert -1 <= masks.labels.min() <= masks.labels.max() < max(len(masks.frame), 1)
-
-    read = lambda: (load_features(folder, ["a", "b"], (12, 16)), feature_size(folder))
-    yield Case(sorted(folder.iterdir()), read, whole)
-
-
-def proposals(folder: Path) -> Iterator[Case]:
-    """Masks of single frames: SAM's JSON, LangSplat's levels, PNGs."""
-    boxes = np.zeros((2, 20, 30), bool)
-    boxes[0, 2:9, 3:8] = boxes[1, 4:18, 10:25] = True
-    text = records(boxes)[0]["segmentation"]
-    counts = {"size": [20, 30], "counts": [62, 7, 13, 7, 13, 7, 13, 7, 13, 7, 451]}
-    for name, content in {
-        "a": [
-            {"segmentation": code, "predicted_iou": 0.9, "stability_score": 0.95, "area": 50} for code in (counts, text)
-        ],
-        "b": {"image": {"id": 1}, "annotations": [{"segmentation": text}]},
-    }.items():
-        (folder / f"{name}.json").write_text(json.dumps(content))
-    ids = np.zeros((20, 30), np.uint8)
-    ids[2:9, 3:8] = 7
-    cv2.imwrite(str(folder / "c.png"), ids)
-    np.save(folder / "d_s.npy", np.broadcast_to(ids.astype(np.float32) - 1, (4, 20, 30)))
-
-    def read():
-        of_frame, _ = proposal_files.proposals_from_disk(folder, ("a", "b", "c", "d"), (20, 30))
-        return [of_frame(n) for n in range(4)]
-
-    def whole(found) -> None:
-        for masks in found:
-            assert masks.dtype == bool
-            assert masks.shape == (len(masks), 20, 30)
-
-    files = sorted(folder.iterdir())
-    yield Case(files[:2] * 3 + files[2:], read, whole)
-
-
-def labels(folder: Path) -> Iterator[Case]:
-    """LERF's labels as LangSplat has them."""
-    thing = {
-        "category": "red mug",
-        "group": 1,
-        "segmentation": [[1, 2], [9, 3], [5, 9.5]],
-        "area": 9.0,
-        "bbox": [1, 2, 9, 9],
-        "iscrowd": 0,
-    }
-    for name in ("frame_1", "frame_2"):
-        content = {
-            "info": {"name": f"{name}.jpg", "width": 30, "height": 20, "note": ""},
-            "objects": [thing, thing | {"bbox": [0, 0, 3, 3]}, thing | {"category": "tea"}],
-        }
-        (folder / f"{name}.json").write_text(json.dumps(content))
-
-    def whole(found) -> None:
-        for frame in found:
-            assert frame.width > 0
-            assert frame.height > 0
-            for category, (mask, boxes) in frame.objects.items():
-                assert isinstance(category, str)
-                assert mask.shape == (frame.height, frame.width)
-                assert mask.dtype == bool
-                assert boxes.shape == (len(boxes), 4)
-                _finite(boxes)
-
-    yield Case(sorted(folder.iterdir()), lambda: load_lerf_labels(folder), whole)
-
-
-def _field(coder: Any = None) -> LanguageField:
-    rng = np.random.default_rng(0)
-    n, r, e, d, t, k, p = 12, 3, 8, 4, 2, 2, 2
-    unit = lambda *shape: (lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True))(rng.normal(size=shape)).astype(
-        np.float32
-    )
-    positive = lambda *shape: rng.random(shape).astype(np.float32)
-    votes = Votes(
-        rng.integers(-1, r, (n, k)).astype(np.int32),
-        positive(n, k),
-        positive(n),
-        positive(n) + 1,
-        positive(n),
-        np.full(n, t, np.int32),
-        np.int32(0),
-        r,
-        shown=positive(n, k),
-        overlap=positive(r, r),
-    )
-    camera = Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16)
-    parts = Parts((np.arange(n) % (p + 1) - 1).astype(np.int32), unit(p, e), positive(p))
-    return LanguageField(
-        _gaussians(n, 4),
-        unit(n, d),
-        votes,
-        Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)),
-        unit(r, d),
-        coder,
-        camera,
-        unit(4, e),
-        np.eye(4),
-        ("a", "b"),
-        "colours",
-        '{"jsecon": "1", "options": {"embedder": null}}',
-        parts,
-    )
-
-
-def _coder() -> Autoencoder:
-    """Layers of the true layout: 8 -> 4 -> 4, and back."""
-    dense = lambda a, b: {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
-    norm = {"scale": np.ones(4, np.float32), "bias": np.zeros(4, np.float32)}
-    stats = {"mean": np.zeros(4, np.float32), "var": np.ones(4, np.float32)}
-    encoder = {
-        "params": {"Dense_0": dense(8, 4), "BatchNorm_0": norm, "Dense_1": dense(4, 4)},
-        "batch_stats": {"BatchNorm_0": stats},
-    }
-    return Autoencoder(encoder, {"params": {"Dense_0": dense(4, 4), "Dense_1": dense(4, 8)}})
-
-
-def field(folder: Path) -> Iterator[Case]:
-    """The language field."""
-    import jax
-
-    def whole(found: LanguageField) -> None:
-        _whole_gaussians(found.gaussians)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(dataclasses.replace(found, gaussians=None)):
-            assert np.asarray(leaf).dtype.kind in "iuf", path
-            _finite(leaf)
-        r = found.regions.count
-        for ids, count in (
-            (found.votes.regions, r),
-            (found.parts.part if found.parts else np.zeros(0, int), len(found.parts.weight) if found.parts else 0),
-        ):
-            assert np.asarray(ids).dtype.kind in "iu"
-            assert ((ids >= -1) & (ids < count)).all(), "indices of nothing"
-        assert type(found.names) is tuple
-        assert all(isinstance(name, str) for name in found.names)
-        assert isinstance(found.embedder, str)
-        assert isinstance(json.loads(found.provenance), dict)
-        assert type(found.cameras.width) is type(found.cameras.height) is int
-        assert min(found.cameras.width, found.cameras.height) > 0
-        if found.autoencoder is not None:
-            codes = found.autoencoder.encode(np.asarray(found.canonical))
-            assert codes.shape == (len(found.canonical), found.codes.shape[1])
-            _finite(codes)
-
-    rotation = Rotation(np.eye(8, 4, dtype=np.float32))
-    for name, value in {
-        "plain": _field(),
-        "rotation": _field(rotation),
-        "coder": _field(_coder()),
-        "bare": dataclasses.replace(_field(rotation), parts=None),
-    }.items():
-        save_field(folder / f"{name}.npz", value)
-        yield Case([folder / f"{name}.npz"], lambda name=name: load_field(folder / f"{name}.npz"), whole)
-
-
-def kept(folder: Path) -> Iterator[Case]:
-    """The run's cache, and what networks found: what cannot be read is computed again."""
-    value = {"a": np.arange(12.0).reshape(3, 4), "cameras": _field().cameras, "told": ("x", 1, None), "list": [1, "b"]}
-    cache.save(folder / "stage-0.npz", value)
-
-    def read():
-        return cache.fetch(folder / "stage-0.npz", lambda: value)
-
-    def whole(found: cache.Kept) -> None:
-        if found.fresh:
-            raise InputError("cache", "computed again", "-", "-")
-        assert isinstance(found.seconds, float)
-
-    yield Case([folder / "stage-0.npz"], read, whole)
-    frame, mask = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), bool)
-    store = EmbeddingStore(folder, "model")
-    store.write(frame, {bytes(range(16)): np.ones(4, np.float32), bytes(16): np.ones(4, np.float32)})
-
-    def whole_store(found: dict) -> None:
-        assert all(isinstance(key, bytes) for key in found)
-        for row in found.values():
-            _finite(row)
-
-    yield Case([store._path(frame)], lambda: store.read(frame), whole_store)
-
-    class Fixed:
-        name = "fixed"
-
-        def __call__(self, frame, index):
-            return np.stack([mask, ~mask, mask])
-
-    stored = StoredSegmenter(Fixed(), folder / "masks")  # pyright: ignore[reportArgumentType]
-    stored(frame, 0)
-
-    def whole_masks(found: np.ndarray) -> None:
-        assert found.shape[1:] == (6, 8)
-        assert found.dtype == bool
-
-    yield Case(sorted((folder / "masks").iterdir()), lambda: stored(frame, 0), whole_masks)
-
-
-def tokenizer(folder: Path) -> Iterator[Case]:
-    """tokenizer.json, and vocab.json with merges.txt."""
-    write_tokenizer(folder / "tokenizer.json")
-    (folder / "vocab.json").write_text(json.dumps(vocabulary()))
-    (folder / "merges.txt").write_text(
-        "#version: 0.2\n" + "\n".join(" ".join(pair) for pair in clip_tokens()["merges"])
-    )
-
-    def read(file: Path) -> np.ndarray:
-        return load_tokenizer(file)(["a red mug's 12 handles", "", "é<end_of_text>"])
-
-    def whole(found: np.ndarray) -> None:
-        assert found.shape == (3, 77)
-        assert found.dtype == np.int64
-        assert found.min() >= 0
-
-    yield Case([folder / "tokenizer.json"], lambda: read(folder / "tokenizer.json"), whole)
-    yield Case([folder / "vocab.json", folder / "merges.txt"], lambda: read(folder / "vocab.json"), whole)
-
-
-def _inputs_of(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.suffix in (".onnx", ".json", ".npz", ".txt"))
-
-
-def _nothing(found: object) -> None:
-    pass
-
-
-def clip(folder: Path) -> Iterator[Case]:
-    """CLIP folders, put to the test as before a run."""
-    for layout in ("immich", "transformers.js", "flat"):
-        write_clip(folder / layout, layout)
-        files = _inputs_of(folder / layout)
-        yield Case(files, lambda layout=layout: ClipEmbedder(folder / layout, threads=1).check(), _nothing)
-
-
-def sam(folder: Path) -> Iterator[Case]:
-    """SAM folders, put to the test, then asked for a frame's masks."""
-    frame = np.zeros((24, 32, 3), np.uint8)
-
-    def read(name: str) -> np.ndarray:
-        from jsecon.networks.sam.segmenter import SamSettings
-
-        segmenter = SamSegmenter(folder / name, SamSettings(points_per_side=2), threads=1)
-        segmenter.check()
-        return segmenter(frame, 0)
-
-    def whole(found: np.ndarray) -> None:
-        assert found.shape[1:] == (24, 32)
-        assert found.dtype == bool
-
-    for name in ("segment-anything", "transformers.js", "sam2"):
-        write_sam(folder / name, name, side=64)
-        yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
-
-
-def sam2(folder: Path) -> Iterator[Case]:
-    """SAM 2 folders, put to the test, then asked to follow a mask."""
-    frames, prompt = np.zeros((2, 16, 16, 3), np.uint8), np.ones((1, 16, 16), bool)
-
-    def read(name: str) -> np.ndarray:
-        tracker = Sam2Tracker(folder / name, threads=1)
-        tracker.check()
-        return tracker(frames, 0, prompt)
-
-    def whole(found: np.ndarray) -> None:
-        assert found.shape == (2, 16, 16)
-        assert -1 <= found.min() <= found.max() < 1
-
-    for version in ("2.0", "2.1"):
-        write_sam2(folder / version, version=version)
-        yield Case(_inputs_of(folder / version), lambda version=version: read(version), whole)
-
-
-def videos(folder: Path) -> Iterator[Case]:
-    """Videos of three containers."""
-    rng = np.random.default_rng(0)
-    for name, code in {"a.avi": "MJPG", "b.mp4": "mp4v", "c.mkv": "mp4v"}.items():
-        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*code), 10, (64, 48))
-        assert writer.isOpened(), name
-        for _ in range(6):
-            writer.write(cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (64, 48)))
-        writer.release()
-
-        def read(name=name):
-            shutil.rmtree(folder / "frames", ignore_errors=True)
-            return video.write_frames(folder / name, folder / "frames", frames=3)
-
-        def whole(found) -> None:
-            assert 1 <= len(found) <= 3
-            assert all(cv2.imread(str(file)).size for file in found)
-
-        yield Case([folder / name], read, whole)
-
-
-READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
-    own.__name__: own
-    for own in (ply, points, colmap, colmap_text, nerfstudio, image, masks, langsplat, proposals, labels, field, kept)
-    + (tokenizer, clip, sam, sam2, videos)
-}
+FINE = ("read", "refused")
+Readers = Mapping[str, Callable[[Path], Iterator[Any]]]
+"""name -> cases (fuzz_readers.Case) in a folder"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -668,13 +51,13 @@ class Trial:
 
     number: int
     outcome: str
-    """read, refused, or what is wrong."""
+    """one of FINE, or what is wrong."""
+    told: str = ""
+    """where it went wrong."""
     seconds: float = 0.0
     mib: float = 0.0
     how: str = ""
     """file, and what was done to it."""
-    told: str = ""
-    """where it went wrong."""
 
 
 def _status(key: str) -> int:
@@ -684,167 +67,150 @@ def _status(key: str) -> int:
 
 
 def _place(error: BaseException) -> str:
-    """Where in jsecon an exception came from."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if "/jsecon/" in f.filename] or traceback.extract_tb(
-        error.__traceback__
-    )
-    return f"{Path(frames[-1].filename).name}:{frames[-1].lineno} {type(error).__name__}: {str(error)[:300]}"
+    """Where in jsecon an exception came from, and what it says."""
+    frames = traceback.extract_tb(error.__traceback__)
+    last = [frame for frame in frames if "/jsecon/" in frame.filename] or frames
+    return f"{Path(last[-1].filename).name}:{last[-1].lineno} {type(error).__name__}: {str(error)[:300]}"
 
 
-def _tried(case: Case, size: int, stderr) -> tuple[str, str, float, float]:
-    """(outcome, told, seconds, MiB)."""
+def _outcome(case: Any) -> tuple[str, str]:
+    """(outcome, told) of reading a case's files as they lie there."""
+    try:
+        case.whole(case.read())
+    except InputError as error:
+        text = str(error)
+        if not (error.found and error.expected and error.remedy) or len(text) > LONGEST_MESSAGE:
+            return "an unreadable message", f"{len(text)} characters: {text[:200]}"
+        out_of_memory = re.search("nsufficient memory|bad.alloc|MemoryError|nable to allocate", text)
+        return ("memory", text[:200]) if out_of_memory else ("refused", "")
+    except AssertionError as error:
+        return "not whole", f"{traceback.extract_tb(error.__traceback__)[-1].line} {error}"
+    except MemoryError as error:
+        return "memory", _place(error)
+    except Exception as error:
+        return "another exception", _place(error)
+    return "read", ""
+
+
+def _tried(case: Any, size: int, stderr: IO[str]) -> Trial:
+    """What comes of files of `size` bytes, watched."""
     stderr.truncate(0)
-    Path("/proc/self/clear_refs").write_text("5")
+    Path("/proc/self/clear_refs").write_text("5")  # the largest memory is counted from here
     before, allowed = _status("VmRSS"), TIMES * size + MORE
     own, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + allowed, hard))
-    outcome, told, began, worked = "read", "", time.perf_counter(), time.process_time()
+    began, worked = time.perf_counter(), time.process_time()
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         for hidden in (ResourceWarning, DeprecationWarning, PendingDeprecationWarning, ImportWarning):
             warnings.simplefilter("ignore", hidden)
-        try:
-            case.whole(case.read())
-        except InputError as error:
-            outcome, text = "refused", str(error)
-            if not (error.found and error.expected and error.remedy) or len(text) > LONGEST_MESSAGE:
-                outcome, told = "an unreadable message", f"{len(text)} characters: {text[:200]}"
-            elif "nsufficient memory" in text or "bad alloc" in text or "MemoryError" in text:
-                outcome, told = "memory", text[:200]
-        except AssertionError as error:
-            frames = traceback.extract_tb(error.__traceback__)
-            outcome, told = "not whole", f"{frames[-1].line} {error}"
-        except MemoryError as error:
-            outcome, told = "memory", _place(error)
-        except Exception as error:
-            outcome, told = "another exception", _place(error)
-        finally:
-            resource.setrlimit(resource.RLIMIT_AS, (own, hard))
+        outcome, told = _outcome(case)
+    resource.setrlimit(resource.RLIMIT_AS, (own, hard))
     seconds = min(time.perf_counter() - began, time.process_time() - worked)
-    taken = max(0, _status("VmHWM") - before)
-    if outcome in ("read", "refused"):
-        said = Path(f"/proc/self/fd/{stderr.fileno()}").read_bytes().decode(errors="replace")
+    taken, said = max(0, _status("VmHWM") - before), Path(stderr.name).read_bytes().decode(errors="replace")
+    if outcome in FINE:
         if warned:
-            outcome, told = (
-                "a warning",
-                f"{Path(warned[0].filename).name}:{warned[0].lineno} {str(warned[0].message)[:160]}",
-            )
+            place = f"{Path(warned[0].filename).name}:{warned[0].lineno}"
+            outcome, told = "a warning", f"{place} {str(warned[0].message)[:160]}"
         elif said:
             outcome, told = "said to stderr", said[:160]
         elif taken > allowed:
             outcome, told = "memory", f"{taken / 2**20:.0f} MiB"
         elif seconds > SECONDS:
             outcome, told = "too long", f"{seconds:.1f} s"
-    return outcome, told, seconds, taken / 2**20
+    return Trial(-1, outcome, told, seconds, taken / 2**20)
 
 
-def _mutation(name: str, cases: list[Case], seed: int, number: int) -> tuple[Case, Path, str, bytes]:
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
-    case = cases[int(rng.integers(len(cases)))]
-    file = case.files[int(rng.integers(len(case.files)))]
-    how, data = damaged(rng, file.read_bytes(), file.suffix)
-    return case, file, f"{how} of {file.parent.name}/{file.name}", data
-
-
-def _work(name: str, folder: Path, seed: int, numbers: range, keep: Path | None, pipe: int) -> None:
+def _work(name: str, readers: Readers, base: Path, seed: int, numbers: range, keep: Path | None, pipe: int) -> None:
     """In the child: reads the true files, then the damaged ones, and tells of each through the pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    stderr = open(folder.parent / "stderr", "a+")  # noqa: SIM115
-    os.dup2(stderr.fileno(), 2)
-    tell = lambda trial: os.write(pipe, (json.dumps(dataclasses.asdict(trial)) + "\n").encode())
-    cases = list(READERS[name](folder))
-    for case in cases:
-        outcome, told, *_ = _tried(case, MORE, stderr)
-        if outcome != "read":
-            tell(Trial(-1, f"true files: {outcome}", told=told))
-            os._exit(1)
-    for number in numbers:
-        case, file, how, data = _mutation(name, cases, seed, number)
-        true = file.read_bytes()
-        tell(Trial(number, "begun", how=how))
-        file.write_bytes(data)
-        kept = keep and keep / f"{name}-{seed}-{number}{file.suffix}"
-        if kept:
-            kept.write_bytes(data)
-        outcome, told, seconds, mib = _tried(case, len(data), stderr)
-        file.write_bytes(true)
-        tell(Trial(number, outcome, seconds, mib, how, told))
-        if kept and outcome in ("read", "refused"):
-            kept.unlink()
-    os._exit(0)
+    from mutations import damaged
+
+    def tell(trial: Trial) -> None:
+        os.write(pipe, (json.dumps(dataclasses.asdict(trial)) + "\n").encode())
+
+    with open(base / "stderr", "a+") as stderr:
+        os.dup2(stderr.fileno(), 2)
+        (base / "files").mkdir()
+        cases = list(readers[name](base / "files"))
+        for case in cases:
+            true = _tried(case, MORE, stderr)
+            if true.outcome != "read":
+                return tell(Trial(-1, f"true files: {true.outcome}", true.told))
+        for number in numbers:
+            rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
+            case = cases[int(rng.integers(len(cases)))]
+            file = case.files[int(rng.integers(len(case.files)))]
+            true = file.read_bytes()
+            way, data = damaged(rng, true, file.suffix)
+            how = f"{way} of {file.parent.name}/{file.name}"
+            tell(Trial(number, "begun", how=how))
+            file.write_bytes(data)
+            kept = keep and keep / f"{name}-{seed}-{number}{file.suffix}"
+            if kept:
+                kept.write_bytes(data)
+            trial = dataclasses.replace(_tried(case, len(data), stderr), number=number, how=how)
+            file.write_bytes(true)
+            if kept and trial.outcome in FINE:
+                kept.unlink()
+            tell(trial)
+
+
+def _heard(pipe: int) -> Iterator[Trial]:
+    """What a child tells, until it ends or falls silent."""
+    rest = b""
+    while select.select([pipe], [], [], SILENCE)[0] and (got := os.read(pipe, 1 << 16)):
+        *lines, rest = (rest + got).split(b"\n")
+        yield from (Trial(**json.loads(line)) for line in lines)
 
 
 def trials(
-    name: str, *, seed: int, numbers: range, seconds: float = math.inf, keep: Path | None = None
+    name: str, readers: Readers, *, seed: int, numbers: range, seconds: float = math.inf, keep: Path | None = None
 ) -> Iterator[Trial]:
-    """What came of the mutations `numbers` of a reader, as many as `seconds` allow."""
-    end, at = time.monotonic() + seconds, numbers.start
-    while at < numbers.stop and time.monotonic() < end:
-        with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as base:
-            folder = Path(base) / "files"
-            folder.mkdir()
+    """What came of the mutations `numbers` of a reader, as many as `seconds` allow once its files are made."""
+    end, at = None, numbers.start
+    while at < numbers.stop:
+        with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as base:
             out, into = os.pipe()
-            sys.stdout.flush()
-            child = os.fork()
+            child, last = os.fork(), None
             if child == 0:
                 try:
-                    os.close(out)
-                    _work(name, folder, seed, range(at, numbers.stop), keep, into)
+                    _work(name, readers, Path(base), seed, range(at, numbers.stop), keep, into)
                 except BaseException:
-                    os.write(
-                        into,
-                        (
-                            json.dumps(dataclasses.asdict(Trial(-1, "harness", told=traceback.format_exc()))) + "\n"
-                        ).encode(),
-                    )
-                os._exit(1)
+                    failed = Trial(-1, "the harness failed", traceback.format_exc()[-500:])
+                    os.write(into, (json.dumps(dataclasses.asdict(failed)) + "\n").encode())
+                os._exit(0)
             os.close(into)
-            last = None
-            for trial in _heard(out, end):
-                if trial.outcome != "begun":
-                    yield trial
-                last = trial
-            os.close(out)
-            ended = os.waitpid(child, os.WNOHANG)
-            if (
-                ended[0] == 0
-                and time.monotonic() < end
-                and (last is None or last.number < numbers.stop - 1 or last.outcome == "begun")
-            ):
-                time.sleep(0.2)
-                ended = os.waitpid(child, os.WNOHANG)
-            if ended[0] == 0:
-                os.kill(child, signal.SIGKILL)
-                os.waitpid(child, 0)
+            try:
+                for last in _heard(out):
+                    end = end or time.monotonic() + seconds
+                    if last.outcome != "begun":
+                        yield last
+                    if time.monotonic() > end:
+                        return
+                code = _ended(child)
+            finally:
+                os.close(out)
+                _ended(child)
             if last is None or last.number < 0:
-                if last is None and time.monotonic() < end:
-                    raise RuntimeError(f"{name}: no true files")
                 return
-            if last.outcome == "begun" and time.monotonic() < end:
-                code = ended[1]
-                outcome = (
-                    "too long"
-                    if ended[0] == 0
-                    else f"crash (signal {os.WTERMSIG(code)})"
-                    if os.WIFSIGNALED(code)
-                    else f"exit {code}"
-                )
-                yield Trial(last.number, outcome, 0.0, 0.0, last.how, outcome)
+            if last.outcome == "begun":
+                outcome = "no end" if code is None else f"crash (signal {os.WTERMSIG(code)})"
+                yield dataclasses.replace(last, outcome=outcome)
             at = last.number + 1
 
 
-def _heard(pipe: int, end: float) -> Iterator[Trial]:
-    """What a child tells, until it falls silent for four times as long as it may take."""
-    rest = b""
-    while True:
-        wait = min(4 * SECONDS if rest is not None else 60, max(0.0, end - time.monotonic()))
-        if not select.select([pipe], [], [], wait)[0]:
-            return
-        got = os.read(pipe, 1 << 16)
-        if not got:
-            return
-        *lines, rest = (rest + got).split(b"\n")
-        yield from (Trial(**json.loads(line)) for line in lines)
+def _ended(child: int) -> int | None:
+    """How a child has ended; None where it had to be ended, or had been."""
+    try:
+        for _ in range(10):
+            if (found := os.waitpid(child, os.WNOHANG))[0]:
+                return found[1]
+            time.sleep(0.05)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    except ChildProcessError:
+        pass
+    return None
 
 
 @dataclasses.dataclass
@@ -860,43 +226,53 @@ class Report:
     def add(self, trial: Trial) -> None:
         self.outcomes[trial.outcome] += 1
         self.seconds, self.mib = max(self.seconds, trial.seconds), max(self.mib, trial.mib)
-        if trial.outcome not in ("read", "refused"):
+        if trial.outcome not in FINE:
             kind = re.sub(r"/\S*/|0x\w+|\d{5,}|\d+ characters|@[\d.]+", "", trial.told)[:110]
             self.findings.setdefault(f"{trial.outcome}: {kind}", []).append(trial)
 
     def lines(self) -> Iterator[str]:
         told = ", ".join(f"{count} {outcome}" for outcome, count in self.outcomes.most_common())
-        yield f"{self.name}: {self.outcomes.total()} mutations: {told}; at most {self.seconds:.2f} s, {self.mib:.0f} MiB"
+        most = f"at most {self.seconds:.2f} s, {self.mib:.0f} MiB"
+        yield f"{self.name}: {self.outcomes.total()} mutations: {told}; {most}"
         for what, found in sorted(self.findings.items(), key=lambda item: -len(item[1])):
             yield f"    {len(found)} x {what!r}, first {found[0].number}: {found[0].how}"
 
 
-def fuzzed(name: str, **more) -> Report:
-    """All of a reader's trials, added up."""
-    report = Report(name)
-    for trial in trials(name, **more):
-        report.add(trial)
-    return report
+def fuzzed(readers: Readers, asked: argparse.Namespace) -> bool:
+    """Prints what came of each reader's mutations; whether all was fine."""
+    fine = True
+    for name in asked.reader or readers:
+        report, numbers = Report(name), range(asked.first, asked.first + asked.mutations)
+        given = {"seed": asked.seed, "numbers": numbers, "seconds": asked.seconds, "keep": asked.keep}
+        for trial in trials(name, readers, **given):
+            report.add(trial)
+        print(*report.lines(), sep="\n", flush=True)
+        fine &= not report.findings
+    return fine
 
 
-def main() -> int:
+def parsed(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--reader", nargs="*", default=list(READERS), choices=list(READERS))
+    parser.add_argument("--reader", nargs="*", metavar="NAME", help="default: all, see tests/fuzz_readers.py")
     parser.add_argument("--mutations", type=int, default=10_000, metavar="N")
     parser.add_argument("--first", type=int, default=0, metavar="N", help="the number of the first")
     parser.add_argument("--seed", type=int, default=0, metavar="S")
-    parser.add_argument("--seconds", type=float, default=math.inf, metavar="S", help="of each reader")
+    parser.add_argument("--seconds", type=float, default=math.inf, metavar="S", help="of each reader, at most")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write each offending file there")
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     if asked.keep:
         asked.keep.mkdir(parents=True, exist_ok=True)
-    found = False
-    for name in asked.reader:
-        numbers = range(asked.first, asked.first + asked.mutations)
-        report = fuzzed(name, seed=asked.seed, numbers=numbers, seconds=asked.seconds, keep=asked.keep)
-        print(*report.lines(), sep="\n", flush=True)
-        found |= bool(report.findings)
-    return int(found)
+    return asked
+
+
+def main() -> int:
+    from jsecon.process import prepare_process
+
+    sys.path.insert(0, str(Path(__file__).parent))
+    prepare_process()  # as the program does, before OpenCV is imported
+    from fuzz_readers import READERS
+
+    return 0 if fuzzed(READERS, parsed()) else 1
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Damage to files: of bytes, texts, JSON, arrays, archives, PNGs and ONNX graphs. Every choice comes from the `rng` that is
+"""Damage to files: of bytes, texts, JSON, arrays, archives, PNGs and ONNX graphs. Every choice comes from the `rng`
 given, so that a seed names a damaged file."""
 
 import copy

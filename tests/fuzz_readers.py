@@ -1,0 +1,626 @@
+"""Every reader, with small files of the true format and what a result must be like: for tests/fuzz.py."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+from capture_files import png, small_capture, transforms, write_images, write_text_model, write_transforms
+from clip_files import fixture as clip_tokens, vocabulary, write_clip, write_tokenizer
+from PIL import Image
+from sam2_files import write_sam2
+from sam_files import write_sam
+from test_proposal_files import records
+
+from experiments.datasets.feature_files import write_features
+from jsecon.app import cache, question
+from jsecon.data import images, mask_files, motion, proposal_files, video
+from jsecon.data.capture import load_capture
+from jsecon.data.colmap import write_colmap
+from jsecon.data.langsplat_files import feature_size, load_features
+from jsecon.data.lerf_labels import load_lerf_labels
+from jsecon.data.ply import load_ply, load_points_ply, save_ply
+from jsecon.errors import InputError
+from jsecon.language.autoencoder import Autoencoder
+from jsecon.language.codes import Rotation
+from jsecon.language.field import load_field, save_field
+from jsecon.networks.clip import ClipEmbedder
+from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
+from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.networks.tokenizer import load_tokenizer
+from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
+from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """Files of the true format and what reads them."""
+
+    files: list[Path]
+    """to damage, one at a time."""
+    read: Callable[[], Any]
+    whole: Callable[[Any], None]
+    """raises AssertionError on a result that is not well-formed."""
+
+
+def _finite(*arrays) -> None:
+    for array in arrays:
+        assert np.isfinite(np.asarray(array)).all(), "numbers that are not finite"
+
+
+def _gaussians(count: int, basis: int) -> Gaussians:
+    rng = np.random.default_rng(count)
+    shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, basis, 3)]
+    return Gaussians(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+
+
+def _whole_gaussians(found: Gaussians) -> None:
+    n = found.count
+    assert found.log_scales.shape == (n, 3)
+    assert found.quaternions.shape == (n, 4)
+    assert found.opacity_logits.shape == (n,)
+    assert found.sh.shape in {(n, k * k, 3) for k in (1, 2, 3, 4)}
+    _finite(found.means, found.log_scales, found.quaternions, found.sh)
+    assert not np.isnan(found.opacity_logits).any()
+    assert (np.linalg.norm(np.asarray(found.quaternions, np.float64), axis=1) > 0).all()
+
+
+def _write_ply(path: Path, columns: dict[str, np.ndarray], form: str, more: str = "") -> Path:
+    """As another program writes it: with a comment, doubles, perhaps ascii, perhaps other elements."""
+    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
+    order = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
+    kinds = {name: array.dtype.str[1:] for name, array in columns.items()}
+    table = np.empty(len(next(iter(columns.values()))), [(name, order + kind) for name, kind in kinds.items()])
+    for name, array in columns.items():
+        table[name] = array
+    head = ["ply", f"format {form} 1.0", "comment of mine", f"element vertex {len(table)}"]
+    head += [f"property {names[kind]} {name}" for name, kind in kinds.items()]
+    body = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in table).encode()
+    path.write_bytes(
+        "\n".join([*head, f"{more}end_header\n"]).encode() + (body if form == "ascii" else table.tobytes())
+    )
+    return path
+
+
+def ply(folder: Path) -> Iterator[Case]:
+    """Gaussians."""
+    files = []
+    for count, basis in ((20, 1), (9, 4), (0, 16)):
+        save_ply(folder / f"{count}.ply", _gaussians(count, basis))
+        files.append(folder / f"{count}.ply")
+    parts = _gaussians(6, 1)
+    columns = {
+        f"{kind}{axis}": np.asarray(array)[:, n]
+        for kind, axes, array in (
+            ("", "xyz", parts.means),
+            ("f_dc_", "012", parts.sh[:, 0]),
+            ("scale_", "012", parts.log_scales),
+            ("rot_", "0123", parts.quaternions),
+        )
+        for n, axis in enumerate(axes)
+    }
+    columns |= {"opacity": np.float64(parts.opacity_logits), "red": np.arange(6, dtype=np.uint8)}
+    face = "element face 0\nproperty list uchar int vertex_indices\n"
+    files += [_write_ply(folder / f"{form}.ply", columns, form, face) for form in ("ascii", "binary_big_endian")]
+    for file in files:
+        yield Case([file], lambda file=file: load_ply(file), _whole_gaussians)
+
+
+def _whole_points(found: tuple[np.ndarray, np.ndarray]) -> None:
+    points, colours = found
+    assert points.shape == colours.shape == (len(points), 3)
+    assert colours.dtype == np.uint8
+    _finite(points)
+
+
+def points(folder: Path) -> Iterator[Case]:
+    """Point clouds (.ply)."""
+    xyz, rng = {axis: np.linspace(-1, 1, 30, dtype=np.float32) for axis in "xyz"}, np.random.default_rng(0)
+    for form in ("ascii", "binary_little_endian"):
+        for kind in (np.uint8, np.uint16, np.float32, None):
+            colours = {c: rng.random(30) * 200 for c in ("red", "green", "blue")} if kind else {}
+            columns = xyz | {name: array.astype(kind) for name, array in colours.items()}
+            file = _write_ply(folder / f"{form}{len(list(folder.iterdir()))}.ply", columns, form)
+            yield Case([file], lambda file=file: load_points_ply(file), _whole_points)
+
+
+def _whole_capture(found) -> None:
+    count, height, width = found.frames.shape[:3]
+    assert found.frames.dtype == np.uint8
+    assert (found.cameras.width, found.cameras.height) == (width, height)
+    assert found.cameras.world_to_camera.shape == (count, 4, 4)
+    assert found.points.shape == found.point_colors.shape == (len(found.points), 3)
+    assert len(found.names) == len(found.held_out) == count
+    assert all(isinstance(name, str) for name in found.names)
+    _finite(found.cameras.world_to_camera, found.points, found.to_source)
+    for own in (found.cameras.fx, found.cameras.fy, found.cameras.cx, found.cameras.cy):
+        assert own.shape == (count,)
+        _finite(own)
+    assert min(found.cameras.fx.min(), found.cameras.fy.min()) > 0
+    if found.depths is not None:
+        _finite(found.depths)
+        assert (found.depths >= 0).all()
+
+
+def colmap(folder: Path) -> Iterator[Case]:
+    """A model in binary, read with its images."""
+    capture = small_capture(3, points=12)
+    for kind, number, more in (
+        ("pinhole", 1, ()),
+        ("opencv", 4, (0.01, 0.002, 0.001, 0.0)),
+        ("fisheye", 5, (0.01, 0.002, 0, 0)),
+    ):
+        write_colmap(capture, folder / kind)
+        model = folder / kind / "sparse" / "0"
+        if more:
+            lens = np.array([20.0, 21.0, 11.75, 8.5, *more], "<f8")
+            cameras = b"".join(
+                np.array([n, number], "<i4").tobytes() + np.array([24, 16], "<u8").tobytes() + lens.tobytes()
+                for n in (1, 2)
+            )
+            (model / "cameras.bin").write_bytes(np.array(2, "<u8").tobytes() + cameras)
+        tracks = b"".join(
+            (model / "points3D.bin").read_bytes()[8 + 51 * n : 51 + 51 * n] + np.array(2, "<u8").tobytes() + bytes(16)
+            for n in range(12)
+        )
+        (model / "points3D.bin").write_bytes(np.array(12, "<u8").tobytes() + tracks)
+        yield Case(sorted(model.iterdir()), lambda kind=kind: load_capture(folder / kind, holdout=2), _whole_capture)
+
+
+def colmap_text(folder: Path) -> Iterator[Case]:
+    """A model in text, read with its images."""
+    capture = small_capture(3, points=12)
+    lenses = {
+        "pinhole": None,
+        "opencv": ["1 OPENCV 24 16 20 21 11.5 8.5 0.01 0.002 0.001 0"],
+        "radial": ["1 RADIAL_FISHEYE 48 32 40 23 16 0.01 0.001"],
+    }
+    for name, lens in lenses.items():
+        write_images(capture, folder / name / "images")
+        write_text_model(capture, folder / name / "sparse" / "0", lens)
+        yield Case(
+            sorted((folder / name / "sparse" / "0").iterdir()),
+            lambda name=name: load_capture(folder / name),
+            _whole_capture,
+        )
+
+
+def nerfstudio(folder: Path) -> Iterator[Case]:
+    """transforms.json with what it names: depth maps and a cloud."""
+    capture = small_capture(3)
+    for name, more in {
+        "plain": {},
+        "distorted": {"camera_model": "OPENCV", "k1": 0.01, "k2": 0.001, "p1": 0.001, "p2": 0.0},
+        "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001},
+        "deep": {
+            "ply_file_path": "cloud.ply",
+            "applied_scale": 2.0,
+            "applied_transform": np.eye(4)[:3].tolist(),
+            "depth_unit_scale_factor": 0.001,
+        },
+    }.items():
+        content = transforms(capture, **more)
+        if name == "plain":
+            content |= {"camera_angle_x": 1.0, "camera_angle_y": 0.8}
+            for entry in content["frames"]:
+                del entry["fl_x"], entry["fl_y"]
+        (folder / name).mkdir()
+        files = [folder / name / "transforms.json"]
+        if name == "deep":
+            rng = np.random.default_rng(0)
+            for n, entry in enumerate(content["frames"]):
+                depth = rng.integers(0, 4000, (16, 24)).astype(np.uint16)
+                entry["depth_file_path"] = f"depth{n}.{'npy' if n == 1 else 'png'}"
+                file = folder / name / entry["depth_file_path"]
+                np.save(file, depth / 1000.0) if n == 1 else cv2.imwrite(str(file), depth)
+                files.append(file)
+            columns = {axis: np.linspace(-1, 1, 5, dtype=np.float32) for axis in "xyz"}
+            files.append(_write_ply(folder / name / "cloud.ply", columns, "ascii"))
+        write_transforms(capture, folder / name, content)
+        files = [files[0]] * 6 + files[1:]
+        yield Case(files, lambda name=name: load_capture(folder / name), _whole_capture)
+
+
+def image(folder: Path) -> Iterator[Case]:
+    """Photographs, depth maps and EXIF."""
+    rng = np.random.default_rng(0)
+    colour = cv2.resize(rng.integers(0, 255, (6, 9, 3), np.uint8), (90, 60))
+    alpha = np.dstack([colour, colour[..., 0]])
+    for ending in (".png", ".jpg", ".webp", ".tif", ".bmp"):
+        cv2.imwrite(str(folder / f"plain{ending}"), colour)
+    cv2.imwrite(str(folder / "deep.png"), colour.astype(np.uint16) * 257)
+    cv2.imwrite(str(folder / "alpha.png"), alpha)
+    cv2.imwrite(str(folder / "alpha.tif"), alpha)
+    cv2.imwrite(str(folder / "progressive.jpg"), colour, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    exif = Image.Exif()
+    exif[0x0110], exif.get_ifd(0x8769)[0x920A] = "camera", 35.0
+    Image.fromarray(colour).save(folder / "exif.jpg", exif=exif)
+
+    def read(file: Path):
+        found = images.read_image(file)
+        return found, images.image_size(file), motion._lenses([file])
+
+    def whole(found) -> None:
+        (picture, _), (width, height), groups = found
+        assert picture.dtype == np.uint8
+        assert picture.shape == (height, width, 3)
+        assert min(width, height) > 0
+        assert groups == [[0]]
+
+    for file in sorted(folder.iterdir()):
+        yield Case([file], lambda file=file: read(file), whole)
+    cv2.imwrite(str(folder / "depth.png"), rng.integers(0, 60000, (30, 40)).astype(np.uint16))
+    np.save(folder / "depth.npy", rng.random((30, 40, 1)))
+
+    def whole_depth(found) -> None:
+        assert found.ndim == 2
+        assert found.dtype == np.float32
+        _finite(found)
+        assert (found >= 0).all()
+
+    for file in (folder / "depth.png", folder / "depth.npy"):
+        yield Case([file], lambda file=file: images.read_depth(file, 0.001), whole_depth)
+
+
+def masks(folder: Path) -> Iterator[Case]:
+    """Masklets: PNGs of every kind, folders of objects, LangSplat's levels, and a mask that is asked for."""
+    ids, names = np.random.default_rng(0).integers(0, 5, (2, 12, 18)).repeat(2, 1).repeat(2, 2), ("a", "b")
+    kinds: dict[str, Callable[[np.ndarray], bytes]] = {
+        "grey": lambda ids: cv2.imencode(".png", ids.astype(np.uint8))[1].tobytes(),
+        "deep": lambda ids: cv2.imencode(".png", (ids * 9000).astype(np.uint16))[1].tobytes(),
+        "colour": lambda ids: cv2.imencode(".png", np.stack([ids, ids * 9, ids * 0], -1).astype(np.uint8))[1].tobytes(),
+        "palette": lambda ids: png(ids, bits=4, colour_type=3, palette=bytes(range(48))),
+        "bits": lambda ids: png(ids % 4, bits=2, colour_type=0),
+    }
+
+    def whole(found) -> None:
+        assert found.labels.shape == (2, 24, 36)
+        assert found.labels.dtype == np.int16
+        assert found.labels.min() >= -1
+        assert found.labels.max() < len(found.ids)
+
+    for kind, write in kinds.items():
+        (folder / kind).mkdir()
+        for name, image in zip(names, ids):
+            (folder / kind / f"{name}.png").write_bytes(write(image))
+        files = sorted((folder / kind).iterdir())
+        yield Case(files, lambda kind=kind: mask_files.load_labels(folder / kind, names, (24, 36)), whole)
+    for object in ("001", "002"):
+        (folder / "objects" / object).mkdir(parents=True)
+        for name, image in zip(names, ids):
+            (folder / "objects" / object / f"{name}.png").write_bytes(kinds["grey"]((image == int(object)) * 255))
+    yield Case(
+        sorted((folder / "objects").rglob("*.png")),
+        lambda: mask_files.load_labels(folder / "objects", names, (24, 36)),
+        whole,
+    )
+    (folder / "levels").mkdir()
+    for name, image in zip(names, ids):
+        np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, 24, 36)).astype(np.float32))
+    yield Case(
+        sorted((folder / "levels").iterdir()), lambda: mask_files.load_labels(folder / "levels", names, (24, 36)), whole
+    )
+    field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
+
+    def whole_outline(found: np.ndarray) -> None:
+        assert found.shape == (24, 36)
+        assert found.dtype == bool
+
+    for kind in ("grey", "colour", "bits"):
+        file = folder / kind / "a.png"
+        yield Case([file], lambda file=file: question.read_mask(file, field), whole_outline)
+
+
+def langsplat(folder: Path) -> Iterator[Case]:
+    """LangSplat's _s.npy with _f.npy."""
+    rng = np.random.default_rng(0)
+    for name in ("a", "b"):
+        write_features(folder, name, rng.integers(-1, 3, (12, 16)), rng.normal(size=(3, 5)))
+
+    def whole(found) -> None:
+        masks, size = found
+        assert masks.labels.shape == (2, 12, 16)
+        assert masks.embeddings.shape == (len(masks.frame), size if len(masks.frame) else masks.embeddings.shape[1])
+        assert masks.embeddings.dtype == np.float32
+        _finite(masks.embeddings)
+        assert -1 <= masks.labels.min() <= masks.labels.max() < max(len(masks.frame), 1)
+
+    read = lambda: (load_features(folder, ["a", "b"], (12, 16)), feature_size(folder))
+    yield Case(sorted(folder.iterdir()), read, whole)
+
+
+def proposals(folder: Path) -> Iterator[Case]:
+    """Masks of single frames: SAM's JSON, LangSplat's levels, PNGs."""
+    boxes = np.zeros((2, 20, 30), bool)
+    boxes[0, 2:9, 3:8] = boxes[1, 4:18, 10:25] = True
+    text = records(boxes)[0]["segmentation"]
+    counts = {"size": [20, 30], "counts": [62, 7, 13, 7, 13, 7, 13, 7, 13, 7, 451]}
+    for name, content in {
+        "a": [
+            {"segmentation": code, "predicted_iou": 0.9, "stability_score": 0.95, "area": 50} for code in (counts, text)
+        ],
+        "b": {"image": {"id": 1}, "annotations": [{"segmentation": text}]},
+    }.items():
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    ids = np.zeros((20, 30), np.uint8)
+    ids[2:9, 3:8] = 7
+    cv2.imwrite(str(folder / "c.png"), ids)
+    np.save(folder / "d_s.npy", np.broadcast_to(ids.astype(np.float32) - 1, (4, 20, 30)))
+
+    def read():
+        of_frame, _ = proposal_files.proposals_from_disk(folder, ("a", "b", "c", "d"), (20, 30))
+        return [of_frame(n) for n in range(4)]
+
+    def whole(found) -> None:
+        for masks in found:
+            assert masks.dtype == bool
+            assert masks.shape == (len(masks), 20, 30)
+
+    files = sorted(folder.iterdir())
+    yield Case(files[:2] * 3 + files[2:], read, whole)
+
+
+def labels(folder: Path) -> Iterator[Case]:
+    """LERF's labels as LangSplat has them."""
+    thing = {
+        "category": "red mug",
+        "group": 1,
+        "segmentation": [[1, 2], [9, 3], [5, 9.5]],
+        "area": 9.0,
+        "bbox": [1, 2, 9, 9],
+        "iscrowd": 0,
+    }
+    for name in ("frame_1", "frame_2"):
+        content = {
+            "info": {"name": f"{name}.jpg", "width": 30, "height": 20, "note": ""},
+            "objects": [thing, thing | {"bbox": [0, 0, 3, 3]}, thing | {"category": "tea"}],
+        }
+        (folder / f"{name}.json").write_text(json.dumps(content))
+
+    def whole(found) -> None:
+        for frame in found:
+            assert frame.width > 0
+            assert frame.height > 0
+            for category, (mask, boxes) in frame.objects.items():
+                assert isinstance(category, str)
+                assert mask.shape == (frame.height, frame.width)
+                assert mask.dtype == bool
+                assert boxes.shape == (len(boxes), 4)
+                _finite(boxes)
+
+    yield Case(sorted(folder.iterdir()), lambda: load_lerf_labels(folder), whole)
+
+
+def _field(coder: Any = None) -> LanguageField:
+    rng = np.random.default_rng(0)
+    n, r, e, d, t, k, p = 12, 3, 8, 4, 2, 2, 2
+    unit = lambda *shape: (lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True))(rng.normal(size=shape)).astype(
+        np.float32
+    )
+    positive = lambda *shape: rng.random(shape).astype(np.float32)
+    votes = Votes(
+        rng.integers(-1, r, (n, k)).astype(np.int32),
+        positive(n, k),
+        positive(n),
+        positive(n) + 1,
+        positive(n),
+        np.full(n, t, np.int32),
+        np.int32(0),
+        r,
+        shown=positive(n, k),
+        overlap=positive(r, r),
+    )
+    camera = Camera(np.tile(np.eye(4, dtype=np.float32), (t, 1, 1)), *np.full((4, t), 20, np.float32), 24, 16)
+    parts = Parts((np.arange(n) % (p + 1) - 1).astype(np.int32), unit(p, e), positive(p))
+    return LanguageField(
+        _gaussians(n, 4),
+        unit(n, d),
+        votes,
+        Regions(unit(r, e), rng.integers(0, 9, (r, t)).astype(np.int32)),
+        unit(r, d),
+        coder,
+        camera,
+        unit(4, e),
+        np.eye(4),
+        ("a", "b"),
+        "colours",
+        '{"jsecon": "1", "options": {"embedder": null}}',
+        parts,
+    )
+
+
+def _coder() -> Autoencoder:
+    """Layers of the true layout: 8 -> 4 -> 4, and back."""
+    dense = lambda a, b: {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
+    norm = {"scale": np.ones(4, np.float32), "bias": np.zeros(4, np.float32)}
+    stats = {"mean": np.zeros(4, np.float32), "var": np.ones(4, np.float32)}
+    encoder = {
+        "params": {"Dense_0": dense(8, 4), "BatchNorm_0": norm, "Dense_1": dense(4, 4)},
+        "batch_stats": {"BatchNorm_0": stats},
+    }
+    return Autoencoder(encoder, {"params": {"Dense_0": dense(4, 4), "Dense_1": dense(4, 8)}})
+
+
+def field(folder: Path) -> Iterator[Case]:
+    """The language field."""
+
+    def whole(found: LanguageField) -> None:
+        _whole_gaussians(found.gaussians)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(dataclasses.replace(found, gaussians=None)):
+            assert np.asarray(leaf).dtype.kind in "iuf", path
+            _finite(leaf)
+        r = found.regions.count
+        for ids, count in (
+            (found.votes.regions, r),
+            (found.parts.part if found.parts else np.zeros(0, int), len(found.parts.weight) if found.parts else 0),
+        ):
+            assert np.asarray(ids).dtype.kind in "iu"
+            assert ((ids >= -1) & (ids < count)).all(), "indices of nothing"
+        assert type(found.names) is tuple
+        assert all(isinstance(name, str) for name in found.names)
+        assert isinstance(found.embedder, str)
+        assert isinstance(json.loads(found.provenance), dict)
+        assert type(found.cameras.width) is type(found.cameras.height) is int
+        assert min(found.cameras.width, found.cameras.height) > 0
+        if found.autoencoder is not None:
+            codes = found.autoencoder.encode(np.asarray(found.canonical))
+            assert codes.shape == (len(found.canonical), found.codes.shape[1])
+            _finite(codes)
+
+    rotation = Rotation(np.eye(8, 4, dtype=np.float32))
+    for name, value in {
+        "plain": _field(),
+        "rotation": _field(rotation),
+        "coder": _field(_coder()),
+        "bare": dataclasses.replace(_field(rotation), parts=None),
+    }.items():
+        save_field(folder / f"{name}.npz", value)
+        yield Case([folder / f"{name}.npz"], lambda name=name: load_field(folder / f"{name}.npz"), whole)
+
+
+def kept(folder: Path) -> Iterator[Case]:
+    """The run's cache, and what networks found: what cannot be read is computed again."""
+    value = {"a": np.arange(12.0).reshape(3, 4), "cameras": _field().cameras, "told": ("x", 1, None), "list": [1, "b"]}
+    cache.save(folder / "stage-0.npz", value)
+
+    def read():
+        return cache.fetch(folder / "stage-0.npz", lambda: value)
+
+    def whole(found: cache.Kept) -> None:
+        if found.fresh:
+            raise InputError("cache", "computed again", "-", "-")
+        assert isinstance(found.seconds, float)
+
+    yield Case([folder / "stage-0.npz"], read, whole)
+    frame, mask = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), bool)
+    store = EmbeddingStore(folder, "model")
+    store.write(frame, {bytes(range(16)): np.ones(4, np.float32), bytes(16): np.ones(4, np.float32)})
+
+    def whole_store(found: dict) -> None:
+        assert all(isinstance(key, bytes) for key in found)
+        for row in found.values():
+            _finite(row)
+
+    yield Case([store._path(frame)], lambda: store.read(frame), whole_store)
+
+    class Fixed:
+        name = "fixed"
+
+        def __call__(self, frame, index):
+            return np.stack([mask, ~mask, mask])
+
+    stored = StoredSegmenter(Fixed(), folder / "masks")  # pyright: ignore[reportArgumentType]
+    stored(frame, 0)
+
+    def whole_masks(found: np.ndarray) -> None:
+        assert found.shape[1:] == (6, 8)
+        assert found.dtype == bool
+
+    yield Case(sorted((folder / "masks").iterdir()), lambda: stored(frame, 0), whole_masks)
+
+
+def tokenizer(folder: Path) -> Iterator[Case]:
+    """tokenizer.json, and vocab.json with merges.txt."""
+    write_tokenizer(folder / "tokenizer.json")
+    (folder / "vocab.json").write_text(json.dumps(vocabulary()))
+    (folder / "merges.txt").write_text(
+        "#version: 0.2\n" + "\n".join(" ".join(pair) for pair in clip_tokens()["merges"])
+    )
+
+    def read(file: Path) -> np.ndarray:
+        return load_tokenizer(file)(["a red mug's 12 handles", "", "é<end_of_text>"])
+
+    def whole(found: np.ndarray) -> None:
+        assert found.shape == (3, 77)
+        assert found.dtype == np.int64
+        assert found.min() >= 0
+
+    yield Case([folder / "tokenizer.json"], lambda: read(folder / "tokenizer.json"), whole)
+    yield Case([folder / "vocab.json", folder / "merges.txt"], lambda: read(folder / "vocab.json"), whole)
+
+
+def _inputs_of(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.suffix in (".onnx", ".json", ".npz", ".txt"))
+
+
+def _nothing(found: object) -> None:
+    pass
+
+
+def clip(folder: Path) -> Iterator[Case]:
+    """CLIP folders, put to the test as before a run."""
+    for layout in ("immich", "transformers.js", "flat"):
+        write_clip(folder / layout, layout)
+        files = _inputs_of(folder / layout)
+        yield Case(files, lambda layout=layout: ClipEmbedder(folder / layout, threads=1).check(), _nothing)
+
+
+def sam(folder: Path) -> Iterator[Case]:
+    """SAM folders, put to the test, then asked for a frame's masks."""
+    frame = np.zeros((24, 32, 3), np.uint8)
+
+    def read(name: str) -> np.ndarray:
+        segmenter = SamSegmenter(folder / name, SamSettings(points_per_side=2), threads=1)
+        segmenter.check()
+        return segmenter(frame, 0)
+
+    def whole(found: np.ndarray) -> None:
+        assert found.shape[1:] == (24, 32)
+        assert found.dtype == bool
+
+    for name in ("segment-anything", "transformers.js", "sam2"):
+        write_sam(folder / name, name, side=64)
+        yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
+
+
+def sam2(folder: Path) -> Iterator[Case]:
+    """SAM 2 folders, put to the test, then asked to follow a mask."""
+    frames, prompt = np.zeros((2, 16, 16, 3), np.uint8), np.ones((1, 16, 16), bool)
+
+    def read(name: str) -> np.ndarray:
+        tracker = Sam2Tracker(folder / name, threads=1)
+        tracker.check()
+        return tracker(frames, 0, prompt)
+
+    def whole(found: np.ndarray) -> None:
+        assert found.shape == (2, 16, 16)
+        assert -1 <= found.min() <= found.max() < 1
+
+    for version in ("2.0", "2.1"):
+        write_sam2(folder / version, version=version)
+        yield Case(_inputs_of(folder / version), lambda version=version: read(version), whole)
+
+
+def videos(folder: Path) -> Iterator[Case]:
+    """Videos of three containers."""
+    rng = np.random.default_rng(0)
+    for name, code in {"a.avi": "MJPG", "b.mp4": "mp4v", "c.mkv": "mp4v"}.items():
+        writer = cv2.VideoWriter(str(folder / name), cv2.VideoWriter.fourcc(*code), 10, (64, 48))
+        assert writer.isOpened(), name
+        for _ in range(6):
+            writer.write(cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (64, 48)))
+        writer.release()
+
+        def read(name=name):
+            shutil.rmtree(folder / "frames", ignore_errors=True)
+            return video.write_frames(folder / name, folder / "frames", frames=3)
+
+        def whole(found) -> None:
+            assert 1 <= len(found) <= 3
+            assert all(cv2.imread(str(file)).size for file in found)
+
+        yield Case([folder / name], read, whole)
+
+
+READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
+    own.__name__: own
+    for own in (
+        *(ply, points, colmap, colmap_text, nerfstudio, image, masks, langsplat, proposals, labels, field, kept),
+        *(tokenizer, clip, sam, sam2, videos),
+    )
+}
