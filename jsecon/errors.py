@@ -14,12 +14,10 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: object, found: str, expected: str, remedy: str):
-        self.where, self.found, self.expected, self.remedy = _quoted(str(where)), _quoted(found), expected, remedy
-        super().__init__(f"{self.where}: found {self.found}; expected {expected}. {remedy}")
-
-
-def _quoted(text: str) -> str:
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+        half = LONGEST // 2
+        where, found = (t if len(t) <= LONGEST else f"{t[:half]} ... {t[-half:]}" for t in (str(where), found))
+        self.where, self.found, self.expected, self.remedy = where, found, expected, remedy
+        super().__init__(f"{where}: found {found}; expected {expected}. {remedy}")
 
 
 def require(condition: bool, name: str, got: object, expected: str, remedy: str) -> None:

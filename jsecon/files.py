@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import struct
 import sys
 import uuid
 import zipfile
@@ -64,9 +65,9 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 
 def parsed_json(text: str | bytes) -> Any:
-    """What a JSON text holds, whole numbers of more than 18 digits as floats. Raises ValueError."""
+    """What a JSON text holds, whole numbers of 300 digits and more as floats. Raises ValueError."""
     try:
-        return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 19 else float(digits))
+        return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 300 else float(digits))
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
 
@@ -130,17 +131,16 @@ def read_arrays(path: str | os.PathLike, *, mapped: int = sys.maxsize) -> dict[s
             stored = entry.compress_type == zipfile.ZIP_STORED
             if entry.file_size > most * (1 if stored else MOST_DEFLATED):
                 raise ValueError(f"{entry.filename} of {entry.file_size} bytes in a file of {most}")
-            with archive.open(entry) as member:
+            name = entry.filename.removesuffix(".npy")
+            with archive.open(entry) as member, open(path, "rb") as file:
                 if not (stored and entry.file_size > mapped):
-                    arrays[entry.filename.removesuffix(".npy")] = read_array(member, entry.file_size)
+                    arrays[name] = read_array(member, entry.file_size)
                     continue
                 while member.read(1 << 24):  # to the end, where its checksum is compared
                     pass
-            with open(path, "rb") as file:
                 file.seek(entry.header_offset + 26)
-                lengths = file.read(4)
-                start = file.tell() + int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
-            arrays[entry.filename.removesuffix(".npy")] = map_array(Path(path), start, entry.file_size)
+                start = sum(struct.unpack("<HH", file.read(4))) + file.tell()
+            arrays[name] = map_array(Path(path), start, entry.file_size)
     return arrays
 
 

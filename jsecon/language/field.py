@@ -145,10 +145,9 @@ def _oddity(field: LanguageField) -> str | None:
             return f"{name} with numbers that are not finite"
         if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
             return f"{name} with numbers of none of {sizes[name]}"
-    if not all(isinstance(text, str) for text in (*field.names, field.embedder, field.provenance)):
-        return "names, embedder or provenance that are no texts"
-    if not isinstance(parsed_json(field.provenance), dict):
-        return "a provenance that is no JSON object"
+    texts = (*field.names, field.embedder, field.provenance)
+    if not all(isinstance(text, str) for text in texts) or not isinstance(parsed_json(field.provenance), dict):
+        return "names, embedder or provenance that are no texts, or no JSON object"
     if not 0 < field.cameras.width * field.cameras.height <= MOST_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     if field.autoencoder is not None:
