@@ -1,5 +1,6 @@
 """The program `jsecon` (and `python -m jsecon`): the process first, before jax starts; then the command line."""
 
+import signal
 import sys
 
 from jsecon.process import prepare_process
@@ -8,6 +9,7 @@ from jsecon.process import prepare_process
 def main() -> int:
     """Entry point: returns the exit code."""
     prepare_process()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: what is half written is removed
     from jsecon.app.command_line import main as run
 
     return run(sys.argv[1:])

@@ -4,6 +4,7 @@ fill, and no Python object is built."""
 
 import contextlib
 import dataclasses
+import fcntl
 import json
 import math
 import os
@@ -41,21 +42,36 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
     """Yields a temporary path beside `path`; on leaving it is renamed to `path`, or removed if the body raised.
 
     The temporary name keeps `path`'s ending, for writers that choose the format by it. Raises InputError where the
-    folder cannot be written.
+    folder cannot be written, or has no room.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
-    except OSError as error:
-        found, remedy = f"{error.strerror} on writing to {path.parent}", "Choose another, or mend its permissions."
-        raise InputError(path, found, "a folder that can be written", remedy) from error
-    try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        remedy = "Choose another, mend its permissions, or free some room."
+        found = f"{error.strerror or error} on writing to {path.parent}"
+        raise InputError(path, found, "a folder that can be written", remedy) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """While it is open, `folder` is this caller's to write to. Raises InputError where it is another's."""
+    with open(folder / ".lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            remedy = "Wait for its end, or choose another output folder."
+            raise InputError(folder, "another run that writes there", "one at a time", remedy) from error
+        except OSError:  # a file system without locks
+            pass
+        yield
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:

@@ -32,6 +32,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import jsecon
@@ -43,10 +44,13 @@ from jsecon.app.progress import Listener, Step
 from jsecon.app.scene_stages import gaussians, held_out, loaded
 from jsecon.app.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.errors import InputError
+from jsecon.files import alone
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 
 FIELD_FILE = "field.npz"
+SMALLER = "Take smaller frames (--long-side), fewer (--frames), or fewer Gaussians (--gaussians-at-most)."
+"""what helps where memory ends"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,13 +109,19 @@ class _Done:
 
 def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
     """The stages, told first, then each computed or read from `folder`."""
-    options, keys = work.options, {}
+    options = work.options
     if work.out.resolve() == options.capture.resolve():
         found = "the capture's own folder as the output folder"
         raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
     require_inputs(options)
     require_writable(work.out)
+    with alone(work.out):
+        return _in_turn(work, stages, folder, listener)
+
+
+def _in_turn(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
     cache.prepare(folder)
+    keys: dict[str, str] = {}
     for stage in stages:
         keys[stage.name] = stage.key(work, keys)
     place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
@@ -120,14 +130,20 @@ def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener)
             place[stage.name].unlink(missing_ok=True)
     steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
     steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
-    listener.steps(f"{options.capture} -> {work.out}", steps)
+    listener.steps(f"{work.options.capture} -> {work.out}", steps)
     work.networks.require_ready([step.name for step in steps if step.status == "run"])
     done = _Done({}, keys, {}, steps, [])
     for stage in stages:
         record = Record(cache.record_path_of(place[stage.name]))
         with listener.progress(stage.name) as progress:
             compute = functools.partial(stage.compute, done.results, progress, record)
-            kept = cache.fetch(place[stage.name], compute, note=listener.note)
+            try:
+                kept = cache.fetch(place[stage.name], compute, note=listener.note)
+            except (MemoryError, jax.errors.JaxRuntimeError) as error:
+                if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+                    found, remedy = f"no memory left ({str(error)[:200]})", f"{SMALLER} What is done is kept."
+                    raise InputError(f"stage {stage.name}", found, "more memory", remedy) from error
+                raise
         outcome: Outcome = kept.value
         done.results[stage.name], done.seconds[stage.name] = outcome.value, kept.seconds
         record.remove()

@@ -116,7 +116,7 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     focals = 1 if model in _ONE_FOCAL else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
-    if not (sane(parameters) and fx > 0 and fy > 0 and width > 0 and height > 0):
+    if not (sane(parameters) and fx > 0 and fy > 0 and 0 < width < 1 << 31 and 0 < height < 1 << 31):
         found = f"a camera of {width}x{height} px with parameters {parameters}"
         raise bad_model(file, found, "positive size and focal length", "Estimate the cameras again.")
     return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="FISHEYE" in model)

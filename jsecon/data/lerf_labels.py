@@ -67,7 +67,7 @@ def _read(file: Path) -> LabelledFrame:
     content = read_json(file, "a label file", _REMEDY)
     info = _get(file, content, "info", dict, "the file")
     name = Path(_get(file, info, "name", str, "info")).stem
-    width, height = (_get(file, info, key, int, "info") for key in ("width", "height"))
+    width, height = (int(_get(file, info, key, int, "info")) for key in ("width", "height"))
     if min(width, height) < 1 or width * height > MOST_PIXELS:
         raise _bad(file, f"an image of {width}x{height}", f"a positive size, at most {MOST_PIXELS} pixels")
     objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}

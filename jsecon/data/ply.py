@@ -112,7 +112,7 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, rgb: Float[Array, "n 3"]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
-        table.astype("<f4", copy=False).tofile(file)
+        file.write(table.astype("<f4", copy=False).tobytes())  # tofile would not tell that the disk is full
 
 
 def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:

@@ -56,8 +56,8 @@ def write_frames(
     for number, (image, _) in enumerate(_decoded(video)):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")
-            with written_whole(written[-1]) as temporary:
-                cv2.imwrite(os.fspath(temporary), image, [cv2.IMWRITE_JPEG_QUALITY, 97])
+            with written_whole(written[-1]) as temporary:  # imwrite would not tell that the disk is full
+                temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes())
         if progress is not None:
             progress(len(sharpness) + number + 1, 2 * len(sharpness))
     return written
