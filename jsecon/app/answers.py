@@ -88,7 +88,7 @@ def write_answer(
         for t, mask in masks.items():
             told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
             with written_whole(out / told["masks"][field.names[t]]) as temporary:
-                cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
+                temporary.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
     write_text(out / f"{slug}.json", json.dumps(told, indent=2) + "\n")
     return told
 

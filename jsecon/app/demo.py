@@ -164,7 +164,8 @@ def _write_picture(path: Path, found: Run, rows: list[Row]) -> None:
         }
     )
     with written_whole(path) as temporary:
-        cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
+        bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+        temporary.write_bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
 
 
 def _query_part(

@@ -151,7 +151,10 @@ def _oddity(field: LanguageField) -> str | None:
     if not 0 < field.cameras.width * field.cameras.height <= MOST_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     if field.autoencoder is not None:
-        coded = jax.eval_shape(field.autoencoder.encode, field.canonical).shape
+        try:
+            coded = jax.eval_shape(field.autoencoder.encode, field.canonical).shape
+        except Exception as error:  # flax's own kinds have no common base but this
+            return f"a coder that does not encode ({error})"
         if coded[1:] != field.codes.shape[1:]:
             return f"a coder to {coded[1:]} numbers beside codes of {field.codes.shape[1:]}"
     return None

@@ -14,7 +14,7 @@ import numpy as np
 
 from jsecon.errors import InputError
 from jsecon.files import UNREADABLE, read_arrays
-from jsecon.networks.onnx_graph import Graph, content_digest, graph_files
+from jsecon.networks.onnx_graph import Graph, Tensor, content_digest, graph_files
 
 STRIDE = 16
 """px of the network's image to one cell of its top features."""
@@ -106,7 +106,12 @@ class Sam2Graphs:
 
     def run(self, role: str, feeds: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The outputs that SIGNATURES names of the network of that role."""
-        return self.graphs[role].run(feeds, list(SIGNATURES[role][1]))
+        outputs, graph = SIGNATURES[role][1], self.graphs[role]
+        found = graph.run(feeds, list(outputs))
+        for name, shape in outputs.items():
+            if not Tensor(name, "", _with_sizes(shape, self.sizes)).fits(found[name].shape):
+                raise _bad(f"{graph.path}, output {name!r}", f"shape {found[name].shape}", str(shape))
+        return found
 
 
 def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
