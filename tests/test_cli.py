@@ -357,7 +357,7 @@ def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_pa
         (["--at", "", 3, 3], "no such frame"),
         (["--at", "#99", 3, 3], "a place, #0 to #"),
         (["--mask", "#0", "a.png", "#1"], "FRAME PNG, in pairs"),
-        (["--mask", "#0", "nowhere.png"], "no readable image"),
+        (["--mask", "#0", "nowhere.png"], "No such file"),
         (["--box", "#0", 3, 3, "x", 9], "whole numbers"),
         (["--box", "#0", 500, 3, 600, 9], "pixels of a frame of 160x120"),
         ([], "nothing to find"),

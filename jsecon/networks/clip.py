@@ -161,7 +161,7 @@ class ClipEmbedder:
         images = np.ascontiguousarray(((crops.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2))
         tensor, output = self._visual_input, self._visual_output.name
         parts = [
-            self._visual.run({tensor.name: part}, [output])[output][:count]
+            _rows(self._visual, {tensor.name: part}, output, count)
             for part, count in batches(images, tensor.fixed(0), self._batch)
         ]
         return np.concatenate(parts)
@@ -178,7 +178,7 @@ class ClipEmbedder:
         parts = []
         for part, count in batches(ids, tensor.fixed(0), self._batch):
             feeds = {tensor.name: part} | {name: _up_to_end(part, self._tokenizer.end) for name in masks}
-            parts.append(graph.run(feeds, [output.name])[output.name][:count])
+            parts.append(_rows(graph, feeds, output.name, count))
         rows = np.concatenate(parts)
         if rows.shape[1] != self.dim:
             expected = f"{self.dim}, like the images of {self.files.visual.name}"
@@ -202,6 +202,15 @@ def embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
         expected = f"one output of two axes, as {what} has, called {', '.join(names)} or otherwise"
         raise InputError(where, found, expected, "Export the graph with its projection.")
     return flat[0]
+
+
+def _rows(graph: Graph, feeds: dict[str, np.ndarray], output: str, count: int) -> np.ndarray:
+    """The first `count` rows (count, E) of an output."""
+    found = graph.run(feeds, [output])[output]
+    if found.ndim != 2 or len(found) < count:
+        remedy = "Export the graph with its projection."
+        raise InputError(f"{graph.path}, output {output!r}", f"shape {found.shape}", f"{count} embeddings", remedy)
+    return found[:count]
 
 
 def _up_to_end(ids: Int64[np.ndarray, "b l"], end: int) -> Int64[np.ndarray, "b l"]:

@@ -120,7 +120,7 @@ def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
         raise InputError(path, f"what cannot be read ({error!r})", expected, "Fetch the file again.") from error
-    if len(mean) != 3 or len(std) != 3 or not sane(mean, std) or min(std) <= 0 or not 1 <= (size or 1) <= MOST_SIDE:
+    if len(mean) != 3 or len(std) != 3 or not sane(mean, std) or min(std) < 1e-6 or not 1 <= (size or 1) <= MOST_SIDE:
         raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, "Fetch the file again.")
     return mean, std, size
 
