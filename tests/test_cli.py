@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import struct
+import time
 from pathlib import Path
 
 import cv2
@@ -162,6 +163,45 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
         assert summary["miou"] == pytest.approx(np.mean([row["iou"] for row in summary["rows"]]), abs=1e-3)
     assert "mAcc@0.25" in told
     assert "alpha > 0.7" in told
+
+
+def _object(capsys, *arguments):
+    """What a verb prints with --json: one object and nothing else."""
+    assert _run(*arguments, "--json") == 0
+    out, err = capsys.readouterr()
+    assert out.count("\n") == 1
+    return json.loads(out), err
+
+
+def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, capsys):
+    run, out = room_run
+    shutil.copytree(out / "cache", tmp_path / "out" / "cache")
+    field, fitted = out / "field.npz", ["--holdout", 4, "--steps", 150]
+    line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", *fitted]
+    told, _ = _object(capsys, *line, "--dry-run")
+    assert {stage["status"] for stage in told["stages"] if stage["name"] != "field"} == {"cached", "left out"}
+    assert 0 < told["seconds"] < 5  # only the field is left to write
+    assert not (tmp_path / "out" / "field.npz").exists()
+    told, err = _object(capsys, *line)
+    assert told["gaussians"] == run.field.gaussians.count
+    assert "gaussians        cached" in err
+    assert all(Path(file).exists() for file in told["written"])
+    (tmp_path / "scene").symlink_to(tmp_path / "out")
+    told, _ = _object(capsys, "fit", room, "--out", tmp_path / "scene.ply", *fitted)
+    assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
+    assert load_ply(told["written"]["scene"]).count == told["gaussians"]
+    told, _ = _object(capsys, "query", field, "red", "--out", tmp_path / "answers", "--views", 1)
+    assert [answer["query"] for answer in told["answers"]] == ["red"]
+    told, _ = _object(capsys, "view", field, "red", "--export", tmp_path / "page.html")
+    assert (told["written"]["page"], told["answers"]) == (str(tmp_path / "page.html"), ["red"])
+    told, _ = _object(capsys, "eval", field, "--labels", room / "label", "--out", tmp_path / "found")
+    assert 0 <= told["anchored"]["miou"] <= 1
+    told, err = _object(capsys, "completion", "bash")
+    assert told["script"].count("jsecon") > 10
+    assert _run("query", field, "red", "zzz", "--out", tmp_path / "answers", "--json") == 2
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["answers"]) == 1
+    assert told["error"]["found"]
 
 
 def test_help_of_every_verb_has_words_for_every_option(capsys):
@@ -413,6 +453,24 @@ def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
                     progress(done, total)
         assert "votes" in err.text
         assert sign in err.text
+
+
+def test_a_step_that_tells_nothing_shows_its_time(monkeypatch):
+    from jsecon.app import progress as console
+
+    monkeypatch.setattr(console, "QUIET_SECONDS", 0.1)
+    monkeypatch.setattr(console, "TICK_SECONDS", 0.05)
+    monkeypatch.setattr(console, "compiling", lambda: True)
+    for tty, sign in ((True, "votes: compiling"), (False, "s so far\n")):
+        err = _Terminal(tty)
+        with Console(err=err).progress("votes") as progress:
+            for _ in range(100):
+                time.sleep(0.05)
+                if sign in err.text:
+                    break
+            progress(1, 4)  # and the bar goes on from there
+        assert sign in err.text
+        assert "votes: compiling" in err.text
 
 
 def test_short_steps_stay_silent_in_logs():

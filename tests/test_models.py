@@ -6,7 +6,7 @@ from sam2_files import write_sam2
 from sam_files import write_sam
 
 from jsecon.app import command_line
-from jsecon.app.models import examine, report_lines, require_usable
+from jsecon.app.models import examine, report_lines, unusable
 from jsecon.errors import InputError
 
 
@@ -38,7 +38,7 @@ def test_what_a_folder_is_good_for(folders, model, words):
         if name != model:
             assert "expected" in use.told
             assert "huggingface.co" in use.told or "github.com" in use.told
-    require_usable(findings)
+    assert unusable(findings) == []
 
 
 def test_every_graph_is_told_with_its_tensors(folders, capsys):

@@ -97,7 +97,10 @@ def test_what_was_stopped_goes_on_with_what_was_found(photos, found, tmp_path):
     (tmp_path / "work" / "found.json").unlink()
     seconds = found[0].seconds
     more, _ = find_poses(photographs(photos[0]), tmp_path / "work", progress=lambda *at: told.append(at))
-    assert all(total == COUNT for _, total in told)  # no pairs, only registrations
+    assert {total for _, total in told} <= {COUNT, motion_steps.AT_ONCE_STEPS + 1}  # no pairs, only registrations
+    steps = [done for done, total in told if total != COUNT]
+    assert 2 <= len(steps) <= motion_steps.AT_ONCE_STEPS + 1
+    assert steps == list(range(len(steps)))
     assert more.seconds["features"] < 0.5 * seconds["features"] + 0.5
     assert more.registered == found[0].registered
     assert more.error_px == pytest.approx(found[0].error_px, rel=0.05)

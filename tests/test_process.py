@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from jsecon.process import forget_programs, settings
+from jsecon.process import compiling, forget_programs, programs_built, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -60,3 +62,21 @@ def test_programs_are_forgotten_where_there_are_too_many_maps_and_work_again():
     assert forget_programs(above=0)
     assert twice._cache_size() == 0
     assert twice(jnp.float32(4)) == 8
+
+
+def test_a_compilation_is_told_while_it_lasts():
+    programs_built()
+    ended, seen = threading.Event(), []
+
+    def look():
+        while not ended.wait(0.001):
+            seen.append(compiling(longer=0.0))
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    now = time.time()  # a program that no cache holds
+    jax.jit(lambda x: sum(jnp.sin(x * (k + now)) for k in range(100)))(jnp.ones(3))
+    ended.set()
+    looking.join()
+    assert any(seen)
+    assert not compiling(longer=0.0)

@@ -1,6 +1,7 @@
 """The server: what it answers, and that odd input has an error of its own kind and nothing crashes."""
 
 import asyncio
+import dataclasses
 import json
 import random
 import threading
@@ -15,7 +16,7 @@ from small_field import make_field
 from starlette.testclient import TestClient
 
 from jsecon.app.guard import Guard, Limits
-from jsecon.app.server import Scene, application, open_scenes, serve
+from jsecon.app.server import Scene, application, open_scenes, ready
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.vision.colours import ColourEmbedder
@@ -122,7 +123,19 @@ def test_a_token_is_asked_for_where_one_is_set(scenes, tmp_path):
     assert guarded.get("/healthz", headers={"Authorization": "Bearer wrong"}).status_code == 401
     assert guarded.get("/healthz", headers={"Authorization": "Bearer secret"}).status_code == 200
     with pytest.raises(InputError, match="a token that clients must have"):
-        serve([tmp_path / "none.npz"], host="0.0.0.0", port=0, token="", embedder=None, say=print)
+        ready([tmp_path / "none.npz"], host="0.0.0.0", port=0, token="", embedder=None)
+
+
+def test_its_address_is_told_and_a_port_in_use_is_refused(scenes, tmp_path):
+    field = dataclasses.replace(scenes["desk"].field, embedder=ColourEmbedder().name)
+    save_field(tmp_path / "field.npz", field)
+    given = {"host": "127.0.0.1", "token": "", "embedder": None}
+    told, _ = ready([tmp_path / "field.npz"], port=0, **given)
+    port = int(told["address"].removeprefix("http://127.0.0.1:"))
+    assert port > 0
+    assert [scene["name"] for scene in told["fields"]] == [tmp_path.name]
+    with pytest.raises(InputError, match="in use"):
+        ready([tmp_path / "field.npz"], port=port, **given)
 
 
 def sent(receive, limits=LIMITS, app=None):

@@ -1,19 +1,41 @@
-"""The command line: its verbs and what each takes. Bad input ends in one message and exit code 2, Ctrl-C in 130."""
+"""The command line: its verbs and what each takes. Bad input ends in one message and exit code 2, Ctrl-C in 130.
+
+A verb's function returns what it wrote and its figures, which is what --json prints (app/ending), and under "then" what
+it does when that is told.
+"""
 
 import argparse
+import contextlib
 import dataclasses
 import inspect
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jsecon
 from jsecon.app.arguments import add_arguments, parsed
+from jsecon.app.ending import Told, ended
 from jsecon.app.options import Options, SceneOptions, require_writable
-from jsecon.app.verbs import Asking, Demo, Eval, Export, Fit, Models, Query, Run, Serve, View
+from jsecon.app.progress import Console
+from jsecon.app.verbs import (
+    Asking,
+    Completion,
+    Demo,
+    Doctor,
+    Eval,
+    Export,
+    Fit,
+    Models,
+    Output,
+    Query,
+    Run,
+    Serve,
+    View,
+)
 from jsecon.errors import InputError
+from jsecon.process import show_whole_traces
 
 EPILOG = """
 examples
@@ -30,80 +52,104 @@ examples
   jsecon run my_capture --out my_field --segmenter sam --embedder clip
                                                         with SAM and CLIP from model folders
   jsecon models check clip                              what a model folder holds and lacks
+  jsecon run my_capture --out my_field --dry-run        what would run, for how long
 
 A run that is stopped goes on where it stopped when the same command is given again.
 """
+_RUN_FILES = ("field.npz", "report.html", "metrics.json")
 RUN_GROUPS = {"downscale": "frames and scene", "masks": "masks", "segmenter": "models", "weighting": "field"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    output = Output("--json" in argv, "--debug" in argv)  # also of a line that cannot be parsed
     try:
         arguments = parser().parse_args(argv)
-    except SystemExit as stop:  # argparse has said why
+        output = parsed(Output, arguments)
+        if output.debug:
+            show_whole_traces()
+        act, kind = _VERBS[arguments.verb]
+        console = Console(sys.stderr if output.json else None)
+        told = act(parsed(kind, arguments), console)
+    except SystemExit as stop:  # --help, --version
         return int(stop.code or 0)
-    act, kind = _VERBS[arguments.verb]
-    try:
-        act(parsed(kind, arguments))
     except InputError as error:
-        print(f"jsecon: {error}", file=sys.stderr)
-        return 2
+        return ended(output, {"refused": [error]})
     except KeyboardInterrupt:
-        print("\njsecon: stopped. Give the same command again and it goes on where it stopped.", file=sys.stderr)
-        return 130
-    return 0
+        remedy = "Give the same command again and it goes on where it stopped."
+        print(f"\njsecon: stopped. {remedy}", file=sys.stderr)
+        return ended(output, {"error": InputError("jsecon", "a stop by the user", "the end of the work", remedy)}, 130)
+    except Exception as error:  # a bug, whose trace the interpreter prints
+        found, remedy = f"{type(error).__name__}: {error}", "Report it with the trace on standard error."
+        ended(output, {"error": InputError("jsecon", found, "no such error: it is a bug", remedy)})
+        raise
+    then = told.pop("then", None)
+    code = ended(output, told)
+    with contextlib.suppress(KeyboardInterrupt):  # which is how a server ends
+        if then is not None:
+            then()
+    return code
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises what is wrong with a command line as InputError, behind the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.print_usage(sys.stderr)
+        raise InputError(self.prog, f"wrong usage ({message})", "what the usage says", f"See: {self.prog} --help")
 
 
 def parser() -> argparse.ArgumentParser:
     """The whole command line."""
     raw = argparse.RawDescriptionHelpFormatter
     about = "Find things in 3D Gaussian scenes by text, at the level of points, on a plain CPU."
-    top = argparse.ArgumentParser(prog="jsecon", formatter_class=raw, epilog=EPILOG, description=about)
+    top = _Parser(prog="jsecon", formatter_class=raw, epilog=EPILOG, description=about)
     top.add_argument("--version", action="version", version=f"jsecon {jsecon.__version__}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     for name, (_, kind) in _VERBS.items():
         short, _, long = (inspect.getdoc(kind) or "").partition("\n\n")
         verb = verbs.add_parser(name, help=short, description=long, formatter_class=raw)
         add_arguments(verb, kind, RUN_GROUPS if kind is Run else None)
+        add_arguments(verb, Output, {"json": "what is said"})
     return top
 
 
-def _demo(asked: Demo) -> None:
-    from jsecon.app.demo import demo
-    from jsecon.app.progress import Console
+def _demo(asked: Demo, console: Console) -> Told:
+    with console.progress("start"):
+        from jsecon.app.demo import demo
 
-    demo(asked.out, seed=asked.seed, steps=asked.steps, listener=Console())
+    told = demo(asked.out, seed=asked.seed, steps=asked.steps, listener=console)
+    return {"written": [asked.out / name for name in (*_RUN_FILES, "queries")]} | told
 
 
-def _run(asked: Run) -> None:
-    from jsecon.app import pipeline
-    from jsecon.app.progress import Console
-    from jsecon.app.summary import write_run
+def _run(asked: Run, console: Console) -> Told:
+    with console.progress("start"):
+        from jsecon.app import pipeline
+        from jsecon.app.summary import write_run
 
-    console = Console()
     options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(Options)})
-    write_run(pipeline.run(options, asked.out, listener=console), asked.out, console)
+    if asked.dry_run:
+        return pipeline.dry_run(options, asked.out, listener=console)
+    told = write_run(pipeline.run(options, asked.out, listener=console), asked.out, console)
+    return {"written": [asked.out / name for name in _RUN_FILES]} | told
 
 
-def _fit(asked: Fit) -> None:
-    from jsecon.app import pipeline
-    from jsecon.app.progress import Console
-    from jsecon.app.summary import write_scene
-    from jsecon.data.gaussian_files import require_written
-
+def _fit(asked: Fit, console: Console) -> Told:
+    with console.progress("start"):
+        from jsecon.app import pipeline
+        from jsecon.app.summary import write_scene
+        from jsecon.data.gaussian_files import require_written
     require_written(asked.out)
-    console = Console()
+
     options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(SceneOptions)})
-    write_scene(*pipeline.fit(options, asked.out.with_suffix(""), listener=console), asked.out, console)
+    folder = asked.out.with_suffix("")
+    if asked.dry_run:
+        return pipeline.dry_run(options, folder, scene_only=True, listener=console)
+    return write_scene(*pipeline.fit(options, folder, listener=console), asked.out, console)
 
 
-def _query(asked: Query) -> None:
-    from jsecon.app import question
-    from jsecon.app.progress import Console
-    from jsecon.app.summary import write_answers
-    from jsecon.data.gaussian_files import require_written
-    from jsecon.language.field import load_field
-
+def _query(asked: Query, console: Console) -> Told:
     if not (asked.texts or asked.at or asked.mask or asked.box):
         remedy = 'For example: jsecon query field.npz "red mug" --out answers'
         raise InputError("query", "nothing to find", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
@@ -114,9 +160,15 @@ def _query(asked: Query) -> None:
             remedy = "For example: --mask frame_00012 mug.png"
             raise InputError("--mask", " ".join(given), "FRAME PNG, in pairs", remedy)
     require_writable(asked.out)
-    require_written(asked.out / f"answer.{asked.format}")
-    field = load_field(asked.field)
-    embedder = _embedder(field, asked) if asked.texts else None
+    with console.progress("field"):
+        from jsecon.app import question
+        from jsecon.app.summary import write_answers
+        from jsecon.data.gaussian_files import require_written
+        from jsecon.language.field import load_field
+
+        require_written(asked.out / f"answer.{asked.format}")
+        field = load_field(asked.field)
+        embedder = _embedder(field, asked) if asked.texts else None
     asking = question.questions_of(
         field,
         embedder,
@@ -130,78 +182,98 @@ def _query(asked: Query) -> None:
         threshold=asked.threshold,
         outliers=not asked.keep_outliers,
     )
-    answers, refused = question.asked_each(asking)
-    if answers:
-        write_answers(field, answers, asked.out, Console(), views=asked.views, ending=asked.format)
-    _tell(refused)
+    with console.progress("answers"):
+        answers, refused = question.asked_each(asking)
+    how = {"views": asked.views, "ending": asked.format}
+    told = write_answers(field, answers, asked.out, console, **how) if answers else {"answers": []}
+    return told | {"refused": refused}
 
 
-def _tell(refused: Sequence[InputError]) -> None:
-    """Raises the last of the errors, the others told."""
-    for error in refused[:-1]:
-        print(f"jsecon: {error}", file=sys.stderr)
-    if refused:
-        raise refused[-1]
+def _export(asked: Export, console: Console) -> Told:
+    with console.progress("field"):
+        from jsecon.app.answers import save_part
+        from jsecon.data.gaussian_files import require_written
+        from jsecon.language.field import load_field
+
+        require_written(asked.out)
+        field = load_field(asked.field)
+        save_part(field, asked.out)
+    count, size = field.gaussians.count, asked.out.stat().st_size
+    console.say(f"{count} Gaussians, {size / 2**20:.1f} MiB  {asked.out}")
+    return {"written": {"scene": asked.out}, "gaussians": count, "bytes": size}
 
 
-def _export(asked: Export) -> None:
-    from jsecon.app.answers import save_part
-    from jsecon.app.progress import Console
-    from jsecon.data.gaussian_files import require_written
-    from jsecon.language.field import load_field
-
-    require_written(asked.out)
-    field = load_field(asked.field)
-    save_part(field, asked.out)
-    Console().say(f"{field.gaussians.count} Gaussians, {asked.out.stat().st_size / 2**20:.1f} MiB  {asked.out}")
-
-
-def _view(asked: View) -> None:
-    from jsecon.app import question
-    from jsecon.app.progress import Console
-    from jsecon.app.splat_page import write_page
-    from jsecon.language.field import load_field
-
+def _view(asked: View, console: Console) -> Told:
     if asked.export.suffix != ".html":
         raise InputError("--export", str(asked.export), "a file that ends in .html", "For example: --export page.html")
     require_writable(asked.export.parent)
-    field = load_field(asked.field)
-    embedder = _embedder(field, asked) if asked.texts else None
-    answers, refused = question.asked_each(question.questions_of(field, embedder, texts=asked.texts))
-    size = write_page(field, answers, asked.export, title=asked.field.resolve().parent.name)
-    Console().say(f"{field.gaussians.count} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {asked.export}")
-    _tell(refused)
+    with console.progress("page"):
+        from jsecon.app import question
+        from jsecon.app.splat_page import write_page
+        from jsecon.language.field import load_field
+
+        field = load_field(asked.field)
+        embedder = _embedder(field, asked) if asked.texts else None
+        answers, refused = question.asked_each(question.questions_of(field, embedder, texts=asked.texts))
+        size = write_page(field, answers, asked.export, title=asked.field.resolve().parent.name)
+    console.say(
+        f"{(count := field.gaussians.count)} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {asked.export}"
+    )
+    figures = {"gaussians": count, "answers": [answer.question for answer in answers], "bytes": size}
+    return {"written": {"page": asked.export}, "refused": refused} | figures
 
 
-def _eval(asked: Eval) -> None:
-    from jsecon.app.progress import Console
-    from jsecon.app.summary import write_evaluation
-    from jsecon.language.field import load_field
-
+def _eval(asked: Eval, console: Console) -> Told:
     out = asked.out or asked.field.parent
     require_writable(out)
-    field = load_field(asked.field)
-    write_evaluation(field, _embedder(field, asked), asked.labels, out, Console())
+    with console.progress("field"):
+        from jsecon.app.summary import write_evaluation
+        from jsecon.language.field import load_field
+
+        field = load_field(asked.field)
+        embedder = _embedder(field, asked)
+    return write_evaluation(field, embedder, asked.labels, out, console)
 
 
-def _serve(asked: Serve) -> None:
-    from jsecon.app.progress import Console
-    from jsecon.app.server import serve
+def _serve(asked: Serve, console: Console) -> Told:
+    with console.progress("start"):
+        from jsecon.app import server
 
     token = asked.token or os.environ.get("JSECON_TOKEN", "")
-    files = [Path(file) for file in asked.fields]
-    serve(files, host=asked.host, port=asked.port, token=token, embedder=asked.embedder, say=Console().say)
+    given = {"host": asked.host, "port": asked.port, "token": token, "embedder": asked.embedder}
+    with console.progress("fields"):
+        told, answer = server.ready([Path(file) for file in asked.fields], **given)
+    for scene in told["fields"]:
+        console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
+    console.say(told["address"])
+    return told | {"then": answer}
 
 
-def _models(asked: Models) -> None:
-    from jsecon.app.models import examine, report_lines, require_usable
-    from jsecon.app.progress import Console
+def _models(asked: Models, console: Console) -> Told:
+    with console.progress("graphs"):
+        from jsecon.app.models import examine, report_lines, unusable
 
-    findings = examine(asked.folder)
-    console = Console()
+        findings = examine(asked.folder)
     for line in report_lines(findings):
         console.say(line)
-    require_usable(findings)
+    return dataclasses.asdict(findings) | {"refused": unusable(findings)}
+
+
+def _doctor(asked: Doctor, console: Console) -> Told:
+    with console.progress("looking"):
+        from jsecon.app.doctor import checks_of, wrong
+
+        checks = checks_of(asked.models)
+    for check in checks:
+        console.say(f"{check.status:<8} {check.name:<10} {check.told}")
+    return {"checks": checks, "refused": wrong(checks)}
+
+
+def _completion(asked: Completion, console: Console) -> Told:
+    from jsecon.app.completion import script_of
+
+    console.say(script := script_of(parser(), asked.shell))
+    return {"shell": asked.shell, "script": script}
 
 
 def _embedder(field: Any, asked: Asking) -> Any:
@@ -227,4 +299,6 @@ _VERBS: dict[str, tuple[Any, type]] = {
     "eval": (_eval, Eval),
     "serve": (_serve, Serve),
     "models": (_models, Models),
+    "doctor": (_doctor, Doctor),
+    "completion": (_completion, Completion),
 }

@@ -57,12 +57,13 @@ def report_lines(findings: Findings) -> Iterable[str]:
         yield f"  {use.told}"
 
 
-def require_usable(findings: Findings) -> None:
-    """Raises InputError where the folder can be used for nothing."""
-    if not any(use.usable for use in findings.uses):
-        expected = f"{' or '.join(use.model for use in findings.uses)} as ONNX graphs"
-        remedy = "See above for what is missing and where such exports are published."
-        raise InputError(findings.folder, "nothing that can be used", expected, remedy)
+def unusable(findings: Findings) -> list[InputError]:
+    """That the folder can be used for nothing, where that is so."""
+    if any(use.usable for use in findings.uses):
+        return []
+    expected = f"{' or '.join(use.model for use in findings.uses)} as ONNX graphs"
+    remedy = "See above for what is missing and where such exports are published."
+    return [InputError(findings.folder, "nothing that can be used", expected, remedy)]
 
 
 def _signature(path: Path) -> str:

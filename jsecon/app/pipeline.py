@@ -97,6 +97,35 @@ def peak_memory_mib() -> float:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Plan:
+    """What would run."""
+
+    keys: dict[str, str]
+    place: dict[str, Path]
+    """where each stage's result is, or will be."""
+    stale: list[str]
+    """the stages whose result is there and whose folder is another run's."""
+    steps: list[Step]
+
+
+def _planned(work: Work, stages: list[Stage], folder: Path) -> _Plan:
+    """The stages, and which of them `folder` holds already; writes nothing. Raises InputError for bad options."""
+    options, keys = work.options, {}
+    if work.out.resolve() == options.capture.resolve():
+        found = "the capture's own folder as the output folder"
+        raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
+    require_inputs(options)
+    for stage in stages:
+        keys[stage.name] = stage.key(work, keys)
+    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
+    stale = [stage.name for stage in stages if stage.leaves is not None and not _left(stage, stages, place)]
+    held = {name for name, path in place.items() if path.exists() and name not in stale}
+    steps = [Step(stage.name, "cached" if stage.name in held else "run", stage.how) for stage in stages]
+    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
+    return _Plan(keys, place, stale, steps)
+
+
+@dataclasses.dataclass(frozen=True)
 class _Done:
     """What stages made, see Run."""
 
@@ -109,30 +138,21 @@ class _Done:
 
 def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
     """The stages, told first, then each computed or read from `folder`."""
-    options = work.options
-    if work.out.resolve() == options.capture.resolve():
-        found = "the capture's own folder as the output folder"
-        raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
-    require_inputs(options)
-    require_writable(work.out)
+    with listener.progress("plan"):
+        plan = _planned(work, stages, folder)
+        require_writable(work.out)
     with alone(work.out):
-        return _in_turn(work, stages, folder, listener)
+        return _in_turn(work, stages, plan, folder, listener)
 
 
-def _in_turn(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
+def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listener: Listener) -> _Done:
+    place, steps = plan.place, plan.steps
     cache.prepare(folder)
-    keys: dict[str, str] = {}
-    for stage in stages:
-        keys[stage.name] = stage.key(work, keys)
-    place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
-    for stage in stages:
-        if stage.leaves is not None and not _left(stage, stages, place):
-            place[stage.name].unlink(missing_ok=True)
-    steps = [Step(stage.name, "cached" if place[stage.name].exists() else "run", stage.how) for stage in stages]
-    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
+    for name in plan.stale:
+        place[name].unlink(missing_ok=True)
     listener.steps(f"{work.options.capture} -> {work.out}", steps)
     work.networks.require_ready([step.name for step in steps if step.status == "run"])
-    done = _Done({}, keys, {}, steps, [])
+    done = _Done({}, plan.keys, {}, steps, [])
     for stage in stages:
         record = Record(cache.record_path_of(place[stage.name]))
         with listener.progress(stage.name) as progress:
@@ -176,15 +196,28 @@ def run(
     work = Work(options, networks.networks_of(options, folder), out, load)
     done = _computed(work, stages_of(work), folder, listener)
     started = time.monotonic()
-    field = field_of(done.results, work.networks.embedder, _provenance(options, done.keys))
-    from jsecon.language.field import save_field
+    with listener.progress("field"):
+        from jsecon.language.field import save_field
 
-    save_field(out / FIELD_FILE, field)
+        field = field_of(done.results, work.networks.embedder, _provenance(options, done.keys))
+        save_field(out / FIELD_FILE, field)
     done.seconds["field"] = time.monotonic() - started
     listener.done("field", done.seconds["field"], True)
     capture, labels, quality = (done.results[name] for name in ("load", "masklets", "held_out"))
     programs = {name: count - before[name] for name, count in programs_built().items()}
     return Run(field, capture, labels, quality, done.seconds, tuple(done.steps), tuple(done.notes), options, programs)
+
+
+def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
+    """Says what `run` (`scene_only`: `fit`) would do and what it would cost, and returns that; writes nothing."""
+    from jsecon.app.estimates import tell
+
+    with listener.progress("plan"):
+        work = Work(options, networks.networks_of(options, out / "cache"), out)
+        stages = [*loaded(work), gaussians(work), held_out(work)] if scene_only else stages_of(work)
+        plan = _planned(work, stages, out / "cache")
+        work.networks.require_ready([step.name for step in plan.steps if step.status == "run"])
+    return tell(work, plan.steps, plan.place, listener)
 
 
 def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:

@@ -15,6 +15,7 @@ import contextlib
 import functools
 import ipaddress
 import json
+import socket
 import tempfile
 import threading
 from collections.abc import Callable
@@ -250,9 +251,12 @@ def application(scenes: dict[str, Scene], *, token: str = "", limits: Limits = L
     return Guard(app, token, limits)
 
 
-def serve(files: list[Path], *, host: str, port: int, token: str, embedder: Path | None, say: Callable) -> None:
-    """Answers until it is stopped. Raises InputError where the extra is missing, and for an address that others can
-    reach without a token."""
+def ready(
+    files: list[Path], *, host: str, port: int, token: str, embedder: Path | None
+) -> tuple[dict[str, Any], Callable[[], None]]:
+    """Where the fields can be asked and what they hold, and the function that answers until it is stopped. Raises
+    InputError where the extra is missing or the address cannot be had, and for one that others can reach without a
+    token."""
     try:
         import uvicorn
     except ImportError as error:
@@ -260,12 +264,19 @@ def serve(files: list[Path], *, host: str, port: int, token: str, embedder: Path
     if not token and not _loopback(host):
         remedy = "Set --token, or leave --host out."
         raise InputError("--host", host, "127.0.0.1, or a token that clients must have", remedy)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        listening = socket.create_server((host, port), family=family)
+    except OSError as error:
+        remedy = "Take another --port; with 0 the system chooses one."
+        found = str(error.strerror).partition(" (")[0]
+        raise InputError(f"{host}:{port}", found, "an address of this machine and a free port", remedy) from error
     scenes = open_scenes(files, embedder)
-    app = application(scenes, token=token)
-    for scene in scenes.values():
-        say(f"{scene.name}: {scene.field.gaussians.count} Gaussians, {scene.field.regions.count} regions")
-    say(f"http://{host}:{port}")
-    uvicorn.run(app, host=host, port=port, log_level="warning", timeout_keep_alive=5, ws="none", server_header=False)
+    given = {"timeout_keep_alive": 5, "ws": "none", "server_header": False}
+    server = uvicorn.Server(uvicorn.Config(application(scenes, token=token), log_level="warning", **given))
+    name = f"[{host}]" if family == socket.AF_INET6 else host
+    told = {"address": f"http://{name}:{listening.getsockname()[1]}", "fields": [s.told() for s in scenes.values()]}
+    return told, lambda: server.run(sockets=[listening])
 
 
 def _loopback(host: str) -> bool:

@@ -45,11 +45,23 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     return metrics
 
 
-def write_scene(gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener) -> None:
-    """The file of a fitted scene, in the world of the capture's files; says the figures."""
+def write_scene(
+    gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener
+) -> dict[str, Any]:
+    """The file of a fitted scene, in the world of the capture's files; says the figures, and returns them."""
     save_gaussians(out, transform_gaussians(gaussians, capture.to_source))
     say_quality(held_out, listener)
     listener.say(f"{gaussians.count} Gaussians  {out}")
+    return {"written": {"scene": out}, "gaussians": gaussians.count} | quality_told(held_out)
+
+
+def quality_told(held_out: Quality) -> dict[str, float | None]:
+    """Mean PSNR (dB) and SSIM of the frames held out; None where there are none."""
+    some, (psnr, ssim) = len(held_out.frames), (held_out.psnr, held_out.ssim)
+    return {
+        "held_out_psnr": round(float(np.mean(psnr)), 3) if some else None,
+        "held_out_ssim": round(float(np.mean(ssim)), 4) if some else None,
+    }
 
 
 def say_quality(held_out: Quality, listener: Listener) -> None:
@@ -68,8 +80,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
         "code_size": int(run.field.region_codes.shape[1]),
         "frames": len(run.capture.names),
         "size": [run.capture.cameras.width, run.capture.cameras.height],
-        "held_out_psnr": round(float(np.mean(run.psnr)), 3) if len(run.psnr) else None,
-        "held_out_ssim": round(float(np.mean(run.held_out.ssim)), 4) if len(run.psnr) else None,
+        **quality_told(run.held_out),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
         "left_out": run.left_out,
         "programs_compiled": run.programs,
@@ -85,30 +96,32 @@ def write_answers(
     *,
     views: int,
     ending: str = "ply",
-) -> None:
-    """The files of each answer, OUT/answers.html, and a line each."""
-    renderer, parts = pictures.Renderer(field.gaussians, field.cameras), []
-    for n, item in enumerate(answers):
-        shown = answers_of.masks_of(field, item, max(views, 1))
-        masks = {t: shown[t] for t in list(shown)[:views]}
-        told = answers_of.write_answer(field, item, out, masks, ending=ending)
-        if told["place"]:
-            place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
-        elif told["region"] is None and item.by in ("votes", "code"):
-            place = "nothing selected: no region answers it"
-        else:
-            place = "nothing selected"
-        count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
-        listener.say(f"{item.question!r}: {count}, {score}, region {told['region']}, {place}")
-        dropped = f"{told['outliers_dropped']} outliers dropped"
-        words = f"{count} by {item.by}; {score}; region {told['region']}; {dropped}; {place}."
-        overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
-        figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
-        parts.append(report.section(item.question, words, report.grid(figures, 3)))
-        with listener.progress("answers") as progress:
+) -> dict[str, Any]:
+    """The files of each answer, OUT/answers.html, and a line each; returns the files and the figures."""
+    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras), [], []
+    with listener.progress("pictures") as progress:
+        for n, item in enumerate(answers):
+            shown = answers_of.masks_of(field, item, max(views, 1))
+            masks = {t: shown[t] for t in list(shown)[:views]}
+            told = answers_of.write_answer(field, item, out, masks, ending=ending)
+            figures_of.append(told)
+            if told["place"]:
+                place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
+            elif told["region"] is None and item.by in ("votes", "code"):
+                place = "nothing selected: no region answers it"
+            else:
+                place = "nothing selected"
+            count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
+            listener.say(f"{item.question!r}: {count}, {score}, region {told['region']}, {place}")
+            dropped = f"{told['outliers_dropped']} outliers dropped"
+            words = f"{count} by {item.by}; {score}; region {told['region']}; {dropped}; {place}."
+            overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
+            figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
+            parts.append(report.section(item.question, words, report.grid(figures, 3)))
             progress(n + 1, len(answers))
     write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
     listener.say(f"pictures  {out / 'answers.html'}")
+    return {"written": {"folder": out, "pictures": out / "answers.html"}, "answers": figures_of}
 
 
 def evaluate(
@@ -135,13 +148,16 @@ def evaluate(
     return found
 
 
-def write_evaluation(field: LanguageField, embedder: Any, folder: Path, out: Path, listener: Listener) -> None:
-    """Prints the table and writes OUT/evaluation.json, with every pair."""
+def write_evaluation(
+    field: LanguageField, embedder: Any, folder: Path, out: Path, listener: Listener
+) -> dict[str, Any]:
+    """Prints the table and writes OUT/evaluation.json, with every pair; returns the table's figures."""
     found = evaluate(field, embedder, load_lerf_labels(folder), listener)
     say_table(found, listener)
     told = {kind: summary | {"rows": [pair(row) for row in rows]} for kind, (rows, summary) in found.items()}
     write_text(out / "evaluation.json", json.dumps(told, indent=2) + "\n")
     listener.say(f"all pairs  {out / 'evaluation.json'}")
+    return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in found.items()}
 
 
 def pair(row: Row) -> dict[str, Any]:

@@ -8,6 +8,17 @@ from jsecon.app.options import Folder, Options, SceneOptions
 
 
 @dataclasses.dataclass(frozen=True)
+class Output:
+    """What every verb takes."""
+
+    json: bool = False
+    """one JSON object on standard output at the end, {"error": ...} with name, found, expected and remedy where it went
+    wrong; all else on standard error"""
+    debug: bool = False
+    """the whole trace of an error"""
+
+
+@dataclasses.dataclass(frozen=True)
 class Demo:
     """make a room, build its field, query it and write a report
 
@@ -35,6 +46,9 @@ class Run(Options):
 
     out: Path
     """folder for the field, the report and the cache"""
+    dry_run: bool = False
+    """only say which stages would run, and about how many seconds, how much memory and disk each takes; writes
+    nothing"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,6 +62,9 @@ class Fit(SceneOptions):
 
     out: Annotated[Path, {"metavar": "FILE"}]
     """the .ply, .spz or .glb to write"""
+    dry_run: bool = False
+    """only say which stages would run, and about how many seconds, how much memory and disk each takes; writes
+    nothing"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -180,3 +197,27 @@ class Models:
     """tell what a model folder holds"""
     folder: Annotated[Path, {"positional": True, "metavar": "DIR"}]
     """folder with .onnx files"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Doctor:
+    """look whether this machine has what runs need
+
+    A line each: the backend's numbers, jax and its devices, cores, memory, disk, where compiled programs are kept,
+    models, and each extra with the command that installs it. Exit code 2 where something is wrong that every run needs.
+    """
+
+    models: Folder = None
+    """folder with .onnx files, or of such folders, to look into"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Completion:
+    """a script that completes jsecon's words in a shell
+
+    bash: jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon. zsh: > a folder of $fpath, as
+    _jsecon. fish: > ~/.config/fish/completions/jsecon.fish. Then open a new shell.
+    """
+
+    shell: Annotated[Literal["bash", "zsh", "fish"], {"positional": True, "metavar": "SHELL"}]
+    """bash, zsh or fish"""

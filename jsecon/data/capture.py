@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jsecon.data.colmap import find_model, read_colmap
-from jsecon.data.frames import Posed, Progress, assemble, check_options
+from jsecon.data.frames import Extent, Posed, Progress, assemble, check_options, extent_of
 from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.data.rgbd import find_rgbd
 from jsecon.errors import InputError
@@ -38,6 +38,14 @@ def load_capture(
     return assemble(
         _posed(Path(path)), downscale=downscale, long_side=long_side, frames=frames, holdout=holdout, progress=progress
     )
+
+
+def capture_extent(
+    path: str | Path, *, downscale: float | None = None, long_side: int | None = None, frames: int | None = None
+) -> Extent:
+    """How much `load_capture` would load; of the images, only the headers are read."""
+    check_options(downscale, frames, None, long_side)
+    return extent_of(_posed(Path(path)), downscale, long_side, frames)
 
 
 def _posed(path: Path) -> Posed:

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -177,6 +178,36 @@ def camera_jumps(poses: Float[np.ndarray, "t 4 4"], names: Sequence[str]) -> lis
     return [f"{told} Where the frames are one walk, poses there are wrong: look at them before you trust the fit."]
 
 
+class Extent(NamedTuple):
+    """How much a capture holds."""
+
+    frames: int
+    size: tuple[int, int]
+    """(width, height) of the frames, px"""
+    source: tuple[int, int]
+    """of most of the images"""
+    points: int
+
+
+def extent_of(posed: Posed, downscale: float | None, long_side: int | None, frames: int | None) -> Extent:
+    """What `assemble` would make of it; of the images, only the headers are read."""
+    source = _commonest([_true_lens(shot) for shot in posed.shots])
+    return Extent(
+        len(spread(len(posed.shots), frames)), shrunk(source, downscale, long_side), source, len(posed.points)
+    )
+
+
+def _commonest(lenses: Sequence[Lens]) -> tuple[int, int]:
+    return collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
+
+
+def shrunk(size: tuple[int, int], downscale: float | None, long_side: int | None) -> tuple[int, int]:
+    """(width, height) of the frames made of images of `size`, see `assemble`."""
+    if downscale is None:
+        downscale = max(max(size) / long_side, 1.0) if long_side is not None else 1.0
+    return max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale))
+
+
 def assemble(
     posed: Posed,
     *,
@@ -215,14 +246,11 @@ def assemble(
     if bent:
         notes.append(f"{bent} images were undistorted; masks and labels must be of the undistorted images.")
 
-    width, height = collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
+    width, height = _commonest(lenses)
     odd = sum((lens.width, lens.height) != (width, height) for lens in lenses)
     if odd:
         notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
-    if downscale is None and long_side is not None:
-        downscale = max(max(width, height) / long_side, 1.0)
-    if downscale is not None:
-        width, height = (max(1, round(size / downscale)) for size in (width, height))
+    width, height = shrunk((width, height), downscale, long_side)
     final = [pinholes[lens].resized(width, height) for lens in lenses]
 
     result = room_for((len(shots), height, width, 3))

@@ -83,9 +83,10 @@ def find_poses(
     The lens is COLMAP's OPENCV (two focal lengths, four coefficients), shared by all photographs whose EXIF names the
     same camera and focal length, or names none. images/ holds links to the photographs (copies where the system has no
     links). `work`: a folder where the steps keep what they have found, to be removed by the caller. `progress(done,
-    total)` counts photographs, then pairs, then photographs registered; `where` names the capture in errors. Seeds are
-    set, but COLMAP's threads add up in any order: another run may differ in the last digits. Raises InputError where
-    pycolmap is not installed, on too few, damaged or unequally large photographs, and where no model can be made.
+    total)` counts photographs, then pairs, then steps of placing them all or photographs registered; `where` names the
+    capture in errors. Seeds are set, but COLMAP's threads add up in any order: another run may differ in the last
+    digits. Raises InputError where pycolmap is not installed, on too few, damaged or unequally large photographs, and
+    where no model can be made.
     """
     if importlib.util.find_spec("pycolmap") is None:
         remedy = "Run: pip install 'jsecon[sfm]' (or give poses: sparse/0 of COLMAP, or transforms.json)."

@@ -25,6 +25,15 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_ENDINGS and path.is_file()
 
 
+def size_of(path: Path) -> tuple[int, int]:
+    """(width, height) of a video's frames, px, as its header says."""
+    reader = cv2.VideoCapture(os.fspath(path))
+    try:
+        return int(reader.get(cv2.CAP_PROP_FRAME_WIDTH)), int(reader.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    finally:
+        reader.release()
+
+
 def sharpest(sharpness: list[float], wanted: int) -> list[int]:
     """The number of the sharpest frame in each of at most `wanted` stretches of equal length."""
     edges = np.linspace(0, len(sharpness), min(wanted, len(sharpness)) + 1).round().astype(int)

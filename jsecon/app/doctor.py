@@ -1,0 +1,177 @@
+"""`jsecon doctor`: what of this machine a run needs, and whether it is there."""
+
+import dataclasses
+import importlib
+import importlib.util
+import os
+import platform
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+from jsecon.errors import InputError
+from jsecon.process import cores
+
+LEAST_MEMORY, LEAST_DISK = 2 << 30, 200 << 20
+"""bytes that `jsecon demo` takes, rounded up"""
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "sklearn",
+    "cv2",
+    "PIL",
+    "jaxtyping",
+    "optax",
+    "flax",
+    "onnxruntime",
+    "tokenizers",
+    "ftfy",
+    "tqdm",
+    "shtab",
+)
+EXTRAS = {
+    "sfm": (("pycolmap",), "poses of photographs and videos"),
+    "formats": (("gsply", "pillow_heif"), ".spz, .sog, HEIC photographs"),
+    "serve": (("starlette", "uvicorn"), "jsecon serve"),
+    "figures": (("matplotlib",), "figures of the experiments"),
+    "export": (("torch", "open_clip", "segment_anything", "sam2", "onnx"), "SAM, SAM 2 and CLIP from checkpoints"),
+}
+"""extra -> the modules that it installs, what it gives"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One line."""
+
+    name: str
+    status: Literal["ok", "missing", "wrong"]
+    told: str
+    remedy: str = ""
+    """what mends it, where every run needs it."""
+
+
+def checks_of(models: Path | None = None) -> list[Check]:
+    """All lines; `models`: a folder to look for models in. Raises InputError where there is no such folder."""
+    checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), _packages()]
+    checks += [*_backend(), _cores(), _memory(), _disk(), _programs(), *_models(models), *map(_extra, EXTRAS)]
+    return [*checks, Check("browser", "ok", "none is needed: pages open in any, Chromium is for the tests")]
+
+
+def wrong(checks: Iterable[Check]) -> list[InputError]:
+    """What every run needs and is not there."""
+    broken = [check for check in checks if check.remedy and check.status != "ok"]
+    return [InputError(check.name, check.told, "what every run needs", check.remedy) for check in broken]
+
+
+def _packages() -> Check:
+    broken = {}
+    for name in PACKAGES:
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # a broken wheel raises anything
+            broken[name] = f"{name} ({type(error).__name__}: {error})"
+    if not broken:
+        return Check("packages", "ok", f"{len(PACKAGES)} that jsecon is built on can be imported")
+    return Check("packages", "missing", ", ".join(broken.values()), 'Run: pip install --force-reinstall "jsecon"')
+
+
+def _backend() -> list[Check]:
+    """The devices of jax, and whether it computes right numbers."""
+    try:
+        import jax
+
+        from jsecon.backend import REMEDY, check_backend
+
+        kinds = [device.platform for device in jax.devices()]
+        devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
+    except Exception as error:  # whatever a driver or a wheel raises
+        told = f"{type(error).__name__}: {error}"
+        return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.12"')]
+    found = [Check("jax", "ok", f"{jax.__version__}, devices: {devices}")]
+    try:
+        report = check_backend()
+    except RuntimeError as error:
+        return [*found, Check("backend", "wrong", str(error), REMEDY)]
+    told = f"cosines right to {report.cosine_error:.0e}"
+    if report.has_jax_39103:
+        told += "; jax issue 39103 is present, in a form that jsecon avoids and your own code may not"
+    return [*found, Check("backend", "ok", told)]
+
+
+def _cores() -> Check:
+    quota = _limit("cpu.max", "cpu/cpu.cfs_quota_us")
+    period = (quota[1:] or _limit("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
+    told = f"{cores()} of {os.cpu_count()} may be used"
+    if quota and quota[0].isdecimal() and int(quota[0]) < cores() * int(period):
+        told += f", but the time of only {int(quota[0]) / int(period):.3g} (cgroup)"
+    return Check("cores", "ok", told)
+
+
+def _memory() -> Check:
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        free = 1024 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return Check("memory", "ok", "this system does not tell how much is free")
+    told, limit = f"{_size(free)} free", _limit("memory.max", "memory/memory.limit_in_bytes")
+    if limit and limit[0].isdecimal() and int(limit[0]) < 1 << 60:  # more is no limit
+        used = _limit("memory.current", "memory/memory.usage_in_bytes") or ["0"]
+        told, free = f"{told}, limit {_size(int(limit[0]))} (cgroup)", min(free, int(limit[0]) - int(used[0]))
+    enough = free >= LEAST_MEMORY
+    told += "" if enough else f"; jsecon demo takes {_size(LEAST_MEMORY)}"
+    return Check("memory", "ok" if enough else "wrong", told, "End other programs, or raise the limit.")
+
+
+def _limit(new: str, old: str) -> list[str]:
+    """The words of a file of this process's cgroup, of version 2 or else 1; none where there is none."""
+    try:
+        own = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
+    except (OSError, ValueError):
+        return []
+    kind, _, name = old.partition("/")
+    group = own.get(kind, "/").lstrip("/")
+    top, at = Path("/sys/fs/cgroup"), own.get("", "/").lstrip("/")
+    places = (top / at / new, top / new, top / kind / group / name, top / kind / name)
+    return next((path.read_text().split() for path in places if path.is_file()), [])
+
+
+def _disk() -> Check:
+    free, writable = shutil.disk_usage(".").free, os.access(".", os.W_OK)
+    told = f"{_size(free)} free in {Path.cwd()}{'' if writable else ', which cannot be written: give --out'}"
+    return Check("disk", "ok" if writable and free >= LEAST_DISK else "wrong", told)
+
+
+def _programs() -> Check:
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if folder is None:
+        return Check("programs", "missing", "no folder that can be written: every run compiles anew (set HOME)")
+    files = [file for file in Path(folder).rglob("*") if file.is_file()]
+    return Check("programs", "ok", f"{len(files)} compiled, {_size(sum(f.stat().st_size for f in files))} in {folder}")
+
+
+def _models(folder: Path | None) -> list[Check]:
+    if folder is None:
+        return [Check("models", "missing", "no folder given (--models DIR): without CLIP, texts name colours")]
+    from jsecon.app.models import examine
+
+    found = [examine(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
+    usable = {use.model: use.told for findings in reversed(found) for use in findings.uses if use.usable}
+    missing = "none in {}: jsecon models check says what is missing"
+    return [
+        Check(use.model, "ok", usable[use.model])
+        if use.model in usable
+        else Check(use.model, "missing", missing.format(folder))
+        for use in found[0].uses
+    ]
+
+
+def _extra(name: str) -> Check:
+    modules, gives = EXTRAS[name]
+    absent = [module for module in modules if importlib.util.find_spec(module) is None]
+    told = f'{gives}: pip install "jsecon[{name}]" ({", ".join(absent)})' if absent else gives
+    return Check(name, "missing" if absent else "ok", told)
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:.1f} GiB" if count >= 1 << 30 else f"{count / 2**20:.0f} MiB"

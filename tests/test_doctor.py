@@ -1,0 +1,75 @@
+"""`jsecon doctor`: a line for each thing that runs need."""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import jax
+import pytest
+from clip_files import write_clip
+
+from jsecon import backend
+from jsecon.app import command_line, doctor
+from jsecon.errors import InputError
+
+PROJECT = tomllib.loads((Path(__file__).resolve().parent.parent / "pyproject.toml").read_text())["project"]
+
+
+def _lines(capsys, *options):
+    code = command_line.main(["doctor", *map(str, options)])
+    out = capsys.readouterr().out
+    return code, {line[9:19].strip(): (line[:8].strip(), line[20:]) for line in out.splitlines()}
+
+
+def test_it_tells_what_is_here_and_what_is_not(tmp_path, capsys, monkeypatch):
+    write_clip(tmp_path / "clip", "immich")
+    monkeypatch.setitem(doctor.EXTRAS, "sfm", (("no_such_module",), "poses"))
+    code, lines = _lines(capsys, "--models", tmp_path)
+    assert code == 0
+    assert {status for status, _ in lines.values()} <= {"ok", "missing", "wrong"}
+    assert jax.__version__ in lines["jax"][1]
+    assert lines["jax"][1].endswith(f"{len(jax.devices())} cpu")
+    assert lines["backend"][0] == "ok"
+    assert lines["CLIP"] == ("ok", lines["CLIP"][1])
+    assert "--embedder" in lines["CLIP"][1]
+    assert lines["SAM"][0] == "missing"
+    assert lines["sfm"] == ("missing", 'poses: pip install "jsecon[sfm]" (no_such_module)')
+    assert re.match(r"\d+(\.\d)? [GM]iB free", lines["memory"][1])
+
+
+def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "LEAST_MEMORY", 1 << 60)
+
+    def wrong():
+        raise RuntimeError("cosines are off")
+
+    monkeypatch.setattr(backend, "check_backend", wrong)
+    assert command_line.main(["doctor", "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert {check["name"]: check["status"] for check in told["checks"]}["backend"] == "wrong"
+    assert [error["name"] for error in told["refused"]] == ["backend", "memory"]
+    assert told["refused"][0]["remedy"] == backend.REMEDY
+    with pytest.raises(InputError, match="no such folder"):
+        doctor.checks_of(Path("nowhere"))
+
+
+def test_a_package_that_cannot_be_imported(monkeypatch):
+    monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "no_such_module"))
+    check = doctor._packages()
+    assert check.status == "missing"
+    assert "no_such_module (ModuleNotFoundError" in check.told
+    assert [error.where for error in doctor.wrong([check])] == ["packages"]
+
+
+def test_it_knows_the_packages_and_extras_of_the_project():
+    assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev"}
+    assert len(doctor.PACKAGES) == len(PROJECT["dependencies"]) - 1  # jax has a line of its own
+
+
+def test_limits_of_a_cgroup_are_told(monkeypatch):
+    files = {"memory.max": ["1073741824"], "memory.current": ["1000"], "cpu.max": ["50000", "100000"]}
+    monkeypatch.setattr(doctor, "_limit", lambda new, old: files.get(new, []))
+    memory, cores = doctor._memory(), doctor._cores()
+    assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.told) == ("wrong", True)
+    assert "the time of only 0.5 (cgroup)" in cores.told

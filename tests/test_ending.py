@@ -1,0 +1,78 @@
+"""How a verb ends: words on standard error or one JSON object on standard output, and the exit code."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from jsecon.app import command_line
+from jsecon.app.ending import ended
+from jsecon.app.verbs import Output
+from jsecon.errors import InputError
+
+ERROR = {"name": "mug.png", "found": "text", "expected": "a picture", "remedy": "Draw one."}
+
+
+def _errors():
+    return [InputError("cup.png", "nothing", "a picture", "Draw it."), InputError(*ERROR.values())]
+
+
+def test_figures_and_paths_are_one_object(capsys):
+    assert ended(Output(json=True), {"written": {"field": Path("out/field.npz")}, "gaussians": 3}) == 0
+    assert json.loads(capsys.readouterr().out) == {"written": {"field": "out/field.npz"}, "gaussians": 3}
+    assert ended(Output(), {"gaussians": 3}) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_what_was_refused_is_told_beside_what_was_not(capsys):
+    assert ended(Output(json=True), {"answers": [1], "refused": _errors()}) == 2
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    assert told["error"] == told["refused"][1] == ERROR
+    assert (told["refused"][0]["name"], told["answers"], err) == ("cup.png", [1], "")
+    assert ended(Output(), {"refused": _errors()}) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert [line.split(":")[1] for line in err.splitlines()] == [" cup.png", " mug.png"]
+
+
+@pytest.mark.parametrize(
+    "line", [["run", "--json"], ["fly", "--json"], ["query", "f", "x", "--threshold", "a", "--json"]]
+)
+def test_wrong_usage_is_an_error_object_too(capsys, line):
+    assert command_line.main(line) == 2
+    out, err = capsys.readouterr()
+    assert json.loads(out)["error"]["found"].startswith("wrong usage")
+    assert err.startswith("usage: jsecon")
+
+
+def test_debug_shows_where_an_error_came_from(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_TRACEBACK_FILTERING", "auto")  # what the user has set stays
+    line = ["eval", str(tmp_path / "none.npz"), "--labels", str(tmp_path), "--out", str(tmp_path)]
+    assert command_line.main(line) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert command_line.main([*line, "--debug"]) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert "in load_field" in err
+    assert err.splitlines()[-1].startswith("jsecon: ")
+    assert os.environ["JAX_TRACEBACK_FILTERING"] == "auto"
+    monkeypatch.delenv("JAX_TRACEBACK_FILTERING")
+    assert command_line.main([*line, "--debug"]) == 2
+    assert os.environ["JAX_TRACEBACK_FILTERING"] == "off"
+
+
+def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monkeypatch, capsys):
+    def fails(error):
+        def act(asked, console):
+            raise error
+
+        monkeypatch.setitem(command_line._VERBS, "models", (act, command_line.Models))
+        return command_line.main(["models", "check", str(tmp_path), "--json"])
+
+    assert fails(KeyboardInterrupt()) == 130
+    assert json.loads(capsys.readouterr().out)["error"]["found"] == "a stop by the user"
+    with pytest.raises(ZeroDivisionError):
+        fails(ZeroDivisionError("a bug"))
+    assert json.loads(capsys.readouterr().out)["error"]["found"] == "ZeroDivisionError: a bug"
