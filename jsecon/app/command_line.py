@@ -52,7 +52,6 @@ examples
   jsecon run my_capture --out my_field --segmenter sam --embedder clip
                                                         with SAM and CLIP from model folders
   jsecon models check clip                              what a model folder holds and lacks
-  jsecon run my_capture --out my_field --dry-run        what would run, for how long
 
 A run that is stopped goes on where it stopped when the same command is given again.
 """
@@ -84,11 +83,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         found, remedy = f"{type(error).__name__}: {error}", "Report it with the trace on standard error."
         ended(output, {"error": InputError("jsecon", found, "no such error: it is a bug", remedy)})
         raise
-    then = told.pop("then", None)
+    then = told.pop("then", lambda: None)
     code = ended(output, told)
-    with contextlib.suppress(KeyboardInterrupt):  # which is how a server ends
-        if then is not None:
-            then()
+    with contextlib.suppress(KeyboardInterrupt):  # so a server ends
+        then()
     return code
 
 
@@ -219,8 +217,8 @@ def _view(asked: View, console: Console) -> Told:
     console.say(
         f"{(count := field.gaussians.count)} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {asked.export}"
     )
-    figures = {"gaussians": count, "answers": [answer.question for answer in answers], "bytes": size}
-    return {"written": {"page": asked.export}, "refused": refused} | figures
+    lit = [answer.question for answer in answers]
+    return {"written": {"page": asked.export}, "refused": refused, "gaussians": count, "answers": lit, "bytes": size}
 
 
 def _eval(asked: Eval, console: Console) -> Told:
@@ -230,8 +228,7 @@ def _eval(asked: Eval, console: Console) -> Told:
         from jsecon.app.summary import write_evaluation
         from jsecon.language.field import load_field
 
-        field = load_field(asked.field)
-        embedder = _embedder(field, asked)
+        embedder = _embedder(field := load_field(asked.field), asked)
     return write_evaluation(field, embedder, asked.labels, out, console)
 
 
@@ -264,8 +261,7 @@ def _doctor(asked: Doctor, console: Console) -> Told:
         from jsecon.app.doctor import checks_of, wrong
 
         checks = checks_of(asked.models)
-    for check in checks:
-        console.say(f"{check.status:<8} {check.name:<10} {check.told}")
+    console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.told}" for check in checks))
     return {"checks": checks, "refused": wrong(checks)}
 
 
