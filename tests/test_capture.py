@@ -9,7 +9,8 @@ from scipy.optimize import linprog
 
 from jsecon.data.capture import check_views_overlap, load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.frames import camera_jumps, held_out, spread
+from jsecon.data.frames import held_out, spread
+from jsecon.data.poses import camera_jumps
 from jsecon.types import Camera
 
 CAPTURE = small_capture()

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.frames import Posed, Shot, inverse_pose, rigid
+from jsecon.data.frames import Posed, Shot
 from jsecon.data.images import IMAGE_ENDINGS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
+from jsecon.data.poses import inverse_pose, rigid
 from jsecon.errors import InputError
 from jsecon.files import read_json
 from jsecon.numerics import sane

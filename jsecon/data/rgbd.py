@@ -16,9 +16,10 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.frames import Posed, Shot, inverse_pose
+from jsecon.data.frames import Posed, Shot
 from jsecon.data.images import image_size
 from jsecon.data.lens import Lens
+from jsecon.data.poses import inverse_pose
 from jsecon.errors import InputError
 from jsecon.files import UNREADABLE
 
