@@ -1,6 +1,8 @@
 """The package's manners: its names, its laziness, and what the program sets before jax starts."""
 
 import ast
+import builtins
+import dis
 import importlib
 import os
 import subprocess
@@ -22,6 +24,24 @@ def test_every_public_name_can_be_had_and_none_is_hidden_by_a_room():
     for name in jsecon.__all__:
         assert callable(getattr(jsecon, name)), name
         assert name in dir(jsecon)
+
+
+def globals_read(code):
+    """The global names that a code object and those within it read."""
+    yield from (step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL")
+    for inner in code.co_consts:
+        if hasattr(inner, "co_code"):
+            yield from globals_read(inner)
+
+
+def test_no_module_reads_a_name_that_it_does_not_have():
+    """Checkers are told to pass over undefined names, as jaxtyping's sizes look like some."""
+    for path in PACKAGE.rglob("*.py"):
+        name = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+        if path.stem != "__main__":
+            has = {*vars(importlib.import_module(name)), *vars(builtins)}
+            missing = set(globals_read(compile(path.read_text(), str(path), "exec"))) - has
+            assert not missing, f"{path.relative_to(PACKAGE)} reads {sorted(missing)}"
 
 
 def test_names_that_outside_code_relies_on_are_there():

@@ -22,6 +22,7 @@ from jsecon.data.images import image_size, read_depth, read_image
 from jsecon.data.lens import Lens, seen_through, undistorted, undistortion_maps
 from jsecon.data.poses import camera_jumps, rigid
 from jsecon.errors import InputError
+from jsecon.numerics import sane
 from jsecon.types import Camera, Capture
 
 Progress = Callable[[int, int], None] | None
