@@ -15,13 +15,16 @@ from clip_files import fixture as clip_tokens, vocabulary, write_clip, write_tok
 from PIL import Image
 from sam2_files import write_sam2
 from sam_files import write_sam
+from splat_files import compressed_ply, scene, sog, splat, spz
 from test_proposal_files import records
+from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from jsecon.app import cache, question
 from jsecon.data import images, mask_files, motion, proposal_files, video
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
+from jsecon.data.gaussian_files import load_gaussians
 from jsecon.data.langsplat_files import feature_size, load_features
 from jsecon.data.lerf_labels import load_lerf_labels
 from jsecon.data.ply import load_ply, load_points_ply, save_ply
@@ -109,6 +112,16 @@ def ply(folder: Path) -> Iterator[Case]:
     files += [_write_ply(folder / f"{form}.ply", columns, form, face) for form in ("ascii", "binary_big_endian")]
     for file in files:
         yield Case([file], lambda file=file: load_ply(file), _whole_gaussians)
+
+
+def splats(folder: Path) -> Iterator[Case]:
+    """Gaussians as viewers and phones keep them."""
+    arrays = scene(300)
+    made = {"c.ply": compressed_ply(arrays), "s.splat": splat(arrays), "s.sog": sog(arrays)}
+    made |= {f"v{version}.spz": spz(arrays, version) for version in (2, 3)}
+    for name, data in made.items():
+        (folder / name).write_bytes(data)
+        yield Case([folder / name], lambda file=folder / name: load_gaussians(file), _whole_gaussians)
 
 
 def _whole_points(found: tuple[np.ndarray, np.ndarray]) -> None:
@@ -224,6 +237,14 @@ def nerfstudio(folder: Path) -> Iterator[Case]:
         write_transforms(capture, folder / name, content)
         files = [files[0]] * 6 + files[1:]
         yield Case(files, lambda name=name: load_capture(folder / name), _whole_capture)
+
+
+def rgbd(folder: Path) -> Iterator[Case]:
+    """Folders of depth cameras and phones; their numbers alone, as pictures have a reader of their own."""
+    for name, write in RGBD.items():
+        write(folder / name)
+        files = [file for file in (folder / name).rglob("*") if file.suffix in (".txt", ".json", ".traj", ".pincam")]
+        yield Case(sorted(files), lambda name=name: load_capture(folder / name), _whole_capture)
 
 
 def image(folder: Path) -> Iterator[Case]:
@@ -620,7 +641,22 @@ def videos(folder: Path) -> Iterator[Case]:
 READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
     own.__name__: own
     for own in (
-        *(ply, points, colmap, colmap_text, nerfstudio, image, masks, langsplat, proposals, labels, field, kept),
+        *(
+            ply,
+            splats,
+            points,
+            colmap,
+            colmap_text,
+            nerfstudio,
+            rgbd,
+            image,
+            masks,
+            langsplat,
+            proposals,
+            labels,
+            field,
+            kept,
+        ),
         *(tokenizer, clip, sam, sam2, videos),
     )
 }

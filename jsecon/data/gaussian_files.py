@@ -4,7 +4,6 @@ SuperSplat's compressed .ply, .spz and .sog are read, and .spz is written, by gs
 """
 
 import importlib.util
-import json
 import math
 import zipfile
 from pathlib import Path
@@ -18,7 +17,7 @@ from jsecon.data.gltf import save_glb
 from jsecon.data.ply import SH_DC, load_ply, save_ply, sound
 from jsecon.data.ply_file import opened
 from jsecon.errors import InputError
-from jsecon.files import written_whole
+from jsecon.files import parsed_json, written_whole
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Array, Gaussians
 
@@ -110,7 +109,7 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
             raise InputError(path, f"a compressed .ply of {found}", f"a chunk for every {_CHUNK}", remedy)
     try:
         if kind == ".sog":
-            told = json.loads(zipfile.ZipFile(path).read("meta.json")).values()
+            told = parsed_json(zipfile.ZipFile(path).read("meta.json")).values()
             if any(len(part.get("codebook", [0] * 256)) < 256 for part in told if isinstance(part, dict)):
                 raise ValueError("a codebook of fewer than 256 numbers")
         data: Any = getattr(gsply, _GSPLY[kind])(path)

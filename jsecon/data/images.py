@@ -40,8 +40,8 @@ def _unreadable(path: Path, found: str) -> InputError:
 def _read_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise _unreadable(path, error.strerror or "an error on reading") from error
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        raise _unreadable(path, getattr(error, "strerror", None) or str(error)) from error
     if not data:
         raise _unreadable(path, "an empty file")
     return data

@@ -6,7 +6,6 @@ polycam_utils.py and record3d_utils.py. Each keeps its own world; phones look al
 
 import contextlib
 import dataclasses
-import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,11 +16,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from jsecon.data.frames import Posed, Shot
-from jsecon.data.images import image_size
+from jsecon.data.images import MOST_PIXELS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.poses import inverse_pose
 from jsecon.errors import InputError
-from jsecon.files import UNREADABLE
+from jsecon.files import UNREADABLE, parsed_json
 
 _TUM = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
@@ -39,7 +38,14 @@ def find_rgbd(path: Path) -> Callable[[Path], Posed] | None:
     """What reads the folder, where it is one of these. It raises InputError on what is damaged, and leaves out frames
     without a pose, which it tells in the notes."""
     fits = lambda marks: all((path / mark).exists() for mark in marks)
-    return next((read for marks, read in _FOLDERS.items() if fits(marks)), None)
+    found = next((read for marks, read in _FOLDERS.items() if fits(marks)), None)
+
+    def read(path: Path) -> Posed:
+        assert found is not None
+        with _reading(path), np.errstate(invalid="ignore", over="ignore"):
+            return found(path)
+
+    return read if found is not None else None
 
 
 @contextlib.contextmanager
@@ -75,6 +81,14 @@ def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), translation
     return pose
+
+
+def _lens(width: float, height: float, *numbers: float) -> Lens:
+    """Raises ValueError for a frame without pixels."""
+    if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS):
+        raise ValueError(f"a frame of {width}x{height}")
+    fx, fy, cx, cy = map(float, numbers)
+    return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
 def _shot(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> Shot:
@@ -153,7 +167,7 @@ def _arkitscenes(path: Path) -> Posed:
             width, height, *numbers = _rows(lenses[image.stem], 6)[0]
             pose = _matrix(Rotation.from_rotvec(rows[own, 1:4]), rows[own, 4:])  # from the world
             depth = path / "lowres_depth" / image.name
-            shots.append(_shot(image, Lens(int(width), int(height), *numbers), np.linalg.inv(pose), depth))
+            shots.append(_shot(image, _lens(width, height, *numbers), np.linalg.inv(pose), depth))
     return _posed(path, shots, len(images))
 
 
@@ -165,8 +179,8 @@ def _polycam(path: Path) -> Posed:
         file = frames / f"{kind}cameras" / f"{image.stem}.json"
         if file.is_file():
             with _reading(file):
-                told = json.loads(file.read_text())
-                lens = Lens(*(told[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
+                told = parsed_json(file.read_bytes())
+                lens = _lens(*(told[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
                 pose = np.array([[told[f"t_{i}{j}"] for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]], np.float64)
             shots.append(_shot(image, lens, pose @ _PHONE, frames / "depth" / f"{image.stem}.png"))
     return _posed(path, shots, len(images))
@@ -175,7 +189,7 @@ def _polycam(path: Path) -> Posed:
 def _record3d(path: Path) -> Posed:
     images, file, shots = _images(path / "rgb"), path / "metadata.json", []
     with _reading(file):
-        told = json.loads(file.read_text())
+        told = parsed_json(file.read_bytes())
         k = told["K"]  # by columns
         numbers = told.get("perFrameIntrinsicCoeffs") or [(k[0], k[4], k[6], k[7])] * len(told["poses"])
         poses = np.array(told["poses"], np.float64).reshape(-1, 7)
@@ -183,7 +197,7 @@ def _record3d(path: Path) -> Posed:
             n = int(image.stem)
             if n < len(poses):
                 pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE
-                shots.append(_shot(image, Lens(told["w"], told["h"], *numbers[n]), pose))
+                shots.append(_shot(image, _lens(told["w"], told["h"], *numbers[n]), pose))
     return _posed(path, shots, len(images), "Record3D's depth was not read: it has a compression of its own.")
 
 
