@@ -23,7 +23,7 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import State, tracked
-from jsecon.app.demo import demo
+from jsecon.app.demo import PLAIN, demo
 from jsecon.app.progress import Listener
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
@@ -51,7 +51,7 @@ QUICK = Options(
     latent=8,
     out=str(results.HOME / "results" / "ablations_quick"),
 )
-QUICK_ROOM = {"views": 12, "width": 160, "height": 120, "points": 1200}
+QUICK_ROOM = PLAIN | {"views": 12, "width": 160, "height": 120, "points": 1200}
 
 
 @dataclasses.dataclass(frozen=True)

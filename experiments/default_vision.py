@@ -35,7 +35,7 @@ from scipy.spatial import cKDTree
 from experiments import replica_apartment_0, results
 from experiments.cells import append_cell, read_cells
 from jsecon.app import cache
-from jsecon.app.demo import demo
+from jsecon.app.demo import PLAIN, demo
 from jsecon.app.masklet_stages import associated, proposals_of
 from jsecon.app.options import Options as RunOptions
 from jsecon.app.progress import Listener
@@ -187,9 +187,9 @@ def connected_parts(capture: Capture, ids: np.ndarray, *, voxel: float = 0.1, le
 
 
 def demo_room(folder: Path, seed: int) -> Scene:
-    """The room of `seed` as `jsecon demo` leaves it."""
+    """The room of `seed` as `demo` with PLAIN leaves it."""
     if not (folder / "field.npz").exists():
-        demo(folder, seed=seed, steps=Demo.steps, listener=Listener())
+        demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
     capture = load_capture(folder / "capture", holdout=8)
     files = [folder / "capture" / "masks" / f"{name}.png" for name in capture.names]
     truth = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.int32) - 1

@@ -2,7 +2,7 @@
 
     python -m experiments.places [ROOMS] [--seeds 0 1 2 3 4]
 
-ROOMS holds a folder <seed> for each room, as `jsecon demo --seed SEED --out ROOMS/SEED` leaves it, made where it is
+ROOMS holds a folder <seed> for each room, as `demo` with PLAIN leaves it, made where it is
 missing. Every thing is asked for by its name. The true box is that of all its surface that any of the 30 views shows,
 by ray casting.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import results
-from jsecon.app.demo import demo
+from jsecon.app.demo import PLAIN, demo
 from jsecon.app.networks import embedder_of_field
 from jsecon.app.place import locate
 from jsecon.app.progress import Listener
@@ -66,7 +66,7 @@ def fields_of(options: Options) -> Iterator[tuple[int, Path, LanguageField]]:
     for seed in options.seeds:
         folder = Path(options.rooms) / str(seed)
         if not (folder / "field.npz").exists():
-            demo(folder, seed=seed, steps=Demo.steps, listener=Listener())
+            demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
         yield seed, folder, load_field(folder / "field.npz")
 
 

@@ -1,5 +1,6 @@
 """The table of contents: what `jsecon` holds, and where each name lives."""
 
+from jsecon.app.notebook import show as show, to_html as to_html, to_png as to_png
 from jsecon.app.place import Place as Place, locate as locate
 from jsecon.association.algorithm1 import masklets as masklets
 from jsecon.backend import check_backend as check_backend

@@ -35,6 +35,20 @@ def record(cls):
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
 
 
+class _Shown:
+    """What a notebook shows as a picture and a line: they are drawn when it asks for them, by `jsecon.to_html`."""
+
+    def _repr_html_(self) -> str:
+        import jsecon
+
+        return jsecon.to_html(self)
+
+    def _repr_png_(self) -> bytes:
+        import jsecon
+
+        return jsecon.to_png(self)
+
+
 @record
 class Gaussians:
     """A scene of N anisotropic 3D Gaussians (Kerbl et al. 2023), stored before their activations."""
@@ -86,7 +100,7 @@ class Camera:
 
 
 @record
-class Capture:
+class Capture(_Shown):
     """A posed set of frames, as every loader returns it. Arrays are NumPy on the host."""
 
     frames: Array
@@ -204,7 +218,7 @@ class Parts:
 
 
 @record
-class LanguageField:
+class LanguageField(_Shown):
     """Everything a query needs, in one file: the scene, its codes and votes, its regions, and where they came from."""
 
     gaussians: Gaussians
@@ -233,7 +247,7 @@ class LanguageField:
 
 
 @record
-class Selection:
+class Selection(_Shown):
     """The answer to one query."""
 
     mask: Array

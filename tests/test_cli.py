@@ -156,7 +156,7 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
     assert _run("eval", out / "field.npz", "--labels", room / "label", "--out", tmp_path) == 0
     told = capsys.readouterr().out
     found = json.loads((tmp_path / "evaluation.json").read_text())
-    assert set(found) == {"anchored", "anchored_code", "one_step", "canonical"}
+    assert set(found) == {"anchored", "silhouette", "all", "anchored_code", "one_step", "canonical"}
     for kind, summary in found.items():
         assert kind in told
         assert len(summary["rows"]) == summary["pairs"] > 0

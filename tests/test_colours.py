@@ -143,6 +143,12 @@ def test_wrong_mask_shapes_are_refused(embedder):
         embedder.embed_regions(np.zeros((4, 5, 3), np.uint8), np.zeros((1, 5, 4), bool))
 
 
+def test_a_mask_of_two_unlike_pixels_has_an_embedding(embedder):
+    frame = np.array([[(200, 30, 30), (90, 10, 10), (0, 0, 0)]], np.uint8)
+    found = embedder.embed_regions(frame, np.array([[[True, True, False]]]))[0]
+    assert np.linalg.norm(found) == pytest.approx(1, abs=1e-5)
+
+
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 def test_equivariance_and_exposure(seed):

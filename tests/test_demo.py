@@ -1,12 +1,15 @@
 """`jsecon demo`, whole, on a room as small as it can be: what it writes, and that a second call finds it all done."""
 
 import json
+import re
 import time
 
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from jsecon.app import demo, pictures, pipeline
+from jsecon.app import demo, film as film_of, pictures, pipeline
 from jsecon.app.progress import Listener
 from jsecon.data.ply import load_ply
 from jsecon.language.field import load_field
@@ -30,14 +33,17 @@ class Ears(Listener):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out, ears, began = tmp_path_factory.mktemp("demo"), Ears(), time.monotonic()
-    metrics = demo.demo(out, steps=150, listener=ears, room=ROOM)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film_of, "SECONDS", 2)
+        metrics = demo.demo(out, steps=150, listener=ears, room=ROOM)
+    assert any("jsecon view" in line for line in ears.said)
     return metrics, out, time.monotonic() - began
 
 
 def test_metrics_have_every_figure_that_is_promised(finished):
     metrics, out, seconds = finished
     assert json.loads((out / "metrics.json").read_text()) == metrics
-    for kind in ("anchored", "one_step", "true_masks"):
+    for kind in ("anchored", "silhouette", "all", "anchored_code", "one_step", "canonical", "true_masks"):
         assert set(metrics[kind]) >= {"miou", "macc", "loc_acc"}
         assert all(0 <= metrics[kind][name] <= 1 for name in ("miou", "macc", "loc_acc"))
     assert metrics["true_masks"]["miou"] > 0.25  # a tiny room and a short fit: far from the figures and from chance
@@ -82,12 +88,26 @@ def test_the_report_shows_every_query_and_stands_alone(finished):
     page = (out / "report.html").read_text()
     for path in (out / "queries").glob("*.json"):
         assert json.loads(path.read_text())["query"] in page
-    for words in ("true masks given", "Seconds of each stage", "left out", "Held-out frames", "mAcc@0.25"):
+    for words in ("true masks given", "Seconds of each stage", "left out", "Held-out frames", "mAcc@0.25", "Settings"):
         assert words in page
+    assert page.count('class="pair"') == len(list((out / "queries").glob("*.json")))
+    assert page.count('class="wide"') > 3  # masklets through the frames
+    assert re.search(r"<td>gaussians</td>.*?<td>\d+ \(\d+\)</td>", page)  # programs compiled
     assert "http" not in page
 
 
-def test_a_second_call_finds_it_all_done(finished):
+def test_the_pictures_show_the_room_and_turn_around_it(finished):
+    _, out, _ = finished
+    image = cv2.imread(str(out / "demo.jpg"))
+    assert image.shape == (120 + 26, 4 * 160 + 3 * 6, 3)
+    with Image.open(out / "demo.webp") as film:
+        assert film.n_frames == 2 * film_of.PER_SECOND
+        assert film.size == (320, 240)
+    assert (out / "demo.webp").stat().st_size < 2 * 2**20
+
+
+def test_a_second_call_finds_it_all_done(finished, monkeypatch):
+    monkeypatch.setattr(film_of, "SECONDS", 2)
     metrics, out, _ = finished
     before, ears = (out / "field.npz").read_bytes(), Ears()
     again = demo.demo(out, steps=150, listener=ears, room=ROOM)

@@ -1,7 +1,11 @@
 """The page and its pictures: self-contained, escaped, colours that stay the same from view to view."""
 
 import base64
+import html
+import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 
 import cv2
@@ -11,9 +15,11 @@ import pytest
 from jsecon.app import pictures, report
 from jsecon.app.progress import Step
 
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
 
 class _Reader(HTMLParser):
-    VOID = ("meta", "img")
+    VOID = ("meta", "img", "input", "br")
 
     def __init__(self):
         super().__init__()
@@ -45,7 +51,14 @@ def page():
                 "Frames", "words", report.grid([report.figure(_image(), "<b>x</b>", strong="IoU 0.5", sharp=True)], 2)
             ),
             report.section("Plan", "", report.steps([Step("photometric fit", "left out", "a .ply is given")])),
-            report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0})),
+            report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0}, {"fit": "12 <b>programs</b>"})),
+            report.section(
+                "Answers", "", report.grid([report.pair(_image(), _image(1), "mask", strong="<i>mug</i>")], 1)
+            ),
+            report.wide(_image(), "in 3 of 4 frames", strong="region 7"),
+            report.film(b"RIFF", "a film"),
+            report.shades(["text", "votes", "code"], [("red <mug>", [0.5, None]), ("mean", [1.0, 0.0])]),
+            report.folded("the others & more", report.table(["c"], [["d"]])),
             report.table(["a", "b"], [[1, "<script>"]]),
             report.preformatted("{}"),
         ],
@@ -57,13 +70,18 @@ def test_the_page_is_well_formed_and_holds_all_it_shows(page):
     reader.feed(page)
     assert reader.open == []
     assert not re.search(r"href|url\(|@import|https?:", re.sub(r"base64,[^\"]*", "", page))
-    assert "script" not in reader.seen
+    assert reader.seen.count("script") == 1
     assert all(image["src"].startswith("data:image/") and image["alt"] for image in reader.images)
 
 
 def test_words_from_outside_are_escaped(page):
     assert "A &lt;title&gt; &amp; more" in page
-    assert "<script>" not in page
+    assert page.count("<script>") == 1
+    assert "&lt;script&gt;" in page
+    assert "red &lt;mug&gt;" in page
+    assert "&lt;i&gt;mug&lt;/i&gt;" in page
+    assert "12 &lt;b&gt;programs&lt;/b&gt;" in page
+    assert "the others &amp; more" in page
     assert "&lt;b&gt;x&lt;/b&gt;" in page
 
 
@@ -81,6 +99,50 @@ def test_pictures_inside_the_page_are_the_pictures_given(sharp):
     )
     assert kind == ("data:image/png;base64" if sharp else "data:image/jpeg;base64")
     assert np.abs(back.astype(int) - image).mean() <= (0 if sharp else 25)
+
+
+def test_a_shade_is_as_deep_as_its_value(page):
+    assert re.findall(r'--v:(\d+)%">([\d.]+)<', page) == [("50", "0.50"), ("100", "1.00"), ("0", "0.00")]
+    assert "<td></td></tr>" in page  # what was not measured
+
+
+PILOT = """
+<script>
+const found = {};
+const side = selector => document.querySelector(selector).getBoundingClientRect();
+const wait = ms => new Promise(done => setTimeout(done, ms));
+(async () => {
+  await wait(100);
+  document.querySelector(".grid figure > img").click();
+  found.enlarged = [large.open, large.firstChild.src === document.querySelector(".grid figure > img").src];
+  large.firstChild.click(); found.closed = large.open;
+  const input = document.querySelector(".pair input");
+  const cut = () => getComputedStyle(document.querySelector(".pair .after")).clipPath;
+  found.half = cut(); input.value = 80; input.dispatchEvent(new Event("input", { bubbles: true })); found.moved = cut();
+  found.covers = [side(".pair input").width, side(".pair .after").width];
+  found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+  found.requests = performance.getEntriesByType("resource").filter(e => !e.name.startsWith("data:")).length;
+  const out = document.createElement("pre"); out.id = "found"; out.textContent = JSON.stringify(found);
+  document.body.append(out);
+})();
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
+def test_in_a_browser_pictures_are_enlarged_and_the_slider_moves(page, tmp_path):
+    file = tmp_path / "page.html"
+    file.write_text(page.replace("</body>", PILOT))
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}"]
+    options += ["--window-size=500,800", "--virtual-time-budget=5000", "--dump-dom", f"file://{file}"]
+    told = subprocess.run([BROWSER, *options], capture_output=True, text=True, timeout=120)
+    found = json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', told.stdout, re.S).group(1)))
+    assert found["enlarged"] == [True, True]
+    assert found["closed"] is False
+    assert "25%" in found["half"]
+    assert "80%" in found["moved"]
+    assert found["covers"][0] == pytest.approx(found["covers"][1])
+    assert found["overflow"] <= 0  # nothing makes a narrow page scroll sideways
+    assert found["requests"] == 0
 
 
 def test_bars_are_as_long_as_their_seconds():
@@ -104,6 +166,34 @@ def test_labels_are_drawn_in_their_colours_and_unlabelled_pixels_stay_grey():
     inside, outside = image[8:16, 8:16].reshape(-1, 3).astype(float), image[:, 24:].reshape(-1, 3)
     assert (outside.max(1) == outside.min(1)).all()
     assert np.corrcoef(inside.mean(0), pictures.palette(4)[3])[0, 1] > 0.99
+
+
+def test_answers_keep_their_colours_and_those_that_leave_no_room_stay_dark():
+    masks = {name: np.zeros((60, 150), bool) for name in ("red mug", "blue cup", "nothing", "on the mug")}
+    masks["red mug"][20:40, 5:50] = masks["blue cup"][25:50, 100:140] = masks["on the mug"][10:20, 20:29] = True
+    frame = np.full((60, 150, 3), (200, 100, 0), np.uint8)
+    image = pictures.answers_overlay(frame, masks)
+    np.testing.assert_array_equal(image[[30, 47], [27, 120]], [(200, 100, 0)] * 2)
+    np.testing.assert_array_equal(image[57, 1], [35] * 3)
+    without = pictures.answers_overlay(frame, {name: masks[name] for name in ("red mug", "blue cup")})
+    np.testing.assert_array_equal(image, without)
+    assert (image[:, :60] > 210).any()  # names
+    assert (image[:, 90:] > 210).any()
+
+
+def test_a_region_is_cut_out_of_each_frame_and_missing_where_it_is_not_seen():
+    frames = np.zeros((3, 60, 80, 3), np.uint8)
+    labels = np.full((3, 60, 80), -1)
+    labels[0, 10:20, 10:30] = labels[2, 30:50, 40:80] = 4
+    frames[labels == 4] = (0, 200, 0)
+    strip = pictures.followed(frames, labels, 4, side=48)
+    assert strip.shape == (48, 3 * 48 + 2 * 3, 3)
+    tiles = [strip[:, k * 51 : k * 51 + 48] for k in range(3)]
+    assert (tiles[1] == 40).all()
+    for tile in (tiles[0], tiles[2]):
+        assert tile[24, 24, 1] > 150
+        assert tile[24, 24, 0] < 60
+        assert 0.1 < (tile[..., 1] > 150).mean() < 0.6
 
 
 def test_a_selection_is_brighter_than_what_it_leaves_and_the_truth_is_outlined():

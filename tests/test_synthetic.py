@@ -13,6 +13,7 @@ from jsecon.data.capture import load_capture
 from jsecon.data.lerf_labels import load_lerf_labels
 from jsecon.data.mask_files import load_labels
 from jsecon.data.synthetic import make_room, render_views, room_cameras, room_capture, write_room
+from jsecon.data.synthetic.crowd import ARCH, BEAM, CLUTTER, THINGS, TWICE, crowded_room
 from jsecon.data.synthetic.light import lamp_points, lamp_visibility
 from jsecon.data.synthetic.raycast import trace
 from jsecon.data.synthetic.room import PALETTE, TABLE_HALF, TABLE_HEIGHT, Part
@@ -349,6 +350,57 @@ def test_sparse_points_lie_on_surfaces_that_two_training_views_see(small, depths
     assert (seen >= 2).mean() > 0.97  # all but points that the noise moved over an edge
     assert np.median(errors) < 0.01
     assert errors.max() > 0  # noise there is
+
+
+# The crowded room.
+
+
+def test_a_crowded_room_holds_what_makes_it_hard():
+    for seed in SEEDS:
+        room = crowded_room(seed)
+        counts = Counter(room.names)
+        assert counts.pop("") == len(CLUTTER)
+        assert {name: count for name, count in counts.items() if count > 1} == {
+            next(name for name in counts if name.split()[0] == TWICE): 2
+        }
+        assert {item.colour for item in room.objects} == {"", *THINGS, BEAM, ARCH}
+        assert room.cloth
+        lidded = [item for item in room.objects if item.shape in ("pot", "kettle")]
+        assert len(lidded) == 2
+        for item in lidded:  # parts of other colours
+            tones = [part.albedo.sum() for part in item.parts]
+            assert min(tones) < 0.2 * max(tones)
+        standing = [item for item in room.objects if item.shape not in ("beam", "arch", "ball")]
+        for k, a in enumerate(standing):
+            for b in standing[k + 1 :]:
+                assert np.hypot(*(a.centre - b.centre)[:2]) > a.radius + b.radius
+    assert crowded_room(0).names != crowded_room(1).names
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_view_of_a_crowded_room_shows_all_of_the_beam(seed):
+    room = crowded_room(seed)
+    cameras = room_cameras(room, views=30, width=80, height=60)
+    k = [item.colour for item in room.objects].index(BEAM)
+    only = dataclasses.replace(room, objects=(room.objects[k],), furniture=())
+    owners = np.array([part.owner for part in room.parts] + [-1])
+    for view in range(30):
+        shown = (owners[trace(room, cameras[view])[1]] == k).sum()
+        assert shown < 0.95 * (trace(only, cameras[view])[1] >= 0).sum()
+
+
+def test_labels_of_a_crowded_room_join_two_of_a_kind_and_leave_out_what_has_no_name(tmp_path):
+    write_room(tmp_path, 0, views=4, width=96, height=72, points=200, holdout=2, crowded=True)
+    told = list(json.loads((tmp_path / "scene.json").read_text())["objects"].values())
+    assert "" in told
+    twice = next(name for name in told if told.count(name) == 2)
+    for frame in load_lerf_labels(tmp_path / "label"):
+        ids = cv2.imread(str(tmp_path / "masks" / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED)
+        assert "" not in frame.objects
+        mask, boxes = frame.objects[twice]
+        both = [k + 1 for k, name in enumerate(told) if name == twice]
+        np.testing.assert_array_equal(mask, np.isin(ids, both))
+        assert len(boxes) == sum((ids == k).any() for k in both)
 
 
 def test_options_that_cannot_be():

@@ -21,7 +21,7 @@ from scipy import sparse
 from experiments import replica_apartment_0, results
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace, load_text_space, made_text_space
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
-from jsecon.app.demo import demo
+from jsecon.app.demo import PLAIN, demo
 from jsecon.app.progress import Listener
 from jsecon.app.verbs import Demo
 from jsecon.language.field import load_field
@@ -34,7 +34,7 @@ class Rooms:
     """The demo rooms that an experiment takes, and the texts that it asks: options that such experiments share."""
 
     demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `jsecon demo --seed K --out demoK` leaves them; made where missing."""
+    """holds demo0 .. demo4, as `demo(demoK, seed=K, room=PLAIN)` leaves them; made where missing."""
     texts: str = str(results.CAPTURES.parent / "text")
     """CLIP's vectors of the LVIS classes; where they are not there, made ones."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -100,9 +100,9 @@ class Sight:
 
 
 def demo_scene(folder: Path, seed: int) -> Scene:
-    """The demo room of `seed`, as `jsecon demo --seed SEED --out FOLDER` leaves it; made where it is missing."""
+    """The demo room of `seed`, as `demo` with PLAIN leaves it in FOLDER; made where it is missing."""
     if not (folder / "field.npz").exists():
-        demo(folder, seed=seed, steps=Demo.steps, listener=Listener())
+        demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
     field = load_field(folder / "field.npz")
     told = json.loads((folder / "capture" / "scene.json").read_text())
     voting = np.array([name not in told["held_out"] for name in field.names])

@@ -5,36 +5,40 @@ cache, and so the frames and the fitted Gaussians. Both are measured on held-out
 """
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from jsecon.app import answers, networks, pictures, pipeline, question, report, summary
+from jsecon.app import networks, pictures, pipeline, question, report, summary
+from jsecon.app.answers import masks_of, write_answer
+from jsecon.app.film import write_film
 from jsecon.app.options import Options, require_writable
 from jsecon.app.pipeline import Run
 from jsecon.app.progress import Listener
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.data.synthetic import write_room
-from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row
 from jsecon.files import write_text, written_whole
 from jsecon.types import LanguageField
 
 HOLDOUT = 5
+PLAIN = {"crowded": False}
+"""`room` of experiments that want one thing of each colour, on a bare table"""
 
 
 def demo(
     out: Path, *, seed: int = 0, steps: int, listener: Listener, room: dict[str, int] | None = None
 ) -> dict[str, Any]:
-    """Writes OUT/{capture, field.npz, true_masks/field.npz, queries, metrics.json, report.html, demo.jpg}; returns the
-    metrics.
+    """Writes OUT/{capture, field.npz, true_masks/field.npz, queries, metrics.json, report.html, demo.jpg, demo.webp};
+    returns the metrics.
 
-    `room` holds options of `write_room` (views, width, height, ...), for rooms smaller than the default.
+    `room` holds options of `write_room` (views, width, height, crowded, ...), for other rooms than the default.
     """
     require_writable(out)
-    capture = _capture(out / "capture", seed, {"holdout": HOLDOUT} | (room or {}), listener)
+    capture = _capture(out / "capture", seed, {"holdout": HOLDOUT, "crowded": True} | (room or {}), listener)
     options = Options(capture, holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
     found = pipeline.run(options, out, listener=listener)
     true_masks = Options(capture, masks=capture / "masks", holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
@@ -43,14 +47,17 @@ def demo(
     labels = load_lerf_labels(capture / "label")
     embedder = networks.embedder_of_field(found.field)
     listener.say("measured on the held-out views")
-    results = summary.evaluate(found.field, embedder, labels, listener, ("anchored", "anchored_code", "one_step"))
+    results = summary.evaluate(found.field, embedder, labels, listener)
     with_true = summary.evaluate(given.field, embedder, labels, listener, ("anchored", "one_step"))
     results["true_masks"], results["true_masks_one_step"] = with_true["anchored"], with_true["one_step"]
     metrics = _metrics(results, found, given)
     with listener.progress("report"):
-        queries = _queries(found.field, embedder, labels, out / "queries")
-        write_text(out / "report.html", _page(found, results, queries, labels, metrics, seed))
-        _write_picture(out / "demo.jpg", found, results["anchored"][0])
+        answers = answers_to(found.field, embedder, sorted({name for frame in labels for name in frame.objects}))
+        queries = write_queries(found.field, answers, out / "queries")
+        most = max(labels, key=lambda frame: (len(frame.objects), frame.name)).name
+        masks = {row.query: row.mask for row in results["anchored"][0] if row.frame == most}
+        pictured = write_pictures(out, found, answers, found.capture.names.index(most), masks)
+        write_text(out / "report.html", _page(found, results, queries, labels, metrics, pictured, seed))
     single = sum(told["left_out"].get("DBSCAN") == "the selection is one component" for told in queries.values())
     metrics["left_out"]["DBSCAN"] = f"{single} of {len(queries)} selections are one component"
     metrics["peak_memory_mib"] = round(pipeline.peak_memory_mib(), 1)
@@ -60,8 +67,15 @@ def demo(
         f"held-out PSNR {metrics['held_out_psnr']:.2f} dB, {metrics['seconds_in_all']:.0f} s of work, "
         f"peak memory {metrics['peak_memory_mib']:.0f} MiB"
     )
-    listener.say(f"field   {out / 'field.npz'}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
+    say_files(out, next(iter(answers), ""), listener)
     return metrics
+
+
+def say_files(out: Path, text: str, listener: Listener) -> None:
+    """Where it all is, and how to look at it."""
+    listener.say(f"field   {out / 'field.npz'}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
+    asked = f' "{text}"' if text else ""
+    listener.say(f"view it jsecon view {out / 'field.npz'}{asked} --export {out / 'view.html'}")
 
 
 def _capture(folder: Path, seed: int, room: dict[str, int], listener: Listener) -> Path:
@@ -93,16 +107,15 @@ def _metrics(results: dict[str, tuple[list[Row], dict[str, Any]]], found: Run, g
     }
 
 
-def _queries(field: LanguageField, embedder: Any, labels: list[LabelledFrame], out: Path) -> dict[str, dict[str, Any]]:
-    """Each labelled object asked for by its name: its files, and its figures by name."""
-    told = {}
-    for text in sorted({name for frame in labels for name in frame.objects}):
-        try:
-            answer = question.ask_text(field, embedder, text)
-            told[text] = answers.write_answer(field, answer, out, answers.masks_of(field, answer, views=2))
-        except InputError as error:
-            told[text] = {"count": 0, "score": 0.0, "region": None, "left_out": {}, "not_understood": str(error)}
-    return told
+def answers_to(field: LanguageField, embedder: Any, texts: Sequence[str]) -> dict[str, question.Answer]:
+    """text → its answer, of those that are understood."""
+    questions = question.questions_of(field, embedder, texts=texts)
+    return {answer.question: answer for answer in question.asked_each(questions)[0]}
+
+
+def write_queries(field: LanguageField, answers: Mapping[str, question.Answer], out: Path) -> dict[str, dict[str, Any]]:
+    """The files of each answer, and its figures, by text."""
+    return {text: write_answer(field, own, out, masks_of(field, own, views=2)) for text, own in answers.items()}
 
 
 def _page(
@@ -111,6 +124,7 @@ def _page(
     queries: dict[str, dict[str, Any]],
     labels: list[LabelledFrame],
     metrics: dict[str, Any],
+    pictured: str,
     seed: int,
 ) -> str:
     anchored = results["anchored"][1]
@@ -126,11 +140,14 @@ def _page(
         }
     )
     names = {
-        "anchored": "text -> region -> its votes",
-        "anchored_code": "text -> region -> its code",
-        "one_step": "text -> codes, directly",
-        "true_masks": "text -> region -> its votes, true masks given",
-        "true_masks_one_step": "text -> codes, directly, true masks given",
+        "anchored": "text → region → its votes",
+        "anchored_code": "text → region → its code",
+        "silhouette": "text → region → its votes, then by the outline",
+        "all": "text → all regions that answer → their votes",
+        "one_step": "text → codes, directly",
+        "canonical": "text → codes, against the canonical phrases",
+        "true_masks": "text → region → its votes, true masks given",
+        "true_masks_one_step": "text → codes, directly, true masks given",
     }
     rows = []
     for kind, (_, told) in results.items():
@@ -139,33 +156,34 @@ def _page(
     table = report.table(["query", "mIoU", "mAcc@0.25", "Acc@0.5", "Loc. acc.", "pairs", "missing"], rows)
     words = f"{metrics['protocol']}. Held-out views only; a missing prediction counts as 0."
     asked = _query_part(found, results["anchored"][0], results["true_masks"][0], queries, labels)
-    parts = [head, report.section("How well", words, table), asked]
+    parts = [head, pictured, report.section("How well", words, table), _iou_part(results), asked]
     lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
     lead += "on a plain CPU and without any learned weights."
     parts += [*summary.scene_parts(found), *summary.work_parts(found)]
     return report.page(f"jsecon demo, room {seed}", lead, parts)
 
 
-def _write_picture(path: Path, found: Run, rows: list[Row]) -> None:
-    """The demo at a glance: a frame, its masklets and codes, and what a text selects in the held-out view
-    beside it."""
-    row = max(rows, key=lambda row: row.iou * row.mask.sum())
-    held = found.capture.names.index(row.frame)
-    train = np.flatnonzero(~np.asarray(found.capture.held_out))
-    near = int(np.abs(train - held).argmin())
-    frames, t = np.asarray(found.capture.frames), int(train[near])
-    codes = pictures.Renderer(found.field.gaussians, found.field.cameras)
-    image = pictures.strip(
-        {
-            "frame": frames[t],
-            "masklets": pictures.label_overlay(frames[t], found.labels[near]),
-            "codes of the Gaussians": codes.colours(t, pictures.code_colours(found.field)),
-            f'"{row.query}"': pictures.selection_overlay(frames[held], row.mask),
-        }
-    )
-    with written_whole(path) as temporary:
-        bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-        temporary.write_bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+def write_pictures(
+    out: Path, run: Run, answers: Mapping[str, question.Answer], frame: int, masks: Mapping[str, np.ndarray]
+) -> str:
+    """OUT/demo.jpg, a frame, the masklets and codes of the nearest that was fitted to, and the `masks` that texts have
+    in it; and OUT/demo.webp, the film. Returns its part of the page."""
+    train = np.flatnonzero(~np.asarray(run.capture.held_out))
+    near = int(np.abs(train - frame).argmin())
+    frames, t = np.asarray(run.capture.frames), int(train[near])
+    codes = pictures.Renderer(run.field.gaussians, run.field.cameras)
+    panels = {
+        "frame": frames[frame],
+        "masklets": pictures.label_overlay(frames[t], run.labels[near]),
+        "codes of the Gaussians": codes.colours(t, pictures.code_colours(run.field)),
+        "answers to texts": pictures.answers_overlay(frames[frame], masks),
+    }
+    with written_whole(out / "demo.jpg") as temporary:
+        image = cv2.cvtColor(pictures.strip(panels), cv2.COLOR_RGB2BGR)
+        temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+    write_film(run.field, [answer for answer in answers.values() if answer.mask.any()], out / "demo.webp")
+    words = "Rendered from the field: each text lights up what it selects."
+    return report.film((out / "demo.webp").read_bytes(), words)
 
 
 def _query_part(
@@ -180,10 +198,21 @@ def _query_part(
         row = max((row for row in rows if row.query == text), key=lambda row: truth[row.frame, text].sum())
         frame, true = frames[row.frame], truth[row.frame, text]
         other = given_rows[row.frame, text]
-        cells.append(report.figure(frame, row.frame, strong=text))
-        words = f"{row.selected} Gaussians, region {row.region}, score {row.score:.2f}"
-        for answer, caption in ((row, words), (other, f"true masks given: {other.selected} Gaussians")):
-            overlay = pictures.selection_overlay(frame, answer.mask, true)
-            cells.append(report.figure(overlay, caption, strong=f"IoU {answer.iou:.2f}"))
-    words = "Pink: the selected Gaussians, rendered alone, over a held-out view. White line: the ground truth."
-    return report.section("Queries", words, report.grid(cells, 3))
+        words = f"IoU {row.iou:.2f}, {row.selected} Gaussians, region {row.region}, score {row.score:.2f}"
+        cells.append(report.pair(frame, pictures.selection_overlay(frame, row.mask, true), words, strong=text))
+        words = f"true masks given, {other.selected} Gaussians"
+        overlay = pictures.selection_overlay(frame, other.mask, true)
+        cells.append(report.figure(overlay, words, strong=f"IoU {other.iou:.2f}"))
+    words = "Pink: the selected Gaussians, rendered alone, over a held-out view; move the line to see the photograph. "
+    words += "White line: the ground truth."
+    return report.section("Queries", words, report.grid(cells, 4))
+
+
+def _iou_part(results: dict[str, tuple[list[Row], dict[str, Any]]]) -> str:
+    """Mean IoU of each text by each kind of query."""
+    texts = sorted({row.query for row in results["anchored"][0]})
+    mean = lambda rows, text: float(np.mean([row.iou for row in rows if row.query == text]))
+    rows = [(text, [mean(own, text) for own, _ in results.values()]) for text in texts]
+    rows.append(("mean of all pairs", [told["miou"] for _, told in results.values()]))
+    header = ["text", *(kind.replace("_", " ") for kind in results)]
+    return report.section("IoU of each text", "Mean over the held-out views that show it.", report.shades(header, rows))

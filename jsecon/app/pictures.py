@@ -16,6 +16,7 @@ SELECTED = (255, 64, 160)
 """RGB of a selection: no natural object's colour"""
 TRUE = (255, 255, 255)
 """RGB of the ground truth's outline, over a black line"""
+_FONT = cv2.FONT_HERSHEY_SIMPLEX, 0.36
 UNKNOWN = 0.25
 """grey of Gaussians without a code"""
 
@@ -58,7 +59,49 @@ def selection_overlay(
     return image
 
 
-def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int], thickness: int) -> np.ndarray:
+def answers_overlay(
+    frame: UInt8[np.ndarray, "h w 3"], masks: Mapping[str, Bool[np.ndarray, "h w"]]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The frame in dark grey, in its colours where masks are, their texts above or beneath them: of the masks, the
+    largest first, those that leave each other and the texts room."""
+    image = np.repeat(0.35 * frame.mean(-1, keepdims=True), 3, axis=-1).astype(np.uint8)
+    taken, places = np.zeros(frame.shape[:2], bool), {}
+    for text in sorted((text for text, mask in masks.items() if mask.any()), key=lambda text: -masks[text].sum()):
+        rows, columns = np.nonzero(masks[text])
+        (wide, high), _ = cv2.getTextSize(text, *_FONT, 1)
+        left = int(np.clip(columns.mean() - wide / 2, 1, max(image.shape[1] - wide - 1, 1)))
+        for base in (max(int(rows.min()) - 4, high + 1), min(int(rows.max()) + high + 5, len(image) - 3)):
+            own = masks[text].copy()
+            own[base - high - 1 : base + 4, left : left + wide] = True
+            if text not in places and not (taken & own).any():
+                places[text], taken = (left, base), taken | own
+    for text in places:
+        image[masks[text]] = frame[masks[text]]
+    for text, at in places.items():
+        for grey, thickness in ((0, 3), (255, 1)):
+            image = cv2.putText(image, text, at, *_FONT, (grey,) * 3, thickness, cv2.LINE_AA)
+    return image
+
+
+def followed(
+    frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"], region: int, *, side: int = 96
+) -> UInt8[np.ndarray, "{side} w2 3"]:
+    """One region through T frames: each cut out around it and outlined, dark where it is not seen."""
+    tiles = []
+    for frame, own in zip(frames, labels == region):
+        rows, columns = np.nonzero(own)
+        tile = np.full((side, side, 3), 40, np.uint8)
+        if len(rows):
+            (top, low), (left, right) = ((int(a.min()), int(a.max()) + 1) for a in (rows, columns))
+            scale = side / (1.3 * max(low - top, right - left) + 8)
+            shift = [side / 2 - scale * (left + right) / 2, side / 2 - scale * (top + low) / 2]
+            matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
+            tile = cv2.warpAffine(_outlined(frame, own, SELECTED, 1), matrix, (side, side), borderValue=(40, 40, 40))
+        tiles += [tile, np.full((side, 3, 3), 128, np.uint8)]
+    return np.concatenate(tiles[:-1], axis=1)
+
+
+def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thickness: int) -> np.ndarray:
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     image = np.ascontiguousarray(image)
     cv2.drawContours(image, contours, -1, colour, thickness)

@@ -71,6 +71,8 @@ class Run:
     options: Options
     programs: dict[str, int]
     """that jax built for it: "all" of them, and those that it read "from_disk"."""
+    built: dict[str, dict[str, int]]
+    """the same for each stage."""
 
     @property
     def psnr(self) -> np.ndarray:
@@ -134,6 +136,7 @@ class _Done:
     seconds: dict[str, float]
     steps: list[Step]
     notes: list[str]
+    built: dict[str, dict[str, int]]
 
 
 def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
@@ -152,9 +155,9 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
         place[name].unlink(missing_ok=True)
     listener.steps(f"{work.options.capture} -> {work.out}", steps)
     work.networks.require_ready([step.name for step in steps if step.status == "run"])
-    done = _Done({}, plan.keys, {}, steps, [])
+    done = _Done({}, plan.keys, {}, steps, [], {})
     for stage in stages:
-        record = Record(cache.record_path_of(place[stage.name]))
+        record, before = Record(cache.record_path_of(place[stage.name])), programs_built()
         with listener.progress(stage.name) as progress:
             compute = functools.partial(stage.compute, done.results, progress, record)
             try:
@@ -166,6 +169,7 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
                 raise
         outcome: Outcome = kept.value
         done.results[stage.name], done.seconds[stage.name] = outcome.value, kept.seconds
+        done.built[stage.name] = _since(before)
         record.remove()
         listener.done(stage.name, kept.seconds, kept.fresh)
         for part, why in outcome.left_out.items():
@@ -204,8 +208,12 @@ def run(
     done.seconds["field"] = time.monotonic() - started
     listener.done("field", done.seconds["field"], True)
     capture, labels, quality = (done.results[name] for name in ("load", "masklets", "held_out"))
-    programs = {name: count - before[name] for name, count in programs_built().items()}
-    return Run(field, capture, labels, quality, done.seconds, tuple(done.steps), tuple(done.notes), options, programs)
+    steps, notes = tuple(done.steps), tuple(done.notes)
+    return Run(field, capture, labels, quality, done.seconds, steps, notes, options, _since(before), done.built)
+
+
+def _since(before: dict[str, int]) -> dict[str, int]:
+    return {name: count - before[name] for name, count in programs_built().items()}
 
 
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:

@@ -1,49 +1,22 @@
-"""One self-contained HTML page: pictures as data, no script, no outside resource, legible in light and dark."""
+"""One self-contained HTML page: pictures as data, no outside resource, legible in light and dark, on a phone and on
+paper; its style and its few lines of script are report_page.html. Without the script nothing is missing but size."""
 
 import base64
 import html
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
 
 import cv2
 import numpy as np
 
 from jsecon.app.progress import Step
 
-_STYLE = """
-:root { color-scheme: light dark; --ink: #1c2024; --soft: #60656c; --line: #e0e2e6; --paper: #fcfcfd; --card: #f3f4f6;
-  --mark: #c2185b; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #eceef0; --soft: #9ba1a8; --line: #33373c; --paper: #121416; --card: #1c1f23; --mark: #ff5fa2; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1180px; padding: 2rem 1.5rem 4rem; background: var(--paper); color: var(--ink);
-  font: 15px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2.4rem 0 .6rem; }
-p { max-width: 75ch; margin: .3rem 0 .8rem; } .soft { color: var(--soft); }
-.tiles { display: flex; flex-wrap: wrap; gap: .75rem; margin: 1.2rem 0; }
-.tile { background: var(--card); border-radius: 8px; padding: .7rem 1rem; min-width: 8.5rem; }
-.tile b { display: block; font-size: 1.5rem; line-height: 1.2; font-variant-numeric: tabular-nums; }
-.tile span { color: var(--soft); font-size: .82rem; }
-table { border-collapse: collapse; margin: .4rem 0 1rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; color: var(--soft); font-size: .85rem; } td.n, th.n { text-align: right; }
-.grid { display: grid; gap: .9rem; grid-template-columns: repeat(var(--columns), minmax(0, 1fr)); }
-@media (max-width: 720px) { .grid { grid-template-columns: repeat(2, minmax(0, 1fr)); } }
-figure { margin: 0; } figure img { width: 100%; display: block; border-radius: 6px; background: #000; }
-figcaption { font-size: .85rem; color: var(--soft); padding-top: .25rem; } figcaption b { color: var(--ink); }
-.bar { background: var(--mark); height: .75rem; margin-top: .3rem; border-radius: 3px; min-width: 2px; }
-pre { background: var(--card); border-radius: 8px; padding: .8rem 1rem; overflow-x: auto; font-size: .8rem;
-  white-space: pre-wrap; }
-.scroll { overflow-x: auto; }
-"""
-
 
 def page(title: str, lead: str, parts: Iterable[str]) -> str:
     """The whole document; `parts` are what the functions below return."""
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
-        f'content="width=device-width, initial-scale=1"><title>{_text(title)}</title><style>{_STYLE}</style></head>\n'
-        f'<body><h1>{_text(title)}</h1><p class="soft">{_text(lead)}</p>\n' + "\n".join(parts) + "\n</body></html>\n"
-    )
+    template = resources.files("jsecon.app").joinpath("report_page.html").read_text(encoding="utf-8")
+    filled = template.replace("__TITLE__", _text(title)).replace("__LEAD__", _text(lead))
+    return filled.replace("__PARTS__", "\n".join(parts))
 
 
 def section(title: str, words: str, *parts: str) -> str:
@@ -70,15 +43,28 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, numbers_fr
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def bars(seconds: Mapping[str, float]) -> str:
-    """A bar for each stage's seconds."""
+def shades(header: Sequence[str], rows: Iterable[tuple[str, Sequence[float | None]]]) -> str:
+    """A table of values from 0 to 1, the higher the deeper in colour; None is a gap."""
+
+    def cell(value: float | None) -> str:
+        return "<td></td>" if value is None else f'<td class="n" style="--v:{100 * value:.0f}%">{value:.2f}</td>'
+
+    head = "".join(f"<th{' class=n' if k else ''}>{_text(name)}</th>" for k, name in enumerate(header))
+    body = "".join(f"<tr><td>{_text(name)}</td>{''.join(map(cell, values))}</tr>" for name, values in rows)
+    return (
+        f'<div class="scroll"><table class="shades"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
+
+
+def bars(seconds: Mapping[str, float], beside: Mapping[str, str] | None = None) -> str:
+    """A bar for each stage's seconds, and what there is to say `beside` it."""
     longest = max(seconds.values(), default=0.0) or 1.0
     rows = "".join(
-        f'<tr><td>{_text(name)}</td><td class="n">{value:.1f} s</td><td style="width:24rem"><div class="bar" '
-        f'style="width:{100 * value / longest:.1f}%"></div></td></tr>'
+        f'<tr><td>{_text(name)}</td><td class="n">{value:.1f} s</td><td class="length"><div class="bar" '
+        f'style="width:{100 * value / longest:.1f}%"></div></td><td>{_text((beside or {}).get(name, ""))}</td></tr>'
         for name, value in seconds.items()
     )
-    total = f'<tr><td><b>all</b></td><td class="n"><b>{sum(seconds.values()):.1f} s</b></td><td></td></tr>'
+    total = f'<tr><td><b>all</b></td><td class="n"><b>{sum(seconds.values()):.1f} s</b></td><td></td><td></td></tr>'
     return f'<div class="scroll"><table><tbody>{rows}{total}</tbody></table></div>'
 
 
@@ -88,15 +74,45 @@ def steps(found: Iterable[Step]) -> str:
 
 
 def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = False) -> str:
-    """(H, W, 3) uint8 RGB with its caption; `sharp` keeps it without loss (masks, flat colours)."""
-    told = (f"<b>{_text(strong)}</b> " if strong else "") + _text(caption)
-    words = _text(f"{strong} {caption}".strip())
-    return f'<figure><img alt="{words}" src="{data_uri(image, sharp=sharp)}"><figcaption>{told}</figcaption></figure>'
+    """(H, W, 3) uint8 RGB with its caption, larger at a click; `sharp` keeps it without loss (masks, flat colours)."""
+    return f"<figure>{_image(image, f'{strong} {caption}', sharp, ' tabindex=0')}{_caption(caption, strong)}</figure>"
+
+
+def wide(image: np.ndarray, caption: str, *, strong: str = "") -> str:
+    """A strip of pictures, which a narrow screen scrolls sideways."""
+    return f'<div class="wide">{figure(image, caption, strong=strong)}</div>'
+
+
+def film(webp: bytes, caption: str) -> str:
+    """An animated WebP with its caption."""
+    data = base64.b64encode(webp).decode()
+    image = f'<img alt="{_text(caption)}" src="data:image/webp;base64,{data}" tabindex=0>'
+    return f'<figure class="film">{image}{_caption(caption, "")}</figure>'
+
+
+def pair(before: np.ndarray, after: np.ndarray, caption: str, *, strong: str = "") -> str:
+    """Two pictures of one view, one on the other, and a slider between them."""
+    both = _image(before, "before") + _image(after, f"{strong} {caption}", more=' class="after"')
+    slider = '<input type="range" value="25" aria-label="how much of each picture is shown">'
+    return f'<figure class="pair"><div>{both}{slider}</div>{_caption(caption, strong)}</figure>'
+
+
+def _image(image: np.ndarray, words: str, sharp: bool = False, more: str = "") -> str:
+    return f'<img alt="{_text(words.strip())}" src="{data_uri(image, sharp=sharp)}"{more}>'
+
+
+def _caption(caption: str, strong: str) -> str:
+    return f"<figcaption>{f'<b>{_text(strong)}</b> ' if strong else ''}{_text(caption)}</figcaption>"
 
 
 def grid(figures: Iterable[str], columns: int) -> str:
     """Figures side by side."""
     return f'<div class="grid" style="--columns:{columns}">{"".join(figures)}</div>'
+
+
+def folded(title: str, *parts: str) -> str:
+    """What opens at a click on its title."""
+    return f"<details><summary>{_text(title)}</summary>{''.join(parts)}</details>"
 
 
 def preformatted(text: str) -> str:

@@ -19,9 +19,17 @@ from jsecon.files import write_text
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 
-KINDS = {"anchored": "votes", "anchored_code": "code", "one_step": "one_step", "canonical": "canonical"}
-"""kind of query in metrics.json -> the method of jsecon.app.question"""
-FRAMES_SHOWN = 6
+KINDS: dict[str, dict[str, Any]] = {
+    "anchored": {"by": "votes"},
+    "silhouette": {"by": "silhouette"},
+    "all": {"several": True},
+    "anchored_code": {"by": "code"},
+    "one_step": {"by": "one_step"},
+    "canonical": {"by": "canonical"},
+}
+"""kind of query in metrics.json -> how jsecon.app.question asks"""
+FRAMES_SHOWN, FOLLOWED, LARGE = 6, 10, 0.15
+"""rows of frames; masklets followed, the largest of those that fill less than a part of a frame; frames of each"""
 
 
 def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
@@ -136,9 +144,9 @@ def evaluate(
     found = {}
     for kind in kinds:
 
-        def select(text: str, by: str = KINDS[kind]) -> Selection | None:
+        def select(text: str, how: dict[str, Any] = KINDS[kind]) -> Selection | None:
             try:
-                asked = question.ask_text(field, embedder, text, by=by)
+                asked = question.ask_text(field, embedder, text, **how)
             except InputError:  # no words for it: no answer, which counts as 0
                 return None
             return dataclasses.replace(asked.selection, mask=asked.mask)
@@ -212,7 +220,7 @@ def scene_parts(run: Run) -> list[str]:
         ]
     words = "One colour is one region in every view. Codes are shown by their first three principal components, as the "
     words += "Gaussians render them; grey is unknown."
-    parts = [report.section("Frames, masklets, codes", words, report.grid(cells, 4))]
+    parts = [report.section("Frames, masklets, codes", words, report.grid(cells, 4)), _followed(run, train)]
     if len(run.psnr):
         out = np.flatnonzero(run.capture.held_out)
         order = out[np.unique(np.linspace(0, len(out) - 1, 4).round().astype(int))]
@@ -225,14 +233,41 @@ def scene_parts(run: Run) -> list[str]:
     return parts
 
 
+def _followed(run: Run, train: np.ndarray) -> str:
+    """Masklets through the frames, a row each."""
+    views = np.unique(np.linspace(0, len(train) - 1, FOLLOWED).round().astype(int))
+    frames, labels = np.asarray(run.capture.frames)[train[views]], run.labels[views]
+    sizes = np.stack([np.bincount(own[own >= 0], minlength=run.field.regions.count) for own in labels])
+    small = np.flatnonzero(sizes.max(0) < LARGE * labels[0].size)
+    largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:FOLLOWED]
+    rows = []
+    for region in largest[sizes.sum(0)[largest] > 0].tolist():
+        seen = int((np.asarray(run.field.regions.pixels)[region] > 0).sum())
+        strip = pictures.followed(frames, labels, region)
+        rows.append(report.wide(strip, f"in {seen} of {len(run.labels)} frames", strong=f"region {region}"))
+    words = "The same region, cut out of frames that follow each other around the scene; dark where it is not seen."
+    return report.section("Masklets through the frames", words, *rows)
+
+
 def work_parts(run: Run) -> list[str]:
     """Seconds, stages, notes and where it all came from."""
     notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
-    origin = report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
-    measured = "Wall time of the computation, also where it happened in an earlier run."
+    given = [(f.name, getattr(run.options, f.name), f.default) for f in dataclasses.fields(run.options)]
+    tables = [
+        report.table([head, "value"], [row[:2] for row in given if (row[1] == row[2]) == usual], numbers_from=9)
+        for head, usual in (("changed", False), ("setting", True))
+    ]
+    kept = report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
+    folded = (
+        report.folded("the others, as they are by default", tables[1]),
+        report.folded("as the field keeps it", kept),
+    )
+    measured = "Wall time, also of what happened in an earlier run; and the programs that jax built for it now, in "
+    measured += "brackets those that it read from disk."
+    built = {name: f"{told['all']} ({told['from_disk']})" if told["all"] else "" for name, told in run.built.items()}
     ran = "What ran, and what was left out because this scene does not need it."
     return [
-        report.section("Seconds of each stage", measured, report.bars(run.seconds)),
+        report.section("Seconds of each stage", measured, report.bars(run.seconds, built)),
         report.section("Stages", ran, report.steps(run.steps), notes),
-        report.section("Where it came from", "", origin),
+        report.section("Settings", "", tables[0], *folded),
     ]

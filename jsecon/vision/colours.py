@@ -244,7 +244,8 @@ def _without_shadow_and_shine(lab: np.ndarray) -> np.ndarray:
     The lit side of a thing carries its name; the shadow side is cut more than the highlights, which are few.
     """
     low, high = np.percentile(lab[:, 0], [30.0, 95.0])
-    return lab[(lab[:, 0] >= low) & (lab[:, 0] <= high)]
+    kept = (lab[:, 0] >= low) & (lab[:, 0] <= high)
+    return lab[kept] if kept.any() else lab  # of two pixels, none lies between
 
 
 def _words(text: str, *, separators: bool = False) -> list[str]:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Int16, UInt
 from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_options, held_out
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
+from jsecon.data.synthetic.crowd import crowded_room
 from jsecon.data.synthetic.raycast import render_views
 from jsecon.data.synthetic.room import Room, make_room
 from jsecon.errors import require
@@ -39,10 +40,10 @@ def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int =
     return Camera(poses, focal_px, focal_px, cx, cy, width, height)
 
 
-def look_at(centre, target):
+def look_at(centre, target, up=(0, 0, 1)):
     """(4, 4) float32 world-to-camera of a camera at `centre` that looks at `target`, upright."""
     forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, (0, 0, 1))
+    right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     turn = np.stack([right, np.cross(forward, right), forward])
     pose = np.eye(4)
@@ -59,10 +60,12 @@ def room_capture(
     holdout: int = 5,
     points: int = 6000,
     num_objects: int = 12,
+    crowded: bool | int = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Capture, Int16[np.ndarray, "t h w"], tuple[str, ...]]:
     """The room of `seed` as a capture, its instances (index into the names, -1 = background) and the objects' names.
 
+    `crowded`: that of `crowded_room`, in which a name may be there twice, or "", instead of `num_objects`.
     Every `holdout`-th frame from the first on is held out (0: none); the sparse points come from the others alone.
     Raises InputError or ValueError on options that leave fewer than two frames.
     """
@@ -70,7 +73,7 @@ def room_capture(
     out = held_out(views, holdout)
     got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
     require(int((~out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
-    room = make_room(seed, num_objects=num_objects)
+    room = crowded_room(seed) if crowded else make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=views, width=width, height=height)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
     capture, instances = captured(room, cameras, names, out, points=points, progress=progress)
@@ -179,15 +182,18 @@ def _clear(folder):
 
 
 def labelled(frame, instance, names, label_pixels):
-    """The label of a frame: its objects' masks and boxes."""
+    """The label of a frame: masks and boxes by name, those of a name together; without a name, none."""
     objects = {}
-    for k, name in enumerate(names):
-        mask = instance == k
-        if mask.sum() >= label_pixels:
-            rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-            box = np.array([[columns[0], rows[0], columns[-1], rows[-1]]], np.float32)
-            objects[name] = mask, box
+    for name in dict.fromkeys(filter(None, names)):
+        each = [mask for mask in (instance == k for k, own in enumerate(names) if own == name) if mask.any()]
+        if sum(mask.sum() for mask in each) >= label_pixels:
+            objects[name] = np.any(each, axis=0), np.concatenate([_box(mask) for mask in each])
     return LabelledFrame(frame, instance.shape[1], instance.shape[0], objects)
+
+
+def _box(mask):
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return np.array([[columns[0], rows[0], columns[-1], rows[-1]]], np.float32)
 
 
 def write_ids(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
-from jsecon.data.synthetic.shapes import SHAPES, reach
+from jsecon.data.synthetic.shapes import SHAPES, Body, reach
 from jsecon.data.synthetic.solids import Solid, box, place, rotation
 from jsecon.errors import require
 
@@ -84,7 +85,7 @@ class RoomObject:
     """One named object."""
 
     name: str
-    """colour + shape: "dark green bottle"; unique in its room."""
+    """colour + shape: "dark green bottle"; unique in `make_room`'s rooms; "" for what no text asks for."""
     colour: str
     shape: str
     centre: np.ndarray
@@ -113,6 +114,8 @@ class Room:
     light_half: float
     """half the lamp's side, m."""
     seed: int
+    cloth: bool = False
+    """whether a chequered cloth lies on the table."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -141,13 +144,19 @@ def make_room(seed: int, *, num_objects: int = 12) -> Room:
     colours = list(PALETTE)[:num_objects]
     shapes = _draw_shapes(draw, colours)
     bodies = [SHAPES[shape](draw) for shape in shapes]
-    radii = [max(reach(solid) for solid, _, _ in body) for body in bodies]
-    spots = _scatter(draw, radii)
-    objects = tuple(_stand(draw, k, *row) for k, row in enumerate(zip(colours, shapes, bodies, radii, spots)))
+    radii = [radius_of(body) for body in bodies]
+    spots = scatter(draw, radii)
+    rows = zip(colours, shapes, map(PALETTE.__getitem__, colours), bodies, radii, spots)
+    objects = tuple(stand(draw, k, *row) for k, row in enumerate(rows))
+    return around(draw, objects, seed)
+
+
+def around(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed: int, *, cloth: bool = False) -> Room:
+    """The room that the objects' table stands in."""
     half = np.array([draw.uniform(2.25, 2.5), draw.uniform(2.1, 2.35)], np.float32)
     aside, turn = draw.uniform(0.8, 1.1), draw.uniform(0, 2 * np.pi)
     light = np.array([aside * np.cos(turn), aside * np.sin(turn), 1.85], np.float32)
-    return Room(objects, _table(), half, 1.9, light, 0.3, seed)
+    return Room(objects, _table(), half, 1.9, light, 0.3, seed, cloth)
 
 
 def _draw_shapes(draw, colours):
@@ -160,14 +169,27 @@ def _draw_shapes(draw, colours):
             return shapes
 
 
-def _scatter(draw, radii):
-    """(K, 2) places on the table, footprints GAP apart: the largest first, anew when one finds no room."""
-    half = np.array(TABLE_HALF) - GAP
+def radius_of(body: Body) -> float:
+    """Of a circle around a shape's footprint, m."""
+    return max(reach(solid) for solid, _, _ in body)
+
+
+def scatter(
+    draw: np.random.Generator,
+    radii: Sequence[float],
+    taken: Sequence[tuple[np.ndarray, float]] = (),
+    *,
+    gap: float = GAP,
+) -> np.ndarray:
+    """(K, 2) float32 places on the table, footprints `gap` apart, and from the circles `taken` (centre, radius): the
+    largest first, anew when one finds no room."""
+    half = np.array(TABLE_HALF) - gap
     while True:
         spots: dict[int, np.ndarray] = {}
         for k in np.argsort(radii)[::-1]:
             for spot in draw.uniform(-(half - radii[k]), half - radii[k], (300, 2)):
-                if all(np.hypot(*(spot - other)) > radii[k] + radii[j] + GAP for j, other in spots.items()):
+                others = [*taken, *((other, radii[j]) for j, other in spots.items())]
+                if all(np.hypot(*(spot - other)) > radii[k] + r + gap for other, r in others):
                     spots[int(k)] = spot
                     break
             else:
@@ -176,10 +198,21 @@ def _scatter(draw, radii):
             return np.array([spots[k] for k in range(len(radii))], np.float32)
 
 
-def _stand(draw, index, colour, shape, body, radius, spot):
-    axes = rotation(yaw=draw.uniform(0, 2 * np.pi))
-    centre = np.array([*spot, 0.0], np.float32)
-    albedo = linear(PALETTE[colour]) * np.float32(draw.uniform(0.94, 1.0))
+def stand(
+    draw: np.random.Generator,
+    index: int,
+    colour: str,
+    shape: str,
+    srgb: tuple[int, int, int],
+    body: Body,
+    radius: float,
+    spot: Sequence[float] | np.ndarray,
+    yaw: float | None = None,
+) -> RoomObject:
+    """The object `index` of a room at `spot`, x y of the table or x y z, turned by `yaw` (default: anyhow)."""
+    axes = rotation(yaw=draw.uniform(0, 2 * np.pi) if yaw is None else yaw)
+    centre = np.array([*spot, 0.0][:3], np.float32)
+    albedo = linear(srgb) * np.float32(draw.uniform(0.94, 1.0))
     # Stripes across many small parts would hide what the object is.
     kinds = ["plain", "marble"] if len(body) > 4 else ["plain", "stripes", "checks", "marble", "marble"]
     kind, scale, depth = str(draw.choice(kinds)), draw.uniform(0.03, 0.05), draw.uniform(0.12, 0.2)
@@ -190,7 +223,7 @@ def _stand(draw, index, colour, shape, body, radius, spot):
         return Part(place(solid, centre, axes), inner, index, np.minimum(albedo * np.float32(tone), 0.95))
 
     parts = tuple(part(*row) for row in body)
-    return RoomObject(f"{colour} {shape}", colour, shape, centre, axes, float(radius), texture, parts)
+    return RoomObject(f"{colour} {shape}".strip(), colour, shape, centre, axes, float(radius), texture, parts)
 
 
 def _table():

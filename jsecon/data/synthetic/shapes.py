@@ -7,10 +7,15 @@ darker). An object stands on z = 0 around the z axis of its own frame; lengths i
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from jsecon.data.synthetic.solids import Solid, box, contains, cut, ellipsoid, frustum, place, rotation
+
+Body: TypeAlias = Sequence[tuple[Solid, Solid | None, float]]
+"""solids, what is hollow of each, and its tone"""
 
 
 def reach(solid: Solid) -> float:
@@ -53,13 +58,40 @@ def _vessel(bottom, top, height, wall):
 def _mug(draw):
     r, h = draw.uniform(0.058, 0.072), draw.uniform(0.12, 0.15)
     outer, hollow = _vessel(r, r, h, 0.008)
-    ring, eye = draw.uniform(0.042, 0.048), 0.016
-    # A ring standing upright beside the mug; its half inside of the mug is cut away.
-    handle = cut(_about_middle(frustum(ring, ring, 0.022), 0.011), (1.0, 0.0, 0.0), 0.004)
+    return [(outer, hollow, 1.0), (*_handle(draw.uniform(0.042, 0.048), r, h * 0.52, 0.0), 1.0)]
+
+
+def _handle(ring, away, up, turned):
+    """A ring standing upright `away` from the axis, on the side of `turned`; its half towards the axis is cut away."""
+    eye, turn = 0.016, rotation(yaw=turned) @ rotation(roll=np.pi / 2) @ rotation(yaw=np.pi)
+    half = cut(_about_middle(frustum(ring, ring, 0.022), 0.011), (1.0, 0.0, 0.0), 0.004)
     hole = _about_middle(frustum(ring - eye, ring - eye, 0.06), 0.03)
-    turn = rotation(roll=np.pi / 2) @ rotation(yaw=np.pi)
-    at = (r, 0, h * 0.52)
-    return [(outer, hollow, 1.0), (place(handle, at, turn), place(hole, at, turn), 1.0)]
+    at = (away * np.cos(turned), away * np.sin(turned), up)
+    return place(half, at, turn), place(hole, at, turn)
+
+
+def _pot(draw):
+    r, h = draw.uniform(0.085, 0.1), draw.uniform(0.1, 0.12)
+    handles = [(*_handle(0.034, r, 0.75 * h, turned), 0.12) for turned in (0.0, np.pi)]
+    lid = place(ellipsoid(r * 1.04, r * 1.04, 0.035, above=0.0), (0, 0, h))
+    return [(frustum(r, r, h), None, 1.0), (lid, None, 0.55), (place(_knob(), (0, 0, h + 0.045)), None, 0.12), *handles]
+
+
+def _kettle(draw):
+    r, h = draw.uniform(0.08, 0.09), draw.uniform(0.13, 0.15)
+    spout = place(frustum(0.024, 0.013, 0.075), (-0.75 * r, 0, 0.45 * h), rotation(pitch=-0.8))
+    lid = place(frustum(r * 0.72, r * 0.5, 0.02), (0, 0, h))
+    return [
+        (frustum(r, r * 0.7, h), None, 1.0),
+        (spout, None, 1.0),
+        (lid, None, 0.5),
+        (place(_knob(), (0, 0, h + 0.03)), None, 0.12),
+        (*_handle(0.05, 0.8 * r, 0.55 * h, 0.0), 0.12),
+    ]
+
+
+def _knob():
+    return ellipsoid(0.016, 0.016, 0.014)
 
 
 def _about_middle(solid: Solid, down: float) -> Solid:
@@ -189,6 +221,8 @@ SHAPES = {
     "box": _box,
     "book": _book,
     "mug": _mug,
+    "pot": _pot,
+    "kettle": _kettle,
     "cup": _cup,
     "bowl": _bowl,
     "plate": _plate,

@@ -72,7 +72,8 @@ def bake(room: Room) -> BakedRoom:
     ground = _flat(room, draw, np.array([-x, -y, floor], np.float32), 2 * x, 2 * y, up, 0.006, 0.05, _tiles)
     above = _flat(room, draw, np.array([-x, -y, ceiling], np.float32), 2 * x, 2 * y, -up, 0.02, None, _plaster)
     tx, ty = TABLE_HALF
-    table = _flat(room, draw, np.array([-tx, -ty, 0], np.float32), 2 * tx, 2 * ty, up, 0.0025, 0.005, _planks)
+    top = _cloth if room.cloth else _planks
+    table = _flat(room, draw, np.array([-tx, -ty, 0], np.float32), 2 * tx, 2 * ty, up, 0.0025, 0.005, top)
     return BakedRoom(room, (*walls, ground, above), table)
 
 
@@ -120,6 +121,12 @@ def _planks(draw, u, v):
     grain = pattern(wood, flat).reshape(u.shape)
     tone = 0.1 * grain + 0.05 * _noise(draw, u.shape, 24) + 0.05 * ((board * 7) % 3 - 1) - 0.2 * ((v % 0.16) < 0.004)
     return linear(TABLE_WOOD) * (1 + tone)[..., None]
+
+
+def _cloth(draw, u, v):
+    share = 0.5 * ((u % 0.11 < 0.055) * 1.0 + (v % 0.11 < 0.055)) - 0.25 * (np.minimum(u % 0.11, v % 0.11) < 0.008)
+    mixed = linear((206, 198, 184)) * (1 - share[..., None]) + linear((104, 110, 124)) * share[..., None]
+    return mixed * (1 + 0.05 * _noise(draw, u.shape, 40))[..., None]
 
 
 def _flat(room, draw, origin, width, depth, normal, texel, shadow_texel, paint):

@@ -1,0 +1,85 @@
+"""A short film of a field: once around the scene, in which the answers to texts light up one after the other."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from jsecon.app.pictures import Renderer
+from jsecon.app.question import Answer
+from jsecon.data.synthetic.capture import look_at
+from jsecon.files import written_whole
+from jsecon.fit.schedule import resized
+from jsecon.splat.sh import C0
+from jsecon.types import Camera, LanguageField
+
+SECONDS, PER_SECOND = 15, 8
+WIDE_GAP = np.radians(60)
+"""between two neighbouring cameras, seen from what they look at: from there on nobody has been behind the scene"""
+DIM, SHINE = 0.35, 0.12
+"""what is left of the grey of what no text has lit, and the part of white in what one has"""
+FAR = 0.75
+"""part of the cameras that stand nearer"""
+WIDE, QUALITY = 480, 70
+"""px of its longer side, at most twice that of the frames"""
+
+
+def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> int:
+    """Writes the film as an animated WebP of SECONDS; returns its bytes."""
+    count = SECONDS * PER_SECOND
+    around, long = orbit(field.cameras, count), max(field.cameras.width, field.cameras.height)
+    renderer = Renderer(field.gaussians, resized(around, min(WIDE / long, 2.0)))
+    own = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh, np.float32)[:, 0], 0, 1)
+    dark = np.repeat(DIM * own.mean(1, keepdims=True), 3, axis=1)
+    frames, every = [], count / (len(answers) + 1)
+    for t in range(count):
+        began = t / every - 1  # answers lit so far
+        rgb = own + min(t / every, 1.0) * (dark - own)
+        for n, answer in enumerate(answers):
+            lit, bright = min(max(2 * (began - n), 0.0), 1.0), SHINE + (1 - SHINE) * own[answer.mask]
+            rgb[answer.mask] += lit * (bright - rgb[answer.mask])
+        image, latest = renderer.colours(t, rgb), int(np.floor(began))
+        if 0 <= latest < len(answers):
+            image = _captioned(image, answers[latest].question)
+        frames.append(Image.fromarray(image))
+    first, *rest = frames
+    how = {"duration": 1000 // PER_SECOND, "loop": 0, "quality": QUALITY, "method": 2}
+    with written_whole(file) as temporary:
+        first.save(temporary, format="WEBP", save_all=True, append_images=rest, **how)
+    return file.stat().st_size
+
+
+def _captioned(image: np.ndarray, text: str) -> np.ndarray:
+    image, at = np.ascontiguousarray(image), (10, image.shape[0] - 14)
+    for grey, thickness in ((0, 4), (255, 1)):
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.7, (grey,) * 3, thickness, cv2.LINE_AA)
+    return image
+
+
+def orbit(cameras: Camera, count: int) -> Camera:
+    """`count` cameras around the point that the given ones look at, farther from it than most of them, at their middle
+    height: a whole turn where they stand on all sides of it, else there and back along their arc."""
+    poses = np.asarray(cameras.world_to_camera, np.float64)
+    eyes, forward = -np.einsum("tij,ti->tj", poses[:, :3, :3], poses[:, :3, 3]), poses[:, 2, :3]
+    up = -poses[:, 1, :3].mean(0)
+    up /= np.linalg.norm(up)
+    across = np.eye(3) - forward[:, :, None] * forward[:, None]
+    target = np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0])[0]
+    away = eyes - target
+    lift = away @ up
+    flat = away - lift[:, None] * up
+    first = flat[0] / np.linalg.norm(flat[0])
+    second = np.cross(up, first)
+    angles = np.sort(np.arctan2(flat @ second, flat @ first))
+    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
+    widest, part = int(gaps.argmax()), np.arange(count) / count
+    if gaps[widest] > WIDE_GAP:
+        part = (2 * np.pi - gaps[widest]) / (2 * np.pi) * (0.5 - 0.5 * np.cos(2 * np.pi * part))
+    turn = angles[(widest + 1) % len(angles)] + 2 * np.pi * part
+    out = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+    places = target + np.quantile(np.linalg.norm(flat, axis=1), FAR) * out + np.median(lift) * up
+    placed = np.stack([look_at(eye, target, up) for eye in places])
+    lens = (np.full(count, np.asarray(a)[0], np.float32) for a in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
+    return Camera(placed, *lens, width=cameras.width, height=cameras.height)
