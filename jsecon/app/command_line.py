@@ -115,16 +115,9 @@ def parser() -> argparse.ArgumentParser:
 
 def _demo(asked: Demo, console: Console) -> Told:
     with console.progress("start"):
-        from jsecon.app.demo import demo
-        from jsecon.app.demo_real import demo_real
+        from jsecon.app.demo_real import asked_demo
 
-    how: dict[str, Any] = {"seed": asked.seed, "steps": asked.steps, "listener": console}
-    if asked.real is not None:
-        told = demo_real(asked.real, asked.out, texts=asked.texts or (), **how)
-    elif asked.texts:
-        raise InputError("--texts", "no --real", "a capture to ask them of", "The room's things are asked by name.")
-    else:
-        told = demo(asked.out, **how)
+    told = asked_demo(asked, console)
     return {"written": [asked.out / name for name in (*_RUN_FILES, "queries", "demo.jpg", "demo.webp")]} | told
 
 

@@ -11,9 +11,11 @@ import numpy as np
 
 from jsecon.app import networks, pictures, pipeline, question, report, summary
 from jsecon.app.answers import masks_of
-from jsecon.app.demo import answers_to, say_files, write_pictures, write_queries
+from jsecon.app.demo import answers_to, demo, say_files, write_pictures, write_queries
 from jsecon.app.options import Options, require_writable
 from jsecon.app.progress import Listener
+from jsecon.app.verbs import Demo
+from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.query.masks import selection_mask
 from jsecon.types import LanguageField
@@ -22,6 +24,16 @@ REAL_FRAMES = 60
 """of the capture, at most: so that it takes minutes"""
 TEXTS, LARGE = 6, 0.01
 """asked where none are given; least part of the Gaussians that such a text selects"""
+
+
+def asked_demo(asked: Demo, listener: Listener) -> dict[str, Any]:
+    """What the command line asks for: the room, or a capture of one's own."""
+    how: dict[str, Any] = {"seed": asked.seed, "steps": asked.steps, "listener": listener}
+    if asked.real is not None:
+        return demo_real(asked.real, asked.out, texts=asked.texts or (), **how)
+    if asked.texts:
+        raise InputError("--texts", "no --real", "a capture to ask them of", "The room's things are asked by name.")
+    return demo(asked.out, **how)
 
 
 def demo_real(
