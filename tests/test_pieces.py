@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_field import make_field, shares
 
-from jsecon.query.anchored import query_anchored
+from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.retrieval import is_piece
 from jsecon.query.several import query_several
 from jsecon.types import Regions
@@ -86,3 +86,20 @@ def test_texts_by_vmap_are_the_loop(broken):
     texts = jnp.asarray(broken.regions.embeddings)
     ask = lambda text: query_anchored(broken, text).similarity
     np.testing.assert_allclose(jax.jit(jax.vmap(ask))(texts), np.stack([ask(t) for t in texts]), rtol=1e-6)
+
+
+def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
+    """As a text would whose embedding is the region's own."""
+    for nearness, regions in ((None, [0]), (1.0, [0]), (0.5, [0, 1])):
+        found = query_region(broken, 0, piece_nearness=nearness)
+        np.testing.assert_allclose(found.similarity, shares(broken, regions), atol=1e-6)
+        assert int(found.region) == 0
+    unknown = with_other(broken, None)
+    np.testing.assert_allclose(query_region(unknown, 0, piece_nearness=0.5).similarity, shares(broken, [0]), atol=1e-6)
+    assert int(query_region(broken, 99, piece_nearness=0.5).region) == -1
+
+
+def test_several_regions_leave_their_pieces_where_that_is_asked_for(broken):
+    text = broken.regions.embeddings[:1]
+    alone = query_several(broken, text, several=False, piece_nearness=1.0)
+    np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Int
 
 from jsecon.data.images import read_stored
 from jsecon.errors import InputError, require
+from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.direct import query_canonical, query_one_step
@@ -31,6 +32,7 @@ from jsecon.query.neighbours import evened, nearest
 from jsecon.query.outliers import outliers_removed
 from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
+from jsecon.query.retrieval import PIECE_NEARNESS
 from jsecon.query.several import parts_of_question, query_several
 from jsecon.query.silhouette import silhouette_members
 from jsecon.types import LanguageField, Selection
@@ -120,9 +122,11 @@ def ask_text(
     outliers: bool = True,
     several: bool = False,
     near: Int[np.ndarray, "n k"] | None = None,
+    piece_nearness: float = PIECE_NEARNESS,
 ) -> Answer:
     """The Gaussians that a text names; with `several`, of all regions that answer it (`query_several` has the rule).
     With `near` (N, K), the `nearest` of each Gaussian, shares of votes are evened out over them before they are cut.
+    `piece_nearness`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`).
 
     A text may be composite: `"red mug" or "bowl" but not "handle"`. Raises InputError where the embedder has no words
     for a part, and for several regions or a composite text by anything but votes.
@@ -137,13 +141,15 @@ def ask_text(
             raise InputError(text, f"several regions by {by}", "by votes or silhouette", remedy)
         given: dict[str, Any] = {} if threshold is None else {"similarity_threshold": threshold}
         embedded = jax.device_put(embedder.embed_text(wanted + unwanted))
-        selection = query_several(field, embedded[: len(wanted)], embedded[len(wanted) :], several=several, **given)
+        split = embedded[: len(wanted)], embedded[len(wanted) :]
+        selection = query_several(field, *split, several=several, piece_nearness=piece_nearness, **given)
         if several and field.parts is not None:
-            selection = query_parts(field, selection, embedded[: len(wanted)])
+            selection = query_parts(field, selection, split[0])
         return _answer(field, text, by, _shaped(field, selection, by, threshold, near), outliers, {}, keep="all")
     embedding = jax.device_put(embedder.embed_text([text])[0])
     if by in ("votes", "silhouette", "code"):
-        selection = query_anchored(field, embedding, by=_membership(by), similarity_threshold=threshold)
+        shape: dict[str, Any] = {"similarity_threshold": threshold, "piece_nearness": piece_nearness}
+        selection = query_anchored(field, embedding, by=_membership(by), **shape)
         selection = _shaped(field, selection, by, threshold, near)
     else:
         from jsecon.language.codes import encode
@@ -186,6 +192,13 @@ def ask_pixel(
     selection = _shaped(field, selection, by, threshold, near)
     left = {"text encoder": "the region under the pixel is the anchor"}
     return _answer(field, f"at {name} {x} {y}", by, selection, outliers, left)
+
+
+def ask_region(field: LanguageField, region: int, *, several: bool = False, **shape: Any) -> Answer:
+    """The Gaussians of a region, with `several` of all that are alike; `shape` as for `query_region`."""
+    selection = query_region(field, region, alike_threshold=ALIKE_THRESHOLD if several else None, **shape)
+    left = {"text encoder": "the region is the anchor"}
+    return _answer(field, f"region {region}", "votes", selection, True, left, keep="all" if several else "largest")
 
 
 def ask_outline(

@@ -143,16 +143,23 @@ class Export:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View(Asking):
-    """a page that shows a field and its answers
+    """look at a field and ask it, in a browser
 
-    One HTML file that opens by double click, without a server or internet: the Gaussians, to turn and come near; each
-    text lights up what it selects; a click lights up the region under it. Its link keeps what is seen.
+    A page on loopback: the Gaussians, to turn and come near; each text lights up what it selects, a click what lies
+    there; thresholds, other candidates, frames, files of the selection, a link that keeps what is seen (extra viewer).
+    With --export instead one HTML file that opens by double click, without a server.
     """
 
     texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
-    """what can be lit up"""
-    export: Annotated[Path, {"metavar": "HTML"}]
-    """the page to write"""
+    """what to light up"""
+    export: Annotated[Path | None, {"metavar": "HTML"}] = None
+    """write a page, and open none"""
+    link: Annotated[str, {"metavar": "LINE"}] = ""
+    """what the viewer gave as its link, to have it back"""
+    host: str = "127.0.0.1"
+    """address to listen on"""
+    port: Annotated[int, {"least": 0}] = 8766
+    """port to listen on"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

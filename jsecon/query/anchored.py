@@ -21,6 +21,7 @@ from jsecon.query.retrieval import (
     answers,
     evidence,
     is_alike,
+    is_piece,
     regions_of_text,
     threshold_of,
 )
@@ -89,17 +90,20 @@ def query_region(
     similarity_threshold: Number | None = None,
     by: str = "votes",
     alike_threshold: Number | None = None,
+    piece_nearness: Number | None = None,
 ) -> Selection:
     """The Gaussians of region `region`, as found by `region_at`: `query_anchored` without the text; score 1.
 
-    Regions that are alike are not joined unless asked for: who points at one of two red chairs means that one.
+    Regions that are alike are not joined unless asked for: who points at one of two red chairs means that one. Nor are
+    pieces (`regions_of_text`), with the region's own embedding in place of a text's.
 
     Nothing for region -1 (or any other id that the field does not have): Selection.region is then -1 and its score 0.
     """
     require_one_of("query_region", by, _THRESHOLDS, "'votes' is the default.")
     if field.regions.count == 0:
         return nothing(field)
-    found = _found_region(jnp.asarray(field.regions.embeddings), jnp.asarray(region), alike_threshold)
+    known = jnp.asarray(field.regions.embeddings), field.votes.overlap
+    found = _found_region(*known, jnp.asarray(region), alike_threshold, piece_nearness)
     return members(field, found, similarity_threshold, by=by)
 
 
@@ -134,9 +138,14 @@ _retrieve = jax.jit(_retrieve_body, static_argnames="retrieval")
 
 
 @jax.jit
-def _found_region(embeddings: Array, region: Array, alike_threshold: Number | None) -> Found:
+def _found_region(
+    embeddings: Array, overlap: Array | None, region: Array, alike_threshold: Number | None, nearness: Number | None
+) -> Found:
     valid = (region >= 0) & (region < embeddings.shape[0])
     chosen = jnp.arange(embeddings.shape[0]) == region
+    if nearness is not None and overlap is not None:
+        cosines, known = similarities(embeddings, embeddings[jnp.maximum(region, 0)])
+        chosen |= is_piece(cosines, known, chosen, overlap, nearness=nearness)
     if alike_threshold is not None:
         chosen |= is_alike(embeddings, jnp.maximum(region, 0), alike_threshold)
     return Found(chosen & valid, jnp.where(valid, region, -1), valid.astype(embeddings.dtype))

@@ -56,8 +56,12 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
     if not (0 <= x < width and 0 <= y < height):
         remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
         raise InputError("pixel", f"({x}, {y})", f"column 0 to {width - 1}, row 0 to {height - 1}", remedy)
-    gaussians, cameras = jax.tree.map(jnp.asarray, (field.gaussians, field.cameras))
-    ids, weights = pixel_weights(gaussians, cameras[frame], x, y)
+    return region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
+
+
+def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
+    """`region_shares_at` for a camera that is none of the field's."""
+    ids, weights = pixel_weights(jax.tree.map(jnp.asarray, field.gaussians), camera, x, y)
     regions = np.asarray(field.votes.regions)[ids]
     share = np.nan_to_num(np.asarray(vote_shares(field.votes))[ids].astype(np.float64))
     shares = np.zeros(field.regions.count)

@@ -10,7 +10,7 @@ from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import Found, members, nothing
 from jsecon.query.direct import Number
-from jsecon.query.retrieval import NEARNESS, answers, evidence, regions_of_text, threshold_of
+from jsecon.query.retrieval import NEARNESS, PIECE_NEARNESS, answers, evidence, regions_of_text, threshold_of
 from jsecon.types import Array, LanguageField, Selection
 
 ROUNDING = 1e-5
@@ -24,6 +24,7 @@ def query_several(
     *,
     several: bool = True,
     nearness: Number = NEARNESS,
+    piece_nearness: Number = PIECE_NEARNESS,
     retrieval: str = "contrast",
     retrieval_threshold: Number | None = None,
     similarity_threshold: Number = SHARE_THRESHOLD,
@@ -47,11 +48,11 @@ def query_several(
         return nothing(field)
     known = field.regions.embeddings, field.canonical, field.regions.pixels, field.votes.overlap
     given = jax.tree.map(jnp.asarray, (*known, wanted, unwanted))
-    return members(field, _retrieve(*given, nearness, least, several, retrieval), similarity_threshold)
+    return members(field, _retrieve(*given, nearness, piece_nearness, least, several, retrieval), similarity_threshold)
 
 
 def _retrieve_body(
-    embeddings, canonical, pixels, overlap, wanted, unwanted, nearness, least, several, retrieval
+    embeddings, canonical, pixels, overlap, wanted, unwanted, nearness, piece_nearness, least, several, retrieval
 ) -> Found:
     count = embeddings.shape[0]
     standing = None if retrieval == "cosine" else evidence(pixels).astype(embeddings.dtype)
@@ -61,7 +62,7 @@ def _retrieve_body(
         for text in texts:
             similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
             rule = {"retrieval_threshold": least, "several": several, "nearness": nearness, "standing": standing}
-            own = regions_of_text(embeddings, similarity, known, overlap, **rule)
+            own = regions_of_text(embeddings, similarity, known, overlap, piece_nearness=piece_nearness, **rule)
             chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, similarity, -jnp.inf))
         return chosen, closeness
 

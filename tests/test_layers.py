@@ -1,0 +1,106 @@
+"""A field in the viewer's window: what viser holds of it, and what is sent."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra viewer is not installed")
+import viser
+from small_field import make_field
+
+from jsecon.app.layers import LARGEST, Layers
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    return make_field(scene, cameras)[0]
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    yield server
+    server.stop()
+
+
+def with_gaussians(field, **changes):
+    return dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, **changes))
+
+
+def colours(layers, count=64):
+    """(N, 4) RGBA as the window has them."""
+    told = np.zeros((count, 4), np.uint8)
+    for rows, handle in layers._groups:
+        told[rows] = np.ascontiguousarray(handle.buffer[:, 7]).view(np.uint8).reshape(-1, 4)
+    return told
+
+
+@pytest.mark.parametrize("size", [1e-4, 1, 300])
+def test_the_window_holds_the_field_at_any_size(field, server, size):
+    logs = np.asarray(field.gaussians.log_scales) + np.float32(np.log(size))
+    layers = Layers(server, with_gaussians(field, means=np.asarray(field.gaussians.means) * size, log_scales=logs))
+    seen = np.zeros(64, int)
+    for rows, handle in layers._groups:
+        seen[rows] += 1
+        centres = np.asarray(field.gaussians.means)[rows] * size
+        np.testing.assert_allclose(handle.centers / layers.scale, centres, rtol=1e-5)
+        spread = handle.covariances.astype(np.float64) / layers.scale**2
+        sizes = np.sort(np.exp(2 * logs[rows].astype(np.float64)), axis=1)
+        np.testing.assert_allclose(np.linalg.eigvalsh(spread), sizes, rtol=0.03, atol=2e-5 * size**2)
+    assert (seen == 1).all()
+
+
+def test_huge_and_tiny_gaussians_stay_within_what_viser_holds(field, server):
+    logs = np.array(field.gaussians.log_scales)
+    logs[0], logs[1] = 20, -40
+    layers = Layers(server, with_gaussians(field, log_scales=logs))
+    for _, handle in layers._groups:
+        assert np.isfinite(handle.covariances).all()
+        assert np.abs(handle.covariances).max() <= 1.001 * LARGEST**2
+    assert layers.scale * np.exp(np.median(logs)) == pytest.approx(1, rel=1e-3)
+
+
+def test_gaussians_that_are_not_finite_are_left_out(field, server):
+    means = np.array(field.gaussians.means)
+    means[3] = np.nan
+    layers = Layers(server, with_gaussians(field, means=means))
+    assert layers.scale == pytest.approx(Layers(server, field).scale, rel=0.1)
+    assert all(np.isfinite(handle.centers).all() for _, handle in layers._groups)
+    np.testing.assert_array_equal(np.flatnonzero(colours(layers)[:, 3] == 0), [3])
+
+
+def test_only_the_groups_that_change_are_sent(field, server, monkeypatch):
+    layers = Layers(server, field)
+    base, all_seen = layers.photo, np.ones(64, bool)
+    sent = []
+    layers.paint(base, all_seen)
+    queue = server._websock_server.queue_message
+    monkeypatch.setattr(server._websock_server, "queue_message", lambda m: (sent.append(m), queue(m))[1])
+    layers.paint(base, all_seen)
+    assert not [m for m in sent if "Update" in type(m).__name__]
+    changed, (rows, _) = base.copy(), layers._groups[2]
+    changed[rows[0]] = 255 - changed[rows[0]]
+    layers.paint(changed, all_seen)
+    assert len([m for m in sent if "Update" in type(m).__name__]) == 1
+    np.testing.assert_array_equal(colours(layers)[:, :3], changed)
+    layers.paint(base, ~all_seen)
+    assert not colours(layers)[:, 3].any()
+
+
+def test_frames_stand_where_they_were_taken(field, server):
+    layers = Layers(server, field)
+    centres = np.asarray(field.cameras.centres) * layers.scale
+    assert list(layers.frustums) == [0, 1, 2, 3]
+    for t, frustum in layers.frustums.items():
+        np.testing.assert_allclose(frustum.position, centres[t], rtol=1e-5)
+        assert frustum.fov == pytest.approx(2 * np.arctan(20 / 43))
+        assert not frustum.visible
+    layers.show_frames(True)
+    assert [frustum.visible for frustum in layers.frustums.values()] == [
+        False,
+        True,
+        True,
+        True,
+    ]  # one stands in the 0th
+    np.testing.assert_allclose(server.initial_camera.position, centres[0], rtol=1e-5)

@@ -1,0 +1,298 @@
+"""The viewer: what its steps do to a field, and in a browser what a person would try."""
+
+import dataclasses
+import io
+import itertools
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the extra viewer is not installed")
+from browser import CHROMIUM, opened, until
+from small_field import make_field
+
+from jsecon.app import viewing
+from jsecon.app.command_line import main
+from jsecon.app.question import Answer
+from jsecon.app.viewer import Viewer, open_viewer
+from jsecon.app.viewing import ViewState
+from jsecon.data.ply import load_ply
+from jsecon.errors import InputError
+from jsecon.language.field import save_field
+from jsecon.language.shares import with_overlap
+from jsecon.query.pixel import region_shares_seen
+from jsecon.types import Camera
+from jsecon.vision.colours import BASIC, ColourEmbedder
+
+START = "orange; pink"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        return found.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def viewer(scene, cameras):
+    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
+    field = dataclasses.replace(field, votes=with_overlap(field.votes), embedder=ColourEmbedder.name)
+    port, state = free_port(), viewing.asked(ViewState(), START)
+    viewer = open_viewer(field, ColourEmbedder(), host="127.0.0.1", port=port, name="<desk>", state=state)
+    yield viewer
+    viewer.stop()
+    viewer.server.stop()
+
+
+@pytest.fixture(autouse=True)
+def as_begun(viewer):
+    """Each test begins with a viewer that was asked nothing."""
+    settled(viewer, lambda: viewer.then(lambda _: ViewState(), whole=True))
+
+
+def settled(viewer: Viewer, act) -> ViewState:
+    """The state once all that was to be done is done."""
+    done = []
+    act()
+    viewer.do(lambda: done.append(True))
+    until(lambda: done and viewer.drawn == viewer.history.state, "the viewer's thread comes to it")
+    return viewer.history.state
+
+
+def word_of(viewer: Viewer) -> str:
+    """A colour that selects a part of the scene."""
+    masks = {word: viewer.answer(viewing.Ask(word)).mask.sum() for word in BASIC}
+    return next(word for word, count in masks.items() if 3 < count < 30)
+
+
+def colours(viewer: Viewer) -> np.ndarray:
+    """(N, 4) RGBA as the window has them."""
+    count = viewer.field.gaussians.count
+    told = np.zeros((count, 4), np.uint8)
+    for rows, handle in viewer.layers._groups:
+        told[rows] = np.ascontiguousarray(handle.buffer[:, 7]).view(np.uint8).reshape(-1, 4)
+    return told
+
+
+def test_a_text_lights_up(viewer):
+    base, word = colours(viewer), word_of(viewer)
+    before = [handle.buffer.copy() for _, handle in viewer.layers._groups]
+    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, word)))
+    mask = viewer.answer(viewing.Ask(word)).mask
+    lit = colours(viewer)
+    assert (lit[~mask, :3].astype(int) <= base[~mask, :3]).all()
+    np.testing.assert_array_equal(lit[:, 3], base[:, 3])
+    tint = 0.45 * base[mask, :3] + 0.55 * viewing.tints(1)[0]
+    np.testing.assert_allclose(lit[mask, :3], tint, atol=1)
+    for (_, handle), was in zip(viewer.layers._groups, before, strict=True):
+        np.testing.assert_array_equal(handle.buffer[:, :7], was[:, :7])
+
+
+def test_show_only_hide_and_undo(viewer):
+    word, opacity = word_of(viewer), colours(viewer)[:, 3]
+    mask = viewer.answer(viewing.Ask(word)).mask
+    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, word)))
+    settled(viewer, lambda: viewer.then(viewing.shown_only))
+    np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, opacity, 0))
+    settled(viewer, viewer.undo)
+    np.testing.assert_array_equal(colours(viewer)[:, 3], opacity)
+    settled(viewer, lambda: viewer.then(viewing.hidden))
+    np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, 0, opacity))
+    assert settled(viewer, lambda: viewer.then(viewing.all_shown)) == ViewState()
+
+
+@pytest.mark.parametrize("paint", viewing.PAINTS)
+def test_every_paint(viewer, paint):
+    settled(viewer, lambda: viewer.then(lambda s: viewing.moved(s, paint=paint)))
+    told = colours(viewer)
+    kinds = len(np.unique(told[:, :3], axis=0))
+    assert kinds == 1 if paint == "score" else kinds > 2
+    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, word_of(viewer))))
+    assert (colours(viewer)[:, :3] != told[:, :3]).any()
+
+
+def test_part_or_whole_changes_what_a_region_takes(viewer):
+    part, whole = (viewer.answer(viewing.Ask(2, whole=w)).mask for w in (0.0, 1.0))
+    overlap = np.asarray(viewer.field.votes.overlap)[2]
+    assert (np.delete(overlap, 2) >= 0.1).any(), "a field whose regions overlap"
+    assert whole.sum() > part.sum() > 0
+    assert (whole | ~part).all()
+
+
+def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
+    state = settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, "the meaning of life; black or ''")))
+    assert len(state.things) == 2
+    told = viewer.panel._told.content
+    assert "no colour word" in told
+    assert "a part without words" in told
+    before = colours(viewer)
+    settled(viewer, lambda: viewer.restore('{"things": [-1]}'))
+    assert viewer.panel._notice.visible
+    assert "Copy the whole line" in viewer.panel._notice.content
+    assert viewer.history.state == state
+    np.testing.assert_array_equal(colours(viewer), before)
+    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, "<script>alert(1)</script> red")))
+    assert "<script>" not in viewer.panel._told.content
+    settled(viewer, lambda: viewer.then(lambda s: viewing.clicked(s, 4000)))
+    assert "nothing here answers it" in viewer.panel._told.content
+
+
+def test_an_error_inside_is_told_and_the_viewer_goes_on(viewer, capsys):
+    settled(viewer, lambda: viewer.then(lambda s: 1 / 0))
+    assert "the terminal has it" in viewer.panel._notice.content
+    assert "ZeroDivisionError" in capsys.readouterr().err
+    assert settled(viewer, lambda: viewer.then(lambda s: viewing.clicked(s, 1))).things == (1,)
+
+
+def test_files_of_the_answers(viewer, tmp_path):
+    answer = viewer.answer(viewing.Ask(1))
+    assert isinstance(answer, Answer)
+    with zipfile.ZipFile(io.BytesIO(viewer.packed([answer]))) as archive:
+        names = archive.namelist()
+        archive.extractall(tmp_path)
+    assert {"region-1.json", "region-1.ply"} <= set(names)
+    assert sum(name.endswith(".png") for name in names) == 3
+    assert load_ply(tmp_path / "region-1.ply").count == answer.mask.sum()
+
+
+def test_a_taken_port_and_a_missing_extra_are_told(viewer, monkeypatch):
+    given = {"host": "127.0.0.1", "name": "x", "state": ViewState()}
+    with pytest.raises(InputError, match="--port"):
+        open_viewer(viewer.field, viewer.embedder, port=viewer.server.get_port(), **given)
+    with pytest.raises(InputError, match="--port"):
+        open_viewer(viewer.field, viewer.embedder, port=8766, **given | {"host": "no.such.host.invalid"})
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r'pip install "jsecon\[viewer\]"'):
+        open_viewer(viewer.field, viewer.embedder, port=0, **given)
+
+
+QUIET = ".mantine-Notifications-root { display: none }"
+
+
+def test_the_command_says_where_it_listens(viewer, tmp_path):
+    file, port = tmp_path / "run" / "field.npz", free_port()
+    file.parent.mkdir()
+    save_field(file, viewer.field)
+    command = [sys.executable, "-m", "jsecon", "view", str(file), "red", "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        told = list(itertools.takewhile(lambda line: not line.startswith("http"), process.stdout))
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 130
+    assert told == ["run: 64 Gaussians, 5 regions\n"]
+
+
+def test_bad_arguments_end_in_one_message(viewer, tmp_path, capsys):
+    save_field(tmp_path / "field.npz", viewer.field)
+    asked = ["view", str(tmp_path / "field.npz"), "--port", str(viewer.server.get_port())]
+    for more, wanted in ((["--link", "what"], "link: found 'what'"), ([], "--port: found")):
+        assert main([*asked, *more]) == 2
+        assert wanted in capsys.readouterr().err
+
+
+CANVAS = "[...document.querySelectorAll('canvas')].sort((a, b) => b.width - a.width)[0]"
+
+
+def scene_of(page) -> np.ndarray:
+    """(H, W, 3) what is seen of the scene, without the panel."""
+    image = cv2.imdecode(np.frombuffer(page.png(), np.uint8), cv2.IMREAD_COLOR)
+    return image[60:, : image.shape[1] * 2 // 5].astype(int)
+
+
+def after_change(page, before: np.ndarray) -> np.ndarray:
+    changed = lambda: (np.abs(scene_of(page) - before).max(-1) > 12).mean() > 0.005
+    until(changed, "the picture changes")
+    return scene_of(page)
+
+
+def input_of(label: str) -> str:
+    """The input beside a label."""
+    return f"""[...document.querySelectorAll('input')].find(e => {{
+        for (let p = e, k = 0; k < 6 && p; k++, p = p.parentElement) if (p.innerText?.trim() === '{label}') return true;
+        }})"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
+    word, address = word_of(viewer), f"http://127.0.0.1:{viewer.server.get_port()}/"
+    with opened(address, tmp_path, width=800, height=420) as page:
+        page.until(f"{input_of('find')} && {input_of('link')} && true")
+        page.js(
+            "document.head.append(Object.assign(document.createElement('style'), { textContent: '" + QUIET + "' }))"
+        )
+        first = after_change(page, np.full_like(scene_of(page), scene_of(page)[-1, 0]))
+        assert len(np.unique(first.reshape(-1, 3) // 16, axis=0)) > 8, "the canvas is blank"
+
+        page.type(input_of("find"), word)
+        until(lambda: viewer.history.state.things == (word,), "the text arrives")
+        after_change(page, first)
+        count = int(viewer.answer(viewing.Ask(word)).mask.sum())
+        page.until(f"document.body.innerText.includes('{word}: {count} Gaussians')")
+        page.until("document.querySelectorAll('figure img').length >= 3")
+
+        page.js("document.querySelectorAll('[role=slider]')[0].focus()")
+        page.key("ArrowRight", 39)
+        until(lambda: viewer.history.state.threshold == 0.51, "the threshold moves")
+
+        width, height = page.js(f"(() => {{ const c = {CANVAS}; return [c.clientWidth, c.clientHeight]; }})()")
+        x, y = round(0.4 * width), round(0.55 * height)
+        focal = height / 2 / np.tan(viewer.layers.fov(0) / 2)
+        lens = (np.float32(v) for v in (focal, focal, width / 2, height / 2))
+        seen_from = Camera(viewer.field.cameras.world_to_camera[0], *lens, width=width, height=height)
+        region = int(region_shares_seen(viewer.field, seen_from, x, y).argmax())
+        left, top = page.js(f"(() => {{ const r = {CANVAS}.getBoundingClientRect(); return [r.x, r.y]; }})()")
+        page.click(left + x, top + y)
+        until(lambda: viewer.history.state.things == (region,), f"region {region} is clicked")
+
+        other = next(
+            (u, v)
+            for v in range(60, height - 40, 7)
+            for u in range(20, width // 2, 7)
+            if int(region_shares_seen(viewer.field, seen_from, u, v).argmax()) != region
+            and region_shares_seen(viewer.field, seen_from, u, v).max() > 0.3
+        )
+        page.click(left + other[0], top + other[1], shift=True)
+        until(lambda: len(viewer.history.state.things) == 2, "a second region beside it")
+        page.click(left + other[0], top + other[1], shift=True)
+        until(lambda: viewer.history.state.things == (region,), "and away again")
+
+        page.press("export")
+        packed = until(lambda: list((tmp_path / "downloads").glob("*.zip")), "the files arrive")[0]
+        assert f"region-{region}.ply" in zipfile.ZipFile(packed).namelist()
+
+        link = page.until(f"(() => {{ const e = {input_of('link')}; return e.value.includes('camera') && e.value }})()")
+        clicked = scene_of(page)
+        page.press("hide")
+        until(lambda: viewer.history.state.hidden, "the region is hidden")
+        after_change(page, clicked)
+        page.type(input_of("link"), link)
+        until(lambda: viewer.history.state.things == (region,) and not viewer.history.state.hidden, "the link is back")
+        until(lambda: (np.abs(scene_of(page) - clicked).max(-1) > 12).mean() < 0.005, "and looks the same")
+
+        page.press("undo")
+        until(lambda: viewer.history.state.hidden, "one step back")
+        client = next(iter(viewer.server.get_clients().values()))
+        viewer.frame(client, 2)
+        centre = viewer.layers._centres[2]
+        until(lambda: np.allclose(client.camera.position, centre, atol=1e-3), "at the frame")
+        page.until("document.querySelectorAll('img').length > 0")
+        viewer.layers.show_frames(True)
+        time.sleep(1)
+        near = viewer.layers._centres[0] + 0.04 * viewer.layers.scale * viewer.layers._turns[0].as_matrix()[:, 2]
+        place = viewer.layers._turns[2].inv().apply(near - centre)
+        focal = height / 2 / np.tan(viewer.layers.fov(2) / 2)
+        things = viewer.history.state.things
+        page.click(left + width / 2 + focal * place[0] / place[2], top + height / 2 + focal * place[1] / place[2])
+        until(lambda: viewer.panel._frame.value == "frame_0", "the camera of another frame is clicked")
+        assert viewer.history.state.things == things
+        outside = [url for url in page.asked if not url.startswith((address, "data:", "blob:", "ws://127.0.0.1"))]
+        assert not outside
