@@ -204,7 +204,9 @@ def _export(asked: Export, console: Console) -> Told:
 
 def _view(asked: View, console: Console) -> Told:
     if asked.export is None:
-        return _window(asked, console)
+        from jsecon.app.viewer import view
+
+        return view(asked, _embedder, console.say)
     if asked.export.suffix != ".html":
         raise InputError("--export", str(asked.export), "a file that ends in .html", "For example: --export page.html")
     require_writable(asked.export.parent)
@@ -222,23 +224,6 @@ def _view(asked: View, console: Console) -> Told:
     )
     lit = [answer.question for answer in answers]
     return {"written": {"page": asked.export}, "refused": refused, "gaussians": count, "answers": lit, "bytes": size}
-
-
-def _window(asked: View, console: Console) -> Told:
-    from jsecon.app import networks, viewing
-    from jsecon.app.viewer import view
-    from jsecon.language.field import load_field
-
-    state = viewing.state_of(asked.link) if asked.link else viewing.ViewState()
-    state = viewing.asked(state, "; ".join(asked.texts)) if asked.texts else state
-    field, name = load_field(asked.field), asked.field.resolve().parent.name
-    dim = networks.given_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
-    if dim is not None and not asked.texts and asked.embedder is None:
-        embedder = networks.GivenSpace(dim)
-    else:
-        embedder = _embedder(field, asked)
-    view(field, embedder, host=asked.host, port=asked.port, name=name, state=state, say=console.say)
-    return {}
 
 
 def _eval(asked: Eval, console: Console) -> Told:

@@ -23,12 +23,14 @@ from jsecon.app import viewing
 from jsecon.app.answers import masks_of, slug_of, write_answer
 from jsecon.app.candidates import Candidate, Pictures, candidates, region_along
 from jsecon.app.layers import Layers
+from jsecon.app.networks import GivenSpace, given_dim
 from jsecon.app.panel import Panel, sheet, told
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
 from jsecon.app.question import Answer, ask_region, ask_text
 from jsecon.app.splat_page import NOWHERE
 from jsecon.app.viewing import Ask, History, ViewState
 from jsecon.errors import InputError
+from jsecon.language.field import load_field
 from jsecon.types import LanguageField
 
 REMEDY = 'pip install "jsecon[viewer]"'
@@ -271,14 +273,21 @@ def open_viewer(field: LanguageField, embedder: Any, *, host: str, port: int, na
     return viewer
 
 
-def view(field: LanguageField, embedder: Any, *, host: str, port: int, name: str, state: ViewState, say: Any) -> None:
-    """Shows a field until it is stopped; raises as `open_viewer` does."""
-    viewer = open_viewer(field, embedder, host=host, port=port, name=name, state=state)
+def view(asked: Any, embedder_of: Callable[..., Any], say: Callable[[str], object]) -> dict[str, Any]:
+    """Shows a field as `jsecon view` asks until it is stopped; raises as `open_viewer` does."""
+    state = viewing.state_of(asked.link) if asked.link else ViewState()
+    state = viewing.asked(state, "; ".join(asked.texts)) if asked.texts else state
+    field, name, dim = load_field(asked.field), asked.field.resolve().parent.name, None
+    if not asked.texts and asked.embedder is None:
+        dim = given_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
+    embedder = embedder_of(field, asked) if dim is None else GivenSpace(dim)
+    viewer = open_viewer(field, embedder, host=asked.host, port=asked.port, name=name, state=state)
     say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
-    if host not in ("127.0.0.1", "::1", "localhost"):
-        say(f"note: who can reach {host} can see and ask this field")
-    say(f"http://{host}:{viewer.server.get_port()}")
+    if asked.host not in ("127.0.0.1", "::1", "localhost"):
+        say(f"note: who can reach {asked.host} can see and ask this field")
+    say(f"http://{asked.host}:{viewer.server.get_port()}")
     try:
         viewer.server.sleep_forever()
     finally:
         viewer.stop()  # a thread inside XLA at the interpreter's end aborts it
+    return {}
