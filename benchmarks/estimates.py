@@ -1,4 +1,4 @@
-"""What the stages of a run cost: the numbers in jsecon/app/estimates.py, which `jsecon run --dry-run` reckons with.
+"""What the stages of a run cost: the numbers in jsecon/pipeline/estimates.py, by which `jsecon run --dry-run` reckons.
 
     python benchmarks/estimates.py [--capture FOLDER ...] [--kept FILE]
 
@@ -38,9 +38,9 @@ from jsecon.process import cores, prepare_process
 
 prepare_process()
 
-from jsecon.app.estimates import units_of, workload
 from jsecon.data.capture import capture_extent
 from jsecon.data.frames import Extent
+from jsecon.pipeline.estimates import units_of, workload
 
 ROOMS = (
     {"views": 12, "width": 160, "height": 120, "points": 1200, "steps": 150},
@@ -63,8 +63,8 @@ def waiting() -> dict[str, tuple[int, int]]:
 
 def one(capture: Path, options: dict[str, Any], out: Path) -> None:
     """A run, and what its stages took, to OUT/measured.json."""
-    from jsecon.app import pipeline
-    from jsecon.app.progress import Listener
+    from jsecon.pipeline import pipeline
+    from jsecon.pipeline.progress import Listener
 
     memory, quiet = {}, {}
 
@@ -152,7 +152,7 @@ def fitted(rows: list[dict[str, float]], names: Sequence[str], values: list[floa
 
 
 def table(kept: dict[str, Any]) -> str:
-    """MEASURED as it stands in jsecon/app/estimates.py, and beneath it the errors on what it was fitted to."""
+    """MEASURED as it stands in jsecon/pipeline/estimates.py, and beneath it the errors on what it was fitted to."""
     cases, rows, lines, errors = list(kept.values()), [], [], []
     for case in cases:
         told = dict(case["warm"]["extent"])

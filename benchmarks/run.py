@@ -28,8 +28,8 @@ def measure(capture: Path, out: Path, steps: int) -> None:
     prepare_process()
     import numpy as np
 
-    from jsecon.app import pipeline
-    from jsecon.app.options import Options
+    from jsecon.pipeline import pipeline
+    from jsecon.pipeline.options import Options
 
     run = pipeline.run(Options(capture, steps=steps), out)
     figures = {

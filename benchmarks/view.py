@@ -26,10 +26,10 @@ import numpy as np
 from browser import Page, opened, until
 from serve import SHADES, WORDS, copied, free_port
 
-from jsecon.app.networks import embedder_of_field
 from jsecon.app.viewer import Viewer, open_viewer
 from jsecon.app.viewing import ViewState
 from jsecon.language.field import load_field, save_field
+from jsecon.pipeline.networks import embedder_of_field
 
 HOOK = """(() => {
   const now = () => performance.timeOrigin + performance.now();

@@ -24,9 +24,9 @@ from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import State, tracked
 from jsecon.app.demo import PLAIN, demo
-from jsecon.app.progress import Listener
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
+from jsecon.pipeline.progress import Listener
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.outliers import remove_outliers
 

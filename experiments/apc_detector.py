@@ -22,7 +22,6 @@ import numpy as np
 from experiments import results
 from experiments.apc_bin import OBJECTS, Options, _image, build_gaussians, load_apc
 from experiments.rivals.lifting import centre_weights, gate
-from jsecon.app.masklet_stages import CLOUD, GRAIN
 from jsecon.association.algorithm1 import clean_masklets
 from jsecon.association.consensus import consensus_masklets
 from jsecon.association.views import SceneViews
@@ -34,6 +33,7 @@ from jsecon.fit.schedule import Schedule
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.shares import vote_shares, with_shown
 from jsecon.language.votes import region_votes
+from jsecon.pipeline.masklet_stages import CLOUD, GRAIN
 from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
 from jsecon.query.silhouette import silhouette_members
 from jsecon.splat.composite import composite_features_vjp

@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results
-from jsecon.app import pipeline
-from jsecon.app.options import Options as RunOptions
 from jsecon.app.question import ask_text
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import iou
+from jsecon.pipeline import pipeline
+from jsecon.pipeline.options import Options as RunOptions
 from jsecon.query.anchored import query_region
 from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.query.outliers import remove_outliers

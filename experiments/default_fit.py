@@ -18,7 +18,7 @@ from experiments import lerf, ovs3d, results
 from experiments.tables.fill import Plan, fill, options_of
 from experiments.tables.methods import METHODS
 from experiments.tables.setting import Fitted
-from jsecon.app.options import Options
+from jsecon.pipeline.options import Options
 
 FIGURES = ("miou", "miou_vala")
 FITS: tuple[Fitted, ...] = get_args(Fitted)

@@ -34,15 +34,15 @@ from scipy.spatial import cKDTree
 
 from experiments import replica_apartment_0, results
 from experiments.cells import append_cell, read_cells
-from jsecon.app import cache
 from jsecon.app.demo import PLAIN, demo
-from jsecon.app.masklet_stages import associated, proposals_of
-from jsecon.app.options import Options as RunOptions
-from jsecon.app.progress import Listener
-from jsecon.app.stages import Work, training_frames
 from jsecon.app.verbs import Demo
 from jsecon.data.capture import load_capture
 from jsecon.language.field import load_field
+from jsecon.pipeline import cache
+from jsecon.pipeline.masklet_stages import associated, proposals_of
+from jsecon.pipeline.options import Options as RunOptions
+from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.stages import Work, training_frames
 from jsecon.types import Capture, Gaussians
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

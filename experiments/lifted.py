@@ -17,10 +17,10 @@ import numpy as np
 
 from experiments import results
 from experiments.places import Options as Places, asked_for, fields_of
-from jsecon.app.networks import embedder_of_field
 from jsecon.app.question import ask_outline, ask_text
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.evaluate.metrics import iou
+from jsecon.pipeline.networks import embedder_of_field
 from jsecon.query.masks import selection_mask
 from jsecon.types import LanguageField
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from experiments import results
 from jsecon.app.demo import PLAIN, demo
-from jsecon.app.networks import embedder_of_field
 from jsecon.app.place import locate
-from jsecon.app.progress import Listener
 from jsecon.app.verbs import Demo
 from jsecon.data.synthetic.raycast import trace
 from jsecon.data.synthetic.room import Room, make_room
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
+from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.progress import Listener
 from jsecon.types import Camera, LanguageField
 
 

@@ -27,10 +27,10 @@ from experiments.bonsai_outlines import Asked, candidates
 from experiments.cells import append_cell, read_cells
 from experiments.default_vision import LEAST, connected_parts
 from experiments.replica_apartment_0 import load_replica
-from jsecon.app import pipeline
-from jsecon.app.masklet_stages import proposals_of
-from jsecon.app.options import Options as RunOptions
-from jsecon.app.stages import Work
+from jsecon.pipeline import pipeline
+from jsecon.pipeline.masklet_stages import proposals_of
+from jsecon.pipeline.options import Options as RunOptions
+from jsecon.pipeline.stages import Work
 from jsecon.types import Capture
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

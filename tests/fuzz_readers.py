@@ -20,7 +20,7 @@ from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
-from jsecon.app import cache, question
+from jsecon.app import question
 from jsecon.data import images, mask_files, motion, proposal_files, video
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
@@ -36,6 +36,7 @@ from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 from jsecon.networks.sam2.tracker import Sam2Tracker
 from jsecon.networks.tokenizer import load_tokenizer
+from jsecon.pipeline import cache
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
 

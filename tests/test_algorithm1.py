@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.app import cache
 from jsecon.association.algorithm1 import clean_masklets, iou_matrix, masklets
+from jsecon.pipeline import cache
 
 
 def squares(frames=5, size=40, *, step=3):

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.app import cache
-from jsecon.app.language_stages import codes, votes
-from jsecon.app.scene_stages import _as_it_is as load
-from jsecon.app.stages import Outcome
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
+from jsecon.pipeline import cache
+from jsecon.pipeline.language_stages import codes, votes
+from jsecon.pipeline.scene_stages import _as_it_is as load
+from jsecon.pipeline.stages import Outcome
 
 
 def _tree(scene, cameras):
@@ -118,7 +118,7 @@ def test_pickles_are_neither_written_nor_read(tmp_path):
 
 
 def test_only_records_of_jsecon_are_made():
-    for record in ("os:system", "jsecon.app.cache:fetch", "jsecon.files:Path"):
+    for record in ("os:system", "jsecon.pipeline.cache:fetch", "jsecon.files:Path"):
         with pytest.raises((ValueError, AttributeError)):
             cache.unpack({"record": record, "fields": {}}, {})
 
@@ -187,7 +187,7 @@ def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeyp
     assert changed("jsecon.language.autoencoder", b"# more") == {"codes"}
     assert changed("jsecon.types", b"# more") == {"load", "codes", "votes"}
     assert changed("jsecon.query.anchored", b"# more") == set()
-    assert changed("jsecon.app.language_stages", b"def other(): pass") == set()
+    assert changed("jsecon.pipeline.language_stages", b"def other(): pass") == set()
 
 
 def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.app import command_line, pipeline
-from jsecon.app.arguments import parsed
-from jsecon.app.options import Options
-from jsecon.app.progress import Console, Listener
+from jsecon.app import command_line
 from jsecon.data.ply import load_ply, save_ply
+from jsecon.pipeline import pipeline
+from jsecon.pipeline.arguments import parsed
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.progress import Console, Listener
 from jsecon.splat.transform import transform_gaussians
 
 
@@ -441,7 +442,7 @@ class _Terminal:
 
 
 def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
-    from jsecon.app import progress as console
+    from jsecon.pipeline import progress as console
 
     monkeypatch.setattr(console, "QUIET_SECONDS", 0.0)
     monkeypatch.setattr(console, "LINE_SECONDS", 0.0)
@@ -456,7 +457,7 @@ def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
 
 
 def test_a_step_that_tells_nothing_shows_its_time(monkeypatch):
-    from jsecon.app import progress as console
+    from jsecon.pipeline import progress as console
 
     monkeypatch.setattr(console, "QUIET_SECONDS", 0.1)
     monkeypatch.setattr(console, "TICK_SECONDS", 0.05)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jsecon.app import demo_real, film
-from jsecon.app.networks import embedder_of_field
-from jsecon.app.progress import Listener
 from jsecon.errors import InputError
+from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.progress import Listener
 
 
 class Ears(Listener):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jsecon.app import command_line
+from jsecon.app import command_line, verbs
 from jsecon.app.ending import ended
 from jsecon.app.verbs import Output
 from jsecon.errors import InputError
@@ -68,7 +68,7 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monke
         def act(asked, console):
             raise error
 
-        monkeypatch.setitem(command_line._VERBS, "models", (act, command_line.Models))
+        monkeypatch.setitem(command_line._VERBS, "models", (act, verbs.Models))
         return command_line.main(["models", "check", str(tmp_path), "--json"])
 
     assert fails(KeyboardInterrupt()) == 130

@@ -7,11 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.app import command_line, estimates
-from jsecon.app.options import Options
+from jsecon.app import command_line
 from jsecon.data.capture import capture_extent, load_capture
 from jsecon.data.frames import Extent
 from jsecon.data.video import size_of
+from jsecon.pipeline import estimates
+from jsecon.pipeline.options import Options
 
 STAGES = ["load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out", "field"]
 

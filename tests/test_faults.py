@@ -11,11 +11,11 @@ import pytest
 from capture_files import refused, small_capture, write_transforms
 from fuzz_readers import _field
 
-from jsecon.app import cache, pipeline
 from jsecon.data.images import write_image
 from jsecon.data.ply import save_ply
 from jsecon.files import alone, write_text
 from jsecon.language.field import save_field
+from jsecon.pipeline import cache, pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -6,8 +6,8 @@ from sam2_files import write_sam2
 from sam_files import write_sam
 
 from jsecon.app import command_line
-from jsecon.app.models import examine, report_lines, unusable
 from jsecon.errors import InputError
+from jsecon.pipeline.models import examine, report_lines, unusable
 
 
 @pytest.fixture(scope="module")

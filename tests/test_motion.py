@@ -16,15 +16,16 @@ from capture_files import refused
 from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
-from jsecon.app import command_line, pipeline
-from jsecon.app.options import Options
-from jsecon.app.progress import Listener
-from jsecon.app.scene_stages import loaded
-from jsecon.app.stages import KEY_FILE, Record, Work
+from jsecon.app import command_line
 from jsecon.data import motion, motion_steps
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_image
 from jsecon.data.motion import find_poses, photographs
+from jsecon.pipeline import pipeline
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.scene_stages import loaded
+from jsecon.pipeline.stages import KEY_FILE, Record, Work
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

@@ -14,12 +14,7 @@ from sam_files import write_sam
 from test_pipeline import Recorder
 
 from experiments.datasets.feature_files import write_features
-from jsecon.app import command_line, networks, pipeline, stages
-from jsecon.app.language_stages import parts, regions
-from jsecon.app.masklet_stages import masklets
-from jsecon.app.networks import GivenSpace
-from jsecon.app.options import Options
-from jsecon.app.scene_stages import gaussians, load
+from jsecon.app import command_line
 from jsecon.data.capture import load_capture
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.errors import InputError
@@ -27,6 +22,12 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
 from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.pipeline import networks, pipeline, stages
+from jsecon.pipeline.language_stages import parts, regions
+from jsecon.pipeline.masklet_stages import masklets
+from jsecon.pipeline.networks import GivenSpace
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.scene_stages import gaussians, load
 from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.stores import StoredSegmenter
 

@@ -16,15 +16,16 @@ import numpy as np
 import pytest
 
 from jsecon import process
-from jsecon.app import cache, networks, pipeline, question, stages
-from jsecon.app.progress import Listener
-from jsecon.app.scene_stages import gaussians
-from jsecon.app.stages import Work
+from jsecon.app import question
 from jsecon.association.algorithm1 import iou_matrix
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language import autoencoder
 from jsecon.language.field import load_field
+from jsecon.pipeline import cache, networks, pipeline, stages
+from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.scene_stages import gaussians
+from jsecon.pipeline.stages import Work
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -381,9 +382,10 @@ WATCHER = """
 import inspect, json, sys, threading
 from pathlib import Path
 import jsecon
-from jsecon.app import answers, cache, pipeline, question
-from jsecon.app.options import Options
-from jsecon.app.stages import Stage
+from jsecon.app import answers, question
+from jsecon.pipeline import cache, pipeline
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.stages import Stage
 from jsecon.language.field import load_field
 from jsecon.vision.colours import ColourEmbedder
 

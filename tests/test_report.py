@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jsecon.app import pictures, report
-from jsecon.app.progress import Step
+from jsecon.pipeline.progress import Step
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

@@ -10,13 +10,13 @@ import pytest
 from capture_files import refused, small_capture
 from scipy.spatial.transform import Rotation
 
-from jsecon.app.options import Options
-from jsecon.app.scene_stages import loaded
-from jsecon.app.stages import Work
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_depth
 from jsecon.data.lens import Lens, seen_through
 from jsecon.errors import InputError
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.scene_stages import loaded
+from jsecon.pipeline.stages import Work
 from jsecon.types import Capture
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

@@ -10,11 +10,11 @@ from capture_files import refused, small_capture
 from splat_files import scene
 from test_gaussian_files import gaussians
 
-from jsecon.app.options import Options
-from jsecon.app.scene_stages import gaussians as stage_of
-from jsecon.app.stages import Record, Work
 from jsecon.data.gaussian_files import save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.scene_stages import gaussians as stage_of
+from jsecon.pipeline.stages import Record, Work
 from jsecon.splat.transform import transform_gaussians
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.app.options import Options
-from jsecon.app.scene_stages import loaded
-from jsecon.app.stages import Work
 from jsecon.data.video import is_video, sharpest, write_frames
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.scene_stages import loaded
+from jsecon.pipeline.stages import Work
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 

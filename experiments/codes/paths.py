@@ -15,12 +15,12 @@ from experiments.codes.solve_l1 import solve_l1
 from experiments.ideas import scenes
 from experiments.protocols.points import point_accuracy, point_class_means
 from experiments.simulated_vision.embeddings import TextSpace
-from jsecon.app import cache
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.distill import descend, descent, distill_votes
 from jsecon.language.shares import with_shown
 from jsecon.language.votes import region_votes
 from jsecon.numerics import cosine_matrix, normalize
+from jsecon.pipeline import cache
 from jsecon.query.anchored import query_anchored
 from jsecon.splat.plan import plan_views
 from jsecon.splat.render import render

@@ -22,10 +22,10 @@ from experiments import replica_apartment_0, results
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace, load_text_space, made_text_space
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
 from jsecon.app.demo import PLAIN, demo
-from jsecon.app.progress import Listener
 from jsecon.app.verbs import Demo
 from jsecon.language.field import load_field
 from jsecon.language.votes import region_votes
+from jsecon.pipeline.progress import Listener
 from jsecon.types import Camera, Gaussians
 
 

@@ -14,13 +14,13 @@ from experiments.datasets.feature_files import load_text_features
 from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import Association, Shared, associated
-from jsecon.app.options import Options
 from jsecon.data.langsplat_files import load_features
 from jsecon.data.mask_files import load_labels
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
+from jsecon.pipeline.options import Options
 from jsecon.types import Camera, Gaussians
 
 

@@ -12,16 +12,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jsecon.app import networks, pictures, pipeline, question, report, summary
+from jsecon.app import pictures, question, report, summary
 from jsecon.app.answers import masks_of, write_answer
 from jsecon.app.film import write_film
-from jsecon.app.options import Options, require_writable
-from jsecon.app.pipeline import Run
-from jsecon.app.progress import Listener
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.data.synthetic import write_room
 from jsecon.evaluate.lerf import Row
 from jsecon.files import write_text, written_whole
+from jsecon.pipeline import networks, pipeline
+from jsecon.pipeline.options import Options, require_writable
+from jsecon.pipeline.pipeline import Run
+from jsecon.pipeline.progress import Listener
 from jsecon.types import LanguageField
 
 HOLDOUT = 5

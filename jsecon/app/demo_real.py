@@ -9,14 +9,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.app import networks, pictures, pipeline, question, report, summary
+from jsecon.app import pictures, question, report, summary
 from jsecon.app.answers import masks_of
 from jsecon.app.demo import answers_to, demo, say_files, write_pictures, write_queries
-from jsecon.app.options import Options, require_writable
-from jsecon.app.progress import Listener
 from jsecon.app.verbs import Demo
 from jsecon.errors import InputError
 from jsecon.files import write_text
+from jsecon.pipeline import networks, pipeline
+from jsecon.pipeline.options import Options, require_writable
+from jsecon.pipeline.progress import Listener
 from jsecon.query.masks import selection_mask
 from jsecon.types import LanguageField
 

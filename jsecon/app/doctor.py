@@ -153,7 +153,7 @@ def _programs() -> Check:
 def _models(folder: Path | None) -> list[Check]:
     if folder is None:
         return [Check("models", "missing", "no folder given (--models DIR): without CLIP, texts name colours")]
-    from jsecon.app.models import examine
+    from jsecon.pipeline.models import examine
 
     found = [examine(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
     usable = {use.model: use.told for findings in reversed(found) for use in findings.uses if use.usable}

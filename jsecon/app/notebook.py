@@ -9,11 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from jsecon.app import networks, pictures, report
+from jsecon.app import pictures, report
 from jsecon.app.answers import masks_of
 from jsecon.app.question import ask_text
 from jsecon.errors import InputError
 from jsecon.fit.schedule import resized, resized_frame
+from jsecon.pipeline import networks
 from jsecon.types import Capture, LanguageField, Selection
 
 LONG_SIDE, SHOWN = 240, 4

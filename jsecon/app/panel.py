@@ -3,7 +3,7 @@
 import base64
 import html
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,9 +17,6 @@ from jsecon.language.shares import membership_probability
 from jsecon.query.retrieval import CONTRAST_THRESHOLD
 from jsecon.types import LanguageField
 
-if TYPE_CHECKING:
-    from jsecon.app.viewer import Viewer
-
 THUMBNAIL = 88
 """px"""
 
@@ -27,7 +24,7 @@ THUMBNAIL = 88
 class Panel:
     """The controls, and what they tell the viewer."""
 
-    def __init__(self, viewer: "Viewer", server: Any, field: LanguageField):
+    def __init__(self, viewer: Any, server: Any, field: LanguageField):
         gui, self._names, self._busy = server.gui, field.names, False
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label(f"jsecon · {viewer.name}")
@@ -93,15 +90,15 @@ class Panel:
         self._ray: Any = None
         """of the last click on a frustum, which the scene hears of too"""
 
-    def _moved(self, viewer: "Viewer", name: str, value: Any) -> None:
+    def _moved(self, viewer: Any, name: str, value: Any) -> None:
         if getattr(viewer.history.state, name) != value:
             viewer.then(lambda state: viewing.moved(state, **{name: value}))
 
-    def _chosen(self, viewer: "Viewer", event: Any) -> None:
+    def _chosen(self, viewer: Any, event: Any) -> None:
         if event.client is not None and event.target.value in self._names:
             viewer.frame(event.client, self._names.index(event.target.value))
 
-    def _clicked(self, viewer: "Viewer", event: Any, frame: int | None) -> None:
+    def _clicked(self, viewer: Any, event: Any, frame: int | None) -> None:
         if frame is not None:
             self._ray = event.ray_direction
             viewer.frame(event.client, frame)

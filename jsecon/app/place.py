@@ -57,7 +57,7 @@ def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) ->
     true one (experiments/places.py). Raises InputError where nothing answers the text.
     """
     if embedder is None:
-        from jsecon.app.networks import embedder_of_field
+        from jsecon.pipeline.networks import embedder_of_field
 
         embedder = embedder_of_field(field)
     return place_of(field, ask_text(field, embedder, text, **how))

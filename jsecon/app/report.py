@@ -9,7 +9,7 @@ from importlib import resources
 import cv2
 import numpy as np
 
-from jsecon.app.progress import Step
+from jsecon.pipeline.progress import Step
 
 
 def page(title: str, lead: str, parts: Iterable[str]) -> str:

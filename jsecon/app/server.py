@@ -29,12 +29,12 @@ import numpy as np
 
 from jsecon.app.answers import best_frames, selected
 from jsecon.app.guard import LIMITS, Guard, Limits, openapi, paths_told
-from jsecon.app.networks import embedder_of_field
 from jsecon.app.place import place_of
 from jsecon.app.question import METHODS, Answer, ask_pixel, ask_text, frame_index
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
+from jsecon.pipeline.networks import embedder_of_field
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import LanguageField

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from jsecon.app import answers as answers_of, pictures, question, report
-from jsecon.app.pipeline import Run, peak_memory_mib
-from jsecon.app.progress import Listener
 from jsecon.data.gaussian_files import save_gaussians
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
+from jsecon.pipeline.pipeline import Run, peak_memory_mib
+from jsecon.pipeline.progress import Listener
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from jsecon.app.options import Folder, Options, SceneOptions
+from jsecon.pipeline.options import Folder, Options, SceneOptions
 
 
 @dataclasses.dataclass(frozen=True)

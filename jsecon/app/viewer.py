@@ -23,7 +23,6 @@ from jsecon.app import viewing
 from jsecon.app.answers import masks_of, slug_of, write_answer
 from jsecon.app.candidates import Candidate, Pictures, candidates, region_along
 from jsecon.app.layers import Layers
-from jsecon.app.networks import GivenSpace, given_dim
 from jsecon.app.panel import Panel, sheet, told
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
 from jsecon.app.question import Answer, ask_region, ask_text
@@ -31,6 +30,7 @@ from jsecon.app.splat_page import NOWHERE
 from jsecon.app.viewing import Ask, History, ViewState
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
+from jsecon.pipeline.networks import GivenSpace, given_dim
 from jsecon.types import LanguageField
 
 REMEDY = 'pip install "jsecon[viewer]"'

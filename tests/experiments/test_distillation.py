@@ -10,7 +10,7 @@ from small_field import REGIONS, labels_of, true_regions, unit_rows
 
 from experiments import distillation
 from experiments.codes import paths
-from jsecon.app import cache
+from jsecon.pipeline import cache
 from jsecon.types import Regions
 
 

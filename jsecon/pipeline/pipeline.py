@@ -10,12 +10,12 @@ The keys of all stages are known before any runs, so all of it is told first: wh
 left out and why. Read on the way, by default, without the ground (the root's modules); behind each file lies more of
 its own room, behind splat/render the engine:
 
-    all stages  app/pipeline, app/stages
-    load        app/scene_stages, data/capture, data/colmap
+    all stages  pipeline/pipeline, pipeline/stages
+    load        pipeline/scene_stages, data/capture, data/colmap
     gaussians   fit/start, fit/optimise
-    masklets    app/masklet_stages, vision/protocols, vision/classical, vision/region_graph, association/atoms,
+    masklets    pipeline/masklet_stages, vision/protocols, vision/classical, vision/region_graph, association/atoms,
                 association/views, association/consensus, association/algorithm1
-    regions     app/language_stages, vision/colours, language/regions
+    regions     pipeline/language_stages, vision/colours, language/regions
     codes       language/codes
     votes       language/votes, splat/plan, splat/render
     distil      language/distill
@@ -36,15 +36,15 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.app import cache, networks
-from jsecon.app.language_stages import codes, distil, field_of, parts, regions, votes
-from jsecon.app.masklet_stages import masklets
-from jsecon.app.options import Options, require_inputs, require_writable
-from jsecon.app.progress import Listener, Step
-from jsecon.app.scene_stages import gaussians, held_out, loaded
-from jsecon.app.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.errors import InputError
 from jsecon.files import alone
+from jsecon.pipeline import cache, networks
+from jsecon.pipeline.language_stages import codes, distil, field_of, parts, regions, votes
+from jsecon.pipeline.masklet_stages import masklets
+from jsecon.pipeline.options import Options, require_inputs, require_writable
+from jsecon.pipeline.progress import Listener, Step
+from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
+from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 
@@ -218,7 +218,7 @@ def _since(before: dict[str, int]) -> dict[str, int]:
 
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
     """Says what `run` (`scene_only`: `fit`) would do and what it would cost, and returns that; writes nothing."""
-    from jsecon.app.estimates import tell
+    from jsecon.pipeline.estimates import tell
 
     with listener.progress("plan"):
         work = Work(options, networks.networks_of(options, out / "cache"), out)

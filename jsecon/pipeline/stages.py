@@ -14,10 +14,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from jsecon.app import cache
-from jsecon.app.options import Options
-from jsecon.app.progress import Progress
 from jsecon.errors import InputError
+from jsecon.pipeline import cache
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.progress import Progress
 from jsecon.types import Capture
 from jsecon.vision.protocols import Networks
 

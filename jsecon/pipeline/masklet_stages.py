@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.app.progress import Progress
-from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.errors import InputError
+from jsecon.pipeline.progress import Progress
+from jsecon.pipeline.stages import Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.types import Capture, Gaussians
 from jsecon.vision.protocols import Segmenter
 

@@ -10,8 +10,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from jsecon.app.options import Options
 from jsecon.errors import InputError
+from jsecon.pipeline.options import Options
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Networks
 from jsecon.vision.stores import StoredSegmenter

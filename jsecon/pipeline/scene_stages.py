@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.app.progress import Progress
-from jsecon.app.stages import KEY_FILE, Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.errors import InputError
 from jsecon.files import write_text
+from jsecon.pipeline.progress import Progress
+from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.types import Camera, Capture, Gaussians
 
 

@@ -1,6 +1,6 @@
 """What a run is asked to do, and whether that can be done at all: checked before any work.
 
-The command line is made from this class: an option's docstring is its help, its type what it takes (app/arguments).
+The command line is made from this class: an option's docstring is its help, its type what it takes (arguments.py).
 """
 
 import dataclasses
@@ -8,8 +8,8 @@ import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
-from jsecon.app.arguments import arguments_of
 from jsecon.errors import InputError
+from jsecon.pipeline.arguments import arguments_of
 
 Folder = Annotated[Path | None, {"metavar": "DIR"}]
 

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.app.progress import Progress
-from jsecon.app.stages import Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.errors import InputError
 from jsecon.language.regions import Embed
+from jsecon.pipeline.progress import Progress
+from jsecon.pipeline.stages import Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.types import LanguageField, Regions
 
 
@@ -111,7 +111,7 @@ def _masks_of(work: Work, results: Results) -> tuple[Callable[[int], np.ndarray]
     if options.masks is not None:
         labels = results["masklets"]
         return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
-    from jsecon.app.masklet_stages import proposals_of
+    from jsecon.pipeline.masklet_stages import proposals_of
 
     return proposals_of(work, capture, results["gaussians"])[0], by_model
 

@@ -15,16 +15,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from jsecon.app import cache
-from jsecon.app.options import Options
-from jsecon.app.progress import Listener, Step
-from jsecon.app.stages import Work
 from jsecon.data.capture import capture_extent
 from jsecon.data.frames import Extent, shrunk
 from jsecon.data.images import image_size
 from jsecon.data.motion import photographs
 from jsecon.data.video import VIDEO_FRAMES, is_video, size_of
 from jsecon.fit.schedule import gaussians_for
+from jsecon.pipeline import cache
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.progress import Listener, Step
+from jsecon.pipeline.stages import Work
 
 REFERENCE = 0.06
 """seconds of `workload` on the machine that it was MEASURED on (two cores of an AMD EPYC)"""
