@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.app import command_line
+from jsecon.app import command_line, verbs
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.pipeline import pipeline
 from jsecon.pipeline.arguments import parsed
@@ -215,13 +215,13 @@ def test_help_of_every_verb_has_words_for_every_option(capsys):
 
 def test_what_is_not_given_has_the_default_of_the_dataclass():
     parse = command_line.parser().parse_args
-    run = parsed(command_line.Run, parse(["run", "room", "--out", "out"]))
+    run = parsed(verbs.Run, parse(["run", "room", "--out", "out"]))
     options = Options(Path("room"))
     assert {field.name: getattr(run, field.name) for field in dataclasses.fields(Options)} == vars(options)
     changed = ["--latent", "auto", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
-    run = parsed(command_line.Run, parse(["run", "room", "--out", "out", *changed]))
+    run = parsed(verbs.Run, parse(["run", "room", "--out", "out", *changed]))
     assert (run.latent, run.sh_degree, run.masks, run.downscale, run.weighting) == ("auto", 2, Path("m"), 2, "uniform")
-    query = parsed(command_line.Query, parse(["query", "f", "a", "b", "--all", "--at", "0", "1", "2", "--out", "o"]))
+    query = parsed(verbs.Query, parse(["query", "f", "a", "b", "--all", "--at", "0", "1", "2", "--out", "o"]))
     assert (query.texts, query.at, query.all, query.keep_outliers) == (["a", "b"], [["0", "1", "2"]], True, False)
 
 

@@ -34,7 +34,8 @@ EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
     "formats": (("gsply", "pillow_heif"), ".spz, .sog, HEIC photographs"),
     "serve": (("starlette", "uvicorn"), "jsecon serve"),
-    "figures": (("matplotlib",), "figures of the experiments"),
+    "viewer": (("viser",), "jsecon view"),
+    "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),
     "export": (("torch", "open_clip", "segment_anything", "sam2", "onnx"), "SAM, SAM 2 and CLIP from checkpoints"),
 }
 """extra -> the modules that it installs, what it gives"""

@@ -145,7 +145,7 @@ class Extent(NamedTuple):
     points: int
 
 
-def extent_of(posed: Posed, downscale: float | None, long_side: int | None, frames: int | None) -> Extent:
+def extent_of(posed: Posed, downscale: float | int | None, long_side: int | None, frames: int | None) -> Extent:
     """What `assemble` would make of it; of the images, only the headers are read."""
     source = _commonest([_true_lens(shot) for shot in posed.shots])
     return Extent(
@@ -157,7 +157,7 @@ def _commonest(lenses: Sequence[Lens]) -> tuple[int, int]:
     return collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
 
 
-def shrunk(size: tuple[int, int], downscale: float | None, long_side: int | None) -> tuple[int, int]:
+def shrunk(size: tuple[int, int], downscale: float | int | None, long_side: int | None) -> tuple[int, int]:
     """(width, height) of the frames made of images of `size`, see `assemble`."""
     if downscale is None:
         downscale = max(max(size) / long_side, 1.0) if long_side is not None else 1.0

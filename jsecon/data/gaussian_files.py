@@ -112,7 +112,10 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
             told = parsed_json(zipfile.ZipFile(path).read("meta.json")).values()
             if any(len(part.get("codebook", [0] * 256)) < 256 for part in told if isinstance(part, dict)):
                 raise ValueError("a codebook of fewer than 256 numbers")
-        data: Any = getattr(gsply, _GSPLY[kind])(path)
+        with np.errstate(invalid="ignore", over="ignore"):
+            data: Any = getattr(gsply, _GSPLY[kind])(path)
+        if (rest := 0 if data.shN is None else data.shN.shape[1]) not in (0, 3, 8, 15):
+            raise ValueError(f"{rest} harmonics above the constant")
     except Exception as error:  # whatever a decoder says of damaged bytes
         raise InputError(path, f"what gsply cannot read ({error})", f"a whole {kind}", remedy) from error
     sh = [np.asarray(data.sh0)[:, None], *([] if data.shN is None else [data.shN])]

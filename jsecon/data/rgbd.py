@@ -9,18 +9,20 @@ import dataclasses
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.frames import Posed, Shot
+from jsecon.data.frames import LEAST_FOCAL, Posed, Shot
 from jsecon.data.images import MOST_PIXELS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.poses import inverse_pose
 from jsecon.errors import InputError
 from jsecon.files import UNREADABLE, parsed_json
+from jsecon.numerics import sane
 
 _TUM = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
@@ -83,11 +85,11 @@ def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4
     return pose
 
 
-def _lens(width: float, height: float, *numbers: float) -> Lens:
-    """Raises ValueError for a frame without pixels."""
-    if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS):
-        raise ValueError(f"a frame of {width}x{height}")
+def _lens(width: Any, height: Any, *numbers: Any) -> Lens:
+    """Of numbers as a file has them. Raises ValueError for a frame without pixels, or without a focal length."""
     fx, fy, cx, cy = map(float, numbers)
+    if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS and sane(numbers) and min(fx, fy) >= LEAST_FOCAL):
+        raise ValueError(f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g}")
     return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
@@ -109,7 +111,8 @@ def _scannet(path: Path) -> Posed:
         first = images[0] if kind == "color" else path / "depth" / f"{images[0].stem}.png"
         if file.is_file() and first.is_file():
             k = _rows(file, 4, 4)
-            lenses[kind] = Lens(*image_size(first), k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+            with _reading(file):
+                lenses[kind] = _lens(*image_size(first), k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     shots = []
     for image in images:
         pose = _rows(path / "pose" / f"{image.stem}.txt", 4, 4)
