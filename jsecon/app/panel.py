@@ -2,6 +2,7 @@
 
 import base64
 import html
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +20,10 @@ from jsecon.types import LanguageField
 
 THUMBNAIL = 88
 """px"""
+
+
+SAME_CLICK = 0.5
+"""seconds within which the scene hears of a click on a frustum"""
 
 
 class Panel:
@@ -87,8 +92,8 @@ class Panel:
         async def _(client: Any) -> None:
             client.camera.on_update(_later(viewer.seen_from))
 
-        self._ray: Any = None
-        """of the last click on a frustum, which the scene hears of too"""
+        self._ray, self._then = np.zeros(3), 0.0
+        """of the last click on a frustum, which the scene hears of too, by a ray that is rounded otherwise; and when"""
 
     def _moved(self, viewer: Any, name: str, value: Any) -> None:
         if getattr(viewer.history.state, name) != value:
@@ -100,9 +105,9 @@ class Panel:
 
     def _clicked(self, viewer: Any, event: Any, frame: int | None) -> None:
         if frame is not None:
-            self._ray = event.ray_direction
+            self._ray, self._then = np.asarray(event.ray_direction), time.monotonic()
             viewer.frame(event.client, frame)
-        elif event.ray_direction != self._ray:
+        elif time.monotonic() - self._then > SAME_CLICK or not np.allclose(event.ray_direction, self._ray, atol=0.02):
             camera = event.client.camera
             focal = camera.image_height / 2 / np.tan(camera.fov / 2)
             viewer.click(event.ray_origin, event.ray_direction, focal, more=event.modifier == "shift")
