@@ -76,7 +76,7 @@ def say_files(out: Path, text: str, listener: Listener) -> None:
     """Where it all is, and how to look at it."""
     listener.say(f"field   {out / 'field.npz'}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
     asked = f' "{text}"' if text else ""
-    listener.say(f"view it jsecon view {out / 'field.npz'}{asked} --export {out / 'view.html'}")
+    listener.say(f"view it jsecon view {out / 'field.npz'}{asked}  (extra viewer; or --export {out / 'view.html'})")
 
 
 def _capture(folder: Path, seed: int, room: dict[str, int], listener: Listener) -> Path:
