@@ -78,9 +78,9 @@ def opening(file: Path) -> float:
 
 
 def quiet(page: Page) -> None:
-    """Waits until the page has drawn all that it wanted to."""
-    count = -1
-    while page.js("settled(), seen.draws") != count:
+    """Waits until the page has drawn all that it wanted to, 15 s at most: where it draws without an end."""
+    count, until_then = -1, time.monotonic() + 15
+    while page.js("settled(), seen.draws") != count and time.monotonic() < until_then:
         count = page.js("seen.draws")
         time.sleep(1.5)
 
