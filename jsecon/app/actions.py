@@ -94,13 +94,13 @@ def _query(asked: Query, console: Console) -> Told:
 
 def _export(asked: Export, console: Console) -> Told:
     with console.progress("field"):
-        from jsecon.app.answers import save_part
+        from jsecon.app.answers import save_scene
         from jsecon.data.gaussian_files import require_written
         from jsecon.language.field import load_field
 
         require_written(asked.out)
         field = load_field(asked.field)
-        save_part(field, asked.out)
+        save_scene(field, asked.out)
     count, size = field.gaussians.count, asked.out.stat().st_size
     console.say(f"{count} Gaussians, {size / 2**20:.1f} MiB  {asked.out}")
     return {"written": {"scene": asked.out}, "gaussians": count, "bytes": size}

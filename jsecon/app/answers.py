@@ -84,7 +84,7 @@ def write_answer(
     told = _figures(field, answer, chosen) | {ending: None, "masks": {}}
     if answer.mask.any():
         told[ending] = f"{slug}.{ending}"
-        save_part(field, out / told[ending], answer.mask)
+        _save(field, chosen, answer.mask, out / told[ending])
         for t, mask in masks.items():
             told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
             with written_whole(out / told["masks"][field.names[t]]) as temporary:
@@ -93,12 +93,13 @@ def write_answer(
     return told
 
 
-def save_part(field: LanguageField, file: Path, mask: Bool[np.ndarray, " n"] | None = None) -> None:
-    """Writes the Gaussians, or the masked ones, in the capture files' own world; with their codes and regions where the
-    file is a .glb."""
-    mask = np.ones(field.gaussians.count, bool) if mask is None else mask
+def save_scene(field: LanguageField, file: Path) -> None:
+    """Writes all Gaussians in the capture files' own world; with their codes and regions where the file is a .glb."""
+    _save(field, transform_gaussians(field.gaussians, field.to_source), np.ones(field.gaussians.count, bool), file)
+
+
+def _save(field: LanguageField, chosen: Gaussians, mask: np.ndarray, file: Path) -> None:
     regions = regions_of(field)[mask]
-    chosen = transform_gaussians(selected(field.gaussians, mask), field.to_source)
     save_gaussians(file, chosen, codes=np.asarray(field.codes)[mask], regions=np.where(regions == NOWHERE, -1, regions))
 
 

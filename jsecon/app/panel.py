@@ -14,7 +14,7 @@ from jsecon.app.candidates import Candidate
 from jsecon.app.question import Answer
 from jsecon.app.viewing import PAINTS, ViewState, tints
 from jsecon.errors import InputError
-from jsecon.language.shares import membership_probability
+from jsecon.language.shares import probability_inside
 from jsecon.query.retrieval import CONTRAST_THRESHOLD
 from jsecon.types import LanguageField
 
@@ -182,7 +182,7 @@ def told(field: LanguageField, state: ViewState, answers: Sequence[Answer | Inpu
         elif not count:
             lines.append(_box(f"{head}: no Gaussian reaches the threshold {state.threshold:.2f}."))
         else:
-            sure = np.asarray(membership_probability(found.selection.similarity, field.votes))[found.mask].mean()
+            sure = probability_inside(found.selection.similarity, field.votes, found.mask).mean()
             kind = f"score {score:.2f}, " if isinstance(thing, str) else ""
             lines.append(f'<div style="margin:0 .8em .4em;font-size:.85em">{head}: {count} Gaussians, {kind}')
             lines[-1] += f"sure to {100 * sure:.0f} %</div>"

@@ -14,7 +14,6 @@ import asyncio
 import contextlib
 import functools
 import ipaddress
-import json
 import socket
 import tempfile
 import threading
@@ -33,6 +32,7 @@ from jsecon.app.place import place_of
 from jsecon.app.question import METHODS, Answer, ask_pixel, ask_text, frame_index
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
+from jsecon.files import parsed_json
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import embedder_of_field
 from jsecon.query.masks import selection_mask
@@ -170,8 +170,8 @@ def application(scenes: dict[str, Scene], *, token: str = "", limits: Limits = L
 
     async def body(request: Request) -> dict:
         try:
-            asked = json.loads(await request.body())
-        except (ValueError, RecursionError) as error:
+            asked = parsed_json(await request.body())
+        except ValueError as error:
             raise HTTPException(400, f"no JSON: {error}") from error
         if not isinstance(asked, dict):
             raise HTTPException(400, 'an object is expected, such as {"text": "red mug"}')
