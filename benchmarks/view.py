@@ -1,12 +1,13 @@
 """The viewer, from enter to changed pixels, and until a field can be asked.
 
-    python benchmarks/view.py FIELD [--copies 3] [--asks 8] [--pixels 120] [--away]
+    python benchmarks/view.py FIELD [--copies 3] [--asks 8] [--pixels 120] [--undrawn]
 
 FIELD, copied side by side until it has as many Gaussians as are wanted, is opened by `jsecon view` in processes of
 their own: the first compiles, the second finds what it compiled. Then Chromium without a window, with WebGL in
 software, looks at it in a picture of few pixels, and texts are typed: new ones, and those that were asked before. Of
 each the time from the enter key to the call that draws the changed colours, and the time of that frame itself, which
-a graphics card would draw.
+a graphics card would draw. With --undrawn the call that draws the splats does nothing: what is left is all that goes
+before it (the server, the transfer, the page's own work), which is what a graphics card would leave to wait for.
 """
 
 import argparse
@@ -31,7 +32,7 @@ from jsecon.app.viewing import ViewState
 from jsecon.language.field import load_field, save_field
 from jsecon.pipeline.networks import embedder_of_field
 
-HOOK = """(() => {
+HOOK = """(undrawn => {
   const now = () => performance.timeOrigin + performance.now();
   const seen = (window.seen = { enter: 0, upload: 0, draws: 0, first: null });
   const canvas = [...document.querySelectorAll('canvas')].sort((a, b) => b.width - a.width)[0];
@@ -45,9 +46,9 @@ HOOK = """(() => {
   }
   const draw = gl.drawElementsInstanced.bind(gl);
   gl.drawElementsInstanced = (...given) => {
-    const began = now();
-    draw(...given);
-    if (given[4] < 1000) return;
+    const began = now(), splats = given[4] >= 1000;
+    if (!splats || !undrawn) draw(...given);
+    if (!splats) return;
     if (seen.upload && !seen.first) {
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);  // returns when it is drawn
       seen.first = [began, now()];
@@ -56,7 +57,7 @@ HOOK = """(() => {
   };
   window.settled = () => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
   return [canvas.width, canvas.height];
-})()"""
+})"""
 FIND = """[...document.querySelectorAll('input')].find(e => {
   for (let p = e, k = 0; k < 6 && p; k++, p = p.parentElement) if (p.innerText?.trim() === 'find') return true; })"""
 
@@ -123,7 +124,7 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=3)
     parser.add_argument("--asks", type=int, default=8)
     parser.add_argument("--pixels", type=int, default=120)
-    parser.add_argument("--away", action="store_true", help="look away, so that a frame in software takes no time")
+    parser.add_argument("--undrawn", action="store_true", help="leave the drawing of splats out, slow in software")
     given = parser.parse_args()
     field = copied(load_field(given.field), given.copies)
     print(f"{field.gaussians.count} Gaussians, {field.regions.count} regions")
@@ -134,19 +135,13 @@ def main() -> None:
             print(f"opened after {opening(file):.1f} s, {name}", flush=True)
         embedder = embedder_of_field(field)
         viewer = open_viewer(field, embedder, host="127.0.0.1", port=free_port(), name="field", state=ViewState())
-        if given.away:
-            begin = viewer.server.initial_camera
-            begin.position, begin.look_at = (
-                1e3 * (begin.position - begin.look_at),
-                2e3 * (begin.position - begin.look_at),
-            )
         address = f"http://127.0.0.1:{viewer.server.get_port()}/"
         same = {"deviceScaleFactor": 1, "mobile": False}
         with opened(address, Path(folder), width=640, height=480) as page:
             page.send("Emulation.setDeviceMetricsOverride", width=given.pixels, height=given.pixels * 3 // 4, **same)
             page.until(f"{FIND} && document.querySelectorAll('canvas').length > 1", 60)
             time.sleep(2)
-            print("canvas", page.js(HOOK), flush=True)
+            print("canvas", page.js(f"{HOOK}({str(given.undrawn).lower()})"), flush=True)
             texts = [f"{shade} {word}" for shade in SHADES for word in WORDS][: given.asks]
             for name in ("new", "known"):
                 rows = [asked(page, viewer, text) for text in texts]
