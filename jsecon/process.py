@@ -25,6 +25,8 @@ from pathlib import Path
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
 _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
 """what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
+MEMBER = "JSECON_MEMBER"
+"""environment variable of a process that is one of several (pipeline/processes.py): "INDEX COUNT HOST:PORT\""""
 _built: dict[str, int] = {}
 _under_way: dict[int, float] = {}
 """thread -> when jax began to compile the program that it waits for"""
@@ -42,6 +44,15 @@ def prepare_process(*, keep_programs: bool = True) -> None:
         mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda parameter, value: None)
         for parameter, value in _MALLOPT.items():
             mallopt(parameter, value)
+
+
+def mute_libraries() -> None:
+    """Drops what C++ writes to the terminal: pages, where another process of the run dies. What Python writes stays."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        getattr(sys, name).flush()
+        kept = os.dup(number)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        setattr(sys, name, os.fdopen(kept, "w", buffering=1))
 
 
 def cores() -> int:

@@ -6,6 +6,7 @@ it does when that is told.
 
 import dataclasses
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from jsecon.app.verbs import Asking, Demo, Doctor, Eval, Export, Fit, Models, Qu
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options, SceneOptions, require_writable
 from jsecon.pipeline.progress import Console
+from jsecon.process import MEMBER
 
 _RUN_FILES = ("field.npz", "report.html", "metrics.json")
 
@@ -29,13 +31,22 @@ def _demo(asked: Demo, console: Console) -> Told:
 def _run(asked: Run, console: Console) -> Told:
     with console.progress("start"):
         from jsecon.app.summary import write_run
-        from jsecon.pipeline import pipeline
+        from jsecon.pipeline import pipeline, processes
 
     options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(Options)})
     if asked.dry_run:
         return pipeline.dry_run(options, asked.out, listener=console)
-    told = write_run(pipeline.run(options, asked.out, listener=console), asked.out, console)
-    return {"written": [asked.out / name for name in _RUN_FILES]} | told
+    if MEMBER not in os.environ and (asked.processes, asked.coordinator, asked.process) != (1, None, None):
+        raise SystemExit(processes.launched(sys.argv[1:], asked.processes, asked.coordinator, asked.process))
+    with processes.lost_touch():
+        joined = processes.join(options)
+        if joined and not processes.is_first():
+            pipeline.assist(options, asked.out)
+            return {}
+        first = processes.First(joined)
+        run = pipeline.run(options, asked.out, listener=console, first=first)
+        first.dismiss()
+    return {"written": [asked.out / name for name in _RUN_FILES]} | write_run(run, asked.out, console)
 
 
 def _fit(asked: Fit, console: Console) -> Told:

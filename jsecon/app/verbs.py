@@ -54,6 +54,14 @@ class Run(Options):
     dry_run: bool = False
     """only say which stages would run, and about how many seconds, how much memory and disk each takes; writes
     nothing"""
+    processes: Annotated[int, {"metavar": "N", "least": 1}] = 1
+    """that share the masklets, the embeddings, the votes and the held-out frames, to the same field: all on this
+    machine, each with its part of the cores, or one a machine, see --coordinator"""
+    coordinator: Annotated[str | None, {"metavar": "HOST:PORT"}] = None
+    """several machines: where process 0 listens, an address of its own machine; every machine runs this command, with
+    the same capture and models at the same paths, and its own name must stand for an address that the others reach"""
+    process: Annotated[int | None, {"metavar": "I"}] = None
+    """which of the processes this is, 0 to N - 1; process 0 writes OUT"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

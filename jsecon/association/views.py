@@ -8,7 +8,7 @@ mask to the Gaussians and rendering it into another frame are then products with
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy import sparse
 
 from jsecon.association.atoms import SMALLEST, Sparse, cast_on_atoms, coverage, image_atoms
 from jsecon.errors import require
+from jsecon.parallel import dealt_out
 from jsecon.process import cores
 from jsecon.types import Camera, Gaussians
 
@@ -81,26 +82,35 @@ class SceneViews:
         atoms = image_atoms(frame, masks, count=self.atoms_per_frame)
         return atoms, coverage(atoms, masks, int(atoms.max()) + 1)
 
+    def _said(self, frames: UInt8[np.ndarray, "t h w 3"], own: Sequence[int]) -> Iterator[tuple]:
+        """Of each frame of `own` its atoms, the Gaussians that it shows, the arrays and the shape of their votes, and
+        the proposals by the share of each atom. While one frame's votes are cast, others are segmented and cut, on all
+        cores."""
+        pool = ThreadPoolExecutor(cores())
+        try:
+            for t, (atoms, within) in zip(own, pool.map(self._cut, (frames[t] for t in own), own)):
+                cast = cast_on_atoms(self.gaussians, self.cameras[t], atoms, centre=self.centre)
+                seen = np.flatnonzero(np.diff(cast.indptr))
+                votes = cast[seen]
+                yield atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
+        finally:
+            pool.shutdown(cancel_futures=True)
+
     def all(
         self, frames: UInt8[np.ndarray, "t h w 3"], progress: Callable[[int, int], None] | None = None
     ) -> list[View]:
-        """All views, each with how clearly it sees its Gaussians. Raises ValueError where the frames are not the
-        cameras'."""
+        """All views, each with how clearly it sees its Gaussians; over several processes (`jax.distributed`) they are
+        dealt out. Raises ValueError where the frames are not the cameras'."""
         expected = (*self.cameras.fx.shape, self.cameras.height, self.cameras.width)
         remedy = "Give the frames of the scene's own cameras, the same at every call."
         require(frames.shape[:3] == expected, "frames", frames.shape, f"{(*expected, 3)}", remedy)
         if not self._views:
-            # While one frame's votes are cast, others are segmented and cut, on all cores.
-            views, pool = [], ThreadPoolExecutor(cores())
-            try:
-                for t, (atoms, within) in enumerate(pool.map(self._cut, frames, range(len(frames)))):
-                    cast = cast_on_atoms(self.gaussians, self.cameras[t], atoms, centre=self.centre)
-                    seen = np.flatnonzero(np.diff(cast.indptr))
-                    views.append(View(atoms, seen, cast[seen], within, np.ones(len(seen), np.float32)))
-                    if progress is not None:
-                        progress(t + 1, len(frames))
-            finally:
-                pool.shutdown(cancel_futures=True)
+            views = [
+                View(atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32))
+                for atoms, seen, votes, shape, within in dealt_out(
+                    len(frames), lambda own: self._said(frames, own), progress
+                )
+            ]
             looks = np.zeros((len(views), self.count), np.float32)
             for t, view in enumerate(views):
                 camera = self.cameras[t]

@@ -1,6 +1,6 @@
 """How well a scene shows its photographs, frame by frame: PSNR and SSIM, and which frames stay far below the others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.fit.photometric import psnr, ssim
 from jsecon.fit.schedule import resized, resized_frame
+from jsecon.parallel import dealt_out
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Capture, Gaussians, Quality
 
@@ -35,17 +36,20 @@ def quality(
     progress: Callable[[int, int], None] | None = None,
 ) -> Quality:
     """PSNR and SSIM of `frames` (by default those held out) against the photographs; renderings clamped to [0, 1].
-    `long_side`: px that larger frames are shrunk to first."""
+    `long_side`: px that larger frames are shrunk to first. Over several processes (`jax.distributed`) the frames are
+    dealt out."""
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
-    gaussians, values, cameras = jax.device_put(gaussians), [], capture.cameras
+    gaussians, cameras = jax.device_put(gaussians), capture.cameras
     if long_side is not None:
         cameras = resized(cameras, min(1.0, long_side / max(cameras.width, cameras.height)))
-    for n, t in enumerate(chosen):
-        image = render_rgb(gaussians, cameras[int(t)]).features
-        frame = resized_frame(np.asarray(capture.frames[t]), cameras)
-        values.append([float(value) for value in _compared(image, frame)])
-        if progress:
-            progress(n + 1, len(chosen))
+
+    def rows(own: Sequence[int]) -> Iterator[list[float]]:
+        for t in chosen[list(own)]:
+            image = render_rgb(gaussians, cameras[int(t)]).features
+            frame = resized_frame(np.asarray(capture.frames[t]), cameras)
+            yield [float(value) for value in _compared(image, frame)]
+
+    values = dealt_out(len(chosen), rows, progress)
     by_frame = np.array(values).reshape(-1, 2)
     return Quality(chosen, by_frame[:, 0], by_frame[:, 1])
 

@@ -1,6 +1,6 @@
 """One embedding per region: the mean of its views' embeddings, weighted by its pixels in each view (paper: phi_bar)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -8,6 +8,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy import sparse
 
 from jsecon.errors import require, require_one_of, require_shape
+from jsecon.parallel import dealt_out
 from jsecon.types import Parts, Regions
 
 ALIKE_THRESHOLD = 0.95
@@ -73,25 +74,29 @@ def pooled(
     num_regions: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Regions:
-    """`region_embeddings` with what embeds the masks of the t-th frame given as a function of t."""
+    """`region_embeddings` with what embeds the masks of the t-th frame given as a function of t. Over several processes
+    (`jax.distributed`) the frames are dealt out."""
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
     highest = int(labels.max(initial=-1))
     count = highest + 1 if num_regions is None else num_regions
     found, remedy = f"label {highest} with num_regions={count}", "Raise num_regions, or leave it out."
     require(highest < count, "num_regions", found, "labels below num_regions", remedy)
-    pixels = np.zeros((count, len(labels)), np.int32)
+    areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
+    pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
+
+    def rows(own: Sequence[int]) -> Iterator[np.ndarray | None]:
+        for t in own:
+            seen = np.flatnonzero(pixels[:, t])
+            yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float64) if len(seen) else None
+
     total: np.ndarray | None = None
-    for t, image in enumerate(labels):
-        pixels[:, t] = np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count]
-        seen = np.flatnonzero(pixels[:, t])
-        if len(seen):
-            found = np.asarray(embed(t, image[None] == seen[:, None, None]), np.float64)
+    for t, found in enumerate(dealt_out(len(labels), rows, progress)):
+        if found is not None:
+            seen = np.flatnonzero(pixels[:, t])
             require_shape("embed", found, (len(seen), "E"), "An embedder returns one row per mask.")
             total = np.zeros((count, found.shape[1])) if total is None else total
             weight = pixels[seen, t].astype(np.float64) if weighting == "pixels" else np.ones(len(seen))
             total[seen] += weight[:, None] * found
-        if progress is not None:
-            progress(t + 1, len(labels))
     if total is None:  # nothing is labelled: the embedder alone knows E
         total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
     length = np.linalg.norm(total, axis=1, keepdims=True)

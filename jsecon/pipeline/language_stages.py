@@ -62,6 +62,7 @@ def regions(work: Work) -> Stage:
         files=options.features,
         uses=(embedder,),
         left_out=left,
+        shared=options.features is None,
     )
 
 
@@ -156,6 +157,7 @@ def votes(work: Work) -> Stage:
         compute,
         after=("load", "gaussians", "masklets"),
         given=work.given("top", "centre"),
+        shared=True,
     )
 
 

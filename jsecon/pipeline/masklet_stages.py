@@ -78,6 +78,7 @@ def _found(work: Work) -> Stage:
         given=given | {"association": options.associated_by, "tracker": None if tracker is None else tracker.name},
         files=options.proposals,
         uses=(segmenter, tracker),
+        shared=options.associated_by == "consensus",
     )
 
 

@@ -38,13 +38,14 @@ import numpy as np
 import jsecon
 from jsecon.errors import InputError
 from jsecon.files import alone
-from jsecon.pipeline import cache, networks
+from jsecon.pipeline import cache, networks, processes
 from jsecon.pipeline.language_stages import codes, distil, field_of, parts, regions, votes
 from jsecon.pipeline.masklet_stages import masklets
 from jsecon.pipeline.options import Options, require_inputs, require_writable
-from jsecon.pipeline.progress import Listener, Step
+from jsecon.pipeline.processes import First
+from jsecon.pipeline.progress import Listener, Progress, Step
 from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
-from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Stage, Work
+from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Results, Stage, Work
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 
@@ -139,16 +140,16 @@ class _Done:
     built: dict[str, dict[str, int]]
 
 
-def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener) -> _Done:
+def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener, first: First) -> _Done:
     """The stages, told first, then each computed or read from `folder`."""
     with listener.progress("plan"):
         plan = _planned(work, stages, folder)
         require_writable(work.out)
     with alone(work.out):
-        return _in_turn(work, stages, plan, folder, listener)
+        return _in_turn(work, stages, plan, folder, listener, first)
 
 
-def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listener: Listener) -> _Done:
+def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listener: Listener, first: First) -> _Done:
     place, steps = plan.place, plan.steps
     cache.prepare(folder)
     for name in plan.stale:
@@ -159,7 +160,7 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
     for stage in stages:
         record, before = Record(cache.record_path_of(place[stage.name])), programs_built()
         with listener.progress(stage.name) as progress:
-            compute = functools.partial(stage.compute, done.results, progress, record)
+            compute = functools.partial(_with_others, first, stage, done.results, progress, record)
             try:
                 kept = cache.fetch(place[stage.name], compute, note=listener.note)
             except (MemoryError, jax.errors.JaxRuntimeError) as error:
@@ -181,6 +182,11 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
     return done
 
 
+def _with_others(first: First, stage: Stage, results: Results, progress: Progress, record: Record) -> Outcome:
+    first.call(stage, results)
+    return stage.compute(results, progress, record)
+
+
 def run(
     options: Options,
     out: Path,
@@ -188,8 +194,10 @@ def run(
     listener: Listener | None = None,
     load: Callable[[], Capture] | None = None,
     cache_folder: Path | None = None,
+    first: First | None = None,
 ) -> Run:
     """Builds the field of a capture, keeps each stage under `cache_folder` (default OUT/cache), writes OUT/field.npz.
+    `first` calls the other processes of the run (`assist`), where there are any.
 
     A run that was stopped goes on where it stopped, to the same result. `load` takes the loader's place for data whose
     layout is one of a kind (the files beneath `options.capture` must still be all that it reads). Raises InputError for
@@ -198,7 +206,7 @@ def run(
     listener, before = listener or Listener(), programs_built()
     folder = cache_folder or out / "cache"
     work = Work(options, networks.networks_of(options, folder), out, load)
-    done = _computed(work, stages_of(work), folder, listener)
+    done = _computed(work, stages_of(work), folder, listener, first or First(several=False))
     started = time.monotonic()
     with listener.progress("field"):
         from jsecon.language.field import save_field
@@ -210,6 +218,11 @@ def run(
     capture, labels, quality = (done.results[name] for name in ("load", "masklets", "held_out"))
     steps, notes = tuple(done.steps), tuple(done.notes)
     return Run(field, capture, labels, quality, done.seconds, steps, notes, options, _since(before), done.built)
+
+
+def assist(options: Options, out: Path) -> None:
+    """What every process of a run but the first does, see `processes`."""
+    processes.assist(stages_of(Work(options, networks.networks_of(options, out / "cache"), out)), out)
 
 
 def _since(before: dict[str, int]) -> dict[str, int]:
@@ -233,7 +246,7 @@ def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tup
     it. Returns the Gaussians, their capture, and the quality of the frames held out."""
     work = Work(options, networks.networks_of(options, out / "cache"), out)
     stages = [*loaded(work), gaussians(work), held_out(work)]
-    results = _computed(work, stages, out / "cache", listener or Listener()).results
+    results = _computed(work, stages, out / "cache", listener or Listener(), First(several=False)).results
     return results["gaussians"], results["load"], results["held_out"]
 
 

@@ -234,4 +234,5 @@ def held_out(work: Work) -> Stage:
         told += "something moved (--drop-frames auto leaves them out)"
         return Outcome(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
-    return Stage("held_out", "PSNR and SSIM of the rendered colours", compute, after=("load", "gaussians"))
+    how = "PSNR and SSIM of the rendered colours"
+    return Stage("held_out", how, compute, after=("load", "gaussians"), shared=True)

@@ -109,6 +109,8 @@ class Stage:
     """what it calls beside what it imports: a segmenter, a tracker, an embedder; None where there is none."""
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """what the options alone make needless: part -> why."""
+    shared: bool = False
+    """whether several processes compute it together: its function then makes the same calls in each."""
     leaves: Path | None = None
     """folder that it leaves for those after it, with its key in KEY_FILE; where another run left it, it runs again."""
 
