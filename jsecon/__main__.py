@@ -3,19 +3,30 @@
 import os
 import signal
 import sys
+import traceback
 
-from jsecon.process import MEMBER, mute_libraries, prepare_process
+from jsecon.process import member, prepare_member, prepare_process
 
 
 def main() -> int:
     """Entry point: returns the exit code."""
+    several = member() is not None
+    if several:
+        prepare_member()
     prepare_process()
-    if MEMBER in os.environ:
-        mute_libraries()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: what is half written is removed
     from jsecon.app.command_line import main as run
 
-    return run(sys.argv[1:])
+    if not several:
+        return run(sys.argv[1:])
+    code = 1
+    try:
+        code = run(sys.argv[1:])
+    except Exception:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code)  # jax would wait for the other processes
 
 
 if __name__ == "__main__":

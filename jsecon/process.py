@@ -26,7 +26,7 @@ _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
 _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
 """what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
 MEMBER = "JSECON_MEMBER"
-"""environment variable of a process that is one of several (pipeline/processes.py): "INDEX COUNT HOST:PORT\""""
+"""environment variable of a process that is one of several (pipeline/processes.py), see `member`"""
 _built: dict[str, int] = {}
 _under_way: dict[int, float] = {}
 """thread -> when jax began to compile the program that it waits for"""
@@ -46,8 +46,17 @@ def prepare_process(*, keep_programs: bool = True) -> None:
             mallopt(parameter, value)
 
 
-def mute_libraries() -> None:
-    """Drops what C++ writes to the terminal: pages, where another process of the run dies. What Python writes stays."""
+def member() -> tuple[int, int, str] | None:
+    """(index, count, HOST:PORT of the first) where this is one of the processes of a run, else None."""
+    told = os.environ.get(MEMBER, "").split()
+    return (int(told[0]), int(told[1]), told[2]) if told else None
+
+
+def prepare_member() -> None:
+    """A member keeps to the cores that MEMBER names last ("0,2"); what C++ writes to the terminal is dropped: pages,
+    where another process of the run dies. What Python writes stays. Before `prepare_process`."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {int(core) for core in os.environ[MEMBER].split()[3].split(",")})
     for number, name in ((1, "stdout"), (2, "stderr")):
         getattr(sys, name).flush()
         kept = os.dup(number)

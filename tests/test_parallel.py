@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.parallel import spread_over_devices
+from jsecon.parallel import dealt_out, exchanged, parcel, parcel_read, spread_over_devices
 
 PROGRAM = """
 import sys
 import jax
 rank, world, port, count = map(int, sys.argv[1:])
 jax.distributed.initialize(f"127.0.0.1:{port}", world, rank)
-from test_parallel import summed
+from test_parallel import rows, summed
 state, outs = summed(count)
-print(*map(int, state), "|", *map(int, outs))
+print(*map(int, state), "|", *map(int, outs), "|", *rows(count))
 """
 
 
@@ -30,6 +30,32 @@ def summed(count: int, progress=None):
     merge = lambda a, b: a + b
     views = 10 * jnp.arange(count)
     return spread_over_devices(step, jnp.zeros(2, int), merge, jnp.int32(2), views, progress=progress)
+
+
+def rows(count: int) -> list[str]:
+    """Rows of several lengths, as words."""
+    found = dealt_out(count, lambda own: ((np.arange(t), {"t": t}) for t in own))
+    return [f"{row.sum()}of{told['t']}" for row, told in found]
+
+
+def test_a_parcel_holds_trees_of_arrays_and_plain_values():
+    tree = {"a": [np.arange(3, dtype=np.int32), np.zeros((0, 2), bool)], "b": (1.5, "two", None), "c": np.float32(4)}
+    back = parcel_read(parcel(tree))
+    np.testing.assert_array_equal(back["a"][0], tree["a"][0])
+    assert (back["a"][0].dtype, back["a"][1].shape) == (np.int32, (0, 2))
+    assert (back["b"], back["c"]) == (tree["b"], 4)
+    assert exchanged(b"alone") == [b"alone"]
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_one_device_and_two_add_up_in_the_same_order(devices):
+    values = np.asarray(np.random.default_rng(0).normal(size=101) * 10.0 ** np.arange(-50, 51).clip(-6, 6), np.float32)
+    step = jax.jit(lambda state, _, view: (state + view, None))
+    got, _ = spread_over_devices(step, np.float32(0), lambda a, b: a + b, np.float32(0), values, most=devices)
+    even, odd = np.float32(0), np.float32(0)
+    for t, value in enumerate(values):
+        even, odd = (even + value, odd) if t % 2 == 0 else (even, odd + value)
+    assert np.float32(got) == even + odd
 
 
 def test_one_process_counts_every_view_once():
@@ -50,6 +76,6 @@ def test_two_processes_end_with_what_one_does(count):
     running = [subprocess.Popen(line, env=places, stdout=-1, stderr=-1, text=True) for line in given]
     said = [process.communicate(timeout=120) for process in running]
     state, outs = summed(count)
-    expected = " ".join(map(str, map(int, state))) + " | " + " ".join(map(str, map(int, outs)))
+    expected = " | ".join(" ".join(map(str, words)) for words in (map(int, state), map(int, outs), rows(count)))
     for out, error in said:
         assert out.strip().splitlines()[-1:] == [expected], error

@@ -15,7 +15,7 @@ from jsecon.app.verbs import Asking, Demo, Doctor, Eval, Export, Fit, Models, Qu
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options, SceneOptions, require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.process import MEMBER
+from jsecon.process import member
 
 _RUN_FILES = ("field.npz", "report.html", "metrics.json")
 
@@ -36,14 +36,15 @@ def _run(asked: Run, console: Console) -> Told:
     options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(Options)})
     if asked.dry_run:
         return pipeline.dry_run(options, asked.out, listener=console)
-    if MEMBER not in os.environ and (asked.processes, asked.coordinator, asked.process) != (1, None, None):
+    if (own := member()) is None and (asked.processes, asked.coordinator, asked.process) != (1, None, None):
         raise SystemExit(processes.launched(sys.argv[1:], asked.processes, asked.coordinator, asked.process))
     with processes.lost_touch():
-        joined = processes.join(options)
-        if joined and not processes.is_first():
-            pipeline.assist(options, asked.out)
-            return {}
-        first = processes.First(joined)
+        if own is not None:
+            processes.join(options, *own)
+            if own[0] > 0:
+                pipeline.assist(options, asked.out)
+                return {}
+        first = processes.First(several=own is not None)
         run = pipeline.run(options, asked.out, listener=console, first=first)
         first.dismiss()
     return {"written": [asked.out / name for name in _RUN_FILES]} | write_run(run, asked.out, console)

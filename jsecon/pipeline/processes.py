@@ -56,15 +56,14 @@ def launched(argv: Sequence[str], count: int, coordinator: str | None, index: in
     if not host or not port.isdigit():
         raise InputError("--coordinator", str(coordinator), "HOST:PORT", "For example 10.0.0.1:7733.")
     own = list(range(count)) if index is None else [index]
-    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
     children, environ = [], {**os.environ, "XLA_FLAGS": _without_devices(os.environ.get("XLA_FLAGS", ""))}
     with contextlib.ExitStack() as files:
         said = [None, *(files.enter_context(tempfile.TemporaryFile()) for _ in own[1:])]
         for place, i in enumerate(own):
-            share = set(usable[i::count] if index is None and usable[i::count] else usable)
+            share = usable[i::count] if index is None and usable[i::count] else usable
             given = {
-                "env": {**environ, MEMBER: f"{i} {count} {host}:{port}"},
-                "preexec_fn": (lambda share=share: os.sched_setaffinity(0, share)) if share else None,
+                "env": {**environ, MEMBER: f"{i} {count} {host}:{port} {','.join(map(str, share))}"},
                 "stdout": subprocess.DEVNULL if place else None,
                 "stderr": said[place],
             }
@@ -127,22 +126,19 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-def join(options: Options) -> bool:
-    """Joins the processes of the run where this is a child of `launched`; whether it is. Before jax makes an array.
+def join(options: Options, index: int, count: int, address: str) -> None:
+    """Joins the processes of the run, in a child of `launched`; before jax makes an array.
 
     The coordinator listens at its own address alone, loopback where no other was given. Raises InputError where the
     processes don't meet, or were not started for the same run.
     """
-    if MEMBER not in os.environ:
-        return False
-    index, count, address = os.environ[MEMBER].split()
     import jax
 
     try:
         jax.distributed.initialize(
             address,
-            int(count),
-            int(index),
+            count,
+            index,
             coordinator_bind_address=address,
             cluster_detection_method="deactivate",
             initialization_timeout=MEET_SECONDS,
@@ -157,12 +153,6 @@ def join(options: Options) -> bool:
     first = exchanged(mine.encode())[0].decode()
     if first != mine:
         raise InputError(f"process {index}", mine, first, "Give all processes the same options and version.")
-    return True
-
-
-def is_first() -> bool:
-    """Whether this process reads, writes and tells. After `join`."""
-    return os.environ[MEMBER].split()[0] == "0"
 
 
 def leave() -> None:

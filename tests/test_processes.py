@@ -1,0 +1,95 @@
+"""A run by several processes: the same field as by one; and what is said where one dies or does not fit."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jsecon.errors import InputError
+from jsecon.pipeline.processes import launched
+from jsecon.process import MEMBER
+
+COMMAND = [sys.executable, "-m", "jsecon"]
+
+
+def members(out: Path) -> dict[int, int]:
+    """index -> process id of the children of a run into `out`."""
+    found = {}
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            environ, line = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if (told := environ.partition(f"{MEMBER}=".encode())[2]) and os.fsencode(out) in line:
+            found[int(told.split(b" ")[0])] = int(place.name)
+    return found
+
+
+@pytest.fixture(scope="module")
+def asked(room, tmp_path_factory) -> list[str]:
+    """The arguments of a small run without fit."""
+    folder = tmp_path_factory.mktemp("processes")
+    line = ["fit", str(room), "--out", str(folder / "scene.ply"), "--steps", "20", "--long-side", "96"]
+    subprocess.run([*COMMAND, *line], check=True, capture_output=True)
+    return ["run", str(room), "--gaussians", str(folder / "scene.ply"), "--long-side", "96"]
+
+
+def test_two_processes_end_in_the_field_of_one_and_a_dead_one_ends_the_other(asked, tmp_path):
+    alone, both = tmp_path / "alone", tmp_path / "both"
+    one = subprocess.Popen([*COMMAND, *asked, "--out", str(alone)], stdout=-1, stderr=-1)
+    line = [*COMMAND, *asked, "--out", str(both), "--processes", "2"]
+
+    killed = subprocess.Popen(line, stdout=-1, stderr=-1, text=True)
+    until = time.monotonic() + 60
+    while len(found := members(both)) < 2 or not (both / ".lock").exists():
+        assert killed.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    os.kill(found[1], signal.SIGKILL)
+    began = time.monotonic()
+    _, error = killed.communicate(timeout=60)
+    assert time.monotonic() - began < 30
+    assert (killed.returncode, error.count("jsecon:")) == (2, 1)
+    assert "process 1 of 2, signal SIGKILL" in error
+    assert "goes on" in error
+
+    again = subprocess.run(line, capture_output=True, text=True, timeout=200)
+    assert again.returncode == 0, again.stderr
+    assert "field" in again.stdout
+    assert "Gloo" not in again.stdout + again.stderr
+    _, error = one.communicate(timeout=200)
+    assert one.returncode == 0, error
+    with np.load(alone / "field.npz") as a, np.load(both / "field.npz") as b:
+        assert a.files == b.files
+        for name in set(a.files) - {"header"}:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def test_what_is_wrong_with_the_input_is_said_once(tmp_path):
+    (tmp_path / "empty").mkdir()
+    line = [*COMMAND, "run", str(tmp_path / "empty"), "--out", str(tmp_path / "out"), "--processes", "2"]
+    ended = subprocess.run(line, capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stderr.count("jsecon:")) == (2, 1)
+    assert "empty" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("count", "coordinator", "index", "where"),
+    [
+        (0, None, None, "processes"),
+        (2, "127.0.0.1:7733", None, "processes"),
+        (2, None, 1, "processes"),
+        (2, "127.0.0.1:7733", 2, "processes"),
+        (2, "nowhere", 0, "--coordinator"),
+        (2, "host:port", 0, "--coordinator"),
+    ],
+)
+def test_numbers_that_do_not_fit_are_refused(count, coordinator, index, where):
+    with pytest.raises(InputError) as caught:
+        launched([], count, coordinator, index)
+    assert caught.value.where == where
