@@ -167,8 +167,14 @@ def prepare(folder: Path) -> None:
             partial.unlink(missing_ok=True)
 
 
-def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None) -> Kept:
-    """A stage's result: read where `path` holds it, else computed and kept there.
+def fetch(
+    path: Path,
+    compute: Callable[[], Any],
+    *,
+    note: Callable[[str], None] | None = None,
+    begin: Callable[[], None] = lambda: None,
+) -> Kept:
+    """A stage's result: read where `path` holds it, else computed, after `begin`, and kept there.
 
     A file that cannot be read is said through `note` and computed again. A fresh result is passed through the same
     packing as a stored one, so that what follows sees the same arrays whether the run was stopped here or not.
@@ -182,6 +188,7 @@ def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None]
                 stage = path.stem.partition("-")[0]
                 note(f"{path.name} cannot be read ({error}); {stage} is computed again")
     started = time.monotonic()
+    begin()
     value = compute()
     jax.block_until_ready(value)
     seconds = time.monotonic() - started

@@ -43,9 +43,9 @@ from jsecon.pipeline.language_stages import codes, distil, field_of, parts, regi
 from jsecon.pipeline.masklet_stages import masklets
 from jsecon.pipeline.options import Options, require_inputs, require_writable
 from jsecon.pipeline.processes import First
-from jsecon.pipeline.progress import Listener, Progress, Step
+from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
-from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Results, Stage, Work
+from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 
@@ -160,9 +160,10 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
     for stage in stages:
         record, before = Record(cache.record_path_of(place[stage.name])), programs_built()
         with listener.progress(stage.name) as progress:
-            compute = functools.partial(_with_others, first, stage, done.results, progress, record)
+            compute = functools.partial(stage.compute, done.results, progress, record)
+            begin = functools.partial(first.call, stage, done.results)
             try:
-                kept = cache.fetch(place[stage.name], compute, note=listener.note)
+                kept = cache.fetch(place[stage.name], compute, note=listener.note, begin=begin)
             except (MemoryError, jax.errors.JaxRuntimeError) as error:
                 if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
                     found, remedy = f"no memory left ({str(error)[:200]})", f"{SMALLER} What is done is kept."
@@ -180,11 +181,6 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
             done.notes.append(note)
             listener.note(note)
     return done
-
-
-def _with_others(first: First, stage: Stage, results: Results, progress: Progress, record: Record) -> Outcome:
-    first.call(stage, results)
-    return stage.compute(results, progress, record)
 
 
 def run(
