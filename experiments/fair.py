@@ -2,13 +2,15 @@
 
     python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
                                [--seeds 10 11 ...] [--choosing 0 ...] [--seeds-trained ...] [--choosing-trained ...]
-                               [--methods NAME ...] [--quick] [--out FOLDER] [--processes N]
+                               [--scenes-trained NAME ...] [--methods NAME ...] [--quick] [--out FOLDER]
+                               [--processes N]
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.rows`), and none may refuse a
 text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
 own; one row of ours, "one reading", takes the same for both. Those readings alone, and the published one, are then
 measured on the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap over (scene, seed,
-text) of ours against each. Methods that train take minutes a setting: they may be given fewer seeds.
+text) of ours against each. Methods that train take minutes a setting: they may be given fewer seeds and scenes, and
+ours is compared with each on its own ("ours there").
 """
 
 import argparse
@@ -46,6 +48,8 @@ class Asked:
     seeds_trained: tuple[int, ...]
     """of `seeds`, those that the methods which train are reported on."""
     choosing_trained: tuple[int, ...]
+    scenes_trained: tuple[str, ...]
+    """the scenes of those methods; empty: the same as the others'."""
     methods: tuple[str, ...]
     """empty: all."""
     quick: bool
@@ -93,21 +97,25 @@ def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str,
     mean = lambda own, figure: by_scene(own, figure, lambda values: float(np.mean(values)))
     rows, told = [], {}
     for method, by_figure in best.items():
-        row = [method]
+        row, settings = [method], 0
         for n, figure in enumerate(figures):
             own = of(by_figure[figure])
             seeds = sorted({cell["seed"] for cell in own})
-            mine = [cell for cell in of(best[MINE][figure]) if cell["seed"] in seeds]
+            scenes = sorted({cell["scene"] for cell in own})
+            mine = [cell for cell in of(best[MINE][figure]) if cell["seed"] in seeds and cell["scene"] in scenes]
             difference = ahead(by_text(mine, n), by_text(own, n))
             values, ours = mean(own, figure), mean(mine, figure)
             wins = [scene for scene, value in values.items() if value > ours[scene]]
             published = mean(of(f"{method}: {PUBLISHED}"), figure)
+            settings = len(scenes) * len(seeds)
             told[f"{method}, {figure}"] = {
                 "row": by_figure[figure],
                 "mean": float(np.mean(list(values.values()))),
                 "published": float(np.mean(list(published.values()))) if published else None,
                 "ahead": difference,
                 "seeds": seeds,
+                "scenes": scenes,
+                "ours there": float(np.mean(list(ours.values()))),
                 "wins": wins,
             }
             here = told[f"{method}, {figure}"]
@@ -116,16 +124,16 @@ def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str,
                 beside = {name: float(np.mean([c[name] for c in own])) for name in BESIDE if name in own[0]}
                 here |= beside
                 row += [f"{value:.3f}" for value in beside.values()]
-            row.append(by_figure[figure].split(": ", 1)[1])
+            row += [by_figure[figure].split(": ", 1)[1], f"{here['ours there']:.3f}"]
             row.append(f"{difference[0]:+.3f} [{difference[1]:+.3f}, {difference[2]:+.3f}]")
             row.append("" if method.startswith("ours") else ", ".join(wins))
-        rows.append(tuple(row))
+        rows.append((*row, str(settings)))
     columns: list[str] = []
     for figure in figures:
         columns += [f"{figure} as published", figure]
         columns += [name for name in BESIDE if name in held[0]] if figure == figures[0] else []
-        columns += ["read by", f"{MINE} ahead by [95 %]", "behind in"]
-    return results.table((f"{name}, {level}", *columns), rows), told
+        columns += ["read by", "ours there", f"{MINE} ahead by [95 %]", "behind in"]
+    return results.table((f"{name}, {level}", *columns, "settings"), rows), told
 
 
 def by_scene(cells: list[dict], figure: str, fold: Callable[[list[float]], float]) -> dict[str, float]:
@@ -140,9 +148,10 @@ def figures_of(table: str) -> tuple[str, ...]:
 
 
 def plan_of(name: str, level: str, asked: Asked, processes: int, seeds: tuple[int, ...], rows: list[str]) -> Plan:
-    """Some rows of a table at a level of noise, on some seeds."""
+    """Some rows of a table, which all train or none, at a level of noise, on some seeds."""
     table = TABLES[name][1 if asked.quick else 0]
-    data = dataclasses.replace(table.data, seeds=seeds, scenes=asked.scenes or table.data.scenes)
+    trained = asked.scenes_trained if rows[0].split(": ")[0] in TRAINED else ()
+    data = dataclasses.replace(table.data, seeds=seeds, scenes=trained or asked.scenes or table.data.scenes)
     place = {"out": asked.out, "cells": str(Path(asked.out) / "cells.jsonl")}
     return dataclasses.replace(
         table, data=data, methods=tuple(rows), level=level, sweep=(), processes=processes, **place
@@ -200,6 +209,7 @@ if __name__ == "__main__":
     parser.add_argument("--choosing", nargs="+", type=int, default=list(CHOOSING), help="that readings are chosen on")
     parser.add_argument("--seeds-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
     parser.add_argument("--choosing-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
+    parser.add_argument("--scenes-trained", nargs="+", default=[], help="of the one table asked for, for those methods")
     parser.add_argument("--methods", nargs="+", default=[], help="that are compared, ours among them; default: all")
     parser.add_argument("--quick", action="store_true", help="one tiny scene of each, one seed: two minutes")
     parser.add_argument("--out", default="")
@@ -216,6 +226,7 @@ if __name__ == "__main__":
         choosing,
         tuple(given.seeds_trained or seeds),
         tuple(given.choosing_trained or choosing),
+        tuple(given.scenes_trained),
         tuple(given.methods),
         given.quick,
         place,
