@@ -111,7 +111,8 @@ def opened(address: str, folder: Path, *, width: int = 960, height: int = 640) -
             port = until(lambda: told.exists() and told.read_text().partition("\n")[0], "Chromium starts")
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=20) as answer:
                 target = next(t for t in json.load(answer) if t["type"] == "page")
-            with connect(target["webSocketDebuggerUrl"], max_size=None, ping_interval=None) as socket:  # a frame may take long
+            patient = {"max_size": None, "ping_interval": None}  # a frame may take the software a minute
+            with connect(target["webSocketDebuggerUrl"], **patient) as socket:
                 page = Page(socket)
                 page.send("Network.enable")
                 where = str(folder / "downloads")
