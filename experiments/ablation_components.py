@@ -10,10 +10,11 @@ from experiments.tables import layout, published
 from experiments.tables.answers import Method
 from experiments.tables.fill import Plan, options_of
 from experiments.tables.methods import METHODS, langsplat
-from experiments.tables.ours import BY_COSINE, asked, paper
+from experiments.tables.ours import BY_COSINE, asked, paper, untracked
 
 COMPONENTS: dict[str, Method] = {
     "LangSplat-m": langsplat,
+    "each frame's own masks, anchored by code": untracked,
     "masklets, one-step": asked("one_step", clean=False),
     "masklets, anchored by code": asked("code", clean=False, **BY_COSINE),
     "+ DBSCAN (the paper, distilled by votes)": asked("code", **BY_COSINE),
@@ -29,8 +30,9 @@ COMPONENTS: dict[str, Method] = {
     "ours, consensus": METHODS["ours, consensus"],
     "ours, consensus, by lead": asked("lead", by="consensus"),
 }
-"""the rows of Table 4: per-frame masks asked in one step (LangSplat-m), then the paper's parts distilled by votes, the
-whole of the paper's path, and ours: the region of the largest contrast and its pieces, by the tracks or by consensus"""
+"""the rows of Table 4: per-frame masks asked in one step (LangSplat-m) and anchored, then the paper's parts distilled
+by votes, the whole of the paper's path, and ours: the region of the largest contrast and its pieces, by the tracks or
+by consensus"""
 PLAN = lerf.beside(lerf.PLAN, "ablation_components", COMPONENTS)
 QUICK = lerf.beside(lerf.QUICK, "ablation_components", COMPONENTS)
 

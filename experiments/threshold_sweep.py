@@ -3,7 +3,8 @@
     python -m experiments.threshold_sweep [--quick] [--root FOLDER] [--out FOLDER] [--processes N]
 
 On LERF-OVS or its twins, under the protocol of `experiments.lerf`; outliers are left in, so that only the threshold
-acts. The spread of a way is its largest less its smallest mean: what the choice of a threshold can cost.
+acts. The spread of a way is its largest less its smallest mean: what the choice of a threshold can cost. Query by query
+(a text in one scene and seed): where its own best thresholds lie, and what one threshold for all loses against them.
 """
 
 import dataclasses
@@ -59,22 +60,54 @@ def main(plan: Sweep) -> str:
     header = ("asked by", *(f"{threshold:g}" for threshold in plan.thresholds), "spread")
     source = "twins in LERF-OVS's layout" if any(cell["twin"] for cell in cells) else "LERF-OVS"
     text = f"mIoU over the threshold, {source}; {lerf.NOTES}\n\n" + results.table(header, rows)
-    results.save(Path(plan.out), plan, {"curves": curves, "cells": cells}, text, _figure(plan.thresholds, curves))
+    each = {way: by_query(cells, way, plan.thresholds) for way in WAYS}
+    apart = {way: best_thresholds(of, plan.thresholds) for way, of in each.items()}
+    columns = ("asked by", "queries", "best threshold: median", "10 %", "90 %", "lost by one threshold for all")
+    text += "\n\nQuery by query:\n\n" + results.table(columns, [(way, *told) for way, told in apart.items()])
+    figure = _figure(plan.thresholds, curves, each)
+    results.save(Path(plan.out), plan, {"curves": curves, "best thresholds": apart, "cells": cells}, text, figure)
     print(text)
     return text
 
 
-def _figure(thresholds: tuple[float, ...], curves: dict[str, list[float]]):
+def by_query(cells: list[dict], way: str, thresholds: tuple[float, ...]) -> np.ndarray:
+    """(Q, K) IoU, the mean of its frames, of each (scene, seed, text) at each threshold. Cells that were measured
+    before single texts were kept have none."""
+    found: dict[tuple, list[float]] = {}
+    for threshold in thresholds:
+        for cell in (cell for cell in cells if cell["method"] == f"{way} {threshold:g}"):
+            for text, (strict, _) in cell.get("texts", {}).items():
+                found.setdefault((cell["scene"], cell["seed"], text), []).append(float(np.mean(strict)))
+    return np.array([row for row in found.values() if len(row) == len(thresholds)])
+
+
+def best_thresholds(each: np.ndarray, thresholds: tuple[float, ...]) -> tuple[float, ...]:
+    """Of curves (Q, K) over K thresholds: Q; the median, 10 % and 90 % quantiles of the best thresholds, the middle of
+    those that are within 0.005 of the best; and the mean that one threshold for all loses against each one's best."""
+    good = each >= each.max(1, keepdims=True) - 0.005
+    own = (good * np.array(thresholds)).sum(1) / good.sum(1)
+    lost = each.max(1).mean() - each.mean(0).max()
+    return len(each), *(float(q) for q in np.quantile(own, (0.5, 0.1, 0.9))), float(lost)
+
+
+def _figure(thresholds: tuple[float, ...], curves: dict[str, list[float]], each: dict[str, np.ndarray]):
+    """Above the means of all ways; below, for each way, a line for each query and a mark at its best threshold."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5, 3.4))
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(10, 7))
+    axes = figure.add_subplot(2, 1, 1)
     for way, curve in curves.items():
         axes.plot(thresholds, curve, marker="o", markersize=3, label=way)
-    axes.set_xlabel("threshold")
-    axes.set_ylabel("mIoU")
-    axes.set_ylim(0, 1)
+    axes.set(xlabel="threshold", ylabel="mIoU", ylim=(0, 1))
     axes.legend(fontsize=8)
+    for n, (way, rows) in enumerate(each.items()):
+        axes = figure.add_subplot(2, len(each), len(each) + n + 1)
+        axes.plot(thresholds, rows.T, color="0.6", linewidth=0.4)
+        axes.plot(thresholds, rows.mean(0), color="C3")
+        axes.plot(np.array(thresholds)[rows.argmax(1)], rows.max(1), ".", markersize=2)
+        axes.set(ylim=(0, 1), title=way)
+        axes.tick_params(labelsize=6)
+    figure.tight_layout()
     return figure
 
 

@@ -193,6 +193,12 @@ def asked(way: str, *, retrieval: str = "contrast", clean: bool = True, pieces: 
     )
 
 
+def untracked(setting: Setting, steps: Steps) -> Answers:
+    """The paper's row without tracking: every mask of every frame is a region of its own, anchored by code, DBSCAN."""
+    field = field_of(setting, by="masks of single frames", labels=np.asarray(setting.evidence.masks))
+    return ask_field(setting, field, "code", **BY_COSINE)
+
+
 def paper(setting: Setting, steps: Steps) -> Answers:
     """The paper's own path: tracks, phi_bar, 3-d codes trained on the rendered L1, the region of the largest cosine,
     anchored by code, DBSCAN."""

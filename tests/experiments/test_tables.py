@@ -129,7 +129,7 @@ def test_levels_of_noise_share_a_fit(folder):
 
 @pytest.mark.slow
 def test_ablations(folder):
-    few = ("masklets, anchored by code", TRACKED)
+    few = ("masklets, anchored by code", "each frame's own masks, anchored by code", TRACKED)
     plan = small(ablation_components.QUICK, folder, "components", methods=few)
     ablation_components.main(plan)
     assert [c["method"] for c in read(folder, "components")[0]["cells"]] == list(few)
@@ -141,7 +141,7 @@ def test_ablations(folder):
     assert "| one-step |" in read(folder, "query")[1]
     measured = [cell["method"] for cell in read_cells(Path(both.cells)).values()]
     assert measured == [*few, "one-step"]  # the row that both have is taken
-    assert len(Path(both.cells).read_text().splitlines()) == 3  # and not measured again
+    assert len(Path(both.cells).read_text().splitlines()) == 4  # and not measured again
     assert not (folder / "query" / "cells.jsonl").exists()
 
 
@@ -151,6 +151,14 @@ def test_threshold_sweep(folder):
     metrics, _ = read(folder, "sweep")
     assert set(metrics["curves"]) == set(threshold_sweep.WAYS)
     assert all(len(curve) == 2 and np.isfinite(curve).all() for curve in metrics["curves"].values())
+    texts = {text for cell in metrics["cells"] for text in cell["texts"]}
+    assert all(told[0] == len(texts) for told in metrics["best thresholds"].values())
+
+
+def test_best_thresholds_are_those_of_single_queries():
+    each = np.array([[0.2, 0.8, 0.3], [0.6, 0.6, 0.1], [0.0, 0.1, 0.9]])
+    found = threshold_sweep.best_thresholds(each, (0.2, 0.4, 0.8))
+    assert found == pytest.approx((3, 0.4, 0.32, 0.72, (0.8 + 0.6 + 0.9) / 3 - 0.5))
 
 
 @pytest.mark.slow
