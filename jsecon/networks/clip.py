@@ -99,10 +99,9 @@ class ClipEmbedder:
         path = self.files.logits
         if path is None or path.suffix == ".json":
             return None if path is None else read_logits(path)
-        shades = np.linspace(0, 255, 3 * self.size).reshape(1, -1, 1) * np.ones((self.size, 1, 3))
-        dark, grey, light = np.split(shades.astype(np.uint8), 3, axis=1)
-        tinted = np.asarray(grey * np.array([0.2, 1.0, 0.6]), np.uint8)
-        images = self._normalised(np.stack([dark, light, tinted]))
+        tints = np.array([[0, 0, 0], [1, 1, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], np.float32)
+        shades = np.linspace(40, 255, self.size)[:, None] * tints[:, None, None]
+        images = self._normalised(np.repeat(shades.astype(np.uint8), self.size, axis=1))
         graph = Graph(path, threads=self._threads)
         length = (self.files.rules and self.files.rules.length) or CONTEXT_LENGTH
         return fitted_logits(graph, images, self._tokenizer([*CANONICAL], length))
