@@ -70,9 +70,9 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
     size, length = model.config.vision_config.image_size, model.config.text_config.max_position_embeddings
     write_vocabulary(folder, "t5", _corpus(), tokenizer_class="SiglipTokenizer")
     read = transformers.PreTrainedTokenizerFast(tokenizer_file=str(folder / "tokenizer.json"), pad_token="</s>")
-    from open_clip.tokenizer import canonicalize_text
+    from open_clip.tokenizer import get_clean_fn  # the class itself needs SentencePiece's own file
 
-    cleaned = [canonicalize_text(text) for text in TEXTS]
+    cleaned = [get_clean_fn("canonicalize")(text) for text in TEXTS]
     ids = read(cleaned, padding="max_length", truncation=True, max_length=length, return_tensors="pt").input_ids
     images = torch.randn(3, 3, size, size, generator=torch.Generator().manual_seed(seed))
     onnx, outputs = folder / "onnx", ("last_hidden_state", "pooler_output")

@@ -4,15 +4,17 @@ The file joins pieces and sets its ends; it does not say how long a text is, wha
 text is cleaned first. That is told by the configurations beside it (`TextRules`, read in clip_folder.py).
 """
 
+import contextlib
 import string
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
 
 from jsecon.errors import InputError
+from jsecon.files import parsed_json
 from jsecon.networks.tokenizer import cleaned, mended
 
 CLEANINGS = ("canonicalize", "lower", "whitespace")
@@ -40,31 +42,23 @@ class FileTokenizer:
         from tokenizers import Tokenizer
 
         self.rules, self._path = rules, Path(path)
-        expected = f"a tokenizer of Hugging Face's kind with the token {rules.pad!r}"
-        try:
-            self._tokenizer = Tokenizer.from_str(self._path.read_text(encoding="utf-8"))
+        with _read(self._path, f"a tokenizer of Hugging Face's kind with the token {rules.pad!r}"):
+            text = self._path.read_text(encoding="utf-8")
+            _check_ends(parsed_json(text).get("post_processor"))
+            self._tokenizer = Tokenizer.from_str(text)
             number = self._tokenizer.token_to_id(rules.pad)
             if number is None:
                 raise ValueError(f"{self._tokenizer.get_vocab_size()} tokens without {rules.pad!r}")
-            self._tokenizer.no_padding()
-            self._tokenizer.no_truncation()
-        except Exception as error:  # of the package tokenizers, whose own have no other base
-            found = f"no such tokenizer ({type(error).__name__}: {error})"
-            raise InputError(path, found, expected, "Fetch tokenizer.json and tokenizer_config.json again.") from error
         self._number = int(number)
 
     def __call__(self, texts: Sequence[str], length: int) -> Int64[np.ndarray, "q _"]:
         """Q texts -> ids (Q, length), cut or filled at the end, as the models were trained (google-research/big_vision;
         a `padding_side` of "left" in tokenizer_config.json is that of the language model that the vocabulary is of)."""
-        try:
+        with _read(self._path, f"{length} ids for every text"):
             self._tokenizer.enable_truncation(max_length=length)
             self._tokenizer.enable_padding(length=length, pad_id=self._number, pad_token=self.rules.pad)
             rows = self._tokenizer.encode_batch([self.clean(text) for text in texts])
-            ids = np.array([row.ids for row in rows], np.int64).reshape(len(texts), length)
-        except Exception as error:  # of the package tokenizers, whose own have no other base
-            found, expected = f"what gives no ids ({type(error).__name__}: {error})", f"{length} ids for every text"
-            raise InputError(self._path, found, expected, "Fetch tokenizer.json again.") from error
-        return ids
+            return np.array([row.ids for row in rows], np.int64).reshape(len(texts), length)
 
     def clean(self, text: str) -> str:
         """A text as the model was trained on it."""
@@ -78,3 +72,24 @@ class FileTokenizer:
     def mask(self, ids: Int64[np.ndarray, "b l"]) -> Int64[np.ndarray, "b l"]:
         """All ones: the models are trained without a mask, and read the padding."""
         return np.ones_like(ids)
+
+
+def _check_ends(processor: Any) -> None:
+    """Raises ValueError where a template names a token that it does not define: the package tokenizers would abort."""
+    for part in [processor, *processor.get("processors", [])] if processor else []:
+        named = [piece["SpecialToken"]["id"] for piece in part.get("single", []) if "SpecialToken" in piece]
+        unknown = set(named) - set(part.get("special_tokens", {}))
+        if unknown:
+            raise ValueError(f"ends {unknown} that are not defined")
+
+
+@contextlib.contextmanager
+def _read(path: Path, expected: str) -> Iterator[None]:
+    """Turns whatever the package tokenizers raises into an InputError: its own exceptions have no other base."""
+    try:
+        yield
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # an abort in its Rust
+            raise
+        found = f"no such tokenizer ({type(error).__name__}: {error})"
+        raise InputError(path, found, expected, "Fetch tokenizer.json and tokenizer_config.json again.") from error

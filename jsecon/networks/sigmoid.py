@@ -56,9 +56,11 @@ def fitted_logits(graph: Graph, images: np.ndarray, ids: np.ndarray) -> Logits:
     logits, texts, seen = (np.asarray(found[name], np.float64) for name in names)
     lengths = np.linalg.norm(seen, axis=-1)[:, None] * np.linalg.norm(texts, axis=-1)
     expected = "logits on one line over cosines that differ"
-    if seen.shape[1:] != texts.shape[1:] or logits.shape != lengths.shape or not (lengths > 0).all():
-        shapes = f"shapes {logits.shape}, {texts.shape}, {seen.shape}"
-        raise InputError(graph.path, shapes, "(B, Q), (Q, E), (B, E)", REMEDY)
+    if seen.shape[1:] != texts.shape[1:] or logits.shape != lengths.shape or not sane(logits, texts, seen):
+        shapes = f"shapes {logits.shape}, {texts.shape}, {seen.shape}, or numbers that are not finite"
+        raise InputError(graph.path, shapes, "finite (B, Q), (Q, E), (B, E)", REMEDY)
+    if not (lengths > 0).all():
+        raise InputError(graph.path, "an embedding of zeros", expected, REMEDY)
     cosines = (seen @ texts.T / lengths).ravel()
     # about the mean: the cosines lie close together, and the line is steep
     line = np.stack([cosines - cosines.mean(), np.ones_like(cosines)], 1)

@@ -17,6 +17,8 @@ from jsecon.networks.file_tokenizer import CLEANINGS, MOST_LENGTH, TextRules
 CLASSES = {"SiglipTokenizer": "canonicalize", "GemmaTokenizer": "lower", "Siglip2Tokenizer": "lower"}
 """transformers' tokenizer -> how it cleans a text. SigLIP was trained without punctuation, SigLIP 2 in lower case
 (google-research/big_vision); the class of the latter's published files is that of Gemma, whose vocabulary it uses"""
+MOST_SIGNS = 100
+"""of the padding token"""
 OPEN_CLIP_LENGTH, TRANSFORMERS_LENGTH = 77, 64
 """of a text, where config.json is silent: what open_clip and transformers' SiglipTextConfig then take"""
 _FETCH = "Fetch the file again, from the folder that the graphs come from."
@@ -61,7 +63,7 @@ def _padding(tokenizer: Path) -> tuple[str, str]:
     content = _table(path)
     pad = content.get("pad_token")
     pad = pad.get("content") if isinstance(pad, dict) else pad  # a token is written with its options, or bare
-    if not isinstance(pad, str) or not pad:
+    if not isinstance(pad, str) or not 0 < len(pad) <= MOST_SIGNS:
         raise InputError(path, f"pad_token {pad!r}", "the token that fills short texts, which SigLIP reads", _FETCH)
     return pad, str(content.get("tokenizer_class", "")).removesuffix("Fast")
 
