@@ -613,7 +613,7 @@ def sam(folder: Path) -> Iterator[Case]:
         assert found.shape[1:] == (24, 32)
         assert found.dtype == bool
 
-    for name in ("segment-anything", "transformers.js", "sam2"):
+    for name in ("segment-anything", "transformers.js", "sam2", "sam2 transformers.js"):
         write_sam(folder / name, name, side=64)
         yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
 
