@@ -7,9 +7,9 @@ PyTorch.
 
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
 every graph's outputs, and a clip tracked by jsecon over the graphs against the official video predictor, frame by
-frame, forward and backward. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and crops
-to embeddings; `siglip` needs the package transformers. `--only` takes some of the parts; figures of the others are
-kept.
+frame, forward and backward. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and
+crops to embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) need the package transformers. `--only`
+takes some of the parts; figures of the others are kept.
 """
 
 import argparse
@@ -24,7 +24,7 @@ TOLERANCE = 1e-3
 """of every output, masks as logits"""
 SAME_PIXELS = 0.999
 """of a mask"""
-PARTS = ("clip", "siglip", "mobileclip", "sam", "sam2", "tracking")
+PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images", "sam2", "tracking")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +111,14 @@ def _sam(options: Options) -> list[dict]:
     return _rows(sam.export(model, Path(options.out) / "sam", seed=options.seed, threads=options.threads))
 
 
+def _sam_images(options: Options) -> dict[str, dict]:
+    from experiments.export import sam_images
+
+    name = "sam2.1-hiera-tiny"
+    model = sam_images.official(options.seed)
+    return {name: sam_images.export(model, Path(options.out) / name, seed=options.seed, threads=options.threads)}
+
+
 def _sam2(options: Options) -> dict[str, list[dict]]:
     from experiments.export import sam2
 
@@ -163,7 +171,8 @@ def table(metrics: dict) -> str:
     groups = {"clip": metrics.get("clip", [])}
     for part in ("siglip", "mobileclip"):
         groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
-    groups |= {"sam": metrics.get("sam", [])} | metrics.get("sam2", {})
+    groups |= {"sam": metrics.get("sam", [])}
+    groups |= {name: found["graphs"] for name, found in metrics.get("sam_images", {}).items()} | metrics.get("sam2", {})
     for model, graphs in groups.items():
         for graph in graphs:
             worst = max(graph["outputs"].values())
@@ -185,6 +194,7 @@ _MADE = {
     "siglip": _siglip,
     "mobileclip": _mobileclip,
     "sam": _sam,
+    "sam_images": _sam_images,
     "sam2": _sam2,
     "tracking": _tracking,
 }
