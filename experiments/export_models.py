@@ -8,7 +8,7 @@ PyTorch.
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
 every graph's outputs, and a clip tracked by jsecon over the graphs against the official video predictor, frame by
 frame, forward and backward. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and
-crops to embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) need the package transformers. `--only`
+crops to embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) also against transformers. `--only`
 takes some of the parts; figures of the others are kept.
 """
 
