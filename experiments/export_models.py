@@ -1,4 +1,5 @@
-"""Exports CLIP, SAM and SAM 2 from their official packages as ONNX graphs, and checks ONNX Runtime against PyTorch.
+"""Exports CLIP, SigLIP, SAM and SAM 2 from their official packages as ONNX graphs, and checks ONNX Runtime against
+PyTorch.
 
     pip install -e ".[export]"        (SAM 2 builds without its CUDA operator: SAM2_BUILD_CUDA=0)
     python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k \\
@@ -6,10 +7,13 @@
 
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
 every graph's outputs, and a clip tracked by jsecon over the graphs against the official video predictor, frame by
-frame, forward and backward. `--only` takes some of clip, sam, sam2, tracking; figures of the others are kept.
+frame, forward and backward. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and
+crops to embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) also against transformers. `--only`
+takes some of the parts; figures of the others are kept.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -20,7 +24,7 @@ TOLERANCE = 1e-3
 """of every output, masks as logits"""
 SAME_PIXELS = 0.999
 """of a mask"""
-PARTS = ("clip", "sam", "sam2", "tracking")
+PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images", "sam2", "tracking")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +38,10 @@ class Options:
     clip: str = "ViT-B-16"
     clip_weights: str | None = None
     """an open_clip tag or a file; None: random."""
+    siglip: tuple[str, ...] = ("ViT-B-16-SigLIP", "ViT-B-16-SigLIP2", "siglip-base-patch16-224")
+    """of open_clip, in immich's layout; the last of transformers, in that of transformers.js. Random weights."""
+    mobileclip: tuple[str, ...] = ("MobileCLIP-S1",)
+    """of open_clip; random weights."""
     sam: str = "vit_b"
     sam_weights: str | None = None
     sam2: tuple[str, ...] = ("sam2.1_hiera_t", "sam2_hiera_t")
@@ -55,8 +63,8 @@ def main(options: Options) -> dict:
     kept = folder / "metrics.json"
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
     for part in options.only:
-        metrics[part] = {"clip": _clip, "sam": _sam, "sam2": _sam2, "tracking": _tracking}[part](options)
-        metrics["versions"] = _versions()
+        metrics[part] = _MADE[part](options)
+        metrics["versions"] = metrics.get("versions", {}) | _versions()
         done = tuple(name for name in PARTS if name in metrics)
         results.save(folder, dataclasses.replace(options, out="models", only=done), metrics, table(metrics))
     print(table(metrics))
@@ -71,12 +79,44 @@ def _clip(options: Options) -> list[dict]:
     return _rows(clip.export(model, options.clip, folder, seed=options.seed, threads=options.threads))
 
 
+def _siglip(options: Options) -> dict[str, dict]:
+    from experiments.export import clip, siglip
+
+    found, given = {}, {"seed": options.seed, "threads": options.threads}
+    for name in options.siglip:
+        folder = Path(options.out) / name
+        if "SigLIP" in name:
+            model = clip.official(name, None, seed=options.seed)
+            found[name] = siglip.export_open_clip(model, name, folder, **given)
+        else:
+            found[name] = siglip.export_transformers(siglip.official_transformers(options.seed), folder, **given)
+    return found
+
+
+def _mobileclip(options: Options) -> dict[str, dict]:
+    from experiments.export import clip
+
+    found, given = {}, {"seed": options.seed, "threads": options.threads}
+    for name in options.mobileclip:
+        model = clip.official(name, None, seed=options.seed)
+        found[name] = clip.export_mobile(model, name, Path(options.out) / name, **given)
+    return found
+
+
 def _sam(options: Options) -> list[dict]:
     from experiments.export import sam
 
     weights = None if options.sam_weights is None else Path(options.sam_weights)
     model = sam.official(options.sam, weights, seed=options.seed)
     return _rows(sam.export(model, Path(options.out) / "sam", seed=options.seed, threads=options.threads))
+
+
+def _sam_images(options: Options) -> dict[str, dict]:
+    from experiments.export import sam_images
+
+    name = "sam2.1-hiera-tiny"
+    model = sam_images.official(options.seed)
+    return {name: sam_images.export(model, Path(options.out) / name, seed=options.seed, threads=options.threads)}
 
 
 def _sam2(options: Options) -> dict[str, list[dict]]:
@@ -116,15 +156,23 @@ def _rows(agreements) -> list[dict]:
 
 
 def _versions() -> dict[str, str]:
-    from importlib.metadata import version
+    from importlib.metadata import PackageNotFoundError, version
 
-    return {name: version(name) for name in ("torch", "onnxruntime", "open_clip_torch", "segment-anything", "sam2")}
+    found = {}
+    for name in ("torch", "onnxruntime", "open_clip_torch", "timm", "transformers", "segment-anything", "sam2"):
+        with contextlib.suppress(PackageNotFoundError):  # of a part that was not asked for
+            found[name] = version(name)
+    return found
 
 
 def table(metrics: dict) -> str:
     """Markdown: a row per graph, then a row per tracked clip."""
     rows = []
-    groups = {"clip": metrics.get("clip", []), "sam": metrics.get("sam", [])} | metrics.get("sam2", {})
+    groups = {"clip": metrics.get("clip", [])}
+    for part in ("siglip", "mobileclip"):
+        groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
+    groups |= {"sam": metrics.get("sam", [])}
+    groups |= {name: found["graphs"] for name, found in metrics.get("sam_images", {}).items()} | metrics.get("sam2", {})
     for model, graphs in groups.items():
         for graph in graphs:
             worst = max(graph["outputs"].values())
@@ -139,6 +187,17 @@ def table(metrics: dict) -> str:
         )
     header = ("model", "graph or clip", "largest difference", "largest value", "same sign (least)", "within the bounds")
     return results.table(header, rows)
+
+
+_MADE = {
+    "clip": _clip,
+    "siglip": _siglip,
+    "mobileclip": _mobileclip,
+    "sam": _sam,
+    "sam_images": _sam_images,
+    "sam2": _sam2,
+    "tracking": _tracking,
+}
 
 
 def _verdict(worst: float, same: float) -> str:

@@ -15,6 +15,7 @@ from clip_files import fixture as clip_tokens, vocabulary, write_clip, write_tok
 from PIL import Image
 from sam2_files import write_sam2
 from sam_files import write_sam
+from siglip_files import write_siglip
 from splat_files import compressed_ply, scene, sog, splat, spz
 from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
@@ -35,6 +36,7 @@ from jsecon.language.field import load_field, save_field
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.networks.sigmoid import MOST_BIAS, MOST_SCALE
 from jsecon.networks.tokenizer import load_tokenizer
 from jsecon.pipeline import cache
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
@@ -582,6 +584,22 @@ def clip(folder: Path) -> Iterator[Case]:
         yield Case(files, lambda layout=layout: ClipEmbedder(folder / layout, threads=1).check(), _nothing)
 
 
+def siglip(folder: Path) -> Iterator[Case]:
+    """SigLIP folders, put to the test as before a run, with their scale and bias."""
+
+    def read(layout: str) -> object:
+        embedder = ClipEmbedder(folder / layout, threads=1)
+        embedder.check()
+        return embedder.logits
+
+    def whole(found: object) -> None:
+        assert found is None or (0 < found[0] <= MOST_SCALE and abs(found[1]) <= MOST_BIAS)
+
+    for layout in ("immich", "transformers.js"):
+        write_siglip(folder / layout, layout)
+        yield Case(_inputs_of(folder / layout), lambda layout=layout: read(layout), whole)
+
+
 def sam(folder: Path) -> Iterator[Case]:
     """SAM folders, put to the test, then asked for a frame's masks."""
     frame = np.zeros((24, 32, 3), np.uint8)
@@ -595,7 +613,7 @@ def sam(folder: Path) -> Iterator[Case]:
         assert found.shape[1:] == (24, 32)
         assert found.dtype == bool
 
-    for name in ("segment-anything", "transformers.js", "sam2"):
+    for name in ("segment-anything", "transformers.js", "sam2", "sam2 transformers.js"):
         write_sam(folder / name, name, side=64)
         yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
 
@@ -658,6 +676,6 @@ READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
             field,
             kept,
         ),
-        *(tokenizer, clip, sam, sam2, videos),
+        *(tokenizer, clip, siglip, sam, sam2, videos),
     )
 }

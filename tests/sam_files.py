@@ -1,6 +1,7 @@
 """SAM folders for tests: graphs of the true signatures that segment by colour. A point's masks are what is connected or
 not, but of about the colour at the point: three widths of "about", from the narrowest to the widest."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -57,16 +58,16 @@ def write_encoder(
 
 
 def write_decoder(path: Path, side: int, dialect: str, batch: int | str, *, masks: int = 4) -> Path:
-    """Dialects: "segment-anything", "transformers.js", "sam2". The first gives a score of 0 unless the prompt ends in a
-    point of label -1."""
+    """Dialects: "segment-anything", "transformers.js", "sam2", "sam2 transformers.js". The first gives a score of 0
+    unless the prompt ends in a point of label -1."""
     grid, low = side // 16, side // 4
-    own, nested = dialect == "segment-anything", dialect == "transformers.js"
-    embedding = "image_embed" if dialect == "sam2" else "image_embeddings"
+    own, nested, boxed = dialect == "segment-anything", "transformers.js" in dialect, dialect == "sam2 transformers.js"
+    embedding = {"sam2": "image_embed", "sam2 transformers.js": "image_embeddings.2"}.get(dialect, "image_embeddings")
     coords, labels, scores, logits = {
         "segment-anything": ("point_coords", "point_labels", "iou_predictions", "low_res_masks"),
         "transformers.js": ("input_points", "input_labels", "iou_scores", "pred_masks"),
         "sam2": ("point_coords", "point_labels", "iou_predictions", "masks"),
-    }[dialect]
+    }[dialect.removeprefix("sam2 ")]
     constants = {
         "sixteen": np.float32(16),
         "highest": np.float32(grid - 1),
@@ -131,7 +132,12 @@ def write_decoder(path: Path, side: int, dialect: str, batch: int | str, *, mask
         logits: ("float32", [*lead, batch, masks, low, low]),
         scores: ("float32", [*lead, batch, masks]),
     }
-    if nested:
+    if boxed:  # as the published graphs do it: no boxes, and so one prompt a call
+        inputs |= {f"image_embeddings.{n}": ("float32", [1, CHANNELS, grid, grid]) for n in (0, 1)}
+        inputs["input_boxes"] = ("float32", ["images", "boxes", 4])
+        outputs["object_score_logits"] = ("float32", [1, batch, 1])
+        nodes.append(node("ReduceMax", [scores], ["object_score_logits"], axes=[2]))
+    elif nested:
         inputs["image_positional_embeddings"] = ("float32", [1, CHANNELS, grid, grid])
     else:
         inputs["mask_input"] = ("float32", [batch if dialect == "sam2" else 1, 1, low, low])
@@ -157,6 +163,12 @@ def write_sam(folder: Path, dialect: str = "segment-anything", *, side: int = 25
         names = ("image_embeddings", "image_positional_embeddings")
         write_encoder(folder / "onnx" / "vision_encoder.onnx", side, names)
         write_decoder(folder / "onnx" / "prompt_encoder_mask_decoder.onnx", side, dialect, batch, masks=3)
+    elif dialect == "sam2 transformers.js":
+        write_encoder(folder / "onnx" / "vision_encoder.onnx", side, tuple(f"image_embeddings.{n}" for n in range(3)))
+        write_decoder(folder / "onnx" / "prompt_encoder_mask_decoder.onnx", side, dialect, batch, masks=3)
+        told = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "rescale_factor": 1 / 255}
+        told |= {"do_normalize": True, "do_rescale": True, "size": {"height": side, "width": side}}
+        (folder / "preprocessor_config.json").write_text(json.dumps(told))
     elif dialect == "sam2":
         names = ("image_embed", "high_res_feats_0", "high_res_feats_1")
         write_encoder(folder / "sam2_tiny.encoder.onnx", side, names)

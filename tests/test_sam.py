@@ -1,6 +1,8 @@
 """SAM's automatic mask generator over small graphs of each dialect: the same masks as a plain twin, whatever the batch,
 and a message that names the tensor for a graph of another kind."""
 
+import json
+
 import numpy as np
 import pytest
 from clip_files import write_clip
@@ -9,7 +11,7 @@ from sam_files import IOUS, write_decoder, write_encoder, write_sam
 from scipy import ndimage
 
 from jsecon.errors import InputError
-from jsecon.networks.sam.graphs import SamFiles, SamGraphs, find_sam
+from jsecon.networks.sam.graphs import MEAN, STD, SamFiles, SamGraphs, find_sam
 from jsecon.networks.sam.masks import box_nms, box_of, crops_of, cut_by_crop, langsplat_nms, point_grid
 from jsecon.networks.sam.segmenter import TOKENS, SamSegmenter, SamSettings
 from jsecon.vision.protocols import Segmenter
@@ -20,6 +22,7 @@ KINDS = [
     ("segment-anything", 7),
     ("transformers.js", "batch"),
     ("sam2", "batch"),
+    ("sam2 transformers.js", "batch"),
 ]
 
 
@@ -105,8 +108,40 @@ def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter
     for true in (red & (frame[..., 1] == 30), green):
         inner = ndimage.binary_erosion(true, iterations=12)
         assert any((inner & mask).sum() == inner.sum() and (mask & ~true).sum() < 0.3 * mask.sum() for mask in masks)
-    if kind[0] != "sam2":  # which sees the frame stretched to a square
+    if "sam2" not in kind[0]:  # which sees the frame stretched to a square
         np.testing.assert_array_equal(masks, segmenter(frame, 0))
+
+
+def test_sam_2_1_for_transformers_js_is_sam_2_asked_one_prompt_a_call(folders, frame, tmp_path):
+    first, second = (folders[kind, "batch"] for kind in ("sam2", "sam2 transformers.js"))
+    one, other = (SamGraphs(find_sam(folder), threads=1) for folder in (first, second))
+    assert (other.batch, other.side, other.dialect.stretched) == (1, one.side, True)
+    points = np.float32([[40, 40], [120, 80], [5, 5]])
+    masks, scores = zip(*one.decode(one.encode(frame), points))
+    others, rated = zip(*other.decode(other.encode(frame), points))
+    assert len(others) == 3
+    np.testing.assert_array_equal(np.concatenate(others), np.concatenate(masks))
+    np.testing.assert_array_equal(np.concatenate(rated), np.concatenate(scores))
+
+
+def test_sam_3_scales_colours_as_its_configuration_says(frame, tmp_path):
+    folder = write_sam(tmp_path / "sam3", "sam2 transformers.js", side=64)
+    plain, name = SamGraphs(find_sam(folder), threads=1).encode(frame), SamSegmenter(folder).name
+    config = folder / "preprocessor_config.json"
+    content = json.loads(config.read_text())
+    config.write_text(json.dumps(content | {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}))
+    assert SamSegmenter(folder).name != name
+    found = SamGraphs(find_sam(folder), threads=1).encode(frame).features["image_embeddings.2"][0, :3]
+    expected = plain.features["image_embeddings.2"][0, :3] * STD[:, None, None] + MEAN[:, None, None]
+    np.testing.assert_allclose(found, (expected / 255 - 0.5) / 0.5, atol=1e-5)
+    config.write_text(json.dumps({key: content[key] for key in content if key != "image_mean"}))
+    with pytest.raises(InputError, match=r"preprocessor_config\.json.*cannot be read"):
+        find_sam(folder)
+    config.unlink()
+    with pytest.raises(
+        InputError, match=r"decoder\.onnx: found a decoder of SAM 2\.1 and SAM 3.*Fetch preprocessor_conf"
+    ):
+        SamGraphs(find_sam(folder))
 
 
 def test_levels_are_the_three_masks_of_a_point(frame, segmenter):

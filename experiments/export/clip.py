@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from experiments.export.embedder import TEXTS, agreements, told
 from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
 from jsecon.files import write_text
 
@@ -61,6 +62,22 @@ def export(model: torch.nn.Module, name: str, folder: Path, *, seed: int, thread
     vocabulary = {"model": {"type": "BPE", "vocab": tokenizer.encoder, "merges": merges}}
     write_text(folder / "textual" / "tokenizer.json", json.dumps(vocabulary, ensure_ascii=False) + "\n")
     return [dataclasses.replace(row, graph=f"{half}/model.onnx") for row, half in zip(rows, ("visual", "textual"))]
+
+
+def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> dict:
+    """MobileCLIP: `export`, with the means and deviations of its published weights and its config.json, as immich's
+    exporter writes it; tokens and embeddings are compared with open_clip's too."""
+    import open_clip
+
+    usual = open_clip.get_pretrained_cfg(name, open_clip.list_pretrained_tags_by_model(name)[0])
+    model.visual.image_mean, model.visual.image_std = usual["mean"], usual["std"]
+    rows = export(model, name, folder, seed=seed, threads=threads)
+    write_text(folder / "config.json", json.dumps(open_clip.get_model_config(name), indent=2) + "\n")
+    ids = _tokenizer(name)(TEXTS, context_length=model.context_length)
+    encode = lambda pixels: model.encode_image(pixels, normalize=True)
+    numbers = {"mean": list(usual["mean"]), "std": list(usual["std"]), "size": list(model.visual.image_size)}
+    found = agreements(folder, encode, model.encode_text(ids, normalize=True), ids, numbers, threads)
+    return told(rows, found)
 
 
 def _tokenizer(name: str):

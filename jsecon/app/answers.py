@@ -54,6 +54,8 @@ def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[st
     if answer.by == "votes" and len(means):
         probability = probability_inside(answer.selection.similarity, field.votes, answer.mask)
         sure = {"mean": round(float(probability.mean()), 4), "tenth": round(float(np.quantile(probability, 0.1)), 4)}
+    if answer.there is not None:
+        sure = {"there": round(answer.there, 4)} | (sure or {})
     return {
         "query": answer.question,
         "by": answer.by,

@@ -15,7 +15,7 @@ from jsecon.app.question import Answer
 from jsecon.app.viewing import PAINTS, ViewState, tints
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
-from jsecon.query.retrieval import CONTRAST_THRESHOLD
+from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD
 from jsecon.types import LanguageField
 
 THUMBNAIL = 88
@@ -177,7 +177,10 @@ def told(field: LanguageField, state: ViewState, answers: Sequence[Answer | Inpu
             continue
         score, count = float(found.selection.score), int(found.mask.sum())
         if int(found.selection.region) < 0:
-            why = f"nothing here answers it: the best score is {score:.2f}, and {CONTRAST_THRESHOLD} is the least"
+            best, least = f"the best score is {score:.2f}", CONTRAST_THRESHOLD
+            if found.there is not None:
+                best, least = f"it is there with a probability of {found.there:.2g}", PRESENCE_THRESHOLD
+            why = f"nothing here answers it: {best}, and {least} is the least"
             lines.append(_box(f"{head}: {why}. Below is what comes nearest."))
         elif not count:
             lines.append(_box(f"{head}: no Gaussian reaches the threshold {state.threshold:.2f}."))

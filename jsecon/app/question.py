@@ -32,10 +32,11 @@ from jsecon.query.neighbours import evened, nearest
 from jsecon.query.outliers import outliers_removed
 from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
-from jsecon.query.retrieval import PIECE_NEARNESS
+from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
 from jsecon.query.several import parts_of_question, query_several
 from jsecon.query.silhouette import silhouette_members
 from jsecon.types import LanguageField, Selection
+from jsecon.vision.protocols import logits_of
 
 METHODS = ("votes", "silhouette", "code", "one_step", "canonical")
 """votes, code: anchored, membership by a Gaussian's votes or its code; silhouette: by votes, then one by one by the
@@ -59,6 +60,9 @@ class Answer:
     """(N,) bool: the selection without outliers."""
     left_out: dict[str, str]
     """part -> why it was not needed."""
+    there: float | None = None
+    """probability that the text is true of the region that answers it, or of the likeliest where none does; None of
+    embedders without one (`Logits`)."""
 
     @property
     def dropped(self) -> int:
@@ -135,6 +139,7 @@ def ask_text(
     if not len(field.canonical):  # its embeddings came from files, without phrases: those of who reads the text
         field = dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
     wanted, unwanted = parts_of_question(text)
+    logits = logits_of(embedder) if by in ("votes", "silhouette", "code") else None
     if several or unwanted or len(wanted) > 1:
         if by not in ("votes", "silhouette"):
             remedy = "Leave out --by, or ask for one thing."
@@ -142,13 +147,15 @@ def ask_text(
         given: dict[str, Any] = {} if threshold is None else {"similarity_threshold": threshold}
         embedded = jax.device_put(embedder.embed_text(wanted + unwanted))
         split = embedded[: len(wanted)], embedded[len(wanted) :]
-        selection = query_several(field, *split, several=several, piece_nearness=piece_nearness, **given)
+        given |= {"piece_nearness": piece_nearness, "logits": logits}
+        selection = query_several(field, *split, several=several, **given)
         if several and field.parts is not None:
             selection = query_parts(field, selection, split[0])
-        return _answer(field, text, by, _shaped(field, selection, by, threshold, near), outliers, {}, keep="all")
+        answer = _answer(field, text, by, _shaped(field, selection, by, threshold, near), outliers, {}, keep="all")
+        return dataclasses.replace(answer, there=best_presence(field.regions, split[0], selection.region, logits))
     embedding = jax.device_put(embedder.embed_text([text])[0])
     if by in ("votes", "silhouette", "code"):
-        shape: dict[str, Any] = {"similarity_threshold": threshold, "piece_nearness": piece_nearness}
+        shape: dict[str, Any] = {"similarity_threshold": threshold, "piece_nearness": piece_nearness, "logits": logits}
         selection = query_anchored(field, embedding, by=_membership(by), **shape)
         selection = _shaped(field, selection, by, threshold, near)
     else:
@@ -162,7 +169,8 @@ def ask_text(
         else:
             canonical = encode(field.autoencoder, jnp.asarray(field.canonical))
             selection = query_canonical(field.codes, code, canonical, least)
-    return _answer(field, text, by, selection, outliers, {})
+    answer = _answer(field, text, by, selection, outliers, {})
+    return dataclasses.replace(answer, there=best_presence(field.regions, embedding[None], selection.region, logits))
 
 
 def ask_pixel(

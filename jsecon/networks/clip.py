@@ -1,4 +1,5 @@
-"""CLIP on ONNX Runtime: a joint space of images and texts, from a model folder of either common layout.
+"""CLIP on ONNX Runtime: a joint space of images and texts, from a model folder of either common layout. So are SigLIP,
+SigLIP 2 and MobileCLIP.
 
 A region is embedded as LangSplat does it: masked, cropped to its box, padded to a black square (preprocess.py). A text
 is embedded as it stands; with several `templates`, as the mean over them.
@@ -10,13 +11,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, require
 from jsecon.networks.clip_folder import ClipFiles, find_clip
+from jsecon.networks.file_tokenizer import FileTokenizer
 from jsecon.networks.onnx_graph import Graph, Tensor, batches, describe
+from jsecon.networks.sigmoid import fitted_logits, read_logits
 from jsecon.networks.tokenizer import CONTEXT_LENGTH, ClipTokenizer, load_tokenizer
-from jsecon.vision.protocols import CANONICAL
+from jsecon.vision.protocols import CANONICAL, Logits
 from jsecon.vision.stores import EmbeddingStore, known_vectors, mask_key
 
 
@@ -45,6 +48,8 @@ DEFAULT_SIZE = 224
 """px of an image, where neither the configuration nor the graph fixes it"""
 _VISUAL_OUTPUTS = ("embedding", "image_embeds", "image_features", "image_embedding")
 _TEXTUAL_OUTPUTS = ("embedding", "text_embeds", "text_features", "text_embedding")
+_POOLED = "pooler_output"
+"""of a SigLIP by transformers: its poolers are the last step, with the projection in them"""
 
 
 class ClipEmbedder:
@@ -86,6 +91,20 @@ class ClipEmbedder:
     def canonical(self) -> Float32[np.ndarray, "c e"]:
         """(C, E) float32 unit: the bare texts of CANONICAL, without templates."""
         return self._embedded(list(CANONICAL))
+
+    @functools.cached_property
+    def logits(self) -> Logits | None:
+        """Scale and bias of a model trained with a sigmoid, where its folder has them; None for every other. Raises
+        InputError where they cannot be read."""
+        path = self.files.logits
+        if path is None or path.suffix == ".json":
+            return None if path is None else read_logits(path)
+        tints = np.array([[0, 0, 0], [1, 1, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], np.float32)
+        shades = np.linspace(40, 255, self.size)[:, None] * tints[:, None, None]
+        images = self._normalised(np.repeat(shades.astype(np.uint8), self.size, axis=1))
+        graph = Graph(path, threads=self._threads)
+        length = (self.files.rules and self.files.rules.length) or CONTEXT_LENGTH
+        return fitted_logits(graph, images, self._tokenizer([*CANONICAL], length))
 
     @property
     def size(self) -> int:
@@ -149,16 +168,23 @@ class ClipEmbedder:
 
     @property
     def _visual_output(self) -> Tensor:
-        return embedding_output(self._visual, _VISUAL_OUTPUTS, "CLIP's graph of images")
+        return embedding_output(self._visual, self._outputs(_VISUAL_OUTPUTS), "CLIP's graph of images")
+
+    def _outputs(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        return names if self.files.rules is None else (*names, _POOLED)
 
     @functools.cached_property
-    def _tokenizer(self) -> ClipTokenizer:
-        return load_tokenizer(self.files.tokenizer)
+    def _tokenizer(self) -> ClipTokenizer | FileTokenizer:
+        rules = self.files.rules
+        return load_tokenizer(self.files.tokenizer) if rules is None else FileTokenizer(self.files.tokenizer, rules)
+
+    def _normalised(self, crops: UInt8[np.ndarray, "b s s 3"]) -> Float32[np.ndarray, "b 3 s s"]:
+        mean, std = np.asarray(self.files.mean, np.float32), np.asarray(self.files.std, np.float32)
+        return np.ascontiguousarray(((crops.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2))
 
     def _through_visual(self, crops: UInt8[np.ndarray, "b s s 3"]) -> np.ndarray:
         """(B, S, S, 3) uint8 RGB -> (B, E) as the graph gives them."""
-        mean, std = np.asarray(self.files.mean, np.float32), np.asarray(self.files.std, np.float32)
-        images = np.ascontiguousarray(((crops.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2))
+        images = self._normalised(crops)
         tensor, output = self._visual_input, self._visual_output.name
         parts = [
             _rows(self._visual, {tensor.name: part}, output, count)
@@ -169,15 +195,15 @@ class ClipEmbedder:
     def _embedded(self, phrases: list[str]) -> Float32[np.ndarray, "p e"]:
         """(P, E) float32 unit."""
         graph, what = self._textual, "CLIP's graph of texts"
-        output = embedding_output(graph, _TEXTUAL_OUTPUTS, what)
+        output = embedding_output(graph, self._outputs(_TEXTUAL_OUTPUTS), what)
         masks = [name for name in graph.inputs if "mask" in name]
         names = [name for name in graph.inputs if name not in masks]
         tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
-        length = tensor.fixed(1) or CONTEXT_LENGTH
+        length = tensor.fixed(1) or (self.files.rules and self.files.rules.length) or CONTEXT_LENGTH
         ids = self._tokenizer(phrases, length)
         parts = []
         for part, count in batches(ids, tensor.fixed(0), self._batch):
-            feeds = {tensor.name: part} | {name: _up_to_end(part, self._tokenizer.end) for name in masks}
+            feeds = {tensor.name: part} | {name: self._tokenizer.mask(part) for name in masks}
             parts.append(_rows(graph, feeds, output.name, count))
         rows = np.concatenate(parts)
         if rows.shape[1] != self.dim:
@@ -190,8 +216,8 @@ class ClipEmbedder:
 def embedding_output(graph: Graph, names: Sequence[str], what: str) -> Tensor:
     """The output (B, E) of a graph: of one of `names`, else its only one of two axes.
 
-    A pooler's does not count: it lies before the projection into the joint space. Raises InputError where there is
-    none, or more than one.
+    A pooler's that is not named does not count: CLIP's lies before the projection into the joint space. Raises
+    InputError where there is none, or more than one.
     """
     for name in names:
         if name in graph.outputs:
@@ -211,12 +237,6 @@ def _rows(graph: Graph, feeds: dict[str, np.ndarray], output: str, count: int) -
         remedy = "Export the graph with its projection."
         raise InputError(f"{graph.path}, output {output!r}", f"shape {found.shape}", f"{count} embeddings", remedy)
     return found[:count]
-
-
-def _up_to_end(ids: Int64[np.ndarray, "b l"], end: int) -> Int64[np.ndarray, "b l"]:
-    """1 for each id up to the first `end`, 0 behind it."""
-    before = np.cumsum(ids == end, axis=1) - (ids == end)
-    return (before == 0).astype(np.int64)
 
 
 def _unit(rows: np.ndarray, path: Path) -> Float32[np.ndarray, "b e"]:

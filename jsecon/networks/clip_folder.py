@@ -1,9 +1,11 @@
-"""Where the parts of a CLIP model lie in a folder, and how it wants its images: read from its own files.
+"""Where the parts of a CLIP model lie in a folder, and how it wants its images and texts: read from its own files.
 
 Three layouts are known:
     immich            visual/model.onnx, textual/model.onnx, visual/preprocess_cfg.json, textual/tokenizer.json
     transformers.js   onnx/vision_model.onnx, onnx/text_model.onnx, preprocessor_config.json, tokenizer.json
     flat              two .onnx files, told apart by their inputs, with those JSON files beside them
+MobileCLIP is a CLIP of other graphs, and comes in the same layouts with CLIP's own vocabulary. SigLIP and SigLIP 2 are
+known by config.json (text_rules.py).
 """
 
 import dataclasses
@@ -12,7 +14,10 @@ from pathlib import Path
 
 from jsecon.errors import InputError
 from jsecon.files import read_json
+from jsecon.networks.file_tokenizer import TextRules
 from jsecon.networks.onnx_graph import Graph, content_digest, describe, graph_files
+from jsecon.networks.sigmoid import LOGITS
+from jsecon.networks.text_rules import read_text_rules
 from jsecon.numerics import sane
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -28,7 +33,8 @@ CONFIGS = ("visual/preprocess_cfg.json", "preprocess_cfg.json", "preprocessor_co
 TOKENIZERS = ("textual/tokenizer.json", "tokenizer.json", "textual/vocab.json", "vocab.json")
 PUBLISHED = (
     "CLIP folders are published on huggingface.co: immich-app/ViT-B-32__laion2b-s34b-b79k and others of immich-app, "
-    "Xenova/clip-vit-base-patch16 and others of Xenova."
+    "Xenova/clip-vit-base-patch16, Xenova/mobileclip_s0, Xenova/siglip-base-patch16-224, "
+    "onnx-community/siglip2-base-patch16-224-ONNX and others of theirs."
 )
 
 
@@ -50,13 +56,18 @@ class ClipFiles:
     """S in px; None: as the graph fixes it, else 224."""
     layout: str = "given"
     """immich, transformers.js, flat, or given: the files were named one by one."""
+    rules: TextRules | None = None
+    """how it takes its texts; None: as CLIP does."""
+    logits: Path | None = None
+    """logits.json, or a graph of both encoders, which know the scale and bias of a sigmoid; None: nothing does."""
 
     def digest(self) -> str:
-        """Hex digits of all that the embeddings depend on: the files' contents, and the three numbers."""
+        """Hex digits of all that the embeddings depend on: the files' contents, the three numbers, and the rules."""
         files = [*graph_files(self.visual), *graph_files(self.textual), self.tokenizer]
         if self.tokenizer.name == "vocab.json":
             files.append(self.tokenizer.with_name("merges.txt"))
-        return content_digest(files, extra=repr((self.mean, self.std, self.size)))
+        told = (self.mean, self.std, self.size)
+        return content_digest(files, extra=repr(told if self.rules is None else (*told, *self.rules)))
 
 
 def find_clip(folder: str | Path) -> ClipFiles:
@@ -69,8 +80,14 @@ def find_clip(folder: str | Path) -> ClipFiles:
     if tokenizer is None:
         raise InputError(folder, f"graphs in the layout of {layout}, no tokenizer", TOKENIZERS[1], PUBLISHED)
     config = next((folder / name for name in CONFIGS if (folder / name).is_file()), None)
-    numbers = (CLIP_MEAN, CLIP_STD, None) if config is None else read_preprocessing(config)
-    return ClipFiles(visual, textual, tokenizer, *numbers, layout)
+    rules = read_text_rules(folder, tokenizer)
+    if config is None and rules is not None:
+        found, needed = "a SigLIP model that does not say how it takes images", f"{CONFIGS[0]} or {CONFIGS[2]}"
+        raise InputError(folder, found, needed, f"Fetch the missing file. {PUBLISHED}")
+    numbers = (CLIP_MEAN, CLIP_STD, None) if config is None else read_preprocessing(config, whole=rules is not None)
+    known = (folder / LOGITS, folder / "onnx" / "model.onnx") if rules is not None else ()
+    logits = next((path for path in known if path.is_file()), None)
+    return ClipFiles(visual, textual, tokenizer, *numbers, layout, rules, logits)
 
 
 def _graphs(folder: Path) -> tuple[str, tuple[Path, Path]]:
@@ -107,15 +124,21 @@ def is_textual(graph: Graph) -> bool:
     return 1 <= len(ids) == len(graph.inputs) <= 2 and bool(vectors)
 
 
-def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
+def read_preprocessing(path: Path, *, whole: bool = False) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
     """(mean, std, size) of a preprocess_cfg.json, preprocessor_config.json or open_clip_config.json; what a file leaves
-    out is CLIP's own, or None for the size. Raises InputError where it cannot be read."""
+    out is CLIP's own, or None for the size; 0 and 1 where it says not to normalise. With `whole`, mean and std may not
+    be left out. Raises InputError where it cannot be read."""
     expected = "mean and std of three channels, and a size in px"
     content = read_json(path, expected, "Fetch the file again.")
     try:
         content = content.get("preprocess_cfg", content)
-        mean = content.get("mean", content.get("image_mean", CLIP_MEAN))
-        std = content.get("std", content.get("image_std", CLIP_STD))
+        mean = content.get("mean", content.get("image_mean", None if whole else CLIP_MEAN))
+        std = content.get("std", content.get("image_std", None if whole else CLIP_STD))
+        if content.get("do_normalize") is False:  # MobileCLIP's
+            mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+        rescale = float(content.get("rescale_factor", 1 / 255)) if content.get("do_rescale", True) else 1.0
+        if abs(255 * rescale - 1) > 1e-3:
+            raise ValueError(f"pixels times {rescale:g}, not 1/255")
         size = _side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:

@@ -49,6 +49,11 @@ class ClipTokenizer:
             row[: len(own)] = own
         return ids
 
+    def mask(self, ids: Int64[np.ndarray, "b l"]) -> Int64[np.ndarray, "b l"]:
+        """1 for each id up to the first end, 0 behind it."""
+        ends = ids == self.end
+        return (np.cumsum(ends, axis=1) - ends == 0).astype(np.int64)
+
     def encode(self, text: str) -> list[int]:
         """The ids of a text, without start and end."""
         ends = dict(zip(_WRITTEN_ENDS, ([self.start], [self.end])))
@@ -80,7 +85,8 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
         expected = "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
         expected += f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}"
         found = f"no tokenizer of CLIP's kind ({type(error).__name__}: {error})"
-        raise InputError(path, found, expected, "Fetch the file again, from a CLIP model.") from error
+        remedy = "Fetch the file again, from a CLIP model; for SigLIP with the model's config.json in the folder."
+        raise InputError(path, found, expected, remedy) from error
 
 
 def word_splitter() -> Any:
@@ -93,7 +99,12 @@ def word_splitter() -> Any:
 
 
 def cleaned(text: str) -> str:
-    """The text as open_clip has it cleaned: ftfy, two rounds of HTML entities, white space, lower case."""
+    """The text as open_clip has it cleaned: `mended`, in lower case."""
+    return mended(text).lower()
+
+
+def mended(text: str) -> str:
+    """The text with mis-decoded signs put right (ftfy), two rounds of HTML entities, and single spaces."""
     import ftfy
 
-    return " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split()).lower()
+    return " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())

@@ -9,6 +9,7 @@ from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.onnx_graph import Graph, describe
 from jsecon.networks.sam import graphs as sam_graphs
 from jsecon.networks.sam2.graphs import open_sam2
+from jsecon.networks.sigmoid import REMEDY as LOGITS_REMEDY
 
 SAM2_PUBLISHED = "The same split of SAM 2 into graphs is that of axinc-ai/segment-anything-2 on github.com."
 
@@ -87,7 +88,19 @@ def _clip(folder: Path) -> str:
     size, files = embedder.size, embedder.files
     told = f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}"
     embedder.close()
-    return f"{told}, tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
+    told = f"{told}, tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
+    if files.rules is None:
+        return told
+    length, pad, clean = files.rules
+    return f"{told}\n  texts of {length} ids, filled by {pad!r}, cleaned by {clean!r}; {_sigmoid(embedder)}"
+
+
+def _sigmoid(embedder: ClipEmbedder) -> str:
+    """What tells how likely a text is there: the scale and bias, or what takes their place."""
+    found, where = embedder.logits, embedder.files.logits
+    if found is None or where is None:
+        return f"no scale and bias, so that a text is refused by its contrast. {LOGITS_REMEDY}"
+    return f"how likely a text is there: sigmoid({found.scale:.4f} cosine {found.bias:+.4f}), from {where.name}"
 
 
 def _sam(folder: Path) -> str:

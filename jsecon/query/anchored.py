@@ -22,10 +22,12 @@ from jsecon.query.retrieval import (
     evidence,
     is_alike,
     is_piece,
+    presence,
     regions_of_text,
     threshold_of,
 )
 from jsecon.types import Array, LanguageField, Selection
+from jsecon.vision.protocols import Logits
 
 _THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}
 
@@ -52,6 +54,7 @@ def query_anchored(
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     piece_nearness: Number | None = PIECE_NEARNESS,
     codes: UnitCodes | None = None,
+    logits: Logits | None = None,
 ) -> Selection:
     """The Gaussians of the region that answers a text's embedding (E,) best.
 
@@ -59,7 +62,8 @@ def query_anchored(
     canonical phrases against what sets the region apart from the scene (`contrasts` has the formula), times what stands
     behind the region's embedding (`evidence`), or "cosine", the plain one (the paper). Where that region's similarity
     is below `retrieval_threshold` (default 0.12 for contrast, 0.2 for cosine) nothing is selected, and Selection.region
-    is -1; Selection.score is how much it was. Membership, `by`:
+    is -1; Selection.score is how much it was. With the embedder's `logits` the threshold is on the probability that the
+    text is true of that region (`presence`; default 0.01). Membership, `by`:
     "votes": the share of the region and of those that are the same thing as the text sees it, an estimate of the
         probability that a pixel of the Gaussian belongs to them (`share_of`); default threshold 0.5. The same thing
         are regions alike, by `alike_threshold`, and pieces, by `piece_nearness` where the votes know which regions
@@ -75,11 +79,11 @@ def query_anchored(
     remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
     require_shape("query_anchored", text_embedding, (size,), remedy)
     require_one_of("query_anchored", by, _THRESHOLDS, "'votes' is the default.")
-    least = threshold_of(retrieval, retrieval_threshold, "query_anchored")
+    least = threshold_of(retrieval, retrieval_threshold, "query_anchored", logits)
     if field.regions.count == 0:
         return nothing(field)
     given = field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels, field.votes.overlap
-    found = _retrieve(*jax.tree.map(jnp.asarray, given), least, alike_threshold, piece_nearness, retrieval)
+    found = _retrieve(*jax.tree.map(jnp.asarray, given), least, alike_threshold, piece_nearness, logits, retrieval)
     return members(field, found, similarity_threshold, by=by, codes=codes)
 
 
@@ -125,11 +129,12 @@ def nothing(field: LanguageField) -> Selection:
 
 
 # Apart from the members, so that fields of any number of Gaussians share the one, and a text and a pixel the other.
-def _retrieve_body(embeddings, text, canonical, pixels, overlap, least, alike, nearness, retrieval) -> Found:
+def _retrieve_body(embeddings, text, canonical, pixels, overlap, least, alike, nearness, logits, retrieval) -> Found:
     similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
     standing = None if retrieval == "cosine" else evidence(pixels).astype(similarity.dtype)
     rule = {"retrieval_threshold": least, "alike_threshold": alike, "piece_nearness": nearness, "standing": standing}
-    chosen = regions_of_text(embeddings, similarity, known, overlap, several=False, **rule)
+    there = None if logits is None else presence(embeddings, text, logits)
+    chosen = regions_of_text(embeddings, similarity, known, overlap, several=False, there=there, **rule)
     best = anchor_of(similarity, known, standing)
     return Found(chosen, jnp.where(chosen[best], best, -1), jnp.where(known[best], similarity[best], 0.0))
 

@@ -6,6 +6,7 @@ that of the cones, and where a region's embedding is noisy it is decided by how 
 are the same for every text and every region of a scene, so that both can be taken out.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, Shaped
 
@@ -13,7 +14,8 @@ from jsecon.errors import require_one_of
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.numerics import normalize
 from jsecon.query.direct import Number, similarities
-from jsecon.types import Array
+from jsecon.types import Array, Regions
+from jsecon.vision.protocols import Logits
 
 RETRIEVALS = ("contrast", "cosine")
 """how a text finds its region: by `contrasts`, or by the plain cosine (the paper)"""
@@ -25,6 +27,11 @@ RETRIEVAL_THRESHOLD = 0.2
 """The paper's "low threshold to filter invalid prompts" on the cosine, which it does not state. In CLIP ViT-B/16 an
 image has a cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without
 CLIP's gap are far above for texts that fit."""
+PRESENCE_THRESHOLD = 0.01
+"""on the probability that a text is true of a region (`presence`), where the embedder has one. It is a probability at
+the odds of the training, one true pair in a batch of 32,768 (SigLIP, arXiv 2303.15343): there 0.01 says that the pair
+is 300 times likelier true than at random. Half would refuse what is there: the example of
+google/siglip2-base-patch16-224 gives its true text 0.106. Not measured here: no trained weights could be had."""
 NEARNESS = 0.75
 """all of a kind: how far a region's similarity has come from that of the middle region to that of the best"""
 PIECE_NEARNESS = 0.5
@@ -85,6 +92,23 @@ def contrasts(
     return jnp.where(known, found, 0.0), known
 
 
+def presence(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: Logits) -> Float[Array, " r"]:
+    """P(a text (E,) is true of a region) of R regions' embeddings (R, E), by the sigmoid that the embedder was trained
+    with: sigmoid(scale cos(e_r, t) + bias). 0 where either is no direction."""
+    cosines, known = similarities(embeddings, text)
+    return jnp.where(known, jax.nn.sigmoid(logits.scale * cosines + logits.bias), 0.0)
+
+
+def best_presence(
+    regions: Regions, texts: Float[Array, "q e"], region: Int[Array, ""], logits: Logits | None
+) -> float | None:
+    """The largest `presence` of any of Q texts in `region`, of -1 in any region; None without `logits`. Host code."""
+    if logits is None or regions.count == 0:
+        return None
+    found = jnp.stack([presence(jnp.asarray(regions.embeddings), text, logits) for text in texts]).max(axis=0)
+    return float(found[region] if int(region) >= 0 else found.max())
+
+
 def evidence(pixels: Shaped[Array, "r t"]) -> Float[Array, " r"]:
     """How much stands behind each of R regions' embeddings, in (0, 1], from its pixels in T views.
 
@@ -112,12 +136,14 @@ def answers(
     return contrasts(embeddings, text, canonical, pixels)
 
 
-def threshold_of(retrieval: str, given: Number | None, where: str) -> Number:
-    """The threshold that was given, or that of the kind of retrieval. Raises ValueError, naming the function `where`,
-    unless `retrieval` is one of RETRIEVALS."""
+def threshold_of(retrieval: str, given: Number | None, where: str, logits: Logits | None = None) -> Number:
+    """The threshold that was given, or that of the kind of retrieval; with `logits` that on the probability. Raises
+    ValueError, naming the function `where`, unless `retrieval` is one of RETRIEVALS."""
     require_one_of(where, retrieval, RETRIEVALS, "'contrast' is the default.")
     if given is not None:
         return given
+    if logits is not None:
+        return PRESENCE_THRESHOLD
     return RETRIEVAL_THRESHOLD if retrieval == "cosine" else CONTRAST_THRESHOLD
 
 
@@ -133,11 +159,13 @@ def regions_of_text(
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     piece_nearness: Number | None = PIECE_NEARNESS,
     standing: Float[Array, " r"] | None = None,
+    there: Float[Array, " r"] | None = None,
 ) -> Bool[Array, " r"]:
     """Which of R regions answer a text, from the similarity s_r of each with it (R,), where that is known (R,).
 
-    a is the region with the largest s_r, times `standing` (R,) where that is given (`evidence`). None where s_a is
-    below `retrieval_threshold`. Else a and every r with one of, b the region with the largest s_r itself,
+    a is the region with the largest s_r, times `standing` (R,) where that is given (`evidence`). None where s_a, or the
+    probability `there` (R,) of a where that is given (`presence`), is below `retrieval_threshold`. Else a and every r
+    with one of, b the region with the largest s_r itself,
 
         s_r >= m + nearness (s_b - m)              with `several`: of the same kind (`is_near`)
         s_r >= m + piece_nearness (s_b - m), o_rc >= PIECE_OVERLAP     with c = a or of its kind: a piece (`is_piece`)
@@ -155,7 +183,8 @@ def regions_of_text(
         chosen |= is_piece(similarity, known, chosen, overlap, nearness=piece_nearness)
     if alike_threshold is not None:
         chosen |= is_alike(embeddings, anchor, alike_threshold)
-    return chosen & known & (scored[anchor] >= retrieval_threshold)
+    accepted = scored if there is None else there
+    return chosen & known & (accepted[anchor] >= retrieval_threshold)
 
 
 def anchor_of(

@@ -10,8 +10,9 @@ from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import Found, members, nothing
 from jsecon.query.direct import Number
-from jsecon.query.retrieval import NEARNESS, PIECE_NEARNESS, answers, evidence, regions_of_text, threshold_of
+from jsecon.query.retrieval import NEARNESS, PIECE_NEARNESS, answers, evidence, presence, regions_of_text, threshold_of
 from jsecon.types import Array, LanguageField, Selection
+from jsecon.vision.protocols import Logits
 
 ROUNDING = 1e-5
 """similarities that differ by no more are equal: one text, wanted and unwanted, answers to neither"""
@@ -28,12 +29,13 @@ def query_several(
     retrieval: str = "contrast",
     retrieval_threshold: Number | None = None,
     similarity_threshold: Number = SHARE_THRESHOLD,
+    logits: Logits | None = None,
 ) -> Selection:
     """The Gaussians of all regions that answer any of the wanted texts (Q, E) and none of the unwanted (U, E).
 
-    A region answers a text by the rule of `regions_of_text`, on the similarities that `retrieval` names, as in
-    `query_anchored`. One that answers a wanted and an unwanted text belongs to the one that it is more similar to, so
-    that "mug but not handle" keeps the mug where the handle was never told apart. Membership is by votes, as in
+    A region answers a text by the rule of `regions_of_text`, on the similarities that `retrieval` names, with `logits`
+    as in `query_anchored`. One that answers a wanted and an unwanted text belongs to the one that it is more similar
+    to, so that "mug but not handle" keeps the mug where the handle was never told apart. Membership is by votes, as in
     `query_anchored`: the share of the chosen regions is at least `similarity_threshold`. Selection.region is the best
     of the chosen, -1 where there is none; Selection.score its similarity. Pure: jit it or vmap it over texts. Raises
     ValueError on texts of another size.
@@ -43,16 +45,17 @@ def query_several(
     fit = wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1
     found, expected = f"wanted {wanted.shape}, unwanted {unwanted.shape}", f"(Q >= 1, {size}) and (U, {size})"
     require(fit, "query_several", found, expected, "Embed the texts with the field's embedder.")
-    least = threshold_of(retrieval, retrieval_threshold, "query_several")
+    least = threshold_of(retrieval, retrieval_threshold, "query_several", logits)
     if field.regions.count == 0:
         return nothing(field)
     known = field.regions.embeddings, field.canonical, field.regions.pixels, field.votes.overlap
     given = jax.tree.map(jnp.asarray, (*known, wanted, unwanted))
-    return members(field, _retrieve(*given, nearness, piece_nearness, least, several, retrieval), similarity_threshold)
+    found = _retrieve(*given, nearness, piece_nearness, least, logits, several, retrieval)
+    return members(field, found, similarity_threshold)
 
 
 def _retrieve_body(
-    embeddings, canonical, pixels, overlap, wanted, unwanted, nearness, piece_nearness, least, several, retrieval
+    embeddings, canonical, pixels, overlap, wanted, unwanted, nearness, pieces, least, logits, several, retrieval
 ) -> Found:
     count = embeddings.shape[0]
     standing = None if retrieval == "cosine" else evidence(pixels).astype(embeddings.dtype)
@@ -62,7 +65,8 @@ def _retrieve_body(
         for text in texts:
             similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
             rule = {"retrieval_threshold": least, "several": several, "nearness": nearness, "standing": standing}
-            own = regions_of_text(embeddings, similarity, known, overlap, piece_nearness=piece_nearness, **rule)
+            rule["there"] = None if logits is None else presence(embeddings, text, logits)
+            own = regions_of_text(embeddings, similarity, known, overlap, piece_nearness=pieces, **rule)
             chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, similarity, -jnp.inf))
         return chosen, closeness
 

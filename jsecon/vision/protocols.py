@@ -6,7 +6,7 @@ Everything here lives on the host: NumPy in, NumPy out. Frames are uint8 RGB.
 
 import dataclasses
 from collections.abc import Collection
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -78,6 +78,19 @@ class Embedder(Protocol):
     def embed_text(self, texts: list[str]) -> np.ndarray:
         """Q texts -> (Q, E) float32 unit. Raises InputError on a text that this space has no words for."""
         ...
+
+
+class Logits(NamedTuple):
+    """What makes a probability of a cosine: P(a text is true of an image) = sigmoid(scale * cosine + bias)."""
+
+    scale: float
+    bias: float
+
+
+def logits_of(embedder: object) -> Logits | None:
+    """Those of an embedder that was trained to tell whether a text is true of an image (its attribute `logits`); None
+    for all others, whose cosines only rank."""
+    return getattr(embedder, "logits", None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,10 +1,12 @@
 """SAM's image encoder and mask decoder as ONNX graphs: found in a folder, their signatures read, run on a frame.
 
-Three dialects of decoder are known, told apart by the names of their inputs:
+Four dialects of decoder are known, told apart by the names of their inputs:
     segment-anything   point_coords (B, P, 2), point_labels (B, P) -> iou_predictions, low_res_masks. B is 1 in the
                        project's own export (one call per point), or free in one that takes a batch of prompts.
     transformers.js    input_points (1, B, P, 2), input_labels (1, B, P) -> iou_scores, pred_masks
     SAM 2 on images    as the first, with high_res_feats_0 and _1 of the encoder; the frame is stretched to a square
+    SAM 2.1, SAM 3     as the second, with image_embeddings.0, .1 and .2 of the encoder, and input_boxes (1, 0, 4); the
+                       frame is stretched, and preprocessor_config.json says how its colours are scaled
 Masks are taken at the decoder's own resolution and brought to the frame's size here.
 """
 
@@ -18,9 +20,10 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from jsecon.errors import InputError
+from jsecon.networks.clip_folder import read_preprocessing
 from jsecon.networks.onnx_graph import Graph, Tensor, batches, content_digest, describe, graph_files
 
-MEAN, STD = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
+MEAN, STD = MEAN_STD = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
 """of RGB in 0..255"""
 IMAGE_SIDE = 1024
 """px of the encoder's square image, where its file does not fix it"""
@@ -30,7 +33,8 @@ ENCODERS = ("vision_encoder.onnx", "image_encoder.onnx", "encoder.onnx")
 DECODERS = ("prompt_encoder_mask_decoder.onnx", "mask_decoder.onnx", "decoder.onnx")
 PUBLISHED = (
     "SAM folders are published on huggingface.co: Xenova/sam-vit-base, Xenova/slimsam-77-uniform (a batch of prompts a "
-    "call); vietanhdev/samexporter and segment-anything's scripts/export_onnx_model.py write one prompt per call."
+    "call), onnx-community/sam2.1-hiera-tiny-ONNX, onnx-community/sam3-tracker-ONNX; vietanhdev/samexporter and "
+    "segment-anything's scripts/export_onnx_model.py write one prompt per call."
 )
 
 
@@ -49,23 +53,34 @@ class Dialect:
     """a prompt without a box must end in a point of label -1."""
     stretched: bool = False
     """the frame is stretched to a square, instead of scaled by its longer side and padded."""
+    configured: bool = False
+    """the folder must say how colours are scaled: SAM 2.1 takes them as SAM does, SAM 3 does not."""
 
 
 OWN = Dialect("segment-anything", "point_coords", "point_labels", "iou_predictions", "low_res_masks", padded=True)
 HUB = Dialect("transformers.js", "input_points", "input_labels", "iou_scores", "pred_masks", nested=True)
 SECOND = Dialect("SAM 2 on images", "point_coords", "point_labels", "iou_predictions", "masks", stretched=True)
+HUB_SECOND = dataclasses.replace(HUB, name="SAM 2.1 and SAM 3 for transformers.js", stretched=True, configured=True)
+CONFIG = "preprocessor_config.json"
 
 
 @dataclasses.dataclass(frozen=True)
 class SamFiles:
-    """The two graphs of a SAM model."""
+    """The two graphs of a SAM model, and how it takes colours."""
 
     encoder: Path
     decoder: Path
+    colours: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """mean and std of RGB in 0..1, where preprocessor_config.json has others than SAM."""
+    configured: bool = False
+    """whether there was such a file."""
+    side: int | None = None
+    """px of the square image by that file."""
 
     def digest(self, *, extra: str = "") -> str:
-        """32 hex digits of the files' contents, and of `extra`."""
-        return content_digest([*graph_files(self.encoder), *graph_files(self.decoder)], extra=extra)
+        """32 hex digits of the files' contents, of the colours, and of `extra`."""
+        told = extra if self.colours is None else f"{extra}{self.colours}"
+        return content_digest([*graph_files(self.encoder), *graph_files(self.decoder)], extra=told)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +109,12 @@ def find_sam(folder: str | Path) -> SamFiles:
         first = f"an image encoder ({' or '.join(ENCODERS)}, or one *encoder*.onnx)"
         second = f"a mask decoder ({' or '.join(DECODERS)}, or one *decoder*.onnx)"
         raise InputError(folder, found, f"{first} and {second}", PUBLISHED)
-    return SamFiles(encoder, decoder)
+    config = folder / CONFIG
+    if not config.is_file():
+        return SamFiles(encoder, decoder)
+    mean, std, side = read_preprocessing(config, whole=True)
+    own = np.allclose(np.multiply((mean, std), 255), MEAN_STD, rtol=1e-5)
+    return SamFiles(encoder, decoder, None if own else (mean, std), True, side)
 
 
 def _one_of(paths: list[Path], names: tuple[str, ...]) -> Path | None:
@@ -117,9 +137,14 @@ class SamGraphs:
         self.dialect = self._checked_decoder()
         coords = self._decoder.inputs[self.dialect.coords]
         self._fixed_batch = coords.fixed(1 if self.dialect.nested else 0)
+        if "input_boxes" in self._decoder.inputs:  # none of them go with one prompt, not with a batch
+            self._fixed_batch = 1
         self.batch = self._fixed_batch or batch
-        self.side = (len(self._image.shape or ()) == 4 and self._image.fixed(3)) or IMAGE_SIDE
+        told = files.side if self.dialect.configured else None
+        self.side = (len(self._image.shape or ()) == 4 and self._image.fixed(3)) or told or IMAGE_SIDE
         self._links = self._checked_links()
+        colours = MEAN_STD if files.colours is None else np.multiply(files.colours, 255)
+        self._mean, self._std = np.asarray(colours, np.float32)
 
     def _checked_image(self) -> Tensor:
         """The encoder's one input: (1, 3, S, S) normalised, or (H, W, 3) of 0..255."""
@@ -133,6 +158,11 @@ class SamGraphs:
     def _checked_decoder(self) -> Dialect:
         inputs = self._decoder.inputs
         dialect = HUB if HUB.coords in inputs else SECOND if "high_res_feats_0" in inputs else OWN
+        if dialect is HUB and "image_embeddings.0" in inputs:
+            dialect = HUB_SECOND
+        if dialect.configured and not self.files.configured:
+            found, remedy = f"a decoder of {dialect.name}", f"Fetch {CONFIG} into the model's folder."
+            raise InputError(self.files.decoder, found, f"{CONFIG} in its folder: means and deviations", remedy)
         lead = (1,) if dialect.nested else ()
         what = f"SAM's mask decoder ({dialect.name})"
         self._decoder.require("input", dialect.coords, (*lead, None, None, 2), what)
@@ -151,7 +181,8 @@ class SamGraphs:
     def _checked_links(self) -> dict[str, str]:
         """Decoder input -> encoder output, for all that the decoder takes from the frame."""
         links = {name: name for name in self._decoder.inputs if name in self._encoder.outputs}
-        own = {self.dialect.coords, self.dialect.labels, "mask_input", "has_mask_input", "orig_im_size"}
+        given = ("mask_input", "has_mask_input", "orig_im_size", "input_boxes")
+        own = {self.dialect.coords, self.dialect.labels, *given}
         left = [name for name in self._decoder.inputs if name not in links and name not in own]
         maps = [name for name, tensor in self._encoder.outputs.items() if tensor.fits((1, None, None, None))]
         if len(left) == 1 and len(maps) == 1:  # the encoder's only map, whatever its exporter called it
@@ -178,7 +209,7 @@ class SamGraphs:
         image = np.asarray(Image.fromarray(frame).resize((size[1], size[0]), Image.Resampling.BILINEAR), np.float32)
         if len(self._image.shape or ()) == 4:
             square = np.zeros((self.side, self.side, 3), np.float32)
-            square[: size[0], : size[1]] = (image - MEAN) / STD
+            square[: size[0], : size[1]] = (image - self._mean) / self._std
             image = square.transpose(2, 0, 1)[None]
         found = self._encoder.run({self._image.name: image}, sorted(set(self._links.values())))
         return Encoded({name: found[output] for name, output in self._links.items()}, height, width, *size)
@@ -214,6 +245,8 @@ class SamGraphs:
             feeds["mask_input"] = np.zeros((tensor.fixed(0) or count, 1, side, side), np.float32)
         if "has_mask_input" in self._decoder.inputs:
             feeds["has_mask_input"] = np.zeros(self._decoder.inputs["has_mask_input"].fixed(0) or count, np.float32)
+        if "input_boxes" in self._decoder.inputs:
+            feeds["input_boxes"] = np.zeros((1, 0, 4), np.float32)
         if "orig_im_size" in self._decoder.inputs:  # of the graph's own upscaled masks, which are not used: tiny
             feeds["orig_im_size"] = np.full(2, 8, np.float32)
         return feeds

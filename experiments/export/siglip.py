@@ -1,0 +1,157 @@
+"""SigLIP and SigLIP 2 as folders of both layouts: of open_clip in immich's (immich-app/ml-models,
+immich_model_exporter), of transformers in that of transformers.js; each with a small vocabulary of its kind."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from experiments.export.clip import Image, Text
+from experiments.export.embedder import FRAMES, TEXTS, agreements, told
+from experiments.export.graph import OPSET, Agreement, declare_missing_operators, shake, write_graph
+from experiments.export.vocabulary import write_vocabulary
+from jsecon.files import write_text, written_whole
+from jsecon.networks.clip import ClipEmbedder
+from jsecon.networks.sigmoid import LOGITS
+
+SCALE, BIAS = 117.330795, -12.932437
+"""put into the random model: about those of the published ones"""
+
+
+def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: int, threads: int) -> dict:
+    """Writes the folder of an open_clip model and compares graphs, tokens and embeddings with open_clip."""
+    import open_clip
+
+    settings = open_clip.get_model_config(name)
+    rules, size = settings["text_cfg"], settings["vision_cfg"]["image_size"]
+    generator = torch.Generator().manual_seed(seed)
+    images, kind = torch.randn(3, 3, size, size, generator=generator), "gemma" if "SigLIP2" in name else "t5"
+    write_vocabulary(folder / "textual", kind, _corpus(), tokenizer_class="PreTrainedTokenizerFast")
+    length, clean = rules["context_length"], rules["tokenizer_kwargs"]["clean"]
+    tokenizer = open_clip.tokenizer.HFTokenizer(str(folder / "textual"), context_length=length, clean=clean)
+    ids = tokenizer(TEXTS).to(torch.int32)
+    rows = [
+        _half(folder / "visual" / "model.onnx", Image(model), "image", images, "image_embedding", threads),
+        _half(folder / "textual" / "model.onnx", Text(model), "text", ids, "text_embedding", threads),
+    ]
+    usual = open_clip.get_pretrained_cfg(name, "webli")
+    preprocessing = {"size": [size, size], "mode": "RGB", "mean": list(usual["mean"]), "std": list(usual["std"])}
+    preprocessing |= {key: usual[key] for key in ("interpolation", "resize_mode")}
+    write_text(folder / "visual" / "preprocess_cfg.json", json.dumps(preprocessing, indent=2) + "\n")
+    write_text(folder / "config.json", json.dumps(settings, indent=2) + "\n")
+    write_text(folder / LOGITS, json.dumps({"scale": SCALE, "bias": BIAS}) + "\n")
+    encode = lambda pixels: model.encode_image(pixels, normalize=True)
+    found = agreements(folder, encode, model.encode_text(ids.long(), normalize=True), ids, preprocessing, threads)
+    return told(rows, found)
+
+
+def official_transformers(seed: int) -> torch.nn.Module:
+    """transformers' SiglipModel at its defaults, which are google/siglip-base-patch16-224, with random weights."""
+    declare_missing_operators()
+    import transformers
+
+    torch.manual_seed(seed)
+    model = transformers.SiglipModel(transformers.SiglipConfig())
+    shake(model, seed)
+    with torch.no_grad():
+        model.logit_scale.fill_(float(np.log(SCALE)))
+        model.logit_bias.fill_(BIAS)
+    return model.eval().requires_grad_(False)
+
+
+def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
+    """Writes the folder of a transformers model, with the graph of both encoders, and compares graphs, tokens,
+    embeddings, and the scale and bias that jsecon finds in it."""
+    import transformers
+
+    size, length = model.config.vision_config.image_size, model.config.text_config.max_position_embeddings
+    write_vocabulary(folder, "t5", _corpus(), tokenizer_class="SiglipTokenizer")
+    read = transformers.PreTrainedTokenizerFast(tokenizer_file=str(folder / "tokenizer.json"), pad_token="</s>")
+    from open_clip.tokenizer import get_clean_fn  # the class itself needs SentencePiece's own file
+
+    cleaned = [get_clean_fn("canonicalize")(text) for text in TEXTS]
+    ids = read(cleaned, padding="max_length", truncation=True, max_length=length, return_tensors="pt").input_ids
+    images = torch.randn(3, 3, size, size, generator=torch.Generator().manual_seed(seed))
+    onnx, outputs = folder / "onnx", ("last_hidden_state", "pooler_output")
+    rows = [
+        _half(onnx / "vision_model.onnx", Pooled(model.vision_model), "pixel_values", images, outputs, threads),
+        _half(onnx / "text_model.onnx", Pooled(model.text_model), "input_ids", ids, outputs, threads),
+    ]
+    _write_joint(onnx / "model.onnx", model, ids[:2], images[:2])
+    preprocessing: dict[str, Any] = {"do_normalize": True, "do_rescale": True, "rescale_factor": 1 / 255}
+    half = [0.5, 0.5, 0.5]
+    preprocessing |= {"image_mean": half, "image_std": half, "size": {"height": size, "width": size}}
+    write_text(folder / "preprocessor_config.json", json.dumps(preprocessing, indent=2) + "\n")
+    write_text(folder / "config.json", json.dumps(model.config.to_diff_dict(), indent=2) + "\n")
+    wanted = torch.nn.functional.normalize(model.text_model(input_ids=ids).pooler_output, dim=-1)
+    encode = lambda pixels: torch.nn.functional.normalize(model.vision_model(pixel_values=pixels).pooler_output, dim=-1)
+    numbers = {"mean": half, "std": half, "size": [size, size]}
+    found = agreements(folder, encode, wanted, ids, numbers, threads)
+    scale, bias = ClipEmbedder(folder, threads=threads).logits or (np.nan, np.nan)
+    logits = {"scale": [scale, SCALE], "bias": [bias, BIAS]}
+    return told(rows, found) | {"logits": logits}
+
+
+class Pooled(torch.nn.Module):
+    """One of transformers' SigLIP encoders: hidden states and what its pooler makes of them."""
+
+    def __init__(self, encoder):
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, given):
+        found = self.encoder(given)
+        return found.last_hidden_state, found.pooler_output
+
+
+class Joint(torch.nn.Module):
+    """Both encoders with scale and bias, as transformers' own forward gives them."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, input_ids, pixel_values):
+        found = self.model(input_ids=input_ids, pixel_values=pixel_values)
+        return found.logits_per_image, found.logits_per_text, found.text_embeds, found.image_embeds
+
+
+def _write_joint(path: Path, model: torch.nn.Module, ids: torch.Tensor, images: torch.Tensor) -> None:
+    """Without a comparison of its own: scale and bias are what is read from it, and those are compared."""
+    outputs = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
+    free = {"input_ids": {0: "texts"}, "pixel_values": {0: "images"}}
+    free |= {"text_embeds": {0: "texts"}, "image_embeds": {0: "images"}}
+    with torch.inference_mode(), written_whole(path) as temporary:
+        torch.onnx.export(
+            Joint(model),
+            (ids, images),
+            str(temporary),
+            input_names=["input_ids", "pixel_values"],
+            output_names=outputs,
+            dynamic_axes=free,
+            opset_version=OPSET,
+            dynamo=False,
+        )
+
+
+def _half(
+    path: Path,
+    module: torch.nn.Module,
+    name: str,
+    given: torch.Tensor,
+    outputs: str | tuple[str, ...],
+    threads: int,
+) -> Agreement:
+    names = [outputs] if isinstance(outputs, str) else list(outputs)
+    free = {name: {0: "batch"}} | {output: {0: "batch"} for output in names}
+    row = write_graph(path, module, {name: given[:2]}, names, free=free, other={name: given}, threads=threads)
+    return dataclasses.replace(row, graph=f"{path.parent.name}/{path.name}")
+
+
+def _corpus() -> list[str]:
+    """What the vocabulary is learned from: texts with the words that the comparison asks for, and some about it."""
+    here = Path(__file__).resolve().parents[2] / "README.md"
+    return [*TEXTS, *FRAMES, *here.read_text(encoding="utf-8").splitlines()]

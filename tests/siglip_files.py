@@ -1,0 +1,132 @@
+"""SigLIP folders for tests: true in format and signature, with graphs that know four colours. Texts are all read, the
+padding too, which shifts every colour a little towards grey: another padding, or another length, shows."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from clip_files import COLOURS, SIZE, write_visual
+from onnx_files import node, write_graph
+
+LENGTH = 12
+HALF = (0.5, 0.5, 0.5)
+SCALE, BIAS = 110.0, -40.0
+TOKENS = [
+    "<pad>",
+    "</s>",
+    "<unk>",
+    *(f"▁{name}" for name in COLOURS),
+    "▁a",
+    "▁thing",
+    "▁",
+    *"abcdefghijklmnopqrstuvwxyz",
+]
+PADDING, UNKNOWN = 0.01, 0.002
+"""grey that a filled place adds, and a token that is no colour"""
+
+
+def write_unigram(folder: Path, *, tokenizer_class: str = "SiglipTokenizer", **settings) -> Path:
+    """tokenizer.json of SentencePiece's kind with tokenizer_config.json beside it, as SigLIP's are: "</s>" both ends a
+    text and fills it."""
+    from tokenizers import Tokenizer, models, pre_tokenizers, processors
+
+    scores = [-1.0 if len(token) > 1 else -8.0 for token in TOKENS]
+    tokenizer = Tokenizer(models.Unigram(list(zip(TOKENS, scores)), unk_id=2))
+    tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
+    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "tokenizer.json").write_text(tokenizer.to_str(), encoding="utf-8")
+    told = {"tokenizer_class": tokenizer_class, "pad_token": {"content": "</s>"}} | settings
+    (folder / "tokenizer_config.json").write_text(json.dumps(told))
+    return folder / "tokenizer.json"
+
+
+def table() -> np.ndarray:
+    """The colour of each token."""
+    rows = np.full((len(TOKENS), 3), UNKNOWN, np.float32)
+    rows[1] = PADDING
+    for name, colour in COLOURS.items():
+        rows[TOKENS.index(f"▁{name}")] = colour
+    return rows
+
+
+def embedded(texts: list[str], length: int = LENGTH) -> np.ndarray:
+    """(Q, 3) unit: what a folder makes of texts of whole words, counted by hand."""
+    found = []
+    for text in texts:
+        tokens = [f"▁{word}" for word in text.split()][: length - 1]
+        tokens += ["</s>"] * (length - len(tokens))
+        found.append(table()[[TOKENS.index(token) for token in tokens]].sum(0))
+    return np.asarray(found) / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def write_textual(
+    path: Path, name: str, outputs: tuple[str, ...], batch: int | str, length: int | str, kind: str
+) -> Path:
+    """Texts -> the sum of their tokens' colours; the last of `outputs` is it, one before it the tokens'."""
+    rows = outputs[0] if len(outputs) > 1 else "rows"
+    nodes = [node("Gather", ["table", name], [rows]), node("ReduceSum", [rows, "axis"], [outputs[-1]], keepdims=0)]
+    declared = {outputs[-1]: ("float32", [batch, 3])}
+    declared |= {rows: ("float32", [batch, length, 3])} if len(outputs) > 1 else {}
+    given = {name: (kind, [batch, length])}
+    return write_graph(path, nodes, given, declared, {"table": table(), "axis": np.asarray([1])})
+
+
+def write_joint(path: Path, scale: float = SCALE, bias: float = BIAS, *, bent: float = 0.0) -> Path:
+    """Both encoders: logits of cosines, as transformers' SiglipModel gives them; `bent` adds the cosine's square."""
+    half = np.full((1, 3, 1, 1), 0.5, np.float32)
+    nodes = [
+        node("Mul", ["pixel_values", "half"], ["scaled"]),
+        node("Add", ["scaled", "half"], ["rgb"]),
+        node("ReduceMean", ["rgb"], ["colour"], axes=[2, 3], keepdims=0),
+        node("Add", ["colour", "little"], ["seen"]),  # black has no direction
+        node("Gather", ["table", "input_ids"], ["rows"]),
+        node("ReduceSum", ["rows", "one"], ["said"], keepdims=0),
+    ]
+    for side, name in (("seen", "image_embeds"), ("said", "text_embeds")):
+        nodes.append(node("ReduceL2", [side], [f"{side} length"], axes=[1], keepdims=1))
+        nodes.append(node("Div", [side, f"{side} length"], [name]))
+    nodes += [
+        node("Transpose", ["text_embeds"], ["turned"], perm=[1, 0]),
+        node("MatMul", ["image_embeds", "turned"], ["cosines"]),
+        node("Mul", ["cosines", "cosines"], ["squares"]),
+        node("Mul", ["squares", "bent"], ["bend"]),
+        node("Mul", ["cosines", "folded"], ["stretched"]),
+        node("Add", ["stretched", "bend"], ["curve"]),
+        node("Add", ["curve", "moved"], ["logits_per_image"]),
+    ]
+    constants = {"half": half, "little": np.float32(1e-3), "table": table(), "one": np.asarray([1])}
+    constants |= {"folded": np.float32(scale), "moved": np.float32(bias), "bent": np.float32(bent)}
+    given = {"pixel_values": ("float32", ["b", 3, SIZE, SIZE]), "input_ids": ("int64", ["q", "l"])}
+    told = {"logits_per_image": ("float32", ["b", "q"])}
+    told |= {"text_embeds": ("float32", ["q", 3]), "image_embeds": ("float32", ["b", 3])}
+    return write_graph(path, nodes, given, told, constants)
+
+
+def write_siglip(folder: Path, layout: str, *, joint: bool = True) -> Path:
+    """A SigLIP folder of immich's layout, with logits.json, or of that of transformers.js, with the joint graph."""
+    if layout == "immich":
+        write_visual(folder / "visual" / "model.onnx", ("image", "image_embedding"), 1, HALF, HALF)
+        write_textual(folder / "textual" / "model.onnx", "text", ("text_embedding",), 1, LENGTH, "int32")
+        write_unigram(folder / "textual", tokenizer_class="T5TokenizerFast")
+        text = {"context_length": LENGTH, "hf_tokenizer_name": "x", "tokenizer_kwargs": {"clean": "canonicalize"}}
+        write_json(folder / "config.json", {"init_logit_bias": -10, "text_cfg": text})
+        write_json(folder / "visual" / "preprocess_cfg.json", {"size": [SIZE, SIZE], "mean": HALF, "std": HALF})
+        if joint:
+            write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})
+        return folder
+    outputs, onnx = ("last_hidden_state", "pooler_output"), folder / "onnx"
+    write_visual(onnx / "vision_model.onnx", ("pixel_values", "pooler_output"), "batch", HALF, HALF)
+    write_textual(onnx / "text_model.onnx", "input_ids", outputs, "batch", "length", "int64")
+    write_unigram(folder)
+    write_json(folder / "config.json", {"model_type": "siglip", "text_config": {"max_position_embeddings": LENGTH}})
+    images = {"do_rescale": True, "rescale_factor": 1 / 255, "image_mean": HALF, "image_std": HALF}
+    write_json(folder / "preprocessor_config.json", images | {"size": {"height": SIZE, "width": SIZE}})
+    if joint:
+        write_joint(onnx / "model.onnx")
+    return folder
+
+
+def write_json(path: Path, content: object) -> None:
+    """`content` as a JSON file."""
+    path.write_text(json.dumps(content), encoding="utf-8")

@@ -1,0 +1,307 @@
+"""SigLIP: both layouts give the same space, the padding included; what a folder leaves open is named; scale and bias
+are found, and a text is refused by the probability that they give."""
+
+import dataclasses
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+from clip_files import COLOURS, write_clip
+from onnx_files import node, write_graph
+from siglip_files import BIAS, LENGTH, SCALE, embedded, write_joint, write_json, write_siglip, write_unigram
+from small_field import make_field, unit_rows
+
+from experiments.export.vocabulary import write_vocabulary
+from jsecon.app import command_line
+from jsecon.app.question import ask_text
+from jsecon.errors import InputError
+from jsecon.language.field import save_field
+from jsecon.networks.clip import ClipEmbedder
+from jsecon.networks.clip_folder import find_clip, read_preprocessing
+from jsecon.networks.file_tokenizer import FileTokenizer, TextRules
+from jsecon.pipeline import networks
+from jsecon.pipeline.models import examine
+from jsecon.query.anchored import query_anchored
+from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, best_presence, contrasts, presence
+from jsecon.query.several import query_several
+from jsecon.vision.protocols import Embedder, Logits, logits_of
+
+LAYOUTS = ("immich", "transformers.js")
+TEXTS = ["a red thing", "blue", "a a a a a a a a a a a green a a a", "yellow red blue"]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    return {layout: write_siglip(tmp_path_factory.mktemp("siglip") / layout, layout) for layout in LAYOUTS}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_images_and_texts_meet_and_the_padding_is_read(folders, layout):
+    embedder = ClipEmbedder(folders[layout], threads=1, batch=2)
+    assert isinstance(embedder, Embedder)
+    np.testing.assert_allclose(embedder.embed_text(TEXTS), embedded(TEXTS), atol=1e-6)
+    assert np.abs(embedded(["blue"]) - embedded(["blue"], LENGTH - 3)).max() > 0.01  # so another padding shows
+    frame = np.zeros((8, 8, 3), np.uint8)
+    frame[:] = np.round(255 * np.asarray(COLOURS["red"]))
+    found = embedder.embed_regions(frame, np.ones((1, 8, 8), bool))[0]
+    np.testing.assert_allclose(found, np.divide(COLOURS["red"], np.linalg.norm(COLOURS["red"])), atol=0.01)
+
+
+def test_texts_are_cleaned_as_the_configurations_say(folders):
+    canonical = ClipEmbedder(folders["immich"], threads=1)
+    np.testing.assert_allclose(canonical.embed_text(["A_red, THING!"]), embedded(["a red thing"]), atol=1e-6)
+    path = folders["immich"] / "textual" / "tokenizer.json"
+    said = "Tea &amp; MILK,  d\u00e9j\u00e0_vu!"
+    expected = {
+        "canonicalize": "tea milk d\u00e9j\u00e0 vu",
+        "lower": "tea & milk, d\u00e9j\u00e0_vu!",
+        "whitespace": "Tea & MILK, d\u00e9j\u00e0_vu!",
+    }
+    for clean, text in expected.items():
+        assert FileTokenizer(path, TextRules(LENGTH, "</s>", clean)).clean(said) == text
+
+
+def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):
+    path = write_vocabulary(tmp_path, "gemma", ["red mug, blue box"] * 9, tokenizer_class="GemmaTokenizerFast")
+    write_siglip(tmp_path / "model", "transformers.js")
+    for name in ("tokenizer.json", "tokenizer_config.json"):
+        (tmp_path / "model" / name).write_bytes((tmp_path / name).read_bytes())
+    rules = find_clip(tmp_path / "model").rules
+    assert rules == TextRules(LENGTH, "<pad>", "lower")
+    tokenizer = FileTokenizer(path, rules)
+    short, long, foreign = tokenizer(["Red Mug,", "mug " * 40, "\u8336"], 8)
+    numbers = json.loads(path.read_text())["model"]["vocab"]
+    assert short[-1] == numbers["<pad>"] == 0
+    assert 1 in short  # its end
+    assert long[-1] == numbers["<eos>"] == 1  # a text that is cut keeps its end
+    bytes_of_tea = [numbers[f"<0x{byte:02X}>"] for byte in "\u8336".encode()]
+    np.testing.assert_array_equal(foreign[: len(bytes_of_tea) + 1], [*bytes_of_tea, 1])
+    np.testing.assert_array_equal(tokenizer(["RED MUG,"], 8)[0], short)
+    np.testing.assert_array_equal(tokenizer.mask(short[None]), np.ones((1, 8)))
+
+
+def test_the_name_follows_the_rules_and_not_the_scale(folders, tmp_path):
+    folder = write_siglip(tmp_path / "model", "immich")
+    name = ClipEmbedder(folder).name
+    assert name == ClipEmbedder(folders["immich"]).name
+    write_json(folder / "logits.json", {"scale": 5.0, "bias": -1.0})
+    assert ClipEmbedder(folder).name == name
+    config = json.loads((folder / "config.json").read_text())
+    config["text_cfg"]["tokenizer_kwargs"] = {"clean": "lower"}
+    write_json(folder / "config.json", config)
+    assert ClipEmbedder(folder).name != name
+
+
+def test_a_clip_folder_is_what_it_was_with_open_clip_s_configuration_beside_it(tmp_path):
+    folder = write_clip(tmp_path / "clip", "immich")
+    name = ClipEmbedder(folder).name
+    write_json(folder / "config.json", {"embed_dim": 3, "text_cfg": {"context_length": 77, "vocab_size": 49408}})
+    assert ClipEmbedder(folder).name == name
+    assert find_clip(folder).rules is None
+    assert logits_of(ClipEmbedder(folder)) is None
+
+
+def test_mobileclip_s_images_are_not_normalised(tmp_path):
+    path = tmp_path / "preprocessor_config.json"
+    write_json(path, {"do_normalize": False, "do_rescale": True, "rescale_factor": 1 / 255, "crop_size": 256})
+    assert read_preprocessing(path) == ((0.0,) * 3, (1.0,) * 3, 256)
+
+
+# What a folder leaves open
+
+
+@pytest.mark.parametrize(
+    ("layout", "name", "change", "words"),
+    [
+        ("immich", "visual/preprocess_cfg.json", None, "does not say how it takes images.*huggingface"),
+        ("immich", "visual/preprocess_cfg.json", {"mean": None}, r"preprocess_cfg\.json.*cannot be read"),
+        ("immich", "textual/tokenizer_config.json", None, r"tokenizer_config\.json: found No such file"),
+        ("immich", "textual/tokenizer_config.json", {"pad_token": None}, "pad_token None.*fills short texts"),
+        ("immich", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),
+        ("immich", "config.json", [], "JSON of list"),
+        ("transformers.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' ids"),
+        ("transformers.js", "preprocessor_config.json", {"rescale_factor": 1}, "pixels times 1, not 1/255"),
+        ("transformers.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, "'BertTokenizer'.*Siglip"),
+        ("immich", "config.json", {"text_cfg": {}}, "no tokenizer of CLIP's kind.*with the model's config"),
+    ],
+)
+def test_what_a_folder_leaves_open_is_named(tmp_path, layout, name, change, words):
+    folder = write_siglip(tmp_path / "model", layout)
+    path = folder / name
+    if change is None:
+        path.unlink()
+    else:
+        write_json(path, json.loads(path.read_text()) | change if isinstance(change, dict) else change)
+    with pytest.raises(InputError, match=words):
+        ClipEmbedder(folder).check()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ({"context_length": 0}, "texts of 0 ids"),
+        ({"tokenizer_kwargs": {"clean": "upper"}}, "cleaned by 'upper'.*canonicalize"),
+        ({"tokenizer_kwargs": {"strip_sep_token": True}}, "tokenizer_kwargs.*strip_sep_token"),
+    ],
+)
+def test_rules_of_open_clip_that_are_not_known_are_refused(tmp_path, text, words):
+    folder = write_siglip(tmp_path / "model", "immich")
+    own = {"context_length": LENGTH, "hf_tokenizer_name": "x"} | text
+    write_json(folder / "config.json", {"text_cfg": own})
+    with pytest.raises(InputError, match=words):
+        find_clip(folder)
+
+
+def test_a_length_that_is_left_out_is_transformers_own(tmp_path):
+    folder = write_siglip(tmp_path / "model", "transformers.js")
+    write_json(folder / "config.json", {"model_type": "siglip"})
+    assert find_clip(folder).rules == TextRules(64, "</s>", "canonicalize")
+
+
+# Scale and bias
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_scale_and_bias_are_found_where_the_layout_has_them(folders, layout):
+    found = logits_of(ClipEmbedder(folders[layout], threads=1))
+    np.testing.assert_allclose(found, (SCALE, BIAS), rtol=1e-4)
+    told = re.search(r"sigmoid\((\d+\.\d+) cosine (-\d+\.\d+)\), from", _told(folders[layout]))
+    np.testing.assert_allclose([float(told[1]), float(told[2])], (SCALE, BIAS), rtol=1e-4)
+
+
+def test_a_folder_without_them_says_so_and_has_no_probability(tmp_path):
+    folder = write_siglip(tmp_path / "model", "immich", joint=False)
+    assert logits_of(ClipEmbedder(folder)) is None
+    assert "refused by its contrast" in _told(folder)
+    assert "logits.json" in _told(folder)
+
+
+@pytest.mark.parametrize(
+    "content", [{}, [], {"scale": 0, "bias": 1}, {"scale": "x", "bias": 1}, {"scale": 1e9, "bias": 0}]
+)
+def test_numbers_that_are_no_scale_and_bias_are_refused(tmp_path, content):
+    folder = write_siglip(tmp_path / "model", "immich")
+    write_json(folder / "logits.json", content)
+    with pytest.raises(InputError, match=r"logits\.json.*logit_bias"):
+        _ = ClipEmbedder(folder).logits
+
+
+def test_a_joint_graph_of_another_kind_is_refused(tmp_path):
+    folder = write_siglip(tmp_path / "model", "transformers.js")
+    joint = write_joint(folder / "onnx" / "model.onnx", bent=300.0)
+    with pytest.raises(InputError, match=r"leave a line by.*Write logits\.json"):
+        _ = ClipEmbedder(folder, threads=1).logits
+    write_joint(joint, scale=-3.0)
+    with pytest.raises(InputError, match="scale -3"):
+        _ = ClipEmbedder(folder, threads=1).logits
+    write_graph(joint, [node("Identity", ["x"], ["y"])], {"x": ("int64", [1])}, {"y": ("int64", [1])})
+    with pytest.raises(InputError, match="input 'pixel_values'"):
+        _ = ClipEmbedder(folder, threads=1).logits
+    write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})  # spares the graph
+    assert ClipEmbedder(folder, threads=1).logits == (SCALE, BIAS)
+
+
+def _told(folder) -> str:
+    use = next(use for use in examine(folder).uses if use.model == "CLIP")
+    assert use.usable, use.told
+    return use.told
+
+
+# The probability in place of the contrast's threshold
+
+
+class Told:
+    """An embedder of given texts, that knows how likely they are true."""
+
+    def __init__(self, texts, logits):
+        self.texts, self.logits = texts, logits
+        self.canonical = np.zeros((0, 12), np.float32)
+
+    def embed_text(self, texts):
+        return np.stack([self.texts[text] for text in texts])
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    return make_field(scene, cameras)[0]
+
+
+def test_a_text_is_refused_by_its_probability_and_not_by_its_contrast(field):
+    embeddings = np.asarray(field.regions.embeddings)
+    text = embeddings[2] / np.linalg.norm(embeddings[2])
+    plain = query_anchored(field, text)
+    cosine = float(embeddings[2] @ text / np.linalg.norm(embeddings[2]))
+    for least in (0.001, PRESENCE_THRESHOLD, 0.7):
+        edge = np.log(least / (1 - least)) - 50 * cosine  # the bias with which the probability is `least`
+        for shift, there in ((0.1, True), (-0.1, False)):
+            given = None if least == PRESENCE_THRESHOLD else least
+            logits = Logits(50.0, edge + shift)
+            found = query_anchored(field, text, logits=logits, retrieval_threshold=given)
+            several = query_several(field, text[None], logits=logits, retrieval_threshold=given, several=False)
+            for selection in (found, several):
+                np.testing.assert_array_equal(selection.mask, plain.mask if there else False)
+                assert int(selection.region) == (int(plain.region) if there else -1)
+            assert float(found.score) == float(plain.score)  # the contrast still ranks
+    given = field.regions.embeddings, field.canonical, field.regions.pixels
+    texts = unit_rows(np.random.default_rng(0), 500, 12)
+    best = [float(contrasts(given[0], text, *given[1:])[0].max()) for text in texts]
+    weak = texts[int(np.argmin(best))]
+    assert min(best) < CONTRAST_THRESHOLD
+    assert int(query_anchored(field, weak).region) == -1
+    assert int(query_anchored(field, weak, logits=Logits(50.0, 60.0)).region) >= 0
+
+
+def test_presence_is_the_sigmoid_of_the_cosine_also_under_jit_and_vmap(field):
+    rng = np.random.default_rng(0)
+    embeddings, texts = rng.normal(size=(2000, 12)), rng.normal(size=(5, 12))
+    embeddings[3] = 0
+    lengths = np.linalg.norm(embeddings, axis=1) * np.linalg.norm(texts, axis=1)[:, None]
+    cosines = np.divide(texts @ embeddings.T, lengths, out=np.zeros_like(lengths), where=lengths > 0)
+    expected = 1 / (1 + np.exp(-(7.0 * cosines - 2.0)))
+    expected[:, 3] = 0
+    given = embeddings.astype(np.float32), texts.astype(np.float32)
+    found = jax.jit(jax.vmap(lambda text: presence(given[0], text, Logits(7.0, -2.0))))(given[1])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    many = jax.vmap(lambda text: query_anchored(field, text, logits=Logits(50.0, -10.0)).region)(given[1])
+    each = [query_anchored(field, text, logits=Logits(50.0, -10.0)).region for text in given[1]]
+    np.testing.assert_array_equal(many, each)
+    assert best_presence(field.regions, given[1], np.asarray(-1), None) is None
+
+
+def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypatch):
+    units = np.asarray(field.regions.embeddings) / np.linalg.norm(field.regions.embeddings, axis=1, keepdims=True)
+    texts = {"mug": units[0], "cup": units[1], "ghost": -units.sum(0)}
+    embedder = Told(texts, Logits(20.0, -18.0))
+    mug = ask_text(field, embedder, "mug")
+    assert int(mug.selection.region) == 0
+    np.testing.assert_allclose(mug.there, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
+    both = ask_text(field, embedder, "mug or cup")
+    np.testing.assert_allclose(both.there, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
+    ghost = ask_text(field, embedder, "ghost")
+    assert int(ghost.selection.region) == -1
+    assert 0 <= ghost.there < PRESENCE_THRESHOLD
+    for by in ("one_step", "canonical"):
+        assert ask_text(field, embedder, "mug", by=by).there is None  # no region is retrieved
+    silent = ask_text(field, Told(texts, None), "mug")
+    assert silent.there is None
+
+    save_field(tmp_path / "field.npz", dataclasses.replace(field, embedder="told"))
+    told = {}
+    for name, known in (("with", embedder), ("without", Told(texts, None))):
+        monkeypatch.setattr(networks, "embedder_of_field", lambda *a, known=known, **k: known)
+        out = tmp_path / name
+        assert command_line.main(["query", str(tmp_path / "field.npz"), "mug", "ghost", "--out", str(out)]) == 0
+        told[name] = [json.loads((out / f"{text}.json").read_text()) for text in ("mug", "ghost")]
+    assert set(told["with"][0]["probability"]) == {"there", "mean", "tenth"}
+    assert list(told["with"][1]["probability"]) == ["there"]
+    assert set(told["without"][0]["probability"]) == {"mean", "tenth"}
+    assert "there" not in (told["without"][1]["probability"] or {})
+
+
+def test_an_unreadable_vocabulary_is_named(tmp_path):
+    path = write_unigram(tmp_path)
+    path.write_text(path.read_text()[:200], encoding="utf-8")
+    with pytest.raises(InputError, match=r"tokenizer\.json: found no such tokenizer"):
+        FileTokenizer(path, TextRules(LENGTH, "</s>", "lower"))
