@@ -65,11 +65,16 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     expected = "the pixels (R, T) of the same regions in the same views"
     same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
     require(same, "with_shown", found, expected, "Give the regions that were made from the labels that voted.")
+    shows = views_that_show(regions, alike_threshold=alike_threshold)
+    return _with_shown(votes, shows, min(_BLOCK, max(votes.regions.shape[0], 1)))
+
+
+def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
+    """(R, T) which views show a region, or one alike to it."""
     known = jnp.any(regions.embeddings != 0, axis=1)
     alike = cosine_matrix(regions.embeddings, regions.embeddings) >= alike_threshold
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
-    shows = (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
-    return _with_shown(votes, shows, min(_BLOCK, max(votes.regions.shape[0], 1)))
+    return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
 
 
 @functools.partial(jax.jit, static_argnums=2)
