@@ -21,11 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jsecon.errors import InputError, require, require_shape
+from jsecon.files import map_array, write_column, written_whole
+from jsecon.language.distill import LEAST_LABELLED, distill_votes
 from jsecon.language.records import append, summed_columns
-from jsecon.language.shares import views_that_show
+from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
 from jsecon.numerics import MIN_TRANSMITTANCE, NEAR
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
@@ -93,7 +95,23 @@ def region_votes_in_blocks(
             if progress is not None:
                 progress(t + 1, views)
         columns = summed_columns(spool, Path(folder), count, num_regions, rows, min(top, max(num_regions, 1)), shows)
-    return Votes(**columns, overflow=np.int32(overflow), num_regions=num_regions)
+    return Votes(**columns, overflow=np.asarray(overflow, np.int32), num_regions=num_regions)
+
+
+def codes_in_blocks(
+    votes: Votes,
+    region_codes: Float[Array, "r d"],
+    path: str | os.PathLike,
+    reduce: str = "mode",
+    *,
+    least_labelled: float = LEAST_LABELLED,
+) -> Float[np.ndarray, "n d"]:
+    """`distill_votes` of mapped votes, block by block: the codes (N, d) as a memory map of the .npy `path`."""
+    shape = (votes.regions.shape[0], region_codes.shape[1])
+    blocks = (distill_votes(own, region_codes, reduce, least_labelled=least_labelled) for own in vote_blocks(votes))
+    with written_whole(path) as temporary:
+        write_column(temporary, shape, np.float32, map(np.asarray, blocks))
+    return map_array(Path(path))
 
 
 @contextlib.contextmanager

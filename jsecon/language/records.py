@@ -9,6 +9,7 @@ A block's records are read back in pieces and summed as a sparse matrix: nothing
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -49,7 +50,7 @@ def _pieces(spool: Path, kind: str, block: int) -> Iterator[np.ndarray]:
 
 def summed_columns(
     spool: Path, folder: Path, count: int, regions: int, rows: int, top: int, shows: Bool[np.ndarray, "r t"] | None
-) -> dict[str, np.ndarray | None]:
+) -> dict[str, Any]:
     """The columns of `Votes` by name, as memory maps of FOLDER/<name>.npy: summed block after block; `shown` where
     `shows`, which views show which region, is given."""
     kinds = {"regions": ("<i4", (top,)), "weights": ("<f4", (top,)), "labelled": ("<f4", ()), "total": ("<f4", ())}
@@ -69,7 +70,7 @@ def summed_columns(
 
 def _block(spool: Path, block: int, count: int, regions: int, top: int, shows: np.ndarray | None):
     """The columns of one block."""
-    cast = sparse.csr_array((count, regions), dtype=np.float64)
+    cast: Any = sparse.csr_array((count, max(regions, 1)), dtype=np.float64)
     for piece in _pieces(spool, "votes", block):
         place = piece["gaussian"].astype(np.int32), piece["region"]
         cast = cast + sparse.coo_array((piece["weight"].astype(np.float64), place), shape=cast.shape).tocsr()
@@ -81,16 +82,16 @@ def _block(spool: Path, block: int, count: int, regions: int, top: int, shows: n
         own["total"] += np.bincount(gaussian, weight, count)
         own["views"] += np.bincount(gaussian, minlength=count)
         np.maximum.at(own["peak"], gaussian, piece["peak"])
-        for k in range(top if shows is not None else 0):
+        for k in range(0 if shows is None else top):
             region = own["regions"][gaussian, k]
-            shown = (region >= 0) & shows[np.maximum(region, 0), piece["view"]]
+            shown = (region >= 0) & np.asarray(shows)[np.maximum(region, 0), piece["view"]]
             own["shown"][:, k] += np.bincount(gaussian[shown], weight[shown], count)
     return own
 
 
-def strongest(cast: sparse.csr_array, top: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N, top) int32 the regions of the largest weights of each row, largest first (as float32; equal ones by region),
-    -1 = none, and (N, top) float32 the weights."""
+def strongest(cast: Any, top: int) -> tuple[np.ndarray, np.ndarray]:
+    """(N, top) int32 the regions with the largest weights of each row of a sparse matrix (N, R), largest first (as
+    float32; equal ones by region), -1 = none; and (N, top) float32 the weights."""
     cast.sort_indices()
     weights, lengths = cast.data.astype(np.float32), np.diff(cast.indptr)
     ids, largest = np.full((cast.shape[0], top), -1, np.int32), np.zeros((cast.shape[0], top), np.float32)
