@@ -13,15 +13,15 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jsecon.errors import InputError, require, require_shape
 from jsecon.files import map_array, write_column, written_whole
@@ -41,10 +41,19 @@ _SLOTS = 4
 """distinct labels of a tile that one walk counts; where a tile shows more, it is walked again for the rest"""
 
 
+@runtime_checkable
+class Images(Protocol):
+    """One image after the other: an array, or what reads them from where they lie."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, t: int, /) -> Any: ...
+
+
 def region_votes_in_blocks(
     gaussians: Gaussians,
     cameras: Camera,
-    labels: Sequence[Int[Array, "h w"]] | Int[Array, "t h w"],
+    labels: Images,
     num_regions: int,
     *,
     folder: str | os.PathLike,
@@ -58,9 +67,9 @@ def region_votes_in_blocks(
 ) -> Votes:
     """`region_votes` for N Gaussians in memory-mapped columns (float32; `load_field(path, mapped=True).gaussians`).
 
-    labels: T label images (H, W; -1 = none), read one at a time: a memory map (T, H, W), or what gives one by its
-    index. The votes come back as memory maps of files in `folder`, which must be empty or new; they stay as long as the
-    files do. The strongest `top` regions are those of the sums over all views; the rest is counted (`Votes.cut`). In
+    labels: T label images (H, W; -1 = none), read one at a time: a memory map (T, H, W), or what gives one by its index
+    and has a length. The votes come back as memory maps of files in `folder`, which must be empty or new; they stay as
+    long as the files do. The strongest `top` regions are those of the sums over all views; the rest is counted (`Votes.cut`). In
     place of each view's total, `regions` (of the same labels) gives `Votes.shown`, as `with_shown` makes it.
 
     Equal to `region_votes` up to float32's rounding, which here and there takes a pixel's last weight, of at most

@@ -118,12 +118,12 @@ def with_overlap(votes: Votes) -> Votes:
     return dataclasses.replace(votes, overlap=_iou(both))
 
 
-def vote_blocks(votes: Votes, rows: int = ROWS) -> Iterator[Votes]:
-    """The votes of `rows` Gaussians after the other, on jax's device; without `by_view` and `overlap`."""
+def vote_blocks(votes: Votes) -> Iterator[Votes]:
+    """The votes of ROWS Gaussians after the other, on jax's device; without `by_view` and `overlap`."""
     columns = [own.name for own in dataclasses.fields(votes) if own.name not in _NO_COLUMNS]
-    for first in range(0, votes.regions.shape[0], rows):
+    for first in range(0, votes.regions.shape[0], ROWS):
         own = {name: getattr(votes, name) for name in columns}
-        own = {name: None if a is None else jnp.asarray(a[first : first + rows]) for name, a in own.items()}
+        own = {name: None if a is None else jnp.asarray(a[first : first + ROWS]) for name, a in own.items()}
         yield dataclasses.replace(votes, **own, by_view=None, overlap=None)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from jsecon.errors import require_one_of, require_shape
 from jsecon.language.codes import CODE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.language.shares import ROWS, SHARE_THRESHOLD, share_of, vote_blocks
+from jsecon.language.shares import SHARE_THRESHOLD, share_of, vote_blocks
 from jsecon.query.direct import Number, UnitCodes, as_codes, similarities
 from jsecon.query.retrieval import (
     PIECE_NEARNESS,
@@ -142,14 +142,16 @@ def members(
 def members_by_block(
     field: LanguageField, several: Sequence[Found], threshold: Number | None, *, by: str = "votes"
 ) -> Iterator[list[Selection]]:
-    """`members` of one question after the other, for each block of ROWS Gaussians: the columns are read once."""
+    """`members` of one question after the other, for each block of Gaussians: the columns are read once."""
     threshold = THRESHOLDS[by] if threshold is None else threshold
     table = jnp.asarray(field.region_codes)
-    for n, votes in enumerate(vote_blocks(field.votes)):
+    first = 0
+    for votes in vote_blocks(field.votes):
+        rows = slice(first, first := first + len(votes.views))
         if by == "votes":
             yield [_by_share(votes, found, threshold) for found in several]
             continue
-        codes = jnp.asarray(field.codes[n * ROWS : (n + 1) * ROWS])
+        codes = jnp.asarray(field.codes[rows])
         yield [_by_code(codes, table, votes.views > 0, found, threshold) for found in several]
 
 

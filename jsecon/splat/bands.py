@@ -134,7 +134,7 @@ def bands(
     require(gaussians.count < 1 << 32, "bands", gaussians.count, "fewer than 2^32 Gaussians", "Split the scene.")
     across, down = grid(camera.width, camera.height, BLOCK * TILE)
     require(size >= across * down, "bands", size, f"a size of {across * down}: all blocks of the image", "Raise it.")
-    blocks, behind = np.flatnonzero(may_touch(bounds, camera, near)), None
+    blocks, behind = np.flatnonzero(may_touch(bounds, camera, near)).tolist(), None
     while is_open().any():
         held, left_out = _nearest(gaussians, bounds.rows, blocks, camera, near, behind, most_held)
         # One key sorts five times faster than it is argsorted; its lower half tells the place, which follows the index.
@@ -154,7 +154,7 @@ def _keys(held: _Held) -> np.ndarray:
 def _nearest(
     gaussians: Gaussians,
     rows: int,
-    blocks: np.ndarray,
+    blocks: list[int],
     camera: Camera,
     near: float,
     behind: np.uint64 | None,
