@@ -248,35 +248,35 @@ def whole(base: Path, count: int, views: int) -> None:
         show(step, one(step, base, *sizes))
 
 
+def cast(base: Path, count: int, views: int, width: int, height: int) -> dict[str, float]:
+    """Votes of all views, compiled before."""
+    folder, told = base / f"{count}", {}
+    if not folder.exists():
+        write_landscape(folder, count)
+    for given in (1, views):
+        cameras, out = ring(given, width, height), base / "votes"
+        call = lambda c=cameras, o=out: jsecon.region_votes_in_blocks(mapped(folder), c, Labels(c), REGIONS, folder=o)
+        timed(told, "s", call)
+        shutil.rmtree(out)
+    return told
+
+
 def growth(base: Path, largest: int) -> None:
-    """Votes of 3 views along N, of N = 1e6 along views and pixels; the median seconds of a view, compiled."""
-    print("| along | N | views | pixels | votes, s | a view, s | one query, s | 100 queries, s | peak GiB |")
-    print("|---" * 9 + "|", flush=True)
+    """Votes along N, views and pixels, in one process; the slopes are those of CPU seconds."""
+    print("| along | N | views | pixels | s | s of CPU |\n|---|---|---|---|---|---|", flush=True)
     sizes = {"N": [(n, 3, 1280, 720) for n in (100_000, 1_000_000, 4_000_000, 20_000_000) if n <= largest]}
-    sizes["views"] = [(1_000_000, t, 640, 360) for t in (2, 4, 8, 16)]
     sizes["pixels"] = [(1_000_000, 3, *size) for size in ((320, 180), (640, 360), (1280, 720), (2560, 1440))]
+    sizes["views"] = [(1_000_000, views, 640, 360) for views in (2, 6, 18)]
     for along, rows in sizes.items():
-        found = []
+        given, taken = [], []
         for count, views, width, height in rows:
-            folder = base / f"{count}"
-            if not (folder / "scene").exists():
-                write_landscape(folder / "scene", count)
-            shutil.rmtree(folder / "votes", ignore_errors=True)
-            one("votes", folder, 1, width, height)  # whose programs are then on disk
-            shutil.rmtree(folder / "votes", ignore_errors=True)
-            cast = one("votes", folder, views, width, height)
-            asked = one("query", folder) if along == "N" else {"one query, s": np.nan, "100 queries, s": np.nan}
-            found.append((count, views, width * height, cast, asked))
-            print(f"| {along} | {count:,} | {views} | {width}x{height} | {cast['votes, s']:.2f} "
-                  f"| {cast['votes, a view, s']:.2f} | {asked['one query, s']:.3f} | {asked['100 queries, s']:.2f} "
-                  f"| {cast['peak GiB']:.2f} |", flush=True)  # fmt: skip
-        at = ["N", "views", "pixels"].index(along)
-        given = [row[at] for row in found]
-        told = "votes, s" if along == "views" else "votes, a view, s"
-        print(f"slope of votes in {along}: {slope(given, [row[3][told] for row in found]):.2f}", flush=True)
-        if along == "N":
-            for name in ("one query, s", "100 queries, s"):
-                print(f"slope of {name[:-3]} in N: {slope(given, [row[4][name] for row in found]):.2f}", flush=True)
+            told = cast(base, count, views, width, height)
+            given.append({"N": count, "views": views, "pixels": width * height}[along])
+            taken.append(told["s of CPU"])
+            row = f"| {along} | {count:,} | {views} | {width}x{height} | {told['s']:.2f} | {told['s of CPU']:.2f} |"
+            print(row, flush=True)
+        steps = [slope(given[k : k + 2], taken[k : k + 2]) for k in range(len(given) - 1)]
+        print(f"slope in {along}: {slope(given, taken):.2f}; from row to row", *(f"{own:.2f}" for own in steps))
 
 
 def main() -> None:

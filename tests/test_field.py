@@ -226,7 +226,7 @@ def test_a_file_cut_short_is_not_mapped(path, share, monkeypatch):
     monkeypatch.setattr(module, "MAPPED", 0)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(InputError, match="zip|damaged"):
+    with pytest.raises(InputError, match=r"zip|damaged"):
         load_field(path, mapped=True)
 
 

@@ -69,8 +69,9 @@ def region_votes_in_blocks(
 
     labels: T label images (H, W; -1 = none), read one at a time: a memory map (T, H, W), or what gives one by its index
     and has a length. The votes come back as memory maps of files in `folder`, which must be empty or new; they stay as
-    long as the files do. The strongest `top` regions are those of the sums over all views; the rest is counted (`Votes.cut`). In
-    place of each view's total, `regions` (of the same labels) gives `Votes.shown`, as `with_shown` makes it.
+    long as the files do. The strongest `top` regions are those of the sums over all views; the rest is counted
+    (`Votes.cut`). In place of each view's total, `regions` (of the same labels) gives `Votes.shown`, as `with_shown`
+    makes it.
 
     Equal to `region_votes` up to float32's rounding, which here and there takes a pixel's last weight, of at most
     0.01, to the other side of the transmittance at which it stops. Memory: `most_held` visible splats of a view, 150
