@@ -1,7 +1,7 @@
 """Votes, codes, queries and export of a scene whose columns stay on disk: seconds, peak memory, growth.
 
     python benchmarks/larger_than_memory.py --gaussians 20000000 --views 20        (11 GB in FOLDER while it runs)
-    python benchmarks/larger_than_memory.py --growth
+    python benchmarks/larger_than_memory.py --growth votes        (or: queries)
 
 A made-up landscape of 100 m, hills and low growth, in the order of a curve that fills the ground; a hundred regions are
 the squares of the ground, as far as its plane tells; cameras on a ring look across it. Every step runs in a process of
@@ -279,11 +279,45 @@ def growth(base: Path, largest: int) -> None:
         print(f"slope in {along}: {slope(given, taken):.2f}; from row to row", *(f"{own:.2f}" for own in steps))
 
 
+def random_votes(folder: Path, count: int) -> Votes:
+    """Mapped columns of votes that nothing cast."""
+    folder.mkdir(parents=True)
+    kinds = {"regions": ((8,), np.int32), "weights": ((8,), np.float32), "shown": ((8,), np.float32)}
+    kinds |= {name: ((), np.float32) for name in ("labelled", "total", "peak")} | {"views": ((), np.int32)}
+    for name, (rest, dtype) in kinds.items():
+        rng = np.random.default_rng(len(name))
+        sizes = ((min(1 << 20, count - first), *rest) for first in range(0, count, 1 << 20))
+        draw = (lambda shape: rng.integers(1, REGIONS, shape)) if dtype is np.int32 else rng.random  # noqa: B023
+        write_column(folder / f"{name}.npy", (count, *rest), dtype, map(draw, sizes))
+    columns = {name: map_array(folder / f"{name}.npy") for name in kinds}
+    return Votes(**columns, overflow=np.zeros((), np.int32), num_regions=REGIONS)
+
+
+def query_growth(base: Path, largest: int) -> None:
+    """A query by votes along N."""
+    print("| N | one query, s | s of CPU | 100 queries, s | s of CPU |\n|---|---|---|---|---|", flush=True)
+    cameras, rows = ring(1, 64, 36), []
+    regions = regions_of(Labels(cameras))
+    texts = texts_near(regions)
+    for count in (100_000, 1_000_000, 4_000_000, 20_000_000):
+        if count <= largest:
+            votes, told = random_votes(base / f"{count}", count), {}
+            none = Gaussians(*(np.zeros((0, *rest), np.float32) for rest in SHAPES.values()))
+            field = field_of(none, votes, np.zeros((count, 0), np.float32), cameras, regions)
+            for _ in range(2):
+                timed(told, "one", lambda f=field: jsecon.query_anchored(f, texts[0]).mask)
+                timed(told, "many", lambda f=field: jsecon.query_in_blocks(f, texts))
+            rows.append((count, told["one of CPU"], told["many of CPU"]))
+            print(f"| {count:,} | {' | '.join(f'{value:.3f}' for value in told.values())} |", flush=True)
+    for k, name in ((1, "one query"), (2, "100 queries")):
+        print(f"slope of {name} in N: {slope([row[0] for row in rows], [row[k] for row in rows]):.2f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gaussians", type=int, default=20_000_000)
     parser.add_argument("--views", type=int, default=20)
-    parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--growth", choices=("votes", "queries"))
     parser.add_argument("--folder", type=Path, help="where the columns go; by default a temporary folder")
     parser.add_argument("--one", nargs="+", help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -294,7 +328,7 @@ def main() -> None:
         return print(json.dumps(told | {"peak GiB": peak}))
     with tempfile.TemporaryDirectory(dir=given.folder) as base:
         if given.growth:
-            growth(Path(base), given.gaussians)
+            {"votes": growth, "queries": query_growth}[given.growth](Path(base), given.gaussians)
         else:
             whole(Path(base), given.gaussians, given.views)
 
