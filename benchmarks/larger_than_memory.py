@@ -195,9 +195,10 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     how = {"folder": folder / "part", "regions": regions}
     blocks = timed(told, "in blocks, s", lambda: jsecon.region_votes_in_blocks(part, cameras, labels, REGIONS, **how))
     memory = timed(
-        told, "in memory, s", lambda: jsecon.region_votes(part, cameras, images, REGIONS, by_view=True).weights
+        told,
+        "in memory, s",
+        lambda: jsecon.with_shown(jsecon.region_votes(part, cameras, images, REGIONS, by_view=True), regions),
     )
-    memory = jsecon.with_shown(jsecon.region_votes(part, cameras, images, REGIONS, by_view=True), regions)
     told["part"], told["seen"] = part.count, float((np.asarray(memory.views) > 0).mean())
     for name in ("weights", "shown", "labelled", "total", "peak"):
         own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
