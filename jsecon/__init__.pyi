@@ -15,8 +15,12 @@ from jsecon.evaluate.metrics import (
     mean_iou as mean_iou,
 )
 from jsecon.language.autoencoder import Autoencoder as Autoencoder, train_autoencoder as train_autoencoder
+from jsecon.language.blocks import (
+    codes_in_blocks as codes_in_blocks,
+    region_votes_in_blocks as region_votes_in_blocks,
+)
 from jsecon.language.distill import distill_l1 as distill_l1, distill_votes as distill_votes
-from jsecon.language.field import load_field as load_field, save_field as save_field
+from jsecon.language.field import check_field as check_field, load_field as load_field, save_field as save_field
 from jsecon.language.regions import region_embeddings as region_embeddings
 from jsecon.language.shares import (
     finish_votes as finish_votes,
@@ -27,6 +31,7 @@ from jsecon.language.shares import (
 from jsecon.language.votes import region_votes as region_votes
 from jsecon.parallel import host_mesh as host_mesh
 from jsecon.query.anchored import query_anchored as query_anchored, query_region as query_region
+from jsecon.query.blocks import query_in_blocks as query_in_blocks
 from jsecon.query.classes import query_classes as query_classes
 from jsecon.query.direct import (
     query_canonical as query_canonical,

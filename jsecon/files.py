@@ -14,7 +14,7 @@ import sys
 import uuid
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,10 @@ UNREADABLE = (
     *(ArithmeticError, zipfile.BadZipFile, zlib.error),
 )
 """what reading a damaged .npz, and `unpacked` of a damaged description, raise"""
+ALIGNED = 64
+"""bytes: the columns of a .npz that is to be mapped begin at a multiple of them, as jax wants its arrays"""
+_PADDING = 0xD935
+"""the zip extra field that Android's zipalign fills up with"""
 MOST_DEFLATED = 1032
 """bytes that one byte of a deflated stream can stand for"""
 _HEADER = (
@@ -138,9 +142,33 @@ def map_array(path: Path, start: int = 0, size: int | None = None) -> np.ndarray
         return np.memmap(path, dtype, "r", file.tell(), shape, "F" if fortran else "C")
 
 
-def read_arrays(path: str | os.PathLike, *, mapped: int = sys.maxsize) -> dict[str, np.ndarray]:
-    """The arrays of a .npz by name; those of more than `mapped` bytes are mapped. Raises one of UNREADABLE where it is
-    damaged."""
+def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes a .npz, not compressed, whose numbers begin at multiples of ALIGNED bytes. Equal arrays give equal bytes;
+    memory maps are copied in pieces."""
+    with open(path, "w+b") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy")
+            # behind a local header, the field for sizes above 4 GiB, and our own before its filling
+            begin = file.tell() + 30 + len(entry.filename.encode()) + 20 + 6
+            filling = -begin % ALIGNED
+            entry.extra = struct.pack("<HHH", _PADDING, 2 + filling, ALIGNED) + bytes(filling)
+            with archive.open(entry, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+
+
+def write_column(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:
+    """Writes a .npy of `shape`, block of rows after block: what a disk has no room for is an error here, and a signal
+    in a memory map."""
+    with open(path, "wb") as file:
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        for block in blocks:
+            file.write(np.ascontiguousarray(block, dtype).tobytes())
+
+
+def read_arrays(path: str | os.PathLike, *, mapped: int = sys.maxsize, checked: bool = True) -> dict[str, np.ndarray]:
+    """The arrays of a .npz by name; those of more than `mapped` bytes are mapped, and not read at all unless they are
+    to be `checked` against their checksums. Raises one of UNREADABLE where it is damaged."""
     arrays, most = {}, os.path.getsize(path)
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
@@ -152,7 +180,7 @@ def read_arrays(path: str | os.PathLike, *, mapped: int = sys.maxsize) -> dict[s
                 if not (stored and entry.file_size > mapped):
                     arrays[name] = read_array(member, entry.file_size)
                     continue
-                while member.read(1 << 24):  # to the end, where its checksum is compared
+                while checked and member.read(1 << 24):  # to the end, where its checksum is compared
                     pass
                 file.seek(entry.header_offset + 26)
                 start = sum(struct.unpack("<HH", file.read(4))) + file.tell()

@@ -32,7 +32,7 @@ from jsecon.data.ply import load_ply, load_points_ply, save_ply
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
-from jsecon.language.field import load_field, save_field
+from jsecon.language.field import check_field, load_field, save_field
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 from jsecon.networks.sam2.tracker import Sam2Tracker
@@ -505,6 +505,14 @@ def field(folder: Path) -> Iterator[Case]:
     }.items():
         save_field(folder / f"{name}.npz", value)
         yield Case([folder / f"{name}.npz"], lambda name=name: load_field(folder / f"{name}.npz"), whole)
+    save_field(folder / "mapped.npz", _field())
+
+    def checked() -> LanguageField:
+        found = load_field(folder / "mapped.npz", mapped=True)
+        check_field(folder / "mapped.npz")
+        return found
+
+    yield Case([folder / "mapped.npz"], checked, whole)
 
 
 def kept(folder: Path) -> Iterator[Case]:

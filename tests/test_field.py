@@ -11,8 +11,9 @@ import pytest
 from small_field import REGIONS, make_field, unit_rows
 
 from jsecon.errors import InputError
+from jsecon.language import field as module
 from jsecon.language.autoencoder import train_autoencoder
-from jsecon.language.field import load_field, save_field
+from jsecon.language.field import check_field, load_field, save_field
 from jsecon.language.shares import with_overlap
 from jsecon.types import Parts
 
@@ -179,6 +180,62 @@ def test_a_field_written_before_regions_overlapped_is_read(field, path):
     back = load_field(path)
     assert back.votes.overlap is None
     assert_same(back, dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=None)))
+
+
+def test_what_a_later_version_added_is_passed_over(field, path):
+    def add(header, arrays):
+        arrays["votes.novel"] = np.ones(7)
+        parts = header["field"]["fields"]["votes"]["fields"]
+        parts["novel"] = {"array": "votes.novel", "shape": [7], "dtype": "float64"}
+        header["field"]["fields"]["meaning"] = {"record": "Meaning", "fields": {"of": {"value": "life"}}}
+
+    rewritten(path, add)
+    assert_same(load_field(path), field)
+
+
+def test_an_old_file_whose_columns_lie_anywhere_is_mapped_too(field, path, monkeypatch):
+    monkeypatch.setattr(module, "MAPPED", 0)
+    rewritten(path, lambda header, arrays: None)  # as np.savez wrote it
+    back = load_field(path, mapped=True)
+    assert isinstance(back.votes.weights, np.memmap)
+    for x, y in zip(jax.tree.leaves(back), jax.tree.leaves(field), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_mapped_columns_are_not_read_until_they_are_asked_for(field, path, monkeypatch):
+    monkeypatch.setattr(module, "MAPPED", 0)
+    back = load_field(path, mapped=True)
+    for x, y in zip(jax.tree.leaves(back), jax.tree.leaves(field), strict=True):
+        assert isinstance(x, np.memmap)
+        assert not x.flags.writeable
+        assert x.ctypes.data % 64 == 0
+        np.testing.assert_array_equal(x, y)
+    check_field(path)
+    content = bytearray(path.read_bytes())
+    place = content.find(np.asarray(field.votes.weights).tobytes())
+    content[place + 5] ^= 0x10
+    path.write_bytes(content)
+    load_field(path, mapped=True)  # opens: nobody has read that column
+    for read in (check_field, load_field):
+        with pytest.raises(InputError, match="damaged"):
+            read(path)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.9999])
+def test_a_file_cut_short_is_not_mapped(path, share, monkeypatch):
+    monkeypatch.setattr(module, "MAPPED", 0)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(InputError, match=r"zip|damaged"):
+        load_field(path, mapped=True)
+
+
+def test_numbers_that_are_not_finite_are_found_a_piece_at_a_time(path, monkeypatch):
+    for name in ("MAPPED", "_ROWS"):
+        monkeypatch.setattr(module, name, 10)
+    rewritten(path, lambda header, arrays: arrays["gaussians.means"].__setitem__((63, 2), np.nan))
+    with pytest.raises(InputError, match=r"gaussians\.means with numbers that are not finite"):
+        check_field(path)
 
 
 def test_fields_that_do_not_fit_together_are_not_written(field, tmp_path):

@@ -108,10 +108,11 @@ def _export(asked: Export, console: Console) -> Told:
     with console.progress("field"):
         from jsecon.app.answers import save_scene
         from jsecon.data.gaussian_files import require_written
-        from jsecon.language.field import load_field
+        from jsecon.language.field import check_field, load_field
 
         require_written(asked.out)
-        field = load_field(asked.field)
+        check_field(asked.field)
+        field = load_field(asked.field, mapped=True)
         save_scene(field, asked.out)
     count, size = field.gaussians.count, asked.out.stat().st_size
     console.say(f"{count} Gaussians, {size / 2**20:.1f} MiB  {asked.out}")

@@ -14,6 +14,7 @@ from jaxtyping import Bool
 from jsecon.app.question import Answer
 from jsecon.app.splat_page import NOWHERE, regions_of
 from jsecon.data.gaussian_files import save_gaussians
+from jsecon.data.ply import save_ply
 from jsecon.files import write_text, written_whole
 from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
@@ -96,7 +97,10 @@ def write_answer(
 
 
 def save_scene(field: LanguageField, file: Path) -> None:
-    """Writes all Gaussians in the capture files' own world; with their codes and regions where the file is a .glb."""
+    """Writes all Gaussians in the capture files' own world; with their codes and regions where the file is a .glb. A
+    .ply is written in blocks: a mapped field need not fit into memory."""
+    if file.suffix == ".ply":
+        return save_ply(file, field.gaussians, similarity=field.to_source)
     _save(field, transform_gaussians(field.gaussians, field.to_source), np.ones(field.gaussians.count, bool), file)
 
 

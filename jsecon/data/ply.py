@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -13,6 +14,7 @@ from jsecon.data.ply_file import bad_ply, read_vertices
 from jsecon.errors import require_shape
 from jsecon.files import written_whole
 from jsecon.numerics import sane
+from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Array, Gaussians
 
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -23,6 +25,8 @@ _POSITION, _OPACITY = ("x", "y", "z"), ("opacity",)
 _DC, _SCALE = (tuple(f"{kind}_{axis}" for axis in range(3)) for kind in ("f_dc", "scale"))
 _ROTATION = tuple(f"rot_{axis}" for axis in range(4))
 _GAUSSIAN = (*_POSITION, *_DC, *_OPACITY, *_SCALE, *_ROTATION)
+_ROWS = 1 << 18
+"""Gaussians written at a time"""
 _REST_COUNTS = (0, 9, 24, 45)
 _WANTED = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
 
@@ -89,30 +93,49 @@ def sound(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     return Gaussians(**{name: jnp.asarray(array) for name, array in arrays.items()})
 
 
-def save_ply(path: str | Path, gaussians: Gaussians, *, rgb: Float[Array, "n 3"] | None = None) -> None:
+def save_ply(
+    path: str | Path,
+    gaussians: Gaussians,
+    *,
+    rgb: Float[Array, "n 3"] | None = None,
+    similarity: Float[Array, "4 4"] | None = None,
+) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
+
+    Written in blocks, so that mapped columns need not fit into memory; `similarity` (4, 4) carries each block into
+    another world (`transform_gaussians`).
 
     Float32 Gaussians come back bit by bit from `load_ply`. `rgb` (0..1) replaces the spherical harmonics by one
     colour a Gaussian, for showing codes or similarities; viewers such as SuperSplat open either. A selection is
     written by giving its subset. Raises InputError where the folder cannot be written.
     """
     count = gaussians.count
-    if rgb is None:
-        sh = np.asarray(gaussians.sh, np.float32)
-    else:
+    if rgb is not None:
         require_shape("rgb", rgb, (count, 3), "Give one colour per Gaussian.")
-        sh = ((np.asarray(rgb, np.float64) - 0.5) / SH_DC).astype(np.float32)[:, None]
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
-    rest_names = (f"f_rest_{index}" for index in range(rest.shape[1]))
+    rest_names = (f"f_rest_{index}" for index in range(0 if rgb is not None else 3 * (gaussians.sh.shape[1] - 1)))
     names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
-    normals, opacity = np.zeros((count, 3)), np.asarray(gaussians.opacity_logits)[:, None]
-    columns = [gaussians.means, normals, sh[:, 0], rest, opacity, gaussians.log_scales, gaussians.quaternions]
-    table = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1)
     properties = (f"property float {name}" for name in names)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
-        file.write(table.astype("<f4", copy=False).tobytes())  # tofile would not tell that the disk is full
+        for first in range(0, count, _ROWS):
+            part = jax.tree.map(lambda a, rows=slice(first, first + _ROWS): np.asarray(a[rows]), gaussians)
+            part = part if similarity is None else transform_gaussians(part, similarity)
+            colours = (
+                part.sh
+                if rgb is None
+                else ((np.asarray(rgb[first : first + _ROWS], np.float64) - 0.5) / SH_DC)[:, None]
+            )
+            file.write(_table(part, np.asarray(colours, np.float32)).tobytes())  # tofile would not tell a full disk
+
+
+def _table(part: Gaussians, sh: np.ndarray) -> np.ndarray:
+    """A row of the file for each Gaussian."""
+    count = len(sh)
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
+    normals, opacity = np.zeros((count, 3)), np.asarray(part.opacity_logits)[:, None]
+    columns = [part.means, normals, sh[:, 0], rest, opacity, part.log_scales, part.quaternions]
+    return np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1).astype("<f4", copy=False)
 
 
 def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:

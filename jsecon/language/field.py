@@ -1,12 +1,16 @@
 """The language field as one file: a zip of .npy arrays with a JSON header that says what they are. No pickle.
 
 The header, member `header.npy` (UTF-8 bytes), holds {"format", "version", "field"}; "field" is the field's tree as
-`jsecon.files.packed` describes it, records by their bare names.
+`jsecon.files.packed` describes it, records by their bare names, each array with its type and shape. Still a zip: it
+knows each column's place and CRC-32, and stored without compression a column can be mapped where it lies. Fields of a
+record that this version does not know are passed over; what would change the meaning of the others raises `version`.
 """
 
+import dataclasses
 import functools
 import json
 import os
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,7 +20,7 @@ import numpy as np
 
 from jsecon.data.images import MOST_PIXELS
 from jsecon.errors import InputError, require
-from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, written_whole
+from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, write_arrays, written_whole
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
@@ -26,6 +30,10 @@ _RECORDS = {
     cls.__name__: cls
     for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
 }
+MAPPED = 1 << 20
+"""bytes of a column from which a mapped field leaves it on disk"""
+_ROWS = 1 << 20
+"""rows of a column that are looked at at once"""
 _REMEDY = "Make the field again with `jsecon run`."
 _LETTERS = {
     "n": ("gaussians.means", 0),
@@ -67,16 +75,27 @@ def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     tree = packed(field, "", arrays, lambda kind: kind.__name__ if kind in _RECORDS.values() else None)
     header = {"format": FORMAT, "version": VERSION, "field": tree}
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    with written_whole(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, allow_pickle=False, header=text, **arrays)
+    with written_whole(path) as temporary:
+        write_arrays(temporary, {"header": text} | arrays)
 
 
-def load_field(path: str | os.PathLike) -> LanguageField:
+def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageField:
     """Reads what `save_field` wrote. Arrays come back on JAX's device, those wider than its number types as NumPy.
 
-    Raises InputError for a file that is missing, not a field, cut short, damaged, of a later version, or inconsistent.
+    `mapped`: columns above 1 MiB stay on disk, as memory maps (NumPy), so that a field larger than memory opens at
+    once. Their sizes are checked then; their checksums and numbers are not, as that would read them: `check_field`
+    does. Raises InputError for a file that is missing, not a field, cut short, damaged, of a later version, or
+    inconsistent.
     """
-    path = Path(path)
+    return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
+
+
+def check_field(path: str | os.PathLike) -> None:
+    """Raises InputError where `load_field` would: reads the whole file, checksums and numbers, a piece at a time."""
+    _read(Path(path), MAPPED, checked=True)
+
+
+def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     if not path.is_file():
         raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
@@ -84,7 +103,7 @@ def load_field(path: str | os.PathLike) -> LanguageField:
         found = f"{path.stat().st_size} bytes that are no complete zip archive"
         raise InputError(path, found, "a field file", changed)
     try:
-        members = read_arrays(path)
+        members = read_arrays(path, mapped=mapped, checked=checked)
         if "header" not in members:
             raise InputError(path, "a zip archive without a jsecon header", "a field file", _REMEDY)
         header = parsed_json(members["header"].tobytes())
@@ -93,10 +112,9 @@ def load_field(path: str | os.PathLike) -> LanguageField:
         if (version := header.get("version")) != VERSION:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
             raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
-        field = unpacked(header["field"], members, _RECORDS.__getitem__)
-        problem = (
-            "no field at its root" if not isinstance(field, LanguageField) else _disagreement(field) or _oddity(field)
-        )
+        field = unpacked(_known(header["field"]), members, _RECORDS.__getitem__)
+        whole = isinstance(field, LanguageField)
+        problem = _disagreement(field) or _oddity(field, checked) if whole else "no field at its root"
         field = jax.tree.map(_on_device, field)
     except InputError:
         raise
@@ -108,10 +126,19 @@ def load_field(path: str | os.PathLike) -> LanguageField:
     return field
 
 
+def _known(node: Any) -> Any:
+    """A description of a tree without what a later version may have added: fields of our records that they lack."""
+    if not isinstance(node, dict) or node.get("record") not in _RECORDS:
+        return node
+    names = {own.name for own in dataclasses.fields(_RECORDS[node["record"]])}
+    return node | {"fields": {name: _known(part) for name, part in node["fields"].items() if name in names}}
+
+
 def _on_device(leaf: object) -> object:
-    """Arrays that jax's number types hold as jax's; others, and plain values, as they are."""
-    fits = isinstance(leaf, np.ndarray) and jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype
-    return jax.device_put(leaf) if fits else leaf
+    """Arrays that jax's number types hold as jax's; others, those that are mapped, and plain values, as they are."""
+    if not isinstance(leaf, np.ndarray) or isinstance(leaf, np.memmap):
+        return leaf
+    return jax.device_put(leaf) if jax.dtypes.canonicalize_dtype(leaf.dtype) == leaf.dtype else leaf
 
 
 def _array(field: LanguageField, name: str) -> Any:
@@ -136,15 +163,19 @@ def _disagreement(field: LanguageField) -> str | None:
     return None
 
 
-def _oddity(field: LanguageField) -> str | None:
-    """What is wrong with the numbers or texts of a field whose shapes agree, in words, or None."""
+def _oddity(field: LanguageField, checked: bool = True) -> str | None:
+    """What is wrong with the numbers or texts of a field whose shapes agree, in words, or None. What is mapped is not
+    read unless it is to be `checked`."""
     sizes = {"votes.regions": field.regions.count, "parts.part": field.parts and len(field.parts.weight)}
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
-        name, numbers = jax.tree_util.keystr(place).lstrip("."), np.asarray(leaf)
-        if (np.isnan(numbers) if name == "gaussians.opacity_logits" else ~np.isfinite(numbers)).any():
-            return f"{name} with numbers that are not finite"
-        if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
-            return f"{name} with numbers of none of {sizes[name]}"
+        if isinstance(leaf, np.memmap) and not checked:
+            continue
+        name, column = jax.tree_util.keystr(place).lstrip("."), np.atleast_1d(np.asarray(leaf))
+        for numbers in (column[first : first + _ROWS] for first in range(0, len(column), _ROWS)):
+            if (np.isnan(numbers) if name == "gaussians.opacity_logits" else ~np.isfinite(numbers)).any():
+                return f"{name} with numbers that are not finite"
+            if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
+                return f"{name} with numbers of none of {sizes[name]}"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parsed_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"

@@ -28,6 +28,10 @@ SHARE_THRESHOLD = 0.5
 """on the share: most of what is seen of the Gaussian, in the views that show the region, lies inside it"""
 CORRELATION = 0.05
 """between two views' errors: a tracker's loss or a proposal's cut lasts, so that views beyond about 20 add nothing"""
+ROWS = 1 << 18
+"""Gaussians at a time of columns that are mapped"""
+_NO_COLUMNS = ("overflow", "num_regions", "by_view", "overlap")
+"""of `Votes`: what has no row for each Gaussian"""
 _BLOCK = 1 << 15
 """Gaussians at a time in `with_shown`: what is dense in the regions stays small"""
 _WORD = 32
@@ -65,11 +69,16 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     expected = "the pixels (R, T) of the same regions in the same views"
     same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
     require(same, "with_shown", found, expected, "Give the regions that were made from the labels that voted.")
+    shows = views_that_show(regions, alike_threshold=alike_threshold)
+    return _with_shown(votes, shows, min(_BLOCK, max(votes.regions.shape[0], 1)))
+
+
+def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
+    """(R, T) which views show a region, or one alike to it."""
     known = jnp.any(regions.embeddings != 0, axis=1)
     alike = cosine_matrix(regions.embeddings, regions.embeddings) >= alike_threshold
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
-    shows = (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
-    return _with_shown(votes, shows, min(_BLOCK, max(votes.regions.shape[0], 1)))
+    return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -98,15 +107,29 @@ def with_overlap(votes: Votes) -> Votes:
 
     with p the shares; 0 for a region without votes. Two pieces that masks cut out of one object in different views
     overlap in its Gaussians; two objects meet only where they touch, and what lies behind all of them is far larger
-    than any. Pure.
+    than any. Pure; votes that are mapped are read in blocks.
     """
-    return dataclasses.replace(
-        votes, overlap=_overlap(jnp.asarray(votes.regions), vote_shares(votes), votes.num_regions)
-    )
+    count = votes.num_regions
+    if not isinstance(votes.regions, np.memmap):
+        return dataclasses.replace(votes, overlap=_iou(_overlap(jnp.asarray(votes.regions), vote_shares(votes), count)))
+    both = jnp.zeros((count, count), jnp.float32)
+    for block in vote_blocks(votes):
+        both += _overlap(jnp.asarray(block.regions), vote_shares(block), count)
+    return dataclasses.replace(votes, overlap=_iou(both))
+
+
+def vote_blocks(votes: Votes) -> Iterator[Votes]:
+    """The votes of ROWS Gaussians after the other, on jax's device; without `by_view` and `overlap`."""
+    columns = [own.name for own in dataclasses.fields(votes) if own.name not in _NO_COLUMNS]
+    for first in range(0, votes.regions.shape[0], ROWS):
+        own = {name: getattr(votes, name) for name in columns}
+        own = {name: None if a is None else jnp.asarray(a[first : first + ROWS]) for name, a in own.items()}
+        yield dataclasses.replace(votes, **own, by_view=None, overlap=None)
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _overlap(regions: Array, share: Array, count: int) -> Array:
+    """(R, R) sum_n min(p_nr, p_ns), of each n at [r, s] where r is the stronger of the two."""
     sound = (regions >= 0) & (regions < count) & jnp.isfinite(share)
     place, share = jnp.where(sound, regions, count).T, jnp.where(sound, share, 0.0).T  # one past the end: dropped
     first, second = jnp.triu_indices(regions.shape[1])
@@ -115,9 +138,13 @@ def _overlap(regions: Array, share: Array, count: int) -> Array:
         j, k = first[n], second[n]
         return both.at[place[j], place[k]].add(jnp.minimum(share[j], share[k]), mode="drop")
 
-    both = lax.fori_loop(0, len(first), add, jnp.zeros((count, count), share.dtype))
+    return lax.fori_loop(0, len(first), add, jnp.zeros((count, count), share.dtype))
+
+
+@jax.jit
+def _iou(both: Array) -> Array:
     size = jnp.diagonal(both)
-    both = jnp.where(jnp.eye(count, dtype=bool), both, both + both.T)
+    both = jnp.where(jnp.eye(len(both), dtype=bool), both, both + both.T)
     either = size[:, None] + size - both
     return jnp.where(either > 0, jnp.minimum(both / jnp.where(either > 0, either, 1.0), 1.0), 0.0)
 

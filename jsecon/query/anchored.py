@@ -4,16 +4,18 @@ The gap between a text's and an image's embedding is crossed once, among R regio
 Gaussians are then compared with a region of their own kind, so that almost any threshold does.
 """
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require_one_of, require_shape
 from jsecon.language.codes import CODE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.language.shares import SHARE_THRESHOLD, share_of
+from jsecon.language.shares import SHARE_THRESHOLD, share_of, vote_blocks
 from jsecon.query.direct import Number, UnitCodes, as_codes, similarities
 from jsecon.query.retrieval import (
     PIECE_NEARNESS,
@@ -29,7 +31,7 @@ from jsecon.query.retrieval import (
 from jsecon.types import Array, LanguageField, Selection
 from jsecon.vision.protocols import Logits
 
-_THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}
+THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}
 
 
 class Found(NamedTuple):
@@ -78,13 +80,29 @@ def query_anchored(
     size = field.regions.embeddings.shape[1]
     remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
     require_shape("query_anchored", text_embedding, (size,), remedy)
-    require_one_of("query_anchored", by, _THRESHOLDS, "'votes' is the default.")
-    least = threshold_of(retrieval, retrieval_threshold, "query_anchored", logits)
+    require_one_of("query_anchored", by, THRESHOLDS, "'votes' is the default.")
+    threshold_of(retrieval, retrieval_threshold, "query_anchored", logits)
     if field.regions.count == 0:
         return nothing(field)
-    given = field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels, field.votes.overlap
-    found = _retrieve(*jax.tree.map(jnp.asarray, given), least, alike_threshold, piece_nearness, logits, retrieval)
+    how = {"alike_threshold": alike_threshold, "piece_nearness": piece_nearness, "logits": logits}
+    found = found_of(field, text_embedding, retrieval_threshold=retrieval_threshold, retrieval=retrieval, **how)
     return members(field, found, similarity_threshold, by=by, codes=codes)
+
+
+def found_of(
+    field: LanguageField,
+    text_embedding: Float[Array, " e"],
+    *,
+    retrieval_threshold: Number | None = None,
+    retrieval: str = "contrast",
+    alike_threshold: Number | None = ALIKE_THRESHOLD,
+    piece_nearness: Number | None = PIECE_NEARNESS,
+    logits: Logits | None = None,
+) -> Found:
+    """The regions of a field that answer a text's embedding (E,), by the rules of `query_anchored`."""
+    least = threshold_of(retrieval, retrieval_threshold, "found_of", logits)
+    given = field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels, field.votes.overlap
+    return _retrieve(*jax.tree.map(jnp.asarray, given), least, alike_threshold, piece_nearness, logits, retrieval)
 
 
 def query_region(
@@ -103,7 +121,7 @@ def query_region(
 
     Nothing for region -1 (or any other id that the field does not have): Selection.region is then -1 and its score 0.
     """
-    require_one_of("query_region", by, _THRESHOLDS, "'votes' is the default.")
+    require_one_of("query_region", by, THRESHOLDS, "'votes' is the default.")
     if field.regions.count == 0:
         return nothing(field)
     known = jnp.asarray(field.regions.embeddings), field.votes.overlap
@@ -115,11 +133,31 @@ def members(
     field: LanguageField, found: Found, threshold: Number | None, *, by: str = "votes", codes: UnitCodes | None = None
 ) -> Selection:
     """The Gaussians of the regions found: "votes", of all that were chosen, or "code", of the best of them."""
-    threshold = _THRESHOLDS[by] if threshold is None else threshold
+    threshold = THRESHOLDS[by] if threshold is None else threshold
+    if isinstance(field.votes.regions, np.memmap) and codes is None:
+        parts = [jax.tree.map(np.asarray, part) for part in members_by_block(field, [found], threshold, by=by)]
+        mask, similarity = (np.concatenate([getattr(p[0], name) for p in parts]) for name in ("mask", "similarity"))
+        return Selection(mask, similarity, found.region.astype(jnp.int32), found.score)
     if by == "votes":
         return _by_share(jax.tree.map(jnp.asarray, field.votes), found, threshold)
     seen, table = jnp.asarray(field.votes.views) > 0, jnp.asarray(field.region_codes)
     return _by_code(as_codes(field.codes if codes is None else codes), table, seen, found, threshold)
+
+
+def members_by_block(
+    field: LanguageField, several: Sequence[Found], threshold: Number | None, *, by: str = "votes"
+) -> Iterator[list[Selection]]:
+    """`members` of one question after the other, for each block of Gaussians: the columns are read once."""
+    threshold = THRESHOLDS[by] if threshold is None else threshold
+    table = jnp.asarray(field.region_codes)
+    first = 0
+    for votes in vote_blocks(field.votes):
+        rows = slice(first, first := first + len(votes.views))
+        if by == "votes":
+            yield [_by_share(votes, found, threshold) for found in several]
+            continue
+        codes = jnp.asarray(field.codes[rows])
+        yield [_by_code(codes, table, votes.views > 0, found, threshold) for found in several]
 
 
 def nothing(field: LanguageField) -> Selection:

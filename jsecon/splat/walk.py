@@ -201,13 +201,19 @@ def weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
 
 
 def walk(
-    table: Array, lists: TileLists, batches: Batches, tiles: Array, body: Callable, state: Any
+    table: Array,
+    lists: TileLists,
+    batches: Batches,
+    tiles: Array,
+    body: Callable,
+    state: Any,
+    left: Array | None = None,
 ) -> tuple[Any, Array]:
     """Applies `transmittance, state = body(transmittance, state, chunk)` chunk by chunk down the lists of one batch of
     `tiles` (B,), until the longest has ended or every pixel has stopped.
 
     Returns the last state, and (B,) int32 how far down its list each tile had a pixel that had not stopped: nothing
-    behind is seen. transmittance (B, pixels) starts at 1. `table` is `make_table`'s.
+    behind is seen. transmittance (B, pixels) starts at 1, or at what earlier lists `left`. `table` is `make_table`'s.
     """
     start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
     corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))
@@ -232,6 +238,6 @@ def walk(
         transmittance, state = body(transmittance, state, chunk)
         return first + CHUNK, transmittance, seen, state
 
-    pixels = jnp.ones((tiles.shape[0], batches.tile**2), table.dtype)
+    pixels = jnp.ones((tiles.shape[0], batches.tile**2), table.dtype) if left is None else left
     _, _, seen, state = lax.while_loop(unfinished, step, (jnp.int32(0), pixels, jnp.zeros_like(tiles), state))
     return state, jnp.minimum(seen, length[:, 0])

@@ -1,0 +1,261 @@
+"""Votes, codes and queries in blocks are those in memory; what is approximate about them is bounded here."""
+
+# ruff: noqa: F811  (the fixtures of test_votes)
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import make_field
+from test_votes import REGIONS, expected, labels  # noqa: F401
+
+from jsecon.errors import InputError
+from jsecon.language import blocks as module, shares
+from jsecon.language.blocks import codes_in_blocks, region_votes_in_blocks
+from jsecon.language.distill import distill_votes
+from jsecon.language.field import load_field, save_field
+from jsecon.language.records import strongest
+from jsecon.language.shares import with_overlap, with_shown
+from jsecon.language.votes import region_votes
+from jsecon.query.anchored import query_anchored
+from jsecon.query.blocks import query_in_blocks
+from jsecon.splat import bands
+from jsecon.types import Camera, Gaussians, Regions, Votes
+
+
+@pytest.fixture
+def small_bands(monkeypatch):
+    """Eight splats in a band: the 64 Gaussians of the scene are composited in a dozen of them."""
+    monkeypatch.setattr(bands, "BAND", 8)
+
+
+def ball(count, views, width, height, *, opaque=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    size = 0.7 * count ** (-1 / 3)
+    columns = rng.normal(size=(count, 3)), np.log(rng.uniform(0.1 * size, size, (count, 3)))
+    columns = *columns, rng.normal(size=(count, 4)), rng.normal(opaque, 1, count), np.zeros((count, 1, 3))
+    poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
+    poses[:, 2, 3] = 4 - 0.3 * np.arange(views)
+    lens = (np.full(views, v, np.float32) for v in (0.9 * width, 0.9 * width, width / 2, height / 2))
+    return Gaussians(*(a.astype(np.float32) for a in columns)), Camera(poses, *lens, width, height)
+
+
+def blocky(rng, views, height, width, regions):
+    return rng.integers(-1, regions, (views, -(-height // 20), -(-width // 20))).repeat(20, 1).repeat(20, 2)[
+        :, :height, :width
+    ].astype(np.int32)  # fmt: skip
+
+
+def assert_alike(blocks, memory, *, pixels=0):
+    """Float32 sums, and `pixels` whose last weight, of at most 0.01, came to lie on the other side of the stop."""
+    assert int(blocks.overflow) == 0
+    for name in ("weights", "labelled", "total"):
+        own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
+        assert np.linalg.norm(own - other) <= 1e-6 * np.linalg.norm(other) + 0.01 * np.sqrt(pixels)
+        np.testing.assert_allclose(own, other, rtol=3e-6, atol=1e-6 + 0.01 * (pixels > 0))
+    # A single pixel's weight hangs on the last bit of a splat's place, which each program rounds its own way.
+    np.testing.assert_allclose(blocks.peak, memory.peak, rtol=2e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [5, 64, 1 << 18])
+def test_equal_to_votes_in_memory_and_to_the_oracle(
+    scene,
+    cameras,
+    labels,
+    expected,
+    tmp_path,
+    small_bands,
+    rows,
+):
+    memory = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
+    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, top=REGIONS, folder=tmp_path / "v", rows=rows)
+    assert_alike(cast, memory)
+    votes, total, peak, views = expected
+    np.testing.assert_allclose(cast.dense(), votes, rtol=2e-4, atol=0.02)
+    assert np.linalg.norm(cast.dense() - votes) <= 1e-4 * np.linalg.norm(votes)
+    np.testing.assert_allclose(cast.total, total.sum(0), rtol=2e-4, atol=0.02)
+    np.testing.assert_allclose(cast.peak, peak, atol=1e-4)
+    np.testing.assert_array_equal(cast.views, views)
+    assert sorted(file.name for file in (tmp_path / "v").iterdir()) == sorted(
+        f"{name}.npy" for name in ("regions", "weights", "labelled", "total", "peak", "views")
+    )
+
+
+def test_few_splats_held_at_once_and_weights_at_the_centre(
+    scene,
+    cameras,
+    labels,
+    tmp_path,
+    small_bands,
+):
+    how = {"top": REGIONS, "centre": 0.7}
+    memory = region_votes(scene, cameras, labels, REGIONS, **how)
+    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "v", rows=16, most_held=9)
+    assert_alike(cast, memory)
+    np.testing.assert_array_equal(cast.regions, memory.regions)
+
+
+@pytest.mark.parametrize("opaque", [0.0, 4.0])
+def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
+    """40,000, more than a band holds, all visible; opaque, most lie behind what stopped every pixel."""
+    monkeypatch.setattr(bands, "BAND", 4096)
+    scene, cameras = ball(40_000, 3, 160, 120, opaque=opaque)
+    labels = blocky(np.random.default_rng(1), 3, 120, 160, 7)
+    memory = region_votes(scene, cameras, labels, 7, top=3)
+    cast = region_votes_in_blocks(scene, cameras, labels, 7, top=3, folder=tmp_path / "v", rows=5000)
+    assert_alike(cast, memory, pixels=3)
+    assert (np.asarray(cast.regions) != np.asarray(memory.regions)).sum() <= 4
+    assert (np.asarray(cast.views) != np.asarray(memory.views)).sum() <= 4
+    np.testing.assert_allclose(cast.cut, memory.cut, rtol=1e-4, atol=1e-3)
+
+
+def test_equal_depths_keep_the_order_of_indices_across_bands(tmp_path, small_bands):
+    """Thirty Gaussians in one place: each sees what those before it leave."""
+    one, cameras = ball(1, 1, 40, 40)
+    scene = jax.tree.map(lambda a: np.repeat(a, 30, 0), one)
+    scene.means[:] = 0
+    scene.log_scales[:] = -1
+    labels = np.zeros((1, 40, 40), np.int32)
+    memory = region_votes(scene, cameras, labels, 1)
+    cast = region_votes_in_blocks(scene, cameras, labels, 1, folder=tmp_path / "v", rows=7)
+    assert (np.diff(cast.total) < 0).all()
+    assert_alike(cast, memory)
+
+
+def test_shown_is_that_of_votes_by_view(scene, cameras, labels, tmp_path, small_bands):
+    rng = np.random.default_rng(0)
+    embeddings = rng.normal(size=(REGIONS, 4)).astype(np.float32)
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
+    pixels[:5, 1] = 0  # as if the noise of that view showed but half of them
+    regions = Regions(embeddings, pixels)
+    memory = with_shown(region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True), regions)
+    cast = region_votes_in_blocks(
+        scene, cameras, labels, REGIONS, top=4, folder=tmp_path / "v", rows=16, regions=regions
+    )
+    np.testing.assert_array_equal(cast.regions, memory.regions)
+    np.testing.assert_allclose(cast.shown, memory.shown, rtol=1e-5, atol=1e-6)
+
+
+def test_no_regions_no_gaussians_and_labels_of_nothing(scene, cameras, labels, tmp_path):
+    none = region_votes_in_blocks(scene, cameras, np.full((4, 40, 48), -1, np.int32), 0, folder=tmp_path / "a")
+    assert none.dense().shape == (scene.count, 0)
+    assert float(none.total.sum()) > 0
+    beyond = region_votes_in_blocks(scene, cameras, labels, 3, folder=tmp_path / "b")
+    assert_alike(beyond, region_votes(scene, cameras, labels, 3))
+    empty = jax.tree.map(lambda a: a[:0], scene)
+    assert region_votes_in_blocks(empty, cameras, labels, 3, folder=tmp_path / "c").regions.shape == (0, 3)
+
+
+def test_labels_are_read_one_at_a_time_and_progress_counts(scene, cameras, labels, tmp_path):
+    class Streamed:
+        def __init__(self):
+            self.asked = []
+
+        def __len__(self):
+            return len(labels)
+
+        def __getitem__(self, t):
+            self.asked.append(t)
+            return labels[t]
+
+    told, streamed = [], Streamed()
+    region_votes_in_blocks(
+        scene, cameras, streamed, REGIONS, folder=tmp_path / "v", progress=lambda *own: told.append(own)
+    )
+    assert streamed.asked == [0, 1, 2, 3]
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_what_does_not_fit_raises(scene, cameras, camera, labels, tmp_path):
+    cast = lambda *given, **how: region_votes_in_blocks(*given, REGIONS, folder=tmp_path / "v", **how)
+    with pytest.raises(ValueError, match="leading axis"):
+        cast(scene, camera, labels)
+    with pytest.raises(ValueError, match="one per view"):
+        cast(scene, cameras, labels[:2])
+    with pytest.raises(ValueError, match="size"):
+        cast(scene, cameras, labels[:, 1:])
+    with pytest.raises(ValueError, match=r"regions\.pixels"):
+        cast(scene, cameras, labels, regions=Regions(np.ones((2, 4), np.float32), np.ones((2, 4), np.int32)))
+    (tmp_path / "v").mkdir(exist_ok=True)
+    (tmp_path / "v" / "mine").touch()
+    with pytest.raises(InputError, match="not empty"):
+        cast(scene, cameras, labels)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="can be written"):
+        region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "file" / "v")
+
+
+def test_a_full_disk_is_told_and_the_spool_removed(scene, cameras, labels, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "append", full)
+    with pytest.raises(InputError, match="No space left"):
+        region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "v")
+    assert not list((tmp_path / "v").iterdir())
+
+
+def test_strongest_is_top_k_with_equal_ones_by_region():
+    from scipy import sparse
+
+    rng = np.random.default_rng(0)
+    dense = rng.integers(0, 4, (500, 9)).astype(np.float64) * (rng.random((500, 9)) < 0.6)
+    ids, weights = strongest(sparse.csr_array(dense), 4)
+    wanted, places = jax.lax.top_k(jnp.asarray(dense), 4)
+    np.testing.assert_array_equal(weights, wanted)
+    np.testing.assert_array_equal(ids, np.where(np.asarray(wanted) > 0, places, -1))
+
+
+@pytest.fixture
+def fields(scene, cameras, tmp_path, monkeypatch):
+    """A field in memory, and the same with all its columns mapped."""
+    from jsecon.language import field as home
+
+    field = make_field(scene, cameras)[0]
+    field = dataclasses.replace(field, votes=with_overlap(field.votes))
+    save_field(tmp_path / "a.npz", field)
+    monkeypatch.setattr(home, "MAPPED", 0)
+    monkeypatch.setattr(shares, "ROWS", 10)
+    return field, load_field(tmp_path / "a.npz", mapped=True)
+
+
+def test_overlap_and_codes_of_mapped_votes(fields, tmp_path):
+    field, mapped = fields
+    assert isinstance(mapped.votes.regions, np.memmap)
+    np.testing.assert_allclose(with_overlap(mapped.votes).overlap, field.votes.overlap, atol=1e-6)
+    for reduce in ("mode", "mean"):
+        codes = codes_in_blocks(mapped.votes, field.region_codes, tmp_path / f"{reduce}.npy", reduce)
+        assert isinstance(codes, np.memmap)
+        np.testing.assert_array_equal(codes, distill_votes(field.votes, field.region_codes, reduce))
+
+
+@pytest.mark.parametrize("by", ["votes", "code"])
+def test_queries_of_a_mapped_field_are_those_in_memory(fields, by):
+    field, mapped = fields
+    texts = np.asarray(field.regions.embeddings) + np.float32(0.05)
+    chosen = query_in_blocks(mapped, texts, by=by)
+    assert len(chosen) == len(texts)
+    assert sum(len(own.gaussians) for own in chosen) > 0
+    for text, own in zip(texts, chosen):
+        memory, blocks = query_anchored(field, text, by=by), query_anchored(mapped, text, by=by)
+        assert isinstance(blocks.mask, np.ndarray)
+        np.testing.assert_array_equal(blocks.mask, memory.mask)
+        np.testing.assert_array_equal(blocks.similarity, memory.similarity)
+        np.testing.assert_array_equal(own.gaussians, np.flatnonzero(memory.mask))
+        np.testing.assert_array_equal(own.similarity, np.asarray(memory.similarity)[own.gaussians])
+        assert own.region == int(memory.region)
+        assert own.score == pytest.approx(float(memory.score), rel=1e-6)
+    with pytest.raises(ValueError, match="query_in_blocks"):
+        query_in_blocks(mapped, texts[:, 1:])
+    none = dataclasses.replace(mapped, regions=Regions(np.zeros((0, 12), np.float32), np.zeros((0, 4), np.int32)))
+    assert [own.region for own in query_in_blocks(none, texts)] == [-1] * len(texts)
+
+
+def test_votes_cast_in_blocks_make_a_field(scene, cameras, labels, tmp_path):
+    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "v")
+    assert isinstance(cast, Votes)
+    assert cast.weights.flags.writeable is False
+    assert with_overlap(cast).overlap.shape == (REGIONS, REGIONS)
