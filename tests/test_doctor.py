@@ -63,7 +63,9 @@ def test_a_package_that_cannot_be_imported(monkeypatch):
 
 
 def test_it_knows_the_packages_and_extras_of_the_project():
-    assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev"}
+    assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev", "all"}
+    wanted = next(need for need in PROJECT["dependencies"] if need.startswith("jax>"))
+    assert f'"{wanted}"' in Path(doctor.__file__).read_text()
     assert len(doctor.PACKAGES) == len(PROJECT["dependencies"]) - 1  # jax has a line of its own
 
 

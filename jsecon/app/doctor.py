@@ -90,7 +90,7 @@ def _backend() -> list[Check]:
         devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     except Exception as error:  # whatever a driver or a wheel raises
         told = f"{type(error).__name__}: {error}"
-        return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.12"')]
+        return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.13"')]
     found = [Check("jax", "ok", f"{jax.__version__}, devices: {devices}")]
     try:
         report = check_backend()
