@@ -14,6 +14,8 @@ def main() -> int:
     if several:
         prepare_member()
     prepare_process()
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # a letter that the terminal lacks is told, and ends nothing
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: what is half written is removed
     from jsecon.app.command_line import main as run
 
