@@ -113,6 +113,8 @@ def test_two_runs_in_one_folder_are_told_apart(capture, tmp_path):
         pipeline.run(pipeline.Options(capture), tmp_path / "out")
     with alone(tmp_path / "out"):
         pass
+    with refused(".lock", "on writing to", "free some room"), alone(tmp_path / "gone"):
+        pass
 
 
 def test_a_program_that_is_told_to_end_says_how_to_go_on(capture, tmp_path):
