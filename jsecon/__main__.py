@@ -1,5 +1,6 @@
 """The program `jsecon` (and `python -m jsecon`): the process first, before jax starts; then the command line."""
 
+import io
 import os
 import signal
 import sys
@@ -14,6 +15,9 @@ def main() -> int:
     if several:
         prepare_member()
     prepare_process()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a letter that the terminal lacks ends nothing
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: what is half written is removed
     from jsecon.app.command_line import main as run
 

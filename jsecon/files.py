@@ -56,18 +56,26 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        remedy = "Choose another, mend its permissions, or free some room."
-        found = f"{error.strerror or error} on writing to {path.parent}"
-        raise InputError(path, found, "a folder that can be written", remedy) from error
+        raise _unwritten(path, error) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
+def _unwritten(path: Path, error: OSError) -> InputError:
+    remedy = "Choose another, mend its permissions, or free some room."
+    found = f"{error.strerror or error} on writing to {path.parent}"
+    return InputError(path, found, "a folder that can be written", remedy)
+
+
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """While it is open, `folder` is this caller's to write to. Raises InputError where it is another's."""
-    with open(folder / ".lock", "w") as lock:
+    """While it is open, `folder` is this caller's to write to. Raises InputError where it is another's, or is full."""
+    try:
+        lock = open(folder / ".lock", "w")  # noqa: SIM115 - closed below; its own errors are told apart from the body's
+    except OSError as error:
+        raise _unwritten(folder / ".lock", error) from error
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -10,15 +10,19 @@ both cores and the speed of benchmarks/results.md does the same:
 From time to time, where it lives long and sees many scenes: `forget_programs()`.
 """
 
+import contextlib
 import ctypes
 import gc
 import hashlib
 import os
+import re
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 # mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
 # kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
@@ -27,6 +31,8 @@ _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO
 """what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
 MEMBER = "JSECON_MEMBER"
 """environment variable of a process that is one of several (pipeline/processes.py), see `member`"""
+_UNKEPT = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
+"""how jax warns of a program that it cannot read from disk, or keep there"""
 _built: dict[str, int] = {}
 _under_way: dict[int, float] = {}
 """thread -> when jax began to compile the program that it waits for"""
@@ -40,10 +46,32 @@ def prepare_process(*, keep_programs: bool = True) -> None:
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
     os.environ.update({name: value for name, value in _OPENCV.items() if name not in os.environ} | chosen)
+    if (folder := chosen.get("JAX_COMPILATION_CACHE_DIR")) is not None:
+        _remove_damaged_programs(Path(folder))
     if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
         mallopt = getattr(ctypes.CDLL(None), "mallopt", lambda parameter, value: None)
         for parameter, value in _MALLOPT.items():
             mallopt(parameter, value)
+
+
+def _remove_damaged_programs(folder: Path) -> None:
+    """From now on, where jax warns of a program in `folder`, the files of that name go, and nothing is said.
+
+    jax writes to a program's final name: a full disk, or a stop amid the writing, leaves a part there, of which it
+    would warn for ever, and never write it anew. `jsecon doctor` tells of a disk without room for programs.
+    """
+    show = warnings.showwarning
+
+    def shown(message: Warning | str, *rest: Any, **given: Any) -> None:
+        told = re.match(_UNKEPT, str(message))
+        if told is None:
+            return show(message, *rest, **given)
+        for file in folder.glob(f"{told[1]}-*-cache"):
+            with contextlib.suppress(OSError):
+                file.unlink()
+
+    warnings.showwarning = shown
+    warnings.filterwarnings("always", _UNKEPT)  # of each, also where two are called alike
 
 
 def member() -> tuple[int, int, str] | None:

@@ -11,6 +11,7 @@ def test_our_forms_are_right_here_and_the_report_says_what_it_measured():
     report = backend.check_backend()
     assert report.platform == "cpu"
     assert 0 < report.cosine_error < 1e-5
+    assert report.has_jax_39103 == (tuple(map(int, report.jax_version.split(".")[:2])) < (0, 11)), backend.REMEDY
     if report.has_jax_39103:
         with pytest.raises(RuntimeError, match=r"39103.*XLA_FLAGS"):
             backend.check_backend(strict=True)

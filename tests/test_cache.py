@@ -146,6 +146,21 @@ def test_files_digest_follows_names_sizes_and_times(tmp_path):
     assert len({first, second, third, cache.files_digest([folder])}) == 4
 
 
+def test_files_digest_passes_over_what_goes_while_it_looks(tmp_path, monkeypatch):
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(b"one")
+    left, is_file = cache.files_digest([tmp_path / "b.png"]), Path.is_file
+
+    def goes(path):
+        found = is_file(path)
+        if path.name == "a.png":
+            path.unlink(missing_ok=True)
+        return found
+
+    monkeypatch.setattr(Path, "is_file", goes)
+    assert cache.files_digest([tmp_path]) == left
+
+
 def test_files_digest_leaves_out_the_output_and_hidden_files(tmp_path):
     (tmp_path / "a.png").write_bytes(b"one")
     before = cache.files_digest([tmp_path], leave_out=tmp_path / "out")
@@ -192,11 +207,14 @@ def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeyp
 
 def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):
     old, young = tmp_path / ".a.0.partial.npz", tmp_path / ".b.0.partial.npz"
-    for path in (old, young):
+    to_come = tmp_path / ".c.0.partial.npz"  # written before the clock was set back
+    for path in (old, young, to_come):
         path.write_bytes(b"half")
     os.utime(old, (0, 0))
+    os.utime(to_come, (2**32, 2**32))
     cache.prepare(tmp_path)
     assert not old.exists()
+    assert not to_come.exists()
     assert young.exists()
     assert (tmp_path / "CACHEDIR.TAG").read_text().startswith("Signature: 8a477f597d28d172789f06886806bc55")
 

@@ -63,7 +63,9 @@ def test_a_package_that_cannot_be_imported(monkeypatch):
 
 
 def test_it_knows_the_packages_and_extras_of_the_project():
-    assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev"}
+    assert set(doctor.EXTRAS) == set(PROJECT["optional-dependencies"]) - {"dev", "all"}
+    wanted = next(need for need in PROJECT["dependencies"] if need.startswith("jax>"))
+    assert f'"{wanted}"' in Path(doctor.__file__).read_text()
     assert len(doctor.PACKAGES) == len(PROJECT["dependencies"]) - 1  # jax has a line of its own
 
 
@@ -73,3 +75,11 @@ def test_limits_of_a_cgroup_are_told(monkeypatch):
     memory, cores = doctor._memory(), doctor._cores()
     assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.told) == ("wrong", True)
     assert "the time of only 0.5 (cgroup)" in cores.told
+
+
+def test_a_disk_without_room_for_programs_is_told(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "not" / "yet"))
+    assert doctor._programs().status == "ok"
+    monkeypatch.setattr(doctor, "LEAST_FOR_PROGRAMS", 1 << 60)
+    check = doctor._programs()
+    assert (check.status, "compiled in every run" in check.told) == ("missing", True)

@@ -1,5 +1,6 @@
 """Faults of the machine end in one message: no room, no memory, another run in the same folder, a request to stop."""
 
+import contextlib
 import resource
 import signal
 import subprocess
@@ -11,11 +12,18 @@ import pytest
 from capture_files import refused, small_capture, write_transforms
 from fuzz_readers import _field
 
+from jsecon.data import frames
 from jsecon.data.images import write_image
 from jsecon.data.ply import save_ply
 from jsecon.files import alone, write_text
 from jsecon.language.field import save_field
 from jsecon.pipeline import cache, pipeline
+from jsecon.pipeline.processes import First
+from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.scene_stages import loaded
+from jsecon.pipeline.stages import Work
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -57,11 +65,55 @@ def test_want_of_memory_names_the_stage_and_what_helps(capture, tmp_path):
         pipeline.run(pipeline.Options(capture), tmp_path / "out", load=lambda: np.ones(1 << 50))
 
 
+def test_frames_that_lie_on_a_full_disk_are_told(no_room, monkeypatch):
+    """They are mapped: a page without a place on the disk would end the process."""
+    monkeypatch.setattr(frames, "IN_MEMORY", 500)
+    with refused("for 0.0 GiB of frames", "TMPDIR"):
+        frames.room_for((2, 20, 30, 3))
+    assert frames.room_for((1, 10, 30, 3)).shape == (1, 10, 30, 3)
+
+
+class Meddler(Listener):
+    """Writes to a file while a stage runs."""
+
+    def __init__(self, file):
+        self.file, self.fresh = file, {}
+
+    @contextlib.contextmanager
+    def progress(self, name):
+        def meddle(done, total):
+            if name == "load" and done == 1 and self.file is not None:
+                self.file.write_bytes(self.file.read_bytes() + b"more")
+
+        yield meddle
+
+    def done(self, name, seconds, fresh):
+        self.fresh[name] = fresh
+
+
+def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(capture, tmp_path):
+    work = Work(pipeline.Options(capture), Networks(ColourEmbedder()), tmp_path / "out")
+    (tmp_path / "out").mkdir()
+
+    def loaded_by(listener):
+        stages = loaded(work)
+        pipeline._computed(work, stages, tmp_path / "out" / "cache", listener, First(several=False))
+        return listener.fresh["load"]
+
+    with refused(capture, "files that changed while stage load read them", "same command again"):
+        loaded_by(Meddler(sorted((capture / "images").iterdir())[-1]))
+    assert list((tmp_path / "out" / "cache").glob("load-*")) == []
+    assert loaded_by(Meddler(None))
+    assert not loaded_by(Meddler(None))
+
+
 def test_two_runs_in_one_folder_are_told_apart(capture, tmp_path):
     (tmp_path / "out").mkdir()
     with alone(tmp_path / "out"), refused(tmp_path / "out", "another run"):
         pipeline.run(pipeline.Options(capture), tmp_path / "out")
     with alone(tmp_path / "out"):
+        pass
+    with refused(".lock", "on writing to", "free some room"), alone(tmp_path / "gone"):
         pass
 
 

@@ -395,10 +395,10 @@ file_of = cache._file_of
 cache._file_of = lambda name: digested.append(name) or file_of(name)
 key = Stage.key
 
-def key_and_cover(stage, work, keys):
+def key_and_cover(stage, *given):
     digested.clear()
     cache._imports_of_module.cache_clear()
-    found = key(stage, work, keys)
+    found = key(stage, *given)
     entries = (stage.compute, *(type(used) for used in stage.uses if used is not None))
     own = {sys.modules[entry.__module__].__file__ for entry in entries}
     ran[stage.name] = {"covered": sorted({str(file_of(name)) for name in digested} | own), "ran": []}

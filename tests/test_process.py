@@ -1,6 +1,8 @@
 """What a program sets before jax starts."""
 
+import ast
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -51,6 +53,33 @@ def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
     environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
     assert done.stdout.split() == [str(len(os.sched_getaffinity(0))), str(kept)]
+
+
+def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_a_word(tmp_path):
+    """As a full disk leaves it, or a stop while jax writes it."""
+    program = (
+        "from jsecon.process import prepare_process, programs_built\n"
+        "prepare_process()\n"
+        "programs_built()\n"
+        "import jax, warnings\n"
+        "print(jax.jit(lambda x: 3 * x)(7), programs_built())\n"
+        "warnings.warn('of another kind')"
+    )
+    environ = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    run = lambda: subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ
+    )
+    first = run()
+    kept = {file: file.read_bytes() for file in tmp_path.rglob("*-cache")}
+    assert len(kept) == ast.literal_eval(first.stdout.split(" ", 1)[1])["all"] > 0
+    for file, data in kept.items():
+        file.write_bytes(data[: len(data) // 2])
+    for from_disk in (0, len(kept)):
+        done = run()
+        assert done.stdout == f"21 { ({'all': len(kept), 'from_disk': from_disk}) }\n"
+        assert re.findall(r"\w+Warning: .*", done.stderr) == ["UserWarning: of another kind"]
+        assert set(tmp_path.rglob("*-cache")) == set(kept)
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="counts memory maps, which Linux tells")

@@ -74,6 +74,24 @@ def test_the_ci_runs_exactly_the_second_command():
     assert os.access(HOME / ".ci" / "run", os.X_OK)
 
 
+def test_the_quick_part_for_other_versions_has_some_of_each_room():
+    script = HOME / ".ci" / "newest"
+    assert ".ci/newest" in README
+    assert os.access(script, os.X_OK)
+    listed = re.search(r'^quick="(.*?)"$', script.read_text(), re.MULTILINE | re.DOTALL)
+    assert listed is not None
+    files = [HOME / "tests" / f"test_{name}.py" for name in listed[1].split()]
+    used = {found for file in files for found in re.findall(r"\bjsecon\.(\w+)", file.read_text())}
+    used |= {
+        name
+        for file in files
+        for names in re.findall("from jsecon import (.*)", file.read_text())
+        for name in names.split(", ")
+    }
+    rooms = {path.name for path in (HOME / "jsecon").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert rooms | {"backend", "files", "numerics", "parallel", "process", "types"} <= used
+
+
 def test_the_package_says_what_it_needs():
     project = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
     needs = {re.split(r"[<>=\[]", line)[0] for line in project["dependencies"]}

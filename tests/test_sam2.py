@@ -268,9 +268,10 @@ def test_prompts_outside_the_sequence_are_refused(folder):
         Sam2Tracker(folder)(a_clip(3), 0, np.zeros((1, 4, 4), bool))
 
 
-def without(path, name):
-    stored = dict(np.load(path))
-    np.savez(path, **{other: array for other, array in stored.items() if other != name})
+def without(path, name, instead=None):
+    """`instead`: the array that takes its place."""
+    stored = {other: array for other, array in np.load(path).items() if other != name}
+    np.savez(path, **stored, **({} if instead is None else {name: instead}))
 
 
 @pytest.mark.parametrize(
@@ -281,6 +282,10 @@ def without(path, name):
         (lambda f: (f / "constants.npz").unlink(), "constants.npz"),
         (lambda f: (f / "constants.npz").write_bytes(b"PK\x03\x04 cut"), "constants.npz"),
         (lambda f: without(f / "constants.npz", "no_obj_ptr"), "no_obj_ptr"),
+        (
+            lambda f: without(f / "constants.npz", "maskmem_tpos_enc", np.zeros((0, 1, 1, 4), np.float32)),
+            "without numbers",
+        ),
         (lambda f: (f / "obj_ptr_tpos_proj_small.onnx").unlink(), "without obj_ptr_tpos_proj"),
         (lambda f: shutil.copy(f / "mlp_small.onnx", f / "mask_decoder_small.onnx"), "image_embeddings"),
         (lambda f: shutil.copy(write_sam2(f / "o", memory=6) / "memory_encoder_small.onnx", f), "vision_features"),

@@ -37,7 +37,8 @@ things = st.lists(texts | st.integers(0, 10_000), max_size=5).map(tuple)
 part = st.floats(0, 1)
 asks = st.lists(st.builds(Ask, texts | st.integers(0, 99), part, part, st.booleans()), max_size=3).map(tuple)
 cameras = st.just(()) | st.lists(st.floats(-1e6, 1e6), min_size=9, max_size=9).map(tuple)
-states = st.builds(ViewState, things, part, part, st.booleans(), st.sampled_from(PAINTS), asks, asks, cameras)
+# A state is built in the test: beartype, which looks at a random entry of each tuple, would do so while drawing.
+parts_of_states = st.tuples(things, part, part, st.booleans(), st.sampled_from(PAINTS), asks, asks, cameras)
 
 
 def test_a_line_asks_for_each_text_once():
@@ -107,8 +108,9 @@ def test_undo_leads_back_and_a_slider_is_one_step():
     assert len(long.past) == History.LENGTH
 
 
-@given(states)
-def test_a_link_keeps_the_state(state):
+@given(parts_of_states)
+def test_a_link_keeps_the_state(parts):
+    state = ViewState(*parts)
     assert state_of(link_of(state)) == state
     assert "\n" not in link_of(state)
 

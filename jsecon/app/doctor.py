@@ -15,6 +15,8 @@ from jsecon.process import cores
 
 LEAST_MEMORY, LEAST_DISK = 2 << 30, 200 << 20
 """bytes that `jsecon demo` takes, rounded up"""
+LEAST_FOR_PROGRAMS = 32 << 20
+"""bytes of its compiled programs, rounded up"""
 PACKAGES = (
     "numpy",
     "scipy",
@@ -88,7 +90,7 @@ def _backend() -> list[Check]:
         devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     except Exception as error:  # whatever a driver or a wheel raises
         told = f"{type(error).__name__}: {error}"
-        return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.12"')]
+        return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.13"')]
     found = [Check("jax", "ok", f"{jax.__version__}, devices: {devices}")]
     try:
         report = check_backend()
@@ -148,7 +150,11 @@ def _programs() -> Check:
     if folder is None:
         return Check("programs", "missing", "no folder that can be written: every run compiles anew (set HOME)")
     files = [file for file in Path(folder).rglob("*") if file.is_file()]
-    return Check("programs", "ok", f"{len(files)} compiled, {_size(sum(f.stat().st_size for f in files))} in {folder}")
+    told = f"{len(files)} compiled, {_size(sum(f.stat().st_size for f in files))} in {folder}"
+    made = next(place for place in (Path(folder), *Path(folder).parents) if place.is_dir())
+    if (free := shutil.disk_usage(made).free) < LEAST_FOR_PROGRAMS:
+        return Check("programs", "missing", f"{told}, {_size(free)} free: what more there is is compiled in every run")
+    return Check("programs", "ok", told)
 
 
 def _models(folder: Path | None) -> list[Check]:

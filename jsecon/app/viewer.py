@@ -158,7 +158,8 @@ class Viewer:
     def packed(self, answers: Sequence[Answer]) -> bytes:
         """A .zip of the answers' files."""
         packed = io.BytesIO()
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        how = {"compression": zipfile.ZIP_DEFLATED, "strict_timestamps": False}  # a clock may stand before 1980
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **how) as archive:
             for answer in answers:
                 write_answer(self.field, answer, Path(folder), masks_of(self.field, answer, VIEWS))
             for file in sorted(Path(folder).iterdir()):

@@ -127,11 +127,19 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def room_for(shape: tuple[int, ...]) -> np.ndarray:
-    """Uninitialised uint8; from IN_MEMORY on in a file without a name, from which the system holds what is in use."""
-    if math.prod(shape) < IN_MEMORY:
+    """Uninitialised uint8; from IN_MEMORY on in a file without a name, from which the system holds what is in use.
+    Raises InputError where the disk has no room for it."""
+    if (size := math.prod(shape)) < IN_MEMORY:
         return np.empty(shape, np.uint8)
     with tempfile.TemporaryFile() as file:
-        return np.memmap(file, np.uint8, "w+", shape=shape)
+        try:
+            if hasattr(os, "posix_fallocate"):  # a mapped page without a place on the disk ends the process by SIGBUS
+                os.posix_fallocate(file.fileno(), 0, size)
+            return np.memmap(file, np.uint8, "w+", shape=shape)
+        except OSError as error:
+            found = f"{error.strerror or error} for {size / 2**30:.1f} GiB of frames"
+            remedy = "Free some room, set TMPDIR to a folder that has it, or take fewer or smaller frames."
+            raise InputError(tempfile.gettempdir(), found, "room on the disk of temporary files", remedy) from error
 
 
 class Extent(NamedTuple):

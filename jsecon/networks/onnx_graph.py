@@ -16,6 +16,7 @@ import numpy as np
 import onnxruntime
 
 from jsecon.errors import InputError
+from jsecon.networks.onnx_bytes import declared_inputs
 from jsecon.process import cores
 
 _DTYPES = {
@@ -82,6 +83,7 @@ class Graph:
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None, optimise: bool = True):
         self.path = Path(path)
         _check_bytes(self.path)
+        _check_inputs(self.path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads or cores()
         options.inter_op_num_threads = 1
@@ -95,9 +97,6 @@ class Graph:
             self._session = onnxruntime.InferenceSession(str(self.path), options, **given)
             self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
             self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
-            for tensor in self.inputs.values():
-                if math.prod(size for size in tensor.shape or () if isinstance(size, int)) > MOST_NUMBERS:
-                    raise ValueError(f"an input {tensor}")
         except Exception as error:  # ONNX Runtime's own kinds have no common base but this
             found = f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})"
             expected = "a whole ONNX graph, with its external data files beside it"
@@ -204,6 +203,13 @@ def _check_bytes(path: Path) -> None:
         raise _unreadable(path, "an empty file")
     if head.startswith(_LFS):
         raise _unreadable(path, "a Git LFS pointer in place of the file", "Fetch the content: git lfs pull.")
+
+
+def _check_inputs(path: Path) -> None:
+    for name, sizes in declared_inputs(path).items():
+        if math.prod(sizes) > MOST_NUMBERS:
+            found = f"an input {name!r} of {' x '.join(map(str, sizes))} numbers"
+            raise InputError(path, found, f"at most {MOST_NUMBERS}", "Fetch or export the file again.")
 
 
 def _unreadable(path: Path, found: str, remedy: str = "Check the path, or fetch the file again.") -> InputError:

@@ -8,6 +8,7 @@ stale result can be taken for a fresh one. A file holds arrays and a JSON descri
 """
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -71,8 +72,9 @@ def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str
                 continue
             if own is not None and path.resolve().is_relative_to(own):
                 continue
-            stat = path.stat()
-            entries.append(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}")
+            with contextlib.suppress(FileNotFoundError):  # gone since it was listed
+                stat = path.stat()
+                entries.append(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}")
     return hashlib.blake2b("\n".join(entries).encode(), digest_size=8).hexdigest()
 
 
@@ -163,7 +165,8 @@ def prepare(folder: Path) -> None:
     if not tag.exists():
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
     for partial in folder.glob(".*.partial.npz"):
-        if time.time() - partial.stat().st_mtime > STALE_SECONDS:
+        age = time.time() - partial.stat().st_mtime
+        if abs(age) > STALE_SECONDS:  # of the time to come where the clock was set back
             partial.unlink(missing_ok=True)
 
 

@@ -104,6 +104,8 @@ class _Plan:
     """What would run."""
 
     keys: dict[str, str]
+    files: dict[str, str | None]
+    """digests of the stages' files, as they went into the keys."""
     place: dict[str, Path]
     """where each stage's result is, or will be."""
     stale: list[str]
@@ -113,19 +115,20 @@ class _Plan:
 
 def _planned(work: Work, stages: list[Stage], folder: Path) -> _Plan:
     """The stages, and which of them `folder` holds already; writes nothing. Raises InputError for bad options."""
-    options, keys = work.options, {}
+    options, keys, files = work.options, {}, {}
     if work.out.resolve() == options.capture.resolve():
         found = "the capture's own folder as the output folder"
         raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
     require_inputs(options)
     for stage in stages:
-        keys[stage.name] = stage.key(work, keys)
+        files[stage.name] = stage.files_digest(work)
+        keys[stage.name] = stage.key(work, keys, files[stage.name])
     place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
     stale = [stage.name for stage in stages if stage.leaves is not None and not _left(stage, stages, place)]
     held = {name for name, path in place.items() if path.exists() and name not in stale}
     steps = [Step(stage.name, "cached" if stage.name in held else "run", stage.how) for stage in stages]
     steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
-    return _Plan(keys, place, stale, steps)
+    return _Plan(keys, files, place, stale, steps)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +163,8 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
     for stage in stages:
         record, before = Record(cache.record_path_of(place[stage.name])), programs_built()
         with listener.progress(stage.name) as progress:
-            compute = functools.partial(stage.compute, done.results, progress, record)
+            given = (work, plan.files[stage.name], done.results, progress, record)
+            compute = functools.partial(stage.computed, *given)
             begin = functools.partial(first.call, stage, done.results)
             try:
                 kept = cache.fetch(place[stage.name], compute, note=listener.note, begin=begin)

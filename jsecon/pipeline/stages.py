@@ -114,18 +114,32 @@ class Stage:
     leaves: Path | None = None
     """folder that it leaves for those after it, with its key in KEY_FILE; where another run left it, it runs again."""
 
-    def key(self, work: Work, keys: Mapping[str, str]) -> str:
+    def key(self, work: Work, keys: Mapping[str, str], files: str | None) -> str:
         """Digest of the source that computes it (`cache.source_digest`), of the keys of the stages that it reads, of
-        what it is given and of its files."""
+        what it is given and of its files: `files`, their digest."""
         return cache.key_of(
             self.name,
             {
                 "source": cache.source_digest(self.compute, *(type(used) for used in self.uses if used is not None)),
                 "after": [keys[other] for other in self.after],
                 "given": dict(self.given),
-                "files": None if self.files is None else cache.files_digest([self.files], leave_out=work.out),
+                "files": files,
             },
         )
+
+    def files_digest(self, work: Work) -> str | None:
+        """Digest of the names, sizes and times of its files."""
+        return None if self.files is None else cache.files_digest([self.files], leave_out=work.out)
+
+    def computed(self, work: Work, files: str | None, *given: Any) -> Outcome:
+        """What it makes of its files. Raises InputError where they are no longer those of the digest `files`: its key
+        would stand for a result of others, or of some of each."""
+        found = self.compute(*given)
+        if files != self.files_digest(work):
+            remedy = "Give the same command again when nothing writes there; what is done is kept."
+            told = f"files that changed while stage {self.name} read them"
+            raise InputError(str(self.files), told, "files that stay as they are during a run", remedy)
+        return found
 
 
 def training_frames(capture: Capture) -> np.ndarray:

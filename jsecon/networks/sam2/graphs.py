@@ -155,8 +155,8 @@ def _read_constants(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             constants = {name: array.astype(np.float32) for name, array in read_arrays(path).items()}
-        if not all(np.isfinite(array).all() for array in constants.values()):
-            raise ValueError("numbers that are not finite")
+        if not all(np.isfinite(array).all() and array.size for array in constants.values()):
+            raise ValueError("arrays without numbers, or numbers that are not finite")
     except UNREADABLE as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else f"what cannot be read ({error})"
         raise _bad(path, found, f"the arrays {', '.join(CONSTANTS)}") from error
