@@ -12,7 +12,7 @@ from jsecon.app.question import Answer, ask_text
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Gaussians, LanguageField
+from jsecon.types import LanguageField
 
 STRAY = 0.02
 """part of the Gaussians at each end of an axis that a box does not reach out for"""
@@ -74,8 +74,10 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     spread = points - points.mean(0)
     axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    low, high = _ends(chosen, np.eye(3))
-    own_low, own_high = _ends(chosen, axes)
+    turns = Rotation.from_quat(np.asarray(chosen.quaternions, np.float64), scalar_first=True).as_matrix()
+    shapes = turns * np.exp(np.asarray(chosen.log_scales, np.float64))[:, None, :]
+    low, high = _ends(points, shapes, np.eye(3))
+    own_low, own_high = _ends(points, shapes, axes)
     return Place(
         answer.question,
         axes @ (0.5 * (own_low + own_high)),
@@ -89,11 +91,11 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     )
 
 
-def _ends(chosen: Gaussians, axes: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Along each column of `axes`, from where to where the Gaussians reach, to one standard deviation, without
-    strays."""
-    turns = Rotation.from_quat(np.asarray(chosen.quaternions, np.float64), scalar_first=True).as_matrix()
-    turned = np.einsum("ij,nik->njk", axes, turns)
-    reach = np.sqrt(np.square(turned * np.exp(np.asarray(chosen.log_scales, np.float64))[:, None, :]).sum(-1))
-    along = np.asarray(chosen.means, np.float64) @ axes
+def _ends(
+    points: Float[np.ndarray, "n 3"], shapes: Float[np.ndarray, "n 3 3"], axes: Float[np.ndarray, "3 3"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Along each column of `axes`, from where to where Gaussians reach, to one standard deviation, without strays. The
+    columns of a Gaussian's shape are its axes, as long as its standard deviations."""
+    reach = np.linalg.norm(axes.T @ shapes, axis=2)
+    along = points @ axes
     return np.quantile(along - reach, STRAY, axis=0), np.quantile(along + reach, 1 - STRAY, axis=0)

@@ -6,7 +6,7 @@
     GET  /mask.png        the selection in a frame
     GET  /healthz, /openapi.json, /
 
-What is asked is computed by one thread, as XLA takes all cores for it; who waits is served in turn, and more than
+What is new is computed by as many threads as there are cores; who waits is served in turn, and more than
 `Limits.waiting` are told to come back. Only what a field holds is ever read: no name in a request is a path.
 """
 
@@ -35,6 +35,7 @@ from jsecon.errors import InputError
 from jsecon.files import parsed_json
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import embedder_of_field
+from jsecon.process import cores
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import LanguageField
@@ -45,15 +46,15 @@ KEPT = 64
 
 
 class Scene:
-    """A loaded field, asked by one thread at a time."""
+    """A loaded field. As many threads as there are cores compute an answer at a time; what is known is told at once."""
 
     def __init__(self, name: str, field: LanguageField, embedder: Any):
         self.name, self.field, self.embedder = name, field, embedder
-        self._alone = threading.Lock()
+        self._free = threading.BoundedSemaphore(cores())
+        self._known: dict[tuple, dict[str, Any]] = {}
         self._gaussians = jax.device_put(field.gaussians)
         self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
         self._answer = functools.lru_cache(KEPT)(self._ask)
-        self._figures = functools.lru_cache(KEPT * KEPT)(self._tell)
 
     def _ask(self, text: str, pixel: tuple | None, by: str, threshold: float | None, several: bool) -> Answer:
         if pixel is not None:
@@ -62,7 +63,7 @@ class Scene:
 
     def ask(self, text: str, pixel: tuple | None = None, by="votes", threshold=None, several=False) -> Answer:
         """The answer to a text, or to a pixel (frame, column, row); those asked last are kept."""
-        with self._alone:
+        with self._free:
             return self._answer(text, pixel, by, threshold, several)
 
     def _tell(self, *question: Any) -> dict[str, Any]:
@@ -74,12 +75,18 @@ class Scene:
 
     def tell(self, text: str, pixel: tuple | None = None, by="votes", threshold=None, several=False) -> dict[str, Any]:
         """What and where the answer is, as plain numbers; kept for longer than the answer."""
-        with self._alone:
-            return self._figures(text, pixel, by, threshold, several)
+        question = text, pixel, by, threshold, several
+        if (told := self._known.get(question)) is None:
+            with self._free:
+                told = self._tell(*question)
+            if len(self._known) >= KEPT * KEPT:
+                self._known.clear()
+            self._known[question] = told
+        return told
 
     def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
         """A frame's name and the selection there as a PNG; of no frame the one that shows most of it."""
-        with self._alone:
+        with self._free:
             frames = [frame] if frame is not None else best_frames(self.field, answer, 1) or [0]
             shown = selection_mask(self._gaussians, self._cameras[frames[0]], jnp.asarray(answer.mask))
         return self.field.names[frames[0]], cv2.imencode(".png", np.asarray(shown, np.uint8) * 255)[1].tobytes()

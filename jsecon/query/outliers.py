@@ -7,6 +7,7 @@ points of a cell with enough of them are core points without a search, the core 
 what is left is whether two cells touch.
 """
 
+import hashlib
 from typing import Any
 
 import numpy as np
@@ -58,22 +59,38 @@ def outliers_removed(
     keep: str = "largest",
 ) -> tuple[Bool[np.ndarray, " n"], str]:
     """What `remove_outliers` returns, and why DBSCAN was not needed, or ""."""
-    means = np.asarray(means)
-    kept = np.asarray(mask) & np.isfinite(means).all(axis=1)
+    kept = np.array(mask, bool)
     chosen = np.flatnonzero(kept)
+    points = np.asarray(means)[chosen].astype(np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    kept[chosen[~finite]] = False
+    chosen, points = chosen[finite], points[finite]
     if len(chosen) < min_samples:
         return kept, f"fewer than {min_samples} Gaussians are selected"
-    points = means[chosen].astype(np.float64)
-    eps = default_eps(points) if eps is None else eps
+    key = hashlib.blake2b(f"{eps} {min_samples} {keep}".encode() + points.tobytes()).digest()
+    if (known := _known.get(key)) is None:
+        known = _kept_of(points, default_eps(points) if eps is None else eps, min_samples, keep)
+        if len(_known) >= _REMEMBERED:
+            _known.clear()
+        _known[key] = known
+    inside, why = known
+    kept[chosen[~inside]] = False
+    return kept, why
+
+
+_REMEMBERED = 256
+"""selections, of a byte a selected Gaussian: texts in other words often select the same"""
+_known: dict[bytes, tuple[Bool[np.ndarray, " m"], str]] = {}
+
+
+def _kept_of(points: np.ndarray, eps: float, min_samples: int, keep: str) -> tuple[Bool[np.ndarray, " m"], str]:
+    """Which of the points (M, 3) stay, and why DBSCAN was not needed, or ""."""
     if one_component(points, eps):
-        return kept, "the selection is one component"
+        return np.ones(len(points), bool), "the selection is one component"
     labels = dbscan(points, eps, min_samples)
     if labels.max() < 0:
-        return kept, ""
-    inside = labels == np.bincount(labels[labels >= 0]).argmax() if keep == "largest" else labels >= 0
-    result = np.zeros_like(kept)
-    result[chosen[inside]] = True
-    return result, ""
+        return np.ones(len(points), bool), ""
+    return labels == np.bincount(labels[labels >= 0]).argmax() if keep == "largest" else labels >= 0, ""
 
 
 def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:
@@ -87,7 +104,7 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
         if len(candidates) > 1:
             sample = candidates[:: -(-len(candidates) // 20_000)]
             neighbours = min(4, len(candidates))
-            spacing = np.median(KDTree(candidates).query(sample, k=neighbours)[0][:, -1])
+            spacing = np.median(KDTree(candidates, balanced_tree=False).query(sample, k=neighbours)[0][:, -1])
             if spacing > 0:
                 return float(spacings * spacing)
     return 1.0
@@ -181,7 +198,7 @@ def _close_pairs(places: np.ndarray, apart: int) -> np.ndarray:
     """(P, 2) pairs of cells, each once, that are at most `apart` apart along each axis."""
     if len(places) == 1:
         return np.empty((0, 2), int)
-    return KDTree(places).query_pairs(apart + 0.5, p=np.inf, output_type="ndarray")
+    return KDTree(places, balanced_tree=False).query_pairs(apart + 0.5, p=np.inf, output_type="ndarray")
 
 
 def _join(count: int, pairs: np.ndarray) -> np.ndarray:
