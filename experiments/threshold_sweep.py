@@ -60,10 +60,12 @@ def main(plan: Sweep) -> str:
     header = ("asked by", *(f"{threshold:g}" for threshold in plan.thresholds), "spread")
     source = "twins in LERF-OVS's layout" if any(cell["twin"] for cell in cells) else "LERF-OVS"
     text = f"mIoU over the threshold, {source}; {lerf.NOTES}\n\n" + results.table(header, rows)
-    each = {way: by_query(cells, way, plan.thresholds) for way in WAYS}
-    apart = {way: best_thresholds(of, plan.thresholds) for way, of in each.items()}
+    each = {way: rows for way in WAYS if len(rows := by_query(cells, way, plan.thresholds))}
+    apart = {way: best_thresholds(rows, plan.thresholds) for way, rows in each.items()}
     columns = ("asked by", "queries", "best threshold: median", "10 %", "90 %", "lost by one threshold for all")
-    text += "\n\nQuery by query:\n\n" + results.table(columns, [(way, *told) for way, told in apart.items()])
+    if apart:
+        text += "\n\nQuery by query, where single texts are kept:\n\n"
+        text += results.table(columns, [(way, *told) for way, told in apart.items()])
     figure = _figure(plan.thresholds, curves, each)
     results.save(Path(plan.out), plan, {"curves": curves, "best thresholds": apart, "cells": cells}, text, figure)
     print(text)
