@@ -20,7 +20,8 @@ from jsecon.app import question
 from jsecon.association.algorithm1 import iou_matrix
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
-from jsecon.language import autoencoder
+from jsecon.files import write_arrays
+from jsecon.language import autoencoder, field as field_file
 from jsecon.language.field import load_field
 from jsecon.pipeline import cache, networks, pipeline, stages
 from jsecon.pipeline.progress import Listener
@@ -277,6 +278,12 @@ def writer_that_stops(stop, victim, nth=1):
     return savez_or_stop
 
 
+def field_writer_that_stops(file, arrays):
+    """`write_arrays`, but only a part reaches the disk."""
+    write_arrays(file, dict(list(arrays.items())[:3]))
+    raise Killed
+
+
 def kill():
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -308,6 +315,7 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
         with monkeypatch.context() as patch:
             patch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
             patch.setattr(np, "savez", writer_that_stops(raise_killed, victim))
+            patch.setattr(field_file, "write_arrays", field_writer_that_stops)
             with pytest.raises(Killed):
                 pipeline.run(run.options, out)
 

@@ -26,7 +26,7 @@ from jsecon.pipeline.models import examine
 from jsecon.query.anchored import query_anchored
 from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, best_presence, contrasts, presence
 from jsecon.query.several import query_several
-from jsecon.vision.protocols import Embedder, Logits, logits_of
+from jsecon.vision.protocols import Embedder, Logits
 
 LAYOUTS = ("immich", "transformers.js")
 TEXTS = ["a red thing", "blue", "a a a a a a a a a a a green a a a", "yellow red blue"]
@@ -100,7 +100,7 @@ def test_a_clip_folder_is_what_it_was_with_open_clip_s_configuration_beside_it(t
     write_json(folder / "config.json", {"embed_dim": 3, "text_cfg": {"context_length": 77, "vocab_size": 49408}})
     assert ClipEmbedder(folder).name == name
     assert find_clip(folder).rules is None
-    assert logits_of(ClipEmbedder(folder)) is None
+    assert ClipEmbedder(folder).logits is None
 
 
 def test_mobileclip_s_images_are_not_normalised(tmp_path):
@@ -165,7 +165,7 @@ def test_a_length_that_is_left_out_is_transformers_own(tmp_path):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_scale_and_bias_are_found_where_the_layout_has_them(folders, layout):
-    found = logits_of(ClipEmbedder(folders[layout], threads=1))
+    found = ClipEmbedder(folders[layout], threads=1).logits
     np.testing.assert_allclose(found, (SCALE, BIAS), rtol=1e-4)
     told = re.search(r"sigmoid\((\d+\.\d+) cosine (-\d+\.\d+)\), from", _told(folders[layout]))
     np.testing.assert_allclose([float(told[1]), float(told[2])], (SCALE, BIAS), rtol=1e-4)
@@ -173,7 +173,7 @@ def test_scale_and_bias_are_found_where_the_layout_has_them(folders, layout):
 
 def test_a_folder_without_them_says_so_and_has_no_probability(tmp_path):
     folder = write_siglip(tmp_path / "model", "immich", joint=False)
-    assert logits_of(ClipEmbedder(folder)) is None
+    assert ClipEmbedder(folder).logits is None
     assert "refused by its contrast" in _told(folder)
     assert "logits.json" in _told(folder)
 

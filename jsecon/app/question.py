@@ -36,7 +36,6 @@ from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
 from jsecon.query.several import parts_of_question, query_several
 from jsecon.query.silhouette import silhouette_members
 from jsecon.types import LanguageField, Selection
-from jsecon.vision.protocols import logits_of
 
 METHODS = ("votes", "silhouette", "code", "one_step", "canonical")
 """votes, code: anchored, membership by a Gaussian's votes or its code; silhouette: by votes, then one by one by the
@@ -139,7 +138,8 @@ def ask_text(
     if not len(field.canonical):  # its embeddings came from files, without phrases: those of who reads the text
         field = dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
     wanted, unwanted = parts_of_question(text)
-    logits = logits_of(embedder) if by in ("votes", "silhouette", "code") else None
+    # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
+    logits = getattr(embedder, "logits", None) if by in ("votes", "silhouette", "code") else None
     if several or unwanted or len(wanted) > 1:
         if by not in ("votes", "silhouette"):
             remedy = "Leave out --by, or ask for one thing."

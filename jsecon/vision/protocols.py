@@ -87,12 +87,6 @@ class Logits(NamedTuple):
     bias: float
 
 
-def logits_of(embedder: object) -> Logits | None:
-    """Those of an embedder that was trained to tell whether a text is true of an image (its attribute `logits`); None
-    for all others, whose cosines only rank."""
-    return getattr(embedder, "logits", None)
-
-
 @dataclasses.dataclass(frozen=True)
 class Networks:
     """What looks at a run's frames. Networks are opened when first needed, and closed when their stage is done."""
