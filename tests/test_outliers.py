@@ -149,3 +149,16 @@ def test_options_out_of_range_are_told():
     for options in ({"keep": "some"}, {"eps": 0.0}, {"eps": -1.0}, {"min_samples": 0}, {"eps": float("nan")}):
         with pytest.raises(ValueError, match="remove_outliers"):
             remove_outliers(points, mask, **options)
+
+
+def test_a_selection_looked_at_before_is_answered_alike_and_other_options_are_not_its():
+    rng = np.random.default_rng(5)
+    means = np.concatenate([rng.normal(size=(200, 3)), rng.normal(size=(80, 3)) + 30, [[100.0, 0, 0]]])
+    whole = np.ones(len(means), bool)
+    first = remove_outliers(means, whole)
+    again = remove_outliers(means, whole)
+    np.testing.assert_array_equal(first, again)
+    again[:] = False  # what is given out is the caller's
+    np.testing.assert_array_equal(remove_outliers(means, whole), first)
+    assert first.sum() < remove_outliers(means, whole, keep="all").sum()
+    assert remove_outliers(means, whole, eps=1000.0).all()

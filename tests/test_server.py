@@ -19,6 +19,7 @@ from jsecon.app.guard import Guard, Limits
 from jsecon.app.server import Scene, application, open_scenes, ready
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
+from jsecon.process import cores
 from jsecon.vision.colours import ColourEmbedder
 
 LIMITS = Limits(body=2000, seconds_to_send=0.3, waiting=4, text=80)
@@ -46,6 +47,26 @@ def test_a_text_and_a_pixel_are_answered(client, scenes):
     assert pixel["place"]["points"] == pixel["count"]
     assert len(pixel["place"]["axes"]) == 3
     assert client.post("/query", json={"at": [1, 24, 20]}).json()["count"] == pixel["count"]
+
+
+def test_what_is_known_is_told_while_all_cores_are_taken(scenes):
+    desk, told = scenes["desk"], []
+    first = desk.tell("red")
+    for _ in range(cores()):
+        desk._free.acquire()
+    try:
+        known, new = (
+            threading.Thread(target=lambda t=t: told.append(desk.tell(t)), daemon=True) for t in ("red", "blue")
+        )
+        new.start()
+        known.start()
+        known.join(20)
+        assert told == [first]  # the new one waits
+    finally:
+        for _ in range(cores()):
+            desk._free.release()
+    new.join(20)
+    assert len(told) == 2
 
 
 def test_what_it_knows_and_files_of_the_answer(client, scenes):
