@@ -83,7 +83,8 @@ class Meddler(Listener):
     def progress(self, name):
         def meddle(done, total):
             if name == "load" and done == 1 and self.file is not None:
-                self.file.write_bytes(self.file.read_bytes() + b"more")
+                with self.file.open("ab") as file:  # grows at once: rewritten, it would be empty for a moment
+                    file.write(b"more")
 
         yield meddle
 
