@@ -153,6 +153,18 @@ def dealt_out(
     return [parts[t % world][t // world] for t in range(count)]
 
 
+def keep_own_programs() -> None:
+    """Lets this process, one of several, keep its compiled programs on disk, if it has a folder for them.
+
+    jax leaves that to the first (jax/_src/compiler.py, `_cache_write`). But a program is kept for its device, and every
+    process has its own: the others would compile all of theirs at every run.
+    """
+    from jax._src import distributed
+
+    jax.local_devices()  # from here on jax knows the process by its devices' number
+    distributed.global_state.process_id = 0
+
+
 def parcel(tree: Any) -> bytes:
     """A tree of arrays, plain values, dicts, lists and tuples as one string of bytes, without pickle."""
     arrays: dict[str, np.ndarray] = {}

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import jsecon
 from jsecon.errors import InputError
-from jsecon.parallel import exchanged, parcel, parcel_read
+from jsecon.parallel import exchanged, keep_own_programs, parcel, parcel_read
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import Record, Results, Stage
@@ -149,6 +149,7 @@ def join(options: Options, index: int, count: int, address: str) -> None:
         remedy = "Start all of them, and see that the address is process 0's own and can be reached."
         raise InputError(f"--coordinator {address}", found, "all of them at that address", remedy) from error
     atexit.unregister(jax.distributed.shutdown)  # it waits for the others, also where this one ends in an error
+    keep_own_programs()
     mine = f"jsecon {jsecon.__version__}, {options}"
     first = exchanged(mine.encode())[0].decode()
     if first != mine:
