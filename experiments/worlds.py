@@ -1,15 +1,18 @@
 """Worlds that fight back: every fault that real vision has and the tables' does not, swept alone and together.
 
     python -m experiments.worlds [--scenes figurines teatime] [--seeds 10 11] [--choosing 0] [--only FAULT ...]
-                                 [--values 1 0.5] [--quick] [--out FOLDER] [--processes N]
+                                 [--values 1 0.5] [--scenes-trained figurines] [--seeds-trained 10] [--quick]
+                                 [--out FOLDER] [--processes N]
 
 Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as its paper
 does (by the relevancy) and by the contrast with a threshold or the ascent for > 10/255 (ours: of one region, of all
 that answer, and of their parts): the best in that world on the seeds `--choosing`, for each figure its own. None may
-refuse a text.
+refuse a text. Methods that train take minutes a setting: those of `--scenes-trained` and `--seeds-trained` have them
+too, in tables of their own beside all the others there.
 """
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +28,8 @@ FRAMES = "kinds", "camouflage"
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
 READ = ("relevancy, threshold", *(f"contrast, threshold{way}" for way in ("", ", all", ", parts")))
 READ += tuple(f"contrast, lenient silhouette{way}" for way in ("", ", parts"))
+READ_TRAINED = (*READ, fair.PUBLISHED, "one mask", "cosine, threshold")
+"""of methods that train; with any of their own constants ("16 roots", "one mask", 0.98)"""
 LEFT_OUT = "ours, outspoken views"
 """a row of `experiments.fair` that is an older one of ours"""
 FIGURES = ("miou", "miou_vala")
@@ -40,6 +45,10 @@ class Asked:
     only: tuple[str, ...]
     values: tuple[float, ...]
     """how hard"""
+    scenes_trained: tuple[str, ...]
+    """of `scenes`, and"""
+    seeds_trained: tuple[int, ...]
+    """of `seeds`: where methods that train are measured too."""
     quick: bool
     out: str
 
@@ -60,21 +69,17 @@ def worlds(only: tuple[str, ...], values: tuple[float, ...]) -> dict[tuple[str, 
     return found
 
 
-def plan_of(level: str, size: dict, asked: Asked, processes: int) -> Plan:
-    """Every row on every scene and seed of a world."""
+def plan_of(level: str, size: dict, asked: Asked, processes: int, trained: bool) -> Plan:
+    """Every row that needs no training on every scene and seed of a world, or the others where they are asked for."""
     table = lerf.QUICK if asked.quick else lerf.PLAN
     data = table.data
     options = tuple({**dict(data.size), **size}.items())
-    seeds = tuple(dict.fromkeys((*asked.choosing, *asked.seeds)))
-    scenes = data.scenes if asked.quick else asked.scenes
+    seeds = tuple(dict.fromkeys((*asked.choosing, *(asked.seeds_trained if trained else asked.seeds))))
+    scenes = asked.scenes_trained if trained else asked.scenes
     return dataclasses.replace(
         table,
-        data=dataclasses.replace(data, seeds=seeds, scenes=scenes, size=options),
-        methods=tuple(
-            row
-            for row in rows_of(points=False)
-            if row.split(": ")[1] in READ and not row.startswith((LEFT_OUT, *TRAINED))
-        ),
+        data=dataclasses.replace(data, seeds=seeds, scenes=data.scenes if asked.quick else scenes, size=options),
+        methods=tuple(row for row in rows_of(points=False) if is_read(row, trained)),
         level=level,
         sweep=(),
         processes=processes,
@@ -83,10 +88,19 @@ def plan_of(level: str, size: dict, asked: Asked, processes: int) -> Plan:
     )
 
 
-def of_world(cells: list[dict], asked: Asked) -> dict[str, dict[str, float]]:
-    """Each method's figures on the seeds that are reported, read as was best on the others."""
-    best = fair.chosen(cells, asked.choosing, FIGURES)
-    held = [cell for cell in cells if cell["seed"] in asked.seeds]
+def is_read(row: str, trained: bool) -> bool:
+    """Whether a row of `experiments.fair` is one of these tables."""
+    method, way = row.split(": ")
+    if not trained:
+        return way in READ and method not in (LEFT_OUT, *TRAINED)
+    plain = re.sub(r"^\d+ roots, | 0\.\d+$|, one mask$", "", way)
+    return method in TRAINED and plain in READ_TRAINED
+
+
+def of_world(cells: list[dict], choosing: tuple[int, ...]) -> dict[str, dict[str, float]]:
+    """Each method's figures on the seeds that are reported, read as was best on those to choose on."""
+    best = fair.chosen(cells, choosing, FIGURES)
+    held = [cell for cell in cells if cell["seed"] not in choosing]
     found = {}
     best.pop(fair.ONE_READING)
     for method, rows in best.items():
@@ -110,8 +124,8 @@ def layout(found: dict[tuple[str, float], dict[str, dict[str, float]]]) -> str:
     return "\n\n".join(parts)
 
 
-def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]]):
-    """mIoU over how hard each fault is, a line for each method."""
+def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained: dict | None = None):
+    """mIoU over how hard each fault is, a line for each method; dashed, on their own scenes, for those that train."""
     from matplotlib.figure import Figure
 
     faults = [f for f in dict.fromkeys(fault for fault, _ in found) if f not in ("none", "together")]
@@ -122,29 +136,43 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]]):
         hard = [0.0, *sorted(v for f, v in found if f == fault)]
         for method in found["none", 0.0]:
             axes.plot(hard, [found["none" if v == 0 else fault, v][method]["miou"] for v in hard], "o-", label=method)
+        for method in set(trained["none", 0.0]) - set(found["none", 0.0]) if trained else ():
+            told = [trained["none", 0.0][method]["miou"], trained[fault, HARD][method]["miou"]]
+            axes.plot([0.0, HARD], told, "s--", markersize=3, label=method)
         if n == 0:
-            axes.legend(fontsize=6)
+            axes.legend(fontsize=5)
     figure.tight_layout()
     return figure
 
 
 def main(asked: Asked, processes: int) -> str:
-    """The table, written."""
-    methods, found, helper = rows_of(points=False), {}, False
-    for name, (level, size) in worlds(asked.only, asked.values).items():
+    """The tables, written."""
+    methods, found, trained, helper = rows_of(points=False), {}, {}, False
+
+    def filled(name: tuple[str, float], trained: bool) -> list[dict]:
+        plan = plan_of(*worlds(asked.only, asked.values)[name], asked, processes, trained)
+        return fill(plan, methods, tell=lambda line: print(line, flush=True))
+
+    for name in worlds(asked.only, asked.values):
         try:
-            plan = plan_of(level, size, asked, processes)
-            cells = fill(plan, methods, tell=lambda line: print(line, flush=True))
+            cells = filled(name, trained=False)
+            found[name] = of_world(cells, asked.choosing)
+            print(name, found[name], flush=True)
+            if asked.scenes_trained and (name[1] in (0.0, HARD)):
+                seeds = (*asked.choosing, *asked.seeds_trained)
+                here = [cell for cell in cells if cell["scene"] in asked.scenes_trained and cell["seed"] in seeds]
+                trained[name] = of_world(filled(name, trained=True) + here, asked.choosing)
         except SystemExit:  # of a helper, which has no table to write
             helper = True
-            continue
-        found[name] = of_world(cells, asked)
-        print(name, found[name], flush=True)
     if helper:
         return ""
     text = layout(found)
+    if trained:
+        where = f"{', '.join(asked.scenes_trained)}, seed {', '.join(map(str, asked.seeds_trained))}"
+        text += f"\n\nWith the methods that train, at {where} alone:\n\n{layout(trained)}"
     metrics = {f"{fault} {value:g}": told for (fault, value), told in found.items()}
-    results.save(Path(asked.out), asked, metrics, text, curves(found))
+    metrics |= {f"{fault} {value:g}, with those that train": told for (fault, value), told in trained.items()}
+    results.save(Path(asked.out), asked, metrics, text, curves(found, trained))
     print(text)
     return text
 
@@ -154,10 +182,13 @@ if __name__ == "__main__":
     parser.add_argument("--choosing", nargs="+", type=int, default=[0], help="that readings are chosen on")
     parser.add_argument("--only", nargs="+", default=list(FAULTS), choices=FAULTS)
     parser.add_argument("--values", nargs="+", type=float, default=[HARD, HALF], help="how hard, 0 to 1")
+    parser.add_argument("--scenes-trained", nargs="+", default=[], help="that methods which train are measured on too")
+    parser.add_argument("--seeds-trained", nargs="+", type=int, default=[], help="and the seeds that they have there")
     given = parser.parse_args()
     seeds, choosing, only = tuple(given.seeds), tuple(given.choosing), tuple(given.only)
     if given.quick:
         seeds, choosing, only = (1,), (0,), ("parts", "kinds")
     values = (HARD,) if given.quick else tuple(given.values)
-    place = place_of(given, "worlds")
-    main(Asked(tuple(given.scenes), seeds, choosing, only, values, given.quick, place), given.processes)
+    there = tuple(given.scenes_trained), tuple(given.seeds_trained) or seeds[:1]
+    asked = Asked(tuple(given.scenes), seeds, choosing, only, values, *there, given.quick, place_of(given, "worlds"))
+    main(asked, given.processes)

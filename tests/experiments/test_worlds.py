@@ -15,6 +15,7 @@ from experiments import kinds, worlds
 from experiments.datasets.twins import by_kind, camouflaged
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, made_text_space, named_after
 from experiments.simulated_vision.worlds import World, seen_in, world_of
+from experiments.tables.rows import TRAINED
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.data.synthetic.room import TABLE_WOOD, linear, make_room
 from jsecon.errors import InputError
@@ -181,15 +182,19 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     found = worlds.worlds(worlds.FAULTS, (1.0, 0.5))
     assert {fault for fault, _ in found} == {"none", "together", *worlds.FAULTS}
     assert all(world_of(level)[0] == "medium" for level, _ in found.values())
-    asked = worlds.Asked(("ramen",), (10,), (0,), ("kinds",), (1.0,), False, "nowhere")
-    plan = worlds.plan_of(*worlds.worlds(asked.only, asked.values)["kinds", 1.0], asked, 1)
+    asked = worlds.Asked(("ramen",), (10,), (0,), ("kinds",), (1.0,), ("ramen",), (10,), False, "nowhere")
+    plan = worlds.plan_of(*worlds.worlds(asked.only, asked.values)["kinds", 1.0], asked, 1, trained=False)
     assert dict(plan.data.size)["kinds"]
     assert plan.data.seeds == (0, 10)
+    rows = worlds.plan_of("medium", {}, asked, 1, trained=True).methods
+    assert {row.split(": ")[0] for row in rows} == set(TRAINED)
+    assert not set(rows) & set(plan.methods)
+    assert {"OpenGaussian: 16 roots, as published", "the paper's path: contrast, threshold 0.98"} <= set(rows)
     own, cells = {"VALA: as published": 0.5, "VALA: contrast, threshold": 0.4, "ours, consensus: x": 0.6}, []
     for seed, value in ((0, 0.1), (10, 0.3)):
         cell = {"seed": seed, "scene": "ramen"}
         cells += [cell | {"method": m, "miou": at + value, "miou_vala": at - value} for m, at in own.items()]
-    told = worlds.of_world(cells, asked)
+    told = worlds.of_world(cells, asked.choosing)
     assert told["VALA"] == {"miou": pytest.approx(0.8), "miou_vala": pytest.approx(0.2)}
     text = worlds.layout({("none", 0.0): told, ("kinds", 1.0): told | {"VALA": {"miou": 0.99, "miou_vala": 0.0}}})
     assert "| kinds 1 | 0.990 | 0.900 | -0.090 |" in text
