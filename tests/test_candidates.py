@@ -35,8 +35,12 @@ def test_the_answer_is_the_first_candidate(field):
 def test_candidates_of_a_composite_text_are_those_of_its_wanted_parts(field):
     each = {word: {c.region: c.score for c in candidates(field, EMBEDDER, word)} for word in ("red", "blue", "green")}
     both = candidates(field, EMBEDDER, "red or blue but not green")
+    near = {region: max(each["red"][region], each["blue"][region]) for region in each["red"]}
+    assert {found.region for found in both} == {region for region in near if near[region] > each["green"][region]}
+    assert 0 < len(both) < len(near)
     for found in both:
-        assert found.score == pytest.approx(max(each["red"][found.region], each["blue"][found.region]))
+        assert found.score == pytest.approx(near[found.region])
+    assert candidates(field, EMBEDDER, "red but not red") == []
     with pytest.raises(InputError, match="no colour word"):
         candidates(field, EMBEDDER, "the meaning of life")
 

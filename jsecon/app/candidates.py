@@ -15,7 +15,7 @@ from jsecon.query.direct import similarities
 from jsecon.query.masks import HIDDEN_LOGIT
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
 from jsecon.query.retrieval import apart_from_scene, contrasts, evidence
-from jsecon.query.several import parts_of_question
+from jsecon.query.several import ROUNDING, parts_of_question
 from jsecon.types import Camera, LanguageField
 
 SIDE = 1025
@@ -38,17 +38,21 @@ class Candidate:
 def candidates(field: LanguageField, embedder: Any, thing: str | int, count: int = 6) -> list[Candidate]:
     """The `count` regions nearest to a text or a region, the nearest first, as queries weigh them (`evidence`).
 
-    For a text the wanted part of `parts_of_question` that is nearest counts; for a region what sets both apart from the
-    scene, itself left out. Raises InputError for a text that the embedder doesn't understand.
+    For a text the nearest wanted part of `parts_of_question` counts, and a region as near to an unwanted one is left
+    out; for a region what sets both apart from the scene, itself left out. Raises InputError for a text that the
+    embedder doesn't understand.
     """
     if field.regions.count == 0:
         return []
     table, pixels = jnp.asarray(field.regions.embeddings), jnp.asarray(field.regions.pixels)
     if isinstance(thing, str):
         canonical = jnp.asarray(field.canonical if len(field.canonical) else embedder.canonical)
-        texts = embedder.embed_text(parts_of_question(thing)[0])
-        each = [_contrasts(table, jnp.asarray(text), canonical, pixels) for text in texts]
-        score, known = np.max([found for found, _ in each], axis=0), np.asarray(each[0][1])
+        wanted, unwanted = parts_of_question(thing)
+        texts = jnp.asarray(embedder.embed_text(wanted + unwanted))
+        each = [_contrasts(table, text, canonical, pixels) for text in texts]
+        near, known = np.stack([found for found, _ in each]), np.array(each[0][1])
+        score = near[: len(wanted)].max(0)
+        known &= score > near[len(wanted) :].max(0, initial=-np.inf) + ROUNDING
     else:
         score, known = (np.array(a) for a in _likeness(table, pixels, min(thing, field.regions.count - 1)))
         known[thing : thing + 1] = False
