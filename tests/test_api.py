@@ -140,7 +140,7 @@ HEIC 570. The demo's harder room, its film and report, notebooks 590. Several pr
 in all. SigLIP with its texts, scale and bias, MobileCLIP, SAM 2.1 and 3 for transformers.js: 40 in the core, 420 in
 all. Scenes larger than memory 810 in the core (a view's splats in bands 240, votes in blocks 370, queries 110, the
 mapped field and its columns 80) and 850 in all. Outliers of selections that were looked at before 20. SAM 3 asked by
-phrases 420 (the model 275, the frames that are asked and what they find 100, its options and frames by name 45)."""
+phrases 420 (the model 270, the frames that are asked and what they find 100, its options and frames by name 50)."""
 
 
 def test_the_library_stays_within_its_budget_of_lines():

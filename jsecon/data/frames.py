@@ -198,8 +198,9 @@ def assemble(
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
     if only is not None:
-        if missing := sorted(set(only) - set(names)):
-            told, wanted = f"{len(names)} frames, {names[0]} ... {names[-1]}", f"one called {missing[0]}"
+        missing = sorted(set(only) - set(names))
+        if missing or not only:
+            told, wanted = f"{len(names)} frames, {names[0]} ... {names[-1]}", f"one called {[*missing, '...'][0]}"
             raise InputError(where, told, wanted, "Give the capture that these names are of.")
         kept = [i for i, name in enumerate(names) if name in only]
         shots, poses, names = [shots[i] for i in kept], poses[kept], tuple(names[i] for i in kept)

@@ -42,11 +42,7 @@ PUBLISHED = (
     "Xenova/clip-vit-base-patch16."
 )
 _GRAPHS = ("image_encoder.onnx", "language_encoder.onnx", "decoder.onnx")
-_WORDS = {
-    "language_mask": "text_attention_mask",
-    "language_features": "text_memory",
-    "language_embeds": "text_embeds",
-}
+_WORDS = {"language_mask": "text_attention_mask", "language_features": "text_memory", "language_embeds": "text_embeds"}
 """input of the decoder -> output of the language encoder"""
 _SIZE = ("original_height", "original_width")
 _BOXES: dict[str, tuple[int | None, ...]] = {
