@@ -14,6 +14,7 @@ from capture_files import png, small_capture, transforms, write_images, write_te
 from clip_files import fixture as clip_tokens, vocabulary, write_clip, write_tokenizer
 from PIL import Image
 from sam2_files import write_sam2
+from sam3_files import KINDS as SAM3_KINDS, write_sam3
 from sam_files import write_sam
 from siglip_files import write_siglip
 from splat_files import compressed_ply, scene, sog, splat, spz
@@ -36,6 +37,7 @@ from jsecon.language.field import check_field, load_field, save_field
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
 from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.networks.sam3 import PhraseMasks, Sam3
 from jsecon.networks.sigmoid import MOST_BIAS, MOST_SCALE
 from jsecon.networks.tokenizer import load_tokenizer
 from jsecon.pipeline import cache
@@ -644,6 +646,25 @@ def sam2(folder: Path) -> Iterator[Case]:
         yield Case(_inputs_of(folder / version), lambda version=version: read(version), whole)
 
 
+def sam3(folder: Path) -> Iterator[Case]:
+    """SAM 3 folders, put to the test, then asked for what a phrase names in a frame."""
+    frame = np.full((24, 32, 3), (230, 26, 26), np.uint8)
+
+    def read(name: str) -> PhraseMasks:
+        model = Sam3(folder / name, threads=1)
+        model.check()
+        return model(frame, "red mug")
+
+    def whole(found: PhraseMasks) -> None:
+        assert found.masks.shape == (len(found.scores), 24, 32)
+        assert found.masks.dtype == bool
+        assert np.isfinite(found.scores).all()
+
+    for name in SAM3_KINDS:
+        write_sam3(folder / name, name, side=56)
+        yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
+
+
 def videos(folder: Path) -> Iterator[Case]:
     """Videos of three containers."""
     rng = np.random.default_rng(0)
@@ -684,6 +705,6 @@ READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
             field,
             kept,
         ),
-        *(tokenizer, clip, siglip, sam, sam2, videos),
+        *(tokenizer, clip, siglip, sam, sam2, sam3, videos),
     )
 }

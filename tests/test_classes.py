@@ -11,6 +11,7 @@ from small_field import unit_rows
 from jsecon.query.classes import query_classes
 from jsecon.query.retrieval import contrasts
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.vision.protocols import Logits
 
 SIZE, REGIONS, KEPT = 12, 6, 3
 
@@ -175,6 +176,29 @@ def test_a_surface_like_the_scene_as_a_whole_is_quieter_than_a_thing_on_it():
     np.testing.assert_array_equal(labels, [1, 0])
     for retrieval in ("contrast", "cosine"):  # who asks for the thing does not get its foot: nor by class
         np.testing.assert_array_equal(query_classes(field, rows, retrieval=retrieval)[0], [0, 0])
+
+
+def test_a_probability_refuses_classes_as_it_refuses_texts():
+    field, texts, rows = made_field(600), unit_rows(np.random.default_rng(1), 5, SIZE), np.arange(REGIONS)
+    known = field.regions
+    cosines = np.asarray(known.embeddings, np.float64) @ texts.T
+    best = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1).argmax(1)
+    own = np.sort(cosines[rows, best])  # a region is of its best class, or of none
+    logits = Logits(40.0, float(np.log(0.01 / 0.99) - 40 * (own[2] + own[3]) / 2))
+    there = 1 / (1 + np.exp(-40 * cosines[rows, best] - logits.bias)) >= 0.01
+    assert there.sum() == 3
+    ids, weights, shown = (np.asarray(a) for a in (field.votes.regions, field.votes.weights, field.votes.shown))
+    part = np.zeros((600, 5))
+    for q in range(5):
+        inside = (ids >= 0) & np.isin(ids, rows[there & (best == q)])
+        part[:, q] = np.where(inside, weights, 0).sum(1) / np.maximum(np.where(inside, shown, 0).max(1), 1e-9)
+    labels, _ = query_classes(field, texts, logits=logits)
+    sure = (np.abs(part - 0.5) > 1e-5).all(1)
+    np.testing.assert_array_equal((np.asarray(labels) >= 0)[sure], (part >= 0.5).any(1)[sure])
+    assert 0.1 < (np.asarray(labels) < 0).mean() < 0.9
+    assert (np.asarray(query_classes(field, texts, logits=Logits(40.0, -1000.0))[0]) == -1).all()
+    every, _ = query_classes(field, texts, logits=logits, retrieval_threshold=0.0)
+    np.testing.assert_array_equal(every, query_classes(field, texts, retrieval_threshold=-2.0)[0])
 
 
 def test_refuses_what_it_cannot_ask():

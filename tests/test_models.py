@@ -3,6 +3,7 @@
 import pytest
 from clip_files import write_clip
 from sam2_files import write_sam2
+from sam3_files import write_sam3
 from sam_files import write_sam
 
 from jsecon.app import command_line
@@ -17,6 +18,7 @@ def folders(tmp_path_factory):
         "CLIP": write_clip(base / "clip", "immich"),
         "SAM": write_sam(base / "sam", "transformers.js"),
         "SAM 2": write_sam2(base / "sam2"),
+        "SAM 3": write_sam3(base / "sam3"),
     }
 
 
@@ -26,6 +28,7 @@ def folders(tmp_path_factory):
         ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
         ("SAM", ["decoder of transformers.js, 64 prompts per call", "images of 256 px", "--segmenter"]),
         ("SAM 2", ["2.1", "--tracker"]),
+        ("SAM 3", ["a phrase of 32 tokens", "raw decoder, images of 112 px", "--phrases"]),
     ],
 )
 def test_what_a_folder_is_good_for(folders, model, words):

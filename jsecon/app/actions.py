@@ -74,6 +74,7 @@ def _query(asked: Query, console: Console) -> Told:
         if len(given) % 2:
             remedy = "For example: --mask frame_00012 mug.png"
             raise InputError("--mask", " ".join(given), "FRAME PNG, in pairs", remedy)
+    _check_phrases(asked)
     require_writable(asked.out)
     with console.progress("field"):
         from jsecon.app import question
@@ -83,11 +84,13 @@ def _query(asked: Query, console: Console) -> Told:
 
         require_written(asked.out / f"answer.{asked.format}")
         field = load_field(asked.field)
-        embedder = _embedder(field, asked) if asked.texts else None
+        texts = asked.texts if asked.phrases is None else []
+        embedder = _embedder(field, asked) if texts else None
+    by_phrase, unread = ([], []) if asked.phrases is None else _phrases(field, asked, console)
     asking = question.questions_of(
         field,
         embedder,
-        texts=asked.texts,
+        texts=texts,
         pixels=pixels,
         masks=asked.mask or (),
         boxes=boxes,
@@ -99,9 +102,45 @@ def _query(asked: Query, console: Console) -> Told:
     )
     with console.progress("answers"):
         answers, refused = question.asked_each(asking)
+    answers, refused = by_phrase + answers, unread + refused
     how = {"views": asked.views, "ending": asked.format}
     told = write_answers(field, answers, asked.out, console, **how) if answers else {"answers": []}
     return told | {"refused": refused}
+
+
+def _check_phrases(asked: Query) -> None:
+    """Raises InputError where --phrases is given with what it has no use for, or --images without it."""
+    if asked.phrases is None:
+        if asked.images is not None:
+            raise InputError("--images", "no --phrases", "a SAM 3 model folder beside it", "Give --phrases DIR.")
+        return
+    if not asked.texts:
+        remedy = 'For example: jsecon query field.npz "red mug" --phrases sam3 --out answers'
+        raise InputError("--phrases", "no text", "a TEXT, the phrase", remedy)
+    given = {"by": asked.by != "votes", "all": asked.all, "even": asked.even}
+    given |= {"template": asked.template is not None, "embedder": asked.embedder is not None}
+    if any(given.values()):
+        found = " ".join(f"--{name}" for name, there in given.items() if there)
+        raise InputError(
+            "--phrases", found, "none of them: SAM 3 reads the texts and finds all of a kind", "Leave out."
+        )
+
+
+def _phrases(field: Any, asked: Query, console: Console) -> tuple[list[Any], list[InputError]]:
+    """What SAM 3 answers to the texts."""
+    with console.progress("phrases") as progress:
+        from jsecon.app import phrases
+        from jsecon.networks.sam3 import Sam3
+
+        assert asked.phrases is not None
+        sam3 = Sam3(asked.phrases)
+        frames = phrases.frames_of(field, asked.images or phrases.capture_of(field, asked.field.parent), asked.looks)
+        how = {"threshold": asked.threshold, "outliers": not asked.keep_outliers, "progress": progress}
+        answers, refused = phrases.ask_phrases(field, sam3, asked.texts, frames, **how)
+    for answer in answers:
+        seen = sum(map(bool, (answer.frames or {}).values()))
+        console.say(f"{answer.question!r}: seen in {seen} of {len(frames)} frames")
+    return answers, refused
 
 
 def _export(asked: Export, console: Console) -> Told:

@@ -68,7 +68,7 @@ def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[st
         "outliers_dropped": answer.dropped,
         "place": place,
         "left_out": answer.left_out,
-    }
+    } | ({} if answer.frames is None else {"frames": dict(answer.frames)})
 
 
 def write_answer(

@@ -52,7 +52,7 @@ class Answer:
 
     question: str
     by: str
-    """one of METHODS, or "outline"."""
+    """one of METHODS, or "outline", or "phrase"."""
     selection: Selection
     """as the query gave it."""
     mask: np.ndarray
@@ -62,6 +62,8 @@ class Answer:
     there: float | None = None
     """probability that the text is true of the region that answers it, or of the likeliest where none does; None of
     embedders without one (`Logits`)."""
+    frames: Mapping[str, list[float]] | None = None
+    """of a phrase: frame -> the score of each mask found there, best first; None of other questions."""
 
     @property
     def dropped(self) -> int:

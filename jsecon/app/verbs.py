@@ -128,6 +128,13 @@ class Query(Asking):
     """even the votes out over each Gaussian's ten neighbours before they are cut: sharper rims where masks are noisy"""
     keep_outliers: bool = False
     """leave out the last step, DBSCAN"""
+    phrases: Folder = None
+    """a SAM 3 model folder (.onnx): each text is put to it as a phrase, in some frames of the capture; selected is what
+    lies in its masks in most of the frames that see it, all things of the kind"""
+    images: Folder = None
+    """with --phrases: the capture, whose frames are asked (default: where the run had it)"""
+    looks: Annotated[int, {"metavar": "N"}] = 8
+    """with --phrases: in how many frames, evenly spaced; a frame takes long"""
     views: Annotated[int, {"metavar": "N"}] = 3
     """masks to write per query"""
     format: Literal["ply", "spz", "glb"] = "ply"

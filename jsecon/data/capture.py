@@ -1,6 +1,7 @@
 """Captures of any known format, and whether their views can be used together."""
 
 import itertools
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ def load_capture(
     long_side: int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
+    only: Collection[str] | None = None,
     progress: Progress = None,
 ) -> Capture:
     """Loads a capture folder: COLMAP (sparse/0 and images/), nerfstudio / instant-ngp (transforms.json; also that file
@@ -30,14 +32,14 @@ def load_capture(
 
     Frames come in name order. `downscale` (>= 1) divides width and height; where it is None, the longer side is brought
     to `long_side` px at most (None: kept). `frames`: at most so many, evenly spaced. `holdout` = k holds out the frames
-    0, k, 2k, ... of those taken; 0 or None none. What was left out or changed is in Capture.notes. A folder that holds
-    both formats is read as COLMAP, which has the points. `progress(done, total)` counts frames.
+    0, k, 2k, ... of those taken; 0 or None none. `only`: frames of these names alone, as Capture.names has them. What
+    was left out or changed is in Capture.notes. A folder that holds both formats is read as COLMAP, which has the
+    points. `progress(done, total)` counts frames.
     Raises InputError where the path holds neither, or what it holds is damaged.
     """
     check_options(downscale, frames, holdout, long_side)
-    return assemble(
-        _posed(Path(path)), downscale=downscale, long_side=long_side, frames=frames, holdout=holdout, progress=progress
-    )
+    how = {"downscale": downscale, "long_side": long_side, "frames": frames, "holdout": holdout, "only": only}
+    return assemble(_posed(Path(path)), **how, progress=progress)
 
 
 def capture_extent(

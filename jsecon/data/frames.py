@@ -9,7 +9,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -179,13 +179,15 @@ def assemble(
     long_side: int | None = None,
     frames: int | None = None,
     holdout: int | None = 8,
+    only: Collection[str] | None = None,
     progress: Progress = None,
 ) -> Capture:
     """Reads the images and makes the Capture: name order, lenses undistorted, one size, some frames held out.
 
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by
     `downscale` (area average), or where that is None so that the longer side is at most `long_side`. Where the sizes
-    differ, the commonest is taken and the others are resized to it, focal lengths with them. Raises InputError on
+    differ, the commonest is taken and the others are resized to it, focal lengths with them. `only`: frames of these
+    names alone. Raises InputError on
     images that are missing, damaged or of another aspect, and on poses that are not finite and rigid.
     """
     check_options(downscale, frames, holdout, long_side)
@@ -195,6 +197,13 @@ def assemble(
     shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
+    if only is not None:
+        missing = sorted(set(only) - set(names))
+        if missing or not only:
+            told, wanted = f"{len(names)} frames, {names[0]} ... {names[-1]}", f"one called {[*missing, '...'][0]}"
+            raise InputError(where, told, wanted, "Give the capture that these names are of.")
+        kept = [i for i, name in enumerate(names) if name in only]
+        shots, poses, names = [shots[i] for i in kept], poses[kept], tuple(names[i] for i in kept)
     notes = [*posed.notes, *camera_jumps(poses, names)]
     chosen = spread(len(shots), frames)
     if len(chosen) < len(shots):

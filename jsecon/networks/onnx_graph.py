@@ -146,7 +146,7 @@ class Graph:
         if not same_kind or not tensor.fits(array.shape):
             given = f"{array.dtype}{list(array.shape)}"
             raise InputError(f"{self.path}, input {tensor.name!r}", str(tensor), given, _MISUSED)
-        return np.ascontiguousarray(array, wanted)
+        return np.asarray(array, wanted, order="C")  # np.ascontiguousarray makes a row of a scalar
 
 
 def describe(tensors: Iterable[Tensor]) -> str:

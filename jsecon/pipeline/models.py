@@ -9,6 +9,7 @@ from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.onnx_graph import Graph, describe
 from jsecon.networks.sam import graphs as sam_graphs
 from jsecon.networks.sam2.graphs import open_sam2
+from jsecon.networks.sam3 import Sam3
 from jsecon.networks.sigmoid import REMEDY as LOGITS_REMEDY
 
 SAM2_PUBLISHED = "The same split of SAM 2 into graphs is that of axinc-ai/segment-anything-2 on github.com."
@@ -19,7 +20,7 @@ class Use:
     """One thing that a folder could be used for."""
 
     model: str
-    """CLIP, SAM, SAM 2."""
+    """CLIP, SAM, SAM 2, SAM 3."""
     usable: bool
     told: str
     """how to use it, or what was found instead of what."""
@@ -119,4 +120,11 @@ def _sam2(folder: Path) -> str:
     return f"SAM {graphs.version}: objects followed through the frames: jsecon run --tracker {folder}"
 
 
-_KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam, "SAM 2": _sam2}
+def _sam3(folder: Path) -> str:
+    sam3 = Sam3(folder)
+    told = sam3.told
+    sam3.check()
+    return f"{told}: jsecon query FIELD TEXT --phrases {folder}"
+
+
+_KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam, "SAM 2": _sam2, "SAM 3": _sam3}

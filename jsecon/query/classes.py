@@ -11,8 +11,9 @@ from jsecon.errors import require
 from jsecon.language.shares import SHARE_THRESHOLD, ratio, share_of, vote_columns
 from jsecon.numerics import safe_norm
 from jsecon.query.direct import Number
-from jsecon.query.retrieval import answers, apart_from_scene, threshold_of
+from jsecon.query.retrieval import answers, apart_from_scene, presence, threshold_of
 from jsecon.types import Array, LanguageField
+from jsecon.vision.protocols import Logits
 
 
 def query_classes(
@@ -22,6 +23,7 @@ def query_classes(
     retrieval: str = "contrast",
     retrieval_threshold: Number | None = None,
     every: bool = False,
+    logits: Logits | None = None,
 ) -> tuple[Int[Array, " n"], Float[Array, "n q"]]:
     """The class of each Gaussian (N,), index of `texts` (Q, E), -1 = none; and how far it answers each text (N, Q).
 
@@ -33,12 +35,13 @@ def query_classes(
     with the text. A large surface lies near the scene's mean and says little; at the foot of a thing, where its splats
     reach over the thing's, it has most of the weight. A region is of the class of its best text, and of none where that
     stays below `retrieval_threshold` (default 0.12 for contrast, 0.2 for cosine), such as the wall behind; those are
-    left out of the sums. The class is the largest among those whose regions have a share of at least 0.5, the threshold
-    of a query by votes: a region that answers a text alone has the same Gaussians by either. With `every` it is the
-    largest of all, as the protocols ask, which know no answer "none"; where no other region votes on a Gaussian, from
-    those that are left out elsewhere. Gaussians never seen, without votes on a region that has an embedding, or with
-    votes that are not finite never have a class, and similarities 0. Pure: jit it or vmap it over sets of texts. Raises
-    ValueError on texts of another size, on none, and on another `retrieval`.
+    left out of the sums. With the embedder's `logits` the threshold is on the probability that this text is true of the
+    region (`presence`; default 0.01), as in `query_anchored`. The class is the largest among those whose regions have a
+    share of at least 0.5, the threshold of a query by votes: a region that answers a text alone has the same Gaussians
+    by either. With `every` it is the largest of all, as the protocols ask, which know no answer "none"; where no other
+    region votes on a Gaussian, from those that are left out elsewhere. Gaussians never seen, without votes on a region
+    that has an embedding, or with votes that are not finite never have a class, and similarities 0. Pure: jit it or
+    vmap it over sets of texts. Raises ValueError on texts of another size, on none, and on another `retrieval`.
 
     experiments/replica.py measures it at the points of Replica's twin.
     """
@@ -46,15 +49,15 @@ def query_classes(
     fit = texts.ndim == 2 and texts.shape[0] >= 1 and texts.shape[1] == size
     remedy = "Embed the names of the classes with the field's embedder."
     require(fit, "query_classes", f"texts {texts.shape}", f"(Q >= 1, {size})", remedy)
-    least = threshold_of(retrieval, retrieval_threshold, "query_classes")
+    least = threshold_of(retrieval, retrieval_threshold, "query_classes", logits)
     if field.regions.count == 0:
         count, dtype = field.codes.shape[0], jnp.asarray(field.regions.embeddings).dtype
         return jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype)
     given = field.regions.embeddings, texts, field.canonical, field.regions.pixels, field.votes
-    return _classes(*jax.tree.map(jnp.asarray, given), least, retrieval, every)
+    return _classes(*jax.tree.map(jnp.asarray, given), least, logits, retrieval, every)
 
 
-def _classes_body(embeddings, texts, canonical, pixels, votes, least, retrieval, every):
+def _classes_body(embeddings, texts, canonical, pixels, votes, least, logits, retrieval, every):
     ask = lambda text: answers(embeddings, text, canonical, pixels, retrieval)
     similarity, known = jax.vmap(ask)(texts)  # (Q, R) both
     asked = jnp.any(known, axis=1)  # a text that means nothing is nobody's class
@@ -63,7 +66,11 @@ def _classes_body(embeddings, texts, canonical, pixels, votes, least, retrieval,
     if retrieval == "contrast":
         clear = safe_norm(apart_from_scene(embeddings, pixels)[0])
     of_asked = jnp.where(asked, table, -jnp.inf)
-    speaks = known & (jnp.max(of_asked, axis=1) >= least)
+    best, accepted = jnp.argmax(of_asked, axis=1), of_asked
+    if logits is not None:
+        accepted = jax.vmap(lambda text: presence(embeddings, text, logits), out_axes=1)(texts)
+    accepted = jnp.where(asked, accepted, -jnp.inf)
+    speaks = known & (jnp.take_along_axis(accepted, best[:, None], axis=1)[:, 0] >= least)
     shape = votes.regions.shape[0], len(texts)
 
     def vote(allowed):
@@ -81,10 +88,10 @@ def _classes_body(embeddings, texts, canonical, pixels, votes, least, retrieval,
     mean = jnp.where(sound[:, None], found / jnp.where(sound, heard, 1.0)[:, None], 0.0)
     open_to = sound[:, None] & asked
     if not every:
-        own = speaks & (jnp.argmax(of_asked, axis=1) == jnp.arange(len(texts))[:, None])
+        own = speaks & (best == jnp.arange(len(texts))[:, None])
         open_to &= jax.vmap(lambda chosen: share_of(votes, chosen).share, out_axes=1)(own) >= SHARE_THRESHOLD
-    best = jnp.argmax(jnp.where(open_to, mean, -jnp.inf), axis=1)
-    return jnp.where(jnp.any(open_to, axis=1), best, -1).astype(jnp.int32), mean
+    label = jnp.argmax(jnp.where(open_to, mean, -jnp.inf), axis=1)
+    return jnp.where(jnp.any(open_to, axis=1), label, -1).astype(jnp.int32), mean
 
 
 _classes = jax.jit(_classes_body, static_argnames=("retrieval", "every"))

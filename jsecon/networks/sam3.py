@@ -1,0 +1,271 @@
+"""SAM 3 asked by a phrase, on ONNX Runtime: every thing in an image that a noun phrase names, a mask and a score each.
+
+The layout is that of vietanhdev/samexporter (export_sam3.py, sam3_onnx.py), three graphs:
+    *image_encoder.onnx      image (3, 1008, 1008) uint8 RGB, the frame stretched to a square; scaled within the graph
+                             -> backbone_fpn_0, _1, _2 and vision_pos_enc_0, _1, _2
+    *language_encoder.onnx   tokens (1, 32), CLIP's, filled with 0
+                             -> text_attention_mask (true where filled), text_memory, text_embeds
+    *decoder.onnx            those, as far as its exporter left them in, the size of the frame, and B boxes that show
+                             what is meant: box_coords (B, 1, 4), box_labels (B, 1), box_masks (1, B), true where unused
+Two kinds of decoder are known, told apart by their outputs:
+    raw        pred_logits (1, Q, 1), presence_logit_dec (1, 1), pred_masks (1, Q, h, w): logits of Q queries
+    filtered   scores (N,), masks (N, 1, h, w): of an older samexporter, true or false at the frame's size, or of
+               wkentaro/sam3-onnx, probabilities at the decoder's own; N are left of the queries above 0.5
+The score of a query is sigmoid(pred_logits) sigmoid(presence_logit_dec), as facebookresearch/sam3 has it.
+No published weights could be had here: tested on small graphs of these signatures.
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from PIL import Image
+
+from jsecon.errors import InputError, require
+from jsecon.networks.onnx_graph import Graph, Tensor, describe
+from jsecon.networks.sam.masks import shared_areas
+from jsecon.networks.tokenizer import ClipTokenizer, load_tokenizer
+
+IMAGE_SIDE, PHRASE_LENGTH = 1008, 32
+"""px of the square image, and tokens of a phrase, where the graphs do not fix them"""
+SCORE_THRESHOLD = 0.5
+"""a mask must have a higher score: the official processor's"""
+MASK_IOU = 0.7
+"""a mask of a higher IoU with a better one repeats it: samexporter's"""
+PUBLISHED = (
+    "nrl-ai/samexporter-onnx-models on huggingface.co has such a folder, sam3, and samexporter.export_sam3 of "
+    "vietanhdev/samexporter on github.com writes one; put CLIP's tokenizer.json beside the graphs, such as that of "
+    "Xenova/clip-vit-base-patch16."
+)
+_GRAPHS = ("image_encoder.onnx", "language_encoder.onnx", "decoder.onnx")
+_WORDS = {"language_mask": "text_attention_mask", "language_features": "text_memory", "language_embeds": "text_embeds"}
+"""input of the decoder -> output of the language encoder"""
+_SIZE = ("original_height", "original_width")
+_BOXES: dict[str, tuple[int | None, ...]] = {
+    "box_coords": (None, 1, 4),
+    "box_labels": (None, 1),
+    "box_masks": (1, None),
+}
+_RAW: dict[str, tuple[int | None, ...]] = {
+    "pred_logits": (1, None, 1),
+    "presence_logit_dec": (1, 1),
+    "pred_masks": (1, None, None, None),
+}
+_FILTERED: dict[str, tuple[int | None, ...]] = {"scores": (None,), "masks": (None, 1, None, None)}
+_TOGETHER = "Take the three graphs from one export."
+
+
+@dataclasses.dataclass(frozen=True)
+class Sam3Files:
+    """The parts of a SAM 3 that is asked by phrases."""
+
+    image: Path
+    language: Path
+    decoder: Path
+    tokenizer: Path
+    """tokenizer.json of CLIP, or vocab.json with merges.txt beside it."""
+
+
+class Sam3Frame(NamedTuple):
+    """A frame as the decoder wants it."""
+
+    features: dict[str, np.ndarray]
+    """by name."""
+    height: int
+    width: int
+
+
+class PhraseMasks(NamedTuple):
+    """What a phrase names in a frame: M things, best score first."""
+
+    masks: Bool[np.ndarray, "m h w"]
+    """they may overlap."""
+    scores: Float32[np.ndarray, " m"]
+    """SCORE_THRESHOLD to 1."""
+
+
+def find_sam3(folder: str | Path) -> Sam3Files:
+    """The parts of the SAM 3 in a folder. Raises InputError naming what was found instead."""
+    folder = Path(folder)
+    graphs = sorted(folder.glob("*.onnx"))
+    found = [[path for path in graphs if path.name.endswith(ending)] for ending in _GRAPHS]
+    if any(len(paths) != 1 for paths in found):
+        told = ", ".join(path.name for path in graphs) or ("no .onnx file" if folder.is_dir() else "no such folder")
+        raise InputError(folder, told, f"SAM 3's graphs, one *{', one *'.join(_GRAPHS)}", PUBLISHED)
+    tokenizer = next((folder / name for name in ("tokenizer.json", "vocab.json") if (folder / name).is_file()), None)
+    if tokenizer is None:
+        raise InputError(folder, "SAM 3's graphs without a tokenizer", "CLIP's tokenizer.json", PUBLISHED)
+    (image,), (language,), (decoder,) = found
+    return Sam3Files(image, language, decoder, tokenizer)
+
+
+class Sam3:
+    """SAM 3 of a model folder, or its files, asked by phrases: `sam3(frame, "red mug")`.
+
+    `threads` as for `Graph`. Graphs are opened when first needed and kept until `close`. With the published weights
+    samexporter's logs tell of 24 s to encode a frame and 3 s to ask it on eight cores, and of 8 to 13 GiB: encode a
+    frame once for all phrases. Raises InputError where the folder holds no such model, and later where a graph is of
+    another kind, naming the tensor.
+    """
+
+    def __init__(self, model: str | Path | Sam3Files, *, threads: int | None = None):
+        self.files = model if isinstance(model, Sam3Files) else find_sam3(model)
+        self._threads = threads
+
+    def __call__(self, frame: UInt8[np.ndarray, "h w 3"], phrase: str) -> PhraseMasks:
+        """frame (H, W, 3) uint8 RGB, a noun phrase -> the masks of what it names. Raises InputError as `read` does."""
+        return self.masks(self.encode(frame), self.read(phrase))
+
+    def read(self, phrase: str) -> dict[str, np.ndarray]:
+        """A phrase as the decoder wants it, by name. Raises InputError where it is empty or too long."""
+        if not phrase.strip():
+            raise InputError("phrase", repr(phrase), "a noun phrase", 'Say what to find, for example "red mug".')
+        length = self._language.inputs["tokens"].fixed(1) or PHRASE_LENGTH
+        count = len(self._tokenizer.encode(phrase)) + 2
+        if count > length:
+            found, expected = f"a phrase of {count} tokens", f"at most {length}, start and end among them"
+            raise InputError(phrase, found, expected, "Say it in fewer words.")
+        found = self._language.run({"tokens": self._tokenizer([phrase], length)}, list(_WORDS.values()))
+        return {name: found[output] for name, output in _WORDS.items()}
+
+    def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> Sam3Frame:
+        """frame (H, W, 3) uint8 RGB -> what the decoder needs of it. Resized by Pillow, which widens the kernel where
+        an image shrinks, as SAM 3 was trained."""
+        fits = frame.ndim == 3 and frame.shape[2] == 3 and min(frame.shape) > 0 and frame.dtype == np.uint8
+        require(fits, "frame", f"{frame.dtype} {frame.shape}", "uint8 (H, W, 3)", "Give an RGB image.")
+        square = Image.fromarray(frame).resize((self.side, self.side), Image.Resampling.BILINEAR)
+        image = np.ascontiguousarray(np.asarray(square).transpose(2, 0, 1))
+        wanted = [name for name in self._decoder.inputs if name in self._image.outputs]
+        return Sam3Frame(self._image.run({"image": image}, wanted), frame.shape[0], frame.shape[1])
+
+    def masks(self, frame: Sam3Frame, phrase: dict[str, np.ndarray]) -> PhraseMasks:
+        """What a phrase that was read names in a frame that was encoded: masks (M, H, W) with a score above
+        SCORE_THRESHOLD, without those that repeat a better one. M may be 0. Raises InputError where the decoder gives
+        numbers that are not finite, or of other shapes than it declares."""
+        boxes = self._decoder.inputs["box_coords"].fixed(0) or 1
+        unused = np.zeros((boxes, 1, 4), np.float32), np.ones((boxes, 1), np.int64), np.ones((1, boxes), bool)
+        sizes = (np.asarray(size, np.int64) for size in (frame.height, frame.width))
+        feeds = frame.features | phrase | dict(zip(_SIZE, sizes)) | dict(zip(_BOXES, unused))
+        found = self._decoder.run({name: feeds[name] for name in self._decoder.inputs}, list(self._outputs))
+        self._check_found(found)
+        if self._outputs is _RAW:
+            logits, presence = (
+                found[name].astype(np.float64).ravel() for name in ("pred_logits", "presence_logit_dec")
+            )
+            scores, maps, level = _sigmoid(logits) * _sigmoid(presence), found["pred_masks"][0], 0.0
+        else:
+            scores, maps, level = found["scores"], found["masks"][:, 0], 0.5
+        order = np.argsort(-scores, kind="stable")
+        order = order[scores[order] > SCORE_THRESHOLD]
+        size = (frame.width, frame.height)
+        masks = [cv2.resize(np.asarray(maps[n], np.float32), size) > level for n in order]
+        stack = np.stack(masks) if masks else np.zeros((0, frame.height, frame.width), bool)
+        kept = _unrepeated(stack)
+        return PhraseMasks(stack[kept], scores[order][kept].astype(np.float32))
+
+    @property
+    def side(self) -> int:
+        """px of the square image."""
+        return self._image.inputs["image"].fixed(2) or IMAGE_SIDE
+
+    @property
+    def told(self) -> str:
+        """What the folder takes and gives, in words. Opens the graphs."""
+        kind = "raw" if self._outputs is _RAW else "filtered"
+        length = self._language.inputs["tokens"].fixed(1) or PHRASE_LENGTH
+        return f"masks of what a phrase of {length} tokens names; {kind} decoder, images of {self.side} px"
+
+    def check(self) -> None:
+        """Opens and closes the graphs, and reads the tokenizer. Raises InputError where they are damaged, or no SAM
+        3's."""
+        _ = self.told, self._tokenizer
+        self.close()
+
+    def close(self) -> None:
+        """Drops the graphs and their memory; they are opened again when needed."""
+        for name in ("_image", "_language", "_decoder"):
+            self.__dict__.pop(name, None)
+
+    @functools.cached_property
+    def _tokenizer(self) -> ClipTokenizer:
+        return load_tokenizer(self.files.tokenizer)
+
+    @functools.cached_property
+    def _image(self) -> Graph:
+        graph = Graph(self.files.image, threads=self._threads)
+        tensor = graph.require("input", "image", (3, None, None), "SAM 3's image encoder")
+        if tensor.dtype != "uint8" or tensor.fixed(1) != tensor.fixed(2):
+            where, expected = f"{graph.path}, input 'image'", "image uint8[3, S, S], as SAM 3's image encoder has"
+            raise InputError(where, str(tensor), expected, "Export the graph with its own scaling of colours.")
+        return graph
+
+    @functools.cached_property
+    def _language(self) -> Graph:
+        graph = Graph(self.files.language, threads=self._threads)
+        graph.require("input", "tokens", (1, None), "SAM 3's language encoder")
+        for name, shape in zip(_WORDS.values(), ((1, None), (None, 1, None), (None, 1, None))):
+            graph.require("output", name, shape, "SAM 3's language encoder")
+        return graph
+
+    @functools.cached_property
+    def _decoder(self) -> Graph:
+        graph, what = Graph(self.files.decoder, threads=self._threads), "SAM 3's decoder"
+        for name, shape in _BOXES.items():
+            graph.require("input", name, shape, what)
+        graph.require("input", "language_mask", (1, None), what)
+        graph.require("input", "language_features", (None, 1, None), what)
+        for name, shape in (_RAW if "pred_logits" in graph.outputs else _FILTERED).items():
+            graph.require("output", name, shape, what)
+        for name, tensor in graph.inputs.items():
+            if name in _WORDS:
+                _check_link(tensor, graph, self._language, _WORDS[name])
+            elif name not in _BOXES and name not in _SIZE:
+                _check_link(tensor, graph, self._image, name)
+        return graph
+
+    @property
+    def _outputs(self) -> dict[str, tuple[int | None, ...]]:
+        return _RAW if "pred_logits" in self._decoder.outputs else _FILTERED
+
+    def _check_found(self, found: dict[str, np.ndarray]) -> None:
+        """Raises InputError unless there are a score and a mask of each query, all finite."""
+        counts = set()
+        for name, shape in self._outputs.items():
+            array, where = found[name], f"{self.files.decoder}, output {name!r}"
+            if array.ndim != len(shape) or not Tensor(name, "", shape).fits(array.shape):
+                raise InputError(where, f"shape {array.shape}", str(Tensor(name, "", shape)), _TOGETHER)
+            if not np.isfinite(array).all():
+                remedy = "Export the graph again, best in 32 bit floats."
+                raise InputError(where, "numbers that are not finite", "finite numbers", remedy)
+            counts |= {array.shape[axis] for axis, size in enumerate(shape[:2]) if size is None}
+        if len(counts) != 1 or (counts != {0} and not all(array.size for array in found.values())):
+            told = ", ".join(f"{name} {found[name].shape}" for name in self._outputs)
+            raise InputError(self.files.decoder, told, "a score and a mask of each query", _TOGETHER)
+
+
+def _check_link(tensor: Tensor, decoder: Graph, encoder: Graph, output: str) -> None:
+    """Raises InputError unless an encoder gives what an input of the decoder takes."""
+    given = encoder.outputs.get(output)
+    if given is None or not (tensor.shape is None or given.fits(tensor.shape)):
+        found = f"{encoder.path.name}, which gives {describe(encoder.outputs.values())}"
+        raise InputError(f"{decoder.path}, input {tensor.name!r}", found, str(tensor), _TOGETHER)
+
+
+def _unrepeated(masks: Bool[np.ndarray, "m h w"]) -> np.ndarray:
+    """Indices (K,) of the masks (M, H, W), best first, that are not empty and repeat no better one that is kept."""
+    shared = shared_areas(masks)
+    area = np.diagonal(shared)
+    kept: list[int] = []
+    for n in range(len(masks)):
+        union = area[n] + area[kept] - shared[n, kept]
+        if area[n] > 0 and not (shared[n, kept] > MASK_IOU * union).any():
+            kept.append(n)
+    return np.asarray(kept, np.int64)
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-np.clip(x.astype(np.float64), -80.0, 80.0)))
