@@ -105,6 +105,7 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
         (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: found no text"),
         (["red", "--phrases", "MODEL", "--all", "--by", "code"], "found --by --all"),
         (["red", "--images", "x"], "--images: found no --phrases"),
+        (["red", "--looks", "3"], "--looks: found no --phrases"),
         (["red", "--phrases", "nowhere"], "no such folder; expected SAM 3's graphs"),
         (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: found nothing there"),
     ],

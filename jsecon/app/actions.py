@@ -109,10 +109,11 @@ def _query(asked: Query, console: Console) -> Told:
 
 
 def _check_phrases(asked: Query) -> None:
-    """Raises InputError where --phrases is given with what it has no use for, or --images without it."""
+    """Raises InputError where --phrases is given with what it has no use for, or --images or --looks without it."""
     if asked.phrases is None:
-        if asked.images is not None:
-            raise InputError("--images", "no --phrases", "a SAM 3 model folder beside it", "Give --phrases DIR.")
+        for name, given in (("--images", asked.images is not None), ("--looks", asked.looks != Query.looks)):
+            if given:
+                raise InputError(name, "no --phrases", "a SAM 3 model folder beside it", "Give --phrases DIR.")
         return
     if not asked.texts:
         remedy = 'For example: jsecon query field.npz "red mug" --phrases sam3 --out answers'
