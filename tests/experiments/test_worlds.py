@@ -186,7 +186,9 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     plan = worlds.plan_of(*worlds.worlds(asked.only, asked.values)["kinds", 1.0], asked, 1, trained=False)
     assert dict(plan.data.size)["kinds"]
     assert plan.data.seeds == (0, 10)
-    rows = worlds.plan_of("medium", {}, asked, 1, trained=True).methods
+    training = worlds.plan_of("medium", {}, asked, 1, trained=True)
+    rows, seeds = training.methods, training.data.seeds
+    assert seeds == (10,)
     assert {row.split(": ")[0] for row in rows} == set(TRAINED)
     assert not set(rows) & set(plan.methods)
     assert {"OpenGaussian: 16 roots, as published", "the paper's path: contrast, threshold 0.98"} <= set(rows)
@@ -194,7 +196,7 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     for seed, value in ((0, 0.1), (10, 0.3)):
         cell = {"seed": seed, "scene": "ramen"}
         cells += [cell | {"method": m, "miou": at + value, "miou_vala": at - value} for m, at in own.items()]
-    told = worlds.of_world(cells, asked.choosing)
+    told = worlds.of_world(cells, asked.choosing, asked.seeds)
     assert told["VALA"] == {"miou": pytest.approx(0.8), "miou_vala": pytest.approx(0.2)}
     text = worlds.layout({("none", 0.0): told, ("kinds", 1.0): told | {"VALA": {"miou": 0.99, "miou_vala": 0.0}}})
     assert "| kinds 1 | 0.990 | 0.900 | -0.090 |" in text
