@@ -12,6 +12,7 @@ too, in tables of their own beside all the others there; a method that trains is
 that its figure is the most that a reading could give.
 """
 
+import contextlib
 import dataclasses
 import re
 from pathlib import Path
@@ -148,24 +149,25 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained:
 
 def main(asked: Asked, processes: int) -> str:
     """The tables, written."""
-    methods, found, trained, helper = rows_of(points=False), {}, {}, False
+    methods, found, trained = rows_of(points=False), {}, {}
 
     def filled(name: tuple[str, float], trained: bool) -> list[dict]:
         plan = plan_of(*worlds(asked.only, asked.values)[name], asked, processes, trained)
-        return fill(plan, methods, tell=lambda line: print(line, flush=True))
+        with contextlib.suppress(SystemExit):  # of a helper, which has no table to write
+            return fill(plan, methods, tell=lambda line: print(line, flush=True))
+        return []
 
     for name in worlds(asked.only, asked.values):
-        try:
-            cells = filled(name, trained=False)
-            found[name] = of_world(cells, asked.choosing, asked.seeds)
+        own = filled(name, trained=False)
+        training = filled(name, trained=True) if asked.scenes_trained and name[1] in (0.0, HARD) else []
+        if own:
+            found[name] = of_world(own, asked.choosing, asked.seeds)
             print(name, found[name], flush=True)
-            if asked.scenes_trained and (name[1] in (0.0, HARD)):
-                here = [cell for cell in cells if cell["scene"] in asked.scenes_trained]
-                trained[name] = of_world(here, asked.choosing, asked.seeds_trained)
-                trained[name] |= of_world(filled(name, trained=True), asked.seeds_trained, asked.seeds_trained)
-        except SystemExit:  # of a helper, which has no table to write
-            helper = True
-    if helper:
+        if training:
+            here = [cell for cell in own if cell["scene"] in asked.scenes_trained]
+            trained[name] = of_world(here, asked.choosing, asked.seeds_trained)
+            trained[name] |= of_world(training, asked.seeds_trained, asked.seeds_trained)
+    if not processes:
         return ""
     text = layout(found)
     if trained:
