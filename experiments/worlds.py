@@ -126,7 +126,7 @@ def layout(found: dict[tuple[str, float], dict[str, dict[str, float]]]) -> str:
     return "\n\n".join(parts)
 
 
-def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained: dict | None = None):
+def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained: dict):
     """mIoU over how hard each fault is, a line for each method; dashed, on their own scenes, for those that train."""
     from matplotlib.figure import Figure
 
@@ -138,7 +138,7 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained:
         hard = [0.0, *sorted(v for f, v in found if f == fault)]
         for method in found["none", 0.0]:
             axes.plot(hard, [found["none" if v == 0 else fault, v][method]["miou"] for v in hard], "o-", label=method)
-        for method in set(trained["none", 0.0]) - set(found["none", 0.0]) if trained else ():
+        for method in sorted(set(trained.get(("none", 0.0), ())) - set(found["none", 0.0])):
             told = [trained["none", 0.0][method]["miou"], trained[fault, HARD][method]["miou"]]
             axes.plot([0.0, HARD], told, "s--", markersize=3, label=method)
         if n == 0:
