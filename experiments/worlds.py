@@ -138,8 +138,9 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained:
         hard = [0.0, *sorted(v for f, v in found if f == fault)]
         for method in found["none", 0.0]:
             axes.plot(hard, [found["none" if v == 0 else fault, v][method]["miou"] for v in hard], "o-", label=method)
-        for method in sorted(set(trained.get(("none", 0.0), ())) - set(found["none", 0.0])):
-            told = [trained["none", 0.0][method]["miou"], trained[fault, HARD][method]["miou"]]
+        ends = [trained.get(name, {}) for name in (("none", 0.0), (fault, HARD))]
+        for method in sorted(set(ends[0]) & set(ends[1]) - set(found["none", 0.0])):
+            told = [end[method]["miou"] for end in ends]
             axes.plot([0.0, HARD], told, "s--", markersize=3, label=method)
         if n == 0:
             axes.legend(fontsize=5)
