@@ -128,7 +128,7 @@ def test_modules_are_short_enough_to_be_read_whole():
 
 
 CORE = ("splat", "fit", "association", "language", "query")
-CORE_LINES, ALL_LINES = 7_000 + 2_910, 16_500 + 7_890
+CORE_LINES, ALL_LINES = 7_000 + 3_120, 16_500 + 8_210
 """What a reader may be asked to read. A feature that needs more raises both by its own lines, and says here which it is
 and how many: fitting photographs 1,350 (steps on all devices, schedule and growth 400, the dense start 300, poses,
 exposures, depth and masks 450, quality 60, SSIM over a mesh 85, colours 30), and with it structure from motion and

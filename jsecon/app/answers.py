@@ -16,6 +16,7 @@ from jsecon.app.splat_page import NOWHERE, regions_of
 from jsecon.data.gaussian_files import save_gaussians
 from jsecon.data.ply import save_ply
 from jsecon.files import write_text, written_whole
+from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import transform_gaussians
@@ -42,6 +43,11 @@ def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
         seen = ((u >= 0) & (u < field.cameras.width) & (v >= 0) & (v < field.cameras.height)).sum(1)
     order = np.argsort(-seen, kind="stable")[:count]
     return [int(t) for t in order if seen[t] > 0]
+
+
+def part_of(field: LanguageField, answer: Answer) -> LanguageField:
+    """The field of the Gaussians that an answer speaks of: of all, but where `Answer.rows` names them."""
+    return field if answer.rows is None else field_of_rows(field, answer.rows)
 
 
 def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[str, Any]:
@@ -82,9 +88,10 @@ def write_answer(
     """Writes OUT/<slug>.ply (or .spz, .glb: `ending`), .json, and <slug>-<frame>.png of `masks` (by frame, see
     `masks_of`); returns the figures. An empty selection leaves out the Gaussians and the masks.
     """
-    slug = slug_of(answer.question)
+    slug, count = slug_of(answer.question), field.gaussians.count
+    field = part_of(field, answer)
     chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
-    told = _figures(field, answer, chosen) | {ending: None, "masks": {}}
+    told = _figures(field, answer, chosen) | {"of": count, ending: None, "masks": {}}
     if answer.mask.any():
         told[ending] = f"{slug}.{ending}"
         _save(field, chosen, answer.mask, out / told[ending])
@@ -111,6 +118,7 @@ def _save(field: LanguageField, chosen: Gaussians, mask: np.ndarray, file: Path)
 
 def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:
     """frame -> (H, W) bool of the `views` best frames: where the selected Gaussians alone have an alpha above 0.7."""
+    field = part_of(field, answer)
     gaussians, mask = jax.device_put((field.gaussians, answer.mask))
     cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
     frames = best_frames(field, answer, views)

@@ -106,7 +106,8 @@ def write_answers(
     ending: str = "ply",
 ) -> dict[str, Any]:
     """The files of each answer, OUT/answers.html, and a line each; returns the files and the figures."""
-    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras), [], []
+    in_blocks = any(item.rows is not None for item in answers)
+    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras, in_blocks=in_blocks), [], []
     with listener.progress("pictures") as progress:
         for n, item in enumerate(answers):
             shown = answers_of.masks_of(field, item, max(views, 1))

@@ -98,7 +98,9 @@ class Query(Asking):
 
     For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA's layout, in the capture's
     own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames
-    that show it best, and answers.html with the pictures.
+    that show it best, and answers.html with the pictures. A field of more than half of the free memory, or than
+    JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, to the same answers: texts and --at, by
+    votes or code.
     """
 
     texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]

@@ -9,7 +9,6 @@ views are summed.
 import contextlib
 import dataclasses
 import functools
-import math
 import os
 import shutil
 import tempfile
@@ -29,11 +28,11 @@ from jsecon.language.distill import LEAST_LABELLED, distill_votes
 from jsecon.language.records import append, summed_columns
 from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import MIN_TRANSMITTANCE, NEAR
+from jsecon.numerics import NEAR
+from jsecon.splat.banded import listed, still_open
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
 from jsecon.splat.fusion import stored
-from jsecon.splat.project import Projection
-from jsecon.splat.tiles import TILE, TileLists, grid, tile_lists
+from jsecon.splat.tiles import TILE, TileLists, grid
 from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
 from jsecon.types import Array, Camera, Gaussians, Regions, Votes
 
@@ -159,12 +158,6 @@ def _prepared(labels: Array) -> _View:
     return _View(tiles, distinct_labels(tiles, _SLOTS), to_tiles(jnp.ones(labels.shape, jnp.float32), TILE))
 
 
-@jax.jit
-def _open(left: Array) -> Array:
-    """(tiles,) whether a pixel has not stopped."""
-    return left[:-1].max(1) > MIN_TRANSMITTANCE
-
-
 def _cast_view(
     gaussians: Gaussians,
     bounds: Bounds,
@@ -182,9 +175,9 @@ def _cast_view(
     across, down = grid(camera.width, camera.height, TILE)
     names = np.asarray(view.distinct)
     several = (names >= 0).sum(1)
-    is_open = lambda: np.asarray(_open(left)).reshape(down, across)
+    is_open = lambda: np.asarray(still_open(left)).reshape(down, across)
     for band in bands(gaussians, bounds, camera, is_open, near=near, size=size, most_held=most_held):
-        splats, lists = _listed(band.splats, camera.width, camera.height, size)
+        splats, lists = listed(band.splats, camera.width, camera.height, size)
         starts, lengths = np.asarray(lists.starts), np.asarray(lists.lengths)
         used = int((starts + lengths).max(initial=0))
         room = size * next(times for times in (1, 2, 4, 8, 16) if used <= times * size)
@@ -208,13 +201,6 @@ def _cast_view(
         yield band, int(lists.overflow.sum()), seen, tuple(np.concatenate(column) for column in zip(*votes))
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _listed(projection: Projection, width: int, height: int, capacity: int) -> tuple[Array, TileLists]:
-    columns = projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]
-    splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
-    return splats, tile_lists(projection, width, height, capacity=capacity)
-
-
 @functools.partial(jax.jit, static_argnums=(6, 7, 8))
 def _cast_band(
     splats: Array,
@@ -232,7 +218,7 @@ def _cast_band(
 
     Tiles that are not `wanted` (tiles + 1,), or have stopped, are passed over.
     """
-    runs = wanted[:-1] & _open(left)
+    runs = wanted[:-1] & still_open(left)
     lists = dataclasses.replace(lists, lengths=jnp.where(runs, lists.lengths, 0))
     batches, table = make_batches(lists, width), make_table(splats)
     slots = lax.dynamic_slice_in_dim(view.distinct, first, _SLOTS, axis=1)

@@ -120,11 +120,16 @@ def with_overlap(votes: Votes) -> Votes:
 
 def vote_blocks(votes: Votes) -> Iterator[Votes]:
     """The votes of ROWS Gaussians after the other, on jax's device; without `by_view` and `overlap`."""
-    columns = [own.name for own in dataclasses.fields(votes) if own.name not in _NO_COLUMNS]
     for first in range(0, votes.regions.shape[0], ROWS):
-        own = {name: getattr(votes, name) for name in columns}
-        own = {name: None if a is None else jnp.asarray(a[first : first + ROWS]) for name, a in own.items()}
-        yield dataclasses.replace(votes, **own, by_view=None, overlap=None)
+        yield jax.tree.map(jnp.asarray, votes_of_rows(votes, slice(first, first + ROWS)))
+
+
+def votes_of_rows(votes: Votes, rows: slice | Int[np.ndarray, " m"]) -> Votes:
+    """The votes of some Gaussians, NumPy; without `by_view` and `overlap`."""
+    columns = [own.name for own in dataclasses.fields(votes) if own.name not in _NO_COLUMNS]
+    own = {name: getattr(votes, name) for name in columns}
+    own = {name: None if a is None else np.asarray(a)[rows] for name, a in own.items()}
+    return dataclasses.replace(votes, **own, by_view=None, overlap=None)
 
 
 @functools.partial(jax.jit, static_argnums=2)
