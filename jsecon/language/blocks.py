@@ -39,6 +39,9 @@ from jsecon.types import Array, Camera, Gaussians, Regions, Votes
 _SLOTS = 4
 """distinct labels of a tile that one walk counts; where a tile shows more, it is walked again for the rest"""
 
+_MOST_SEEN = 1 << 26
+"""weights, each of a view on a Gaussian, of a block that is summed with `by_view`"""
+
 
 @runtime_checkable
 class Images(Protocol):
@@ -57,6 +60,7 @@ def region_votes_in_blocks(
     *,
     folder: str | os.PathLike,
     top: int = 8,
+    by_view: bool = False,
     centre: float = 0.0,
     near: float = NEAR,
     regions: Regions | None = None,
@@ -69,14 +73,15 @@ def region_votes_in_blocks(
     labels: T label images (H, W; -1 = none), read one at a time: a memory map (T, H, W), or what gives one by its index
     and has a length. The votes come back as memory maps of files in `folder`, which must be empty or new; they stay as
     long as the files do. The strongest `top` regions are those of the sums over all views; the rest is counted
-    (`Votes.cut`). In place of each view's total, `regions` (of the same labels) gives `Votes.shown`, as `with_shown`
-    makes it.
+    (`Votes.cut`). `by_view` is as in `region_votes`, and `with_shown` reads it in blocks; in its place `regions` (of
+    the same labels) gives `Votes.shown` at once.
 
     Equal to `region_votes` up to float32's rounding, which here and there takes a pixel's last weight, of at most
     0.01, to the other side of the transmittance at which it stops. Memory: `most_held` visible splats of a view, 150
     bytes each at the peak, a band, and one block of `rows` Gaussians with its votes. Disk, until it returns: 12 bytes a
-    (tile, Gaussian, region) with weight and 16 a Gaussian, for each view. One device, host code. Raises ValueError on
-    shapes that disagree, InputError where `folder` cannot be written or is not empty.
+    (tile, Gaussian, region) with weight and 16 a Gaussian, for each view; `by_view` keeps 4 for every view and
+    Gaussian. One device, host code. Raises ValueError on shapes that disagree, InputError where `folder` cannot be
+    written or is not empty.
     """
     count, views = gaussians.count, len(cameras.world_to_camera)
     poses, remedy = cameras.world_to_camera, "Add a leading axis to all arrays of a single camera."
@@ -87,7 +92,10 @@ def region_votes_in_blocks(
     shows = None if regions is None else np.asarray(views_that_show(regions))
     if shows is not None:
         require_shape("regions.pixels", shows, (num_regions, views), "Give the regions made from these labels.")
-    cameras = jax.tree.map(np.asarray, cameras)
+    cameras, rows = (
+        jax.tree.map(np.asarray, cameras),
+        min(rows, max(_MOST_SEEN // max(views, 1), 1)) if by_view else rows,
+    )
     bounds, size = block_bounds(gaussians, rows), band_size(count, cameras.width, cameras.height)
     with _spool(Path(folder)) as spool:
         overflow = 0
@@ -103,7 +111,8 @@ def region_votes_in_blocks(
                 append(spool, "votes", rows, band.ids[votes[0]], *votes[1:])
             if progress is not None:
                 progress(t + 1, views)
-        columns = summed_columns(spool, Path(folder), count, num_regions, rows, min(top, max(num_regions, 1)), shows)
+        sizes = count, num_regions, rows, min(top, max(num_regions, 1))
+        columns = summed_columns(spool, Path(folder), *sizes, shows, views if by_view else 0)
     return Votes(**columns, overflow=np.asarray(overflow, np.int32), num_regions=num_regions)
 
 

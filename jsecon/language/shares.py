@@ -59,8 +59,8 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
 
     Regions whose embeddings have a cosine of at least `alike_threshold` are shown together, as queries join them. The
     share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
-    contain the object. Pure. Raises ValueError where the votes were cast without `by_view`, or over other views than
-    `regions` knows.
+    contain the object. Pure; `by_view` that is mapped is read in blocks. Raises ValueError where the votes were cast
+    without `by_view`, or over other views than `regions` knows.
     """
     views = None if votes.by_view is None else votes.by_view.shape[0]
     remedy = "Cast them with region_votes(..., by_view=True)."
@@ -70,7 +70,14 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
     require(same, "with_shown", found, expected, "Give the regions that were made from the labels that voted.")
     shows = views_that_show(regions, alike_threshold=alike_threshold)
-    return _with_shown(votes, shows, min(_BLOCK, max(votes.regions.shape[0], 1)))
+    count, top = votes.regions.shape
+    if not isinstance(votes.by_view, np.memmap):
+        return _with_shown(votes, shows, min(_BLOCK, max(count, 1)))
+    parts = [np.zeros((0, top), np.float32)]
+    for rows in (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK)):
+        part = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(votes.by_view[:, rows]))
+        parts.append(np.asarray(_with_shown(part, shows, min(_BLOCK, count - rows.start)).shown))
+    return dataclasses.replace(votes, by_view=None, shown=np.concatenate(parts))
 
 
 def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
