@@ -14,7 +14,6 @@ from jaxtyping import Bool
 from jsecon.app.question import Answer
 from jsecon.app.splat_page import NOWHERE, regions_of
 from jsecon.data.gaussian_files import save_gaussians
-from jsecon.data.ply import save_ply
 from jsecon.files import write_text, written_whole
 from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
@@ -94,7 +93,8 @@ def write_answer(
     told = _figures(field, answer, chosen) | {"of": count, ending: None, "masks": {}}
     if answer.mask.any():
         told[ending] = f"{slug}.{ending}"
-        _save(field, chosen, answer.mask, out / told[ending])
+        own = {"codes": np.asarray(field.codes), "regions": _regions(field)} if ending == "glb" else {}
+        save_gaussians(out / told[ending], chosen, **{name: table[answer.mask] for name, table in own.items()})
         for t, mask in masks.items():
             told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
             with written_whole(out / told["masks"][field.names[t]]) as temporary:
@@ -104,16 +104,16 @@ def write_answer(
 
 
 def save_scene(field: LanguageField, file: Path) -> None:
-    """Writes all Gaussians in the capture files' own world; with their codes and regions where the file is a .glb. A
-    .ply is written in blocks: a mapped field need not fit into memory."""
-    if file.suffix == ".ply":
-        return save_ply(file, field.gaussians, similarity=field.to_source)
-    _save(field, transform_gaussians(field.gaussians, field.to_source), np.ones(field.gaussians.count, bool), file)
+    """Writes all Gaussians in the capture files' own world, in blocks: a mapped field need not fit into memory. With
+    their codes and regions where the file is a .glb."""
+    own = {"codes": field.codes, "regions": _regions(field)} if file.suffix == ".glb" else {}
+    save_gaussians(file, field.gaussians, similarity=field.to_source, **own)
 
 
-def _save(field: LanguageField, chosen: Gaussians, mask: np.ndarray, file: Path) -> None:
-    regions = regions_of(field)[mask]
-    save_gaussians(file, chosen, codes=np.asarray(field.codes)[mask], regions=np.where(regions == NOWHERE, -1, regions))
+def _regions(field: LanguageField) -> np.ndarray:
+    """(N,) as a .glb holds them: -1 = none."""
+    regions = regions_of(field)
+    return np.where(regions == NOWHERE, -1, regions)
 
 
 def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:

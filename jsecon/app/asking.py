@@ -33,6 +33,8 @@ from jsecon.query.parts import query_parts
 from jsecon.types import LanguageField, Selection
 
 _T = TypeVar("_T")
+_LEAST = 1 << 12
+"""rows of an answer in blocks, some of them empty: programs are compiled for powers of two from there on"""
 
 
 def questions_of(
@@ -148,7 +150,7 @@ def answered_in_blocks(
 
 def _answered(field: LanguageField, asked: _Asked, chosen: Chosen, several: bool, outliers: bool) -> Answer:
     count = len(chosen.gaussians)
-    size = min(1 << max(count - 1, 0).bit_length(), field.gaussians.count)  # few sizes to compile for
+    size = min(max(1 << max(count - 1, 0).bit_length(), _LEAST), field.gaussians.count)  # few sizes to compile for
     rows, similarity = np.zeros(size, np.int64), np.zeros(size, np.float32)
     rows[:count], similarity[:count] = chosen.gaussians, chosen.similarity
     own, mask = field_of_rows(field, rows), np.arange(size) < count

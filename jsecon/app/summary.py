@@ -16,7 +16,6 @@ from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
 from jsecon.pipeline.pipeline import Run, peak_memory_mib
 from jsecon.pipeline.progress import Listener
-from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -57,7 +56,7 @@ def write_scene(
     gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener
 ) -> dict[str, Any]:
     """The file of a fitted scene, in the world of the capture's files; says the figures, and returns them."""
-    save_gaussians(out, transform_gaussians(gaussians, capture.to_source))
+    save_gaussians(out, gaussians, similarity=capture.to_source)
     say_quality(held_out, listener)
     listener.say(f"{gaussians.count} Gaussians  {out}")
     return {"written": {"scene": out}, "gaussians": gaussians.count} | quality_told(held_out)

@@ -69,7 +69,7 @@ class Fit(SceneOptions):
     """fit Gaussians to a capture, and no more
 
     From posed frames to a scene of 3D Gaussians in the capture's own world, as a .ply (INRIA's layout; SuperSplat opens
-    it), .spz (extra formats) or .glb, with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the
+    it), .spz or .glb, with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the
     same name without the ending, from which it goes on when it was stopped, and `jsecon run` into that folder too.
     """
 
@@ -141,7 +141,7 @@ class Query(Asking):
 class Export:
     """write the whole scene of a field for other programs
 
-    As .ply (INRIA's layout), .spz (extra formats) or .glb, in the capture's own world. The .glb is glTF with Khronos'
+    As .ply (INRIA's layout), .spz or .glb, in the capture's own world. The .glb is glTF with Khronos'
     KHR_gaussian_splatting, y up, and holds each Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
     """
 
