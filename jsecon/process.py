@@ -24,6 +24,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from jsecon.errors import InputError
+
 # mallopt's parameters (malloc.h), and values: a request is served from memory that was freed before, not from the
 # kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
@@ -31,6 +33,8 @@ _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO
 """what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
 MEMBER = "JSECON_MEMBER"
 """environment variable of a process that is one of several (pipeline/processes.py), see `member`"""
+MEMORY = "JSECON_MEMORY"
+"""environment variable: GiB that a scene's columns may take, in place of half of the memory that is free"""
 _UNKEPT = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
 """how jax warns of a program that it cannot read from disk, or keep there"""
 _built: dict[str, int] = {}
@@ -95,6 +99,46 @@ def prepare_member() -> None:
 def cores() -> int:
     """The CPU cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory() -> tuple[int | None, int | None]:
+    """Bytes that are free, and the limit of this process's cgroup, which what is free counts in; None where the system
+    does not tell, or sets none."""
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        free = 1024 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return None, None
+    limit = cgroup_words("memory.max", "memory/memory.limit_in_bytes")
+    if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
+        return free, None
+    used = cgroup_words("memory.current", "memory/memory.usage_in_bytes") or ["0"]
+    return min(free, int(limit[0]) - int(used[0])), int(limit[0])
+
+
+def memory_budget() -> float:
+    """Bytes that a scene's columns may take, above which they are read in blocks: half of what is free, as reading
+    takes twice what it reads, or what MEMORY says. Raises InputError where that is no number."""
+    told = os.environ.get(MEMORY)
+    if told is None:
+        return float("inf") if (free := memory()[0]) is None else free / 2
+    try:
+        return float(told) * 2**30
+    except ValueError:
+        raise InputError(MEMORY, repr(told), "GiB, a number", f"For example: export {MEMORY}=4") from None
+
+
+def cgroup_words(new: str, old: str) -> list[str]:
+    """The words of a file of this process's cgroup, of version 2 or else 1; none where there is none."""
+    try:
+        own = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
+    except (OSError, ValueError):
+        return []
+    kind, _, name = old.partition("/")
+    group = own.get(kind, "/").lstrip("/")
+    top, at = Path("/sys/fs/cgroup"), own.get("", "/").lstrip("/")
+    places = (top / at / new, top / new, top / kind / group / name, top / kind / name)
+    return next((path.read_text().split() for path in places if path.is_file()), [])
 
 
 def programs_built() -> dict[str, int]:

@@ -22,11 +22,12 @@ from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
-from jsecon.app import question
+from jsecon.app import asking
 from jsecon.data import images, mask_files, motion, proposal_files, video
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
 from jsecon.data.gaussian_files import load_gaussians
+from jsecon.data.gltf import save_glb
 from jsecon.data.langsplat_files import feature_size, load_features
 from jsecon.data.lerf_labels import load_lerf_labels
 from jsecon.data.ply import load_ply, load_points_ply, save_ply
@@ -126,6 +127,8 @@ def splats(folder: Path) -> Iterator[Case]:
     made |= {f"v{version}.spz": spz(arrays, version) for version in (2, 3)}
     for name, data in made.items():
         (folder / name).write_bytes(data)
+    save_glb(folder / "g.glb", _gaussians(30, 4))
+    for name in [*made, "g.glb"]:
         yield Case([folder / name], lambda file=folder / name: load_gaussians(file), _whole_gaussians)
 
 
@@ -339,7 +342,7 @@ def masks(folder: Path) -> Iterator[Case]:
 
     for kind in ("grey", "colour", "bits"):
         file = folder / kind / "a.png"
-        yield Case([file], lambda file=file: question.read_mask(file, field), whole_outline)
+        yield Case([file], lambda file=file: asking.read_mask(file, field), whole_outline)
 
 
 def langsplat(folder: Path) -> Iterator[Case]:

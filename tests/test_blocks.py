@@ -124,7 +124,7 @@ def test_equal_depths_keep_the_order_of_indices_across_bands(tmp_path, small_ban
     assert_alike(cast, memory)
 
 
-def test_shown_is_that_of_votes_by_view(scene, cameras, labels, tmp_path, small_bands):
+def test_shown_is_that_of_votes_by_view(scene, cameras, labels, tmp_path, small_bands, monkeypatch):
     rng = np.random.default_rng(0)
     embeddings = rng.normal(size=(REGIONS, 4)).astype(np.float32)
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
@@ -137,6 +137,13 @@ def test_shown_is_that_of_votes_by_view(scene, cameras, labels, tmp_path, small_
     )
     np.testing.assert_array_equal(cast.regions, memory.regions)
     np.testing.assert_allclose(cast.shown, memory.shown, rtol=1e-5, atol=1e-6)
+    monkeypatch.setattr(shares, "_BLOCK", 24)
+    how = {"top": 4, "rows": 16, "by_view": True}
+    kept = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "w")
+    whole = region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True).by_view
+    assert isinstance(kept.by_view, np.memmap)
+    np.testing.assert_allclose(kept.by_view, whole, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(with_shown(kept, regions).shown, memory.shown, rtol=1e-5, atol=1e-6)
 
 
 def test_no_regions_no_gaussians_and_labels_of_nothing(scene, cameras, labels, tmp_path):

@@ -1,15 +1,20 @@
 """A .glb read byte by byte: the container, the extension's attributes, the axes, and what belongs to a field."""
 
+import contextlib
 import json
 import struct
 
 import numpy as np
 import pytest
 from capture_files import refused
+from scipy.spatial.transform import Rotation
 from splat_files import C0, opacity, scene
 from test_gaussian_files import gaussians, image
 
-from jsecon.data.gltf import save_glb
+from jsecon.data import gltf
+from jsecon.data.gaussian_files import load_gaussians
+from jsecon.data.gltf import load_glb, save_glb
+from jsecon.errors import InputError
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians
 
@@ -81,6 +86,102 @@ def test_what_it_holds_shows_the_same_image(tmp_path):
     np.testing.assert_allclose(image(turned), image(given), atol=2e-4)
 
 
+@pytest.mark.parametrize("basis", [1, 4, 9, 16])
+def test_read_back_as_written(tmp_path, basis):
+    """To float32: sizes and opacities by way of their exponential and sigmoid."""
+    given = scene(101, basis)
+    save_glb(tmp_path / "a.glb", gaussians(given), codes=np.ones((101, 5), np.float32), regions=np.zeros(101, int))
+    found = load_gaussians(tmp_path / "a.glb")
+    sign = np.sign((np.asarray(found.quaternions) * given["quaternions"]).sum(1, keepdims=True))  # q and -q turn alike
+    for name, array in (given | {"quaternions": sign * given["quaternions"]}).items():
+        assert getattr(found, name).dtype == np.float32
+        np.testing.assert_allclose(getattr(found, name), array, atol=3e-6)
+    sure = given | {"opacity_logits": np.where(np.arange(101) % 2, np.inf, -np.inf)}
+    save_glb(tmp_path / "a.glb", gaussians(sure))
+    np.testing.assert_array_equal(load_glb(tmp_path / "a.glb").opacity_logits, sure["opacity_logits"])
+
+
+def rewritten(file, change):
+    """The .glb with its JSON as `change` leaves it."""
+    data = file.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    told = json.loads(data[20 : 20 + size])
+    change(told)
+    text = json.dumps(told).encode()
+    text += b" " * (-len(text) % 4)
+    behind = data[20 + size :]
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(behind), len(text), b"JSON")
+    file.write_bytes(head + text + behind)
+
+
+def test_other_writers_ways(tmp_path):
+    """Two primitives, under nodes of which one turns and the other is a matrix; rows apart; opacities of 8 bits."""
+    given, turn = gaussians(scene(30, 4)), Rotation.from_rotvec([0.1, -0.5, 0.3])
+    save_glb(tmp_path / "a.glb", given)
+
+    def change(told):
+        outer = {"rotation": turn.as_quat().tolist(), "translation": [1, 2, 3], "scale": [2, 2, 2], "children": [1, 2]}
+        shift = np.eye(4)
+        shift[:3, 3] = 5, 0, 0
+        told["nodes"] = [outer, {"mesh": 0}, {"mesh": 0, "matrix": shift.T.ravel().tolist()}]
+        names = told["meshes"][0]["primitives"][0]["attributes"]
+        alpha = told["accessors"][names[f"{NAME}:OPACITY"]]
+        colour = told["accessors"][names["COLOR_0"]]
+        alpha |= {"bufferView": colour["bufferView"], "byteOffset": 3, "componentType": 5121, "normalized": True}
+        told["bufferViews"][colour["bufferView"]]["byteStride"] = 4
+
+    rewritten(tmp_path / "a.glb", change)
+    found, axes = load_glb(tmp_path / "a.glb"), np.diag([-1.0, -1.0, 1.0])
+    inner = np.asarray(given.means) @ axes
+    both = np.concatenate([inner, inner + np.array([5, 0, 0])])
+    np.testing.assert_allclose(found.means, (turn.apply(2 * both) + np.array([1, 2, 3])) @ axes, atol=1e-5)
+    np.testing.assert_allclose(found.log_scales, np.tile(given.log_scales, (2, 1)) + np.log(2), atol=1e-5)
+    alpha = 1 / (1 + np.exp(-np.asarray(found.opacity_logits)))
+    np.testing.assert_allclose(alpha[:30], opacity(scene(30, 4)), atol=0.51 / 255)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda told: told.update(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
+        (lambda told: told["accessors"][0].update(count=1 << 40), "rows of 12 bytes"),
+        (lambda told: told["accessors"][0].update(sparse={}), "sparse"),
+        (lambda told: told["bufferViews"][0].update(byteOffset=-4), "from -4 on"),
+        (lambda told: told["bufferViews"][0].update(byteStride=0), "rows of 0 bytes"),
+        (lambda told: told["meshes"][0]["primitives"][0]["extensions"].clear(), "no primitive with the extension"),
+        (lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"), "KeyError"),
+        (lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
+        (lambda told: told["nodes"][0].update(children=[0]), "node 0 twice"),
+        (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "similarity"),
+        (lambda told: told["meshes"][0]["primitives"][0]["extensions"][NAME].update(kernel="cube"), "kernel cube"),
+        (lambda told: told["accessors"][4].update(bufferView=0, byteOffset=0), "not finite"),
+    ],
+)
+def test_what_is_none_or_not_known(tmp_path, change, says):
+    save_glb(tmp_path / "a.glb", gaussians(scene(30, 4)))
+    rewritten(tmp_path / "a.glb", change)
+    with refused("a.glb", says):
+        load_glb(tmp_path / "a.glb")
+
+
+def test_spoilt_files_are_refused(tmp_path):
+    save_glb(tmp_path / "a.glb", gaussians(scene(30, 1)))
+    whole, rng = (tmp_path / "a.glb").read_bytes(), np.random.default_rng(0)
+    for length in [*range(0, len(whole), 97), len(whole) - 1]:
+        (tmp_path / "a.glb").write_bytes(whole[:length])
+        with refused("a.glb"):
+            load_glb(tmp_path / "a.glb")
+    with refused("none.glb", "No such file"):
+        load_gaussians(tmp_path / "none.glb")
+    for _ in range(50):
+        spoilt = bytearray(whole)
+        for place in rng.integers(0, 1500, 4):
+            spoilt[place] = rng.integers(256)
+        (tmp_path / "a.glb").write_bytes(spoilt)
+        with contextlib.suppress(InputError):
+            assert load_glb(tmp_path / "a.glb").count <= 30
+
+
 @pytest.mark.parametrize("size", [1, 4, 6, 16])
 def test_codes_and_regions_are_the_applications(tmp_path, size):
     rng = np.random.default_rng(size)
@@ -93,9 +194,12 @@ def test_codes_and_regions_are_the_applications(tmp_path, size):
     assert len(found) == 6 + len(parts) + 1
 
 
-def test_nothing_to_write_and_nowhere_to_write_it(tmp_path):
+def test_nothing_to_write_and_nowhere_to_write_it(tmp_path, monkeypatch):
     with refused("a.glb", "no Gaussians"):
         save_glb(tmp_path / "a.glb", gaussians(scene(0, 1)))
     (tmp_path / "file").write_text("in the way")
+    with monkeypatch.context() as patched, refused("a.glb", "at most 4 GiB"):
+        patched.setattr(gltf, "_MOST", 1000)
+        save_glb(tmp_path / "a.glb", gaussians(scene(3, 1)))
     with refused("a.glb", "a folder"):
         save_glb(tmp_path / "file" / "a.glb", gaussians(scene(3, 1)))

@@ -111,6 +111,24 @@ def test_a_damaged_stage_is_said_and_computed_again_to_the_same_field(room_run, 
     assert (tmp_path / "out" / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
 
 
+def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_field(room_run, tmp_path, monkeypatch):
+    run, out = room_run
+    shutil.copytree(out, tmp_path / "out")
+    for file in (tmp_path / "out" / "cache").glob("votes-*"):
+        file.unlink()
+    monkeypatch.setenv("JSECON_MEMORY", "1e-6")
+    monkeypatch.setattr(cache, "MAPPED", 1000)  # what is kept of them is mapped, as were it larger
+    _, listener = _again(run, tmp_path / "out", reduce="mean")  # so that codes are made of them too
+    assert any("votes are cast in blocks: " in note for note in listener.notes)
+    assert sorted(path.suffix for path in (tmp_path / "out" / "cache").iterdir()) == [".TAG"] + 9 * [".npz"]
+    blocks, memory = (load_field(folder / "field.npz").votes for folder in (tmp_path / "out", out))
+    np.testing.assert_allclose(blocks.weights, memory.weights, rtol=1e-4, atol=0.02)
+    for name in ("weights", "total", "shown", "overlap"):
+        own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
+        assert np.linalg.norm(own - other) <= 1e-4 * np.linalg.norm(other)
+    assert (np.asarray(blocks.regions) != np.asarray(memory.regions)).mean() < 1e-3
+
+
 @pytest.fixture(scope="module")
 def on_given_gaussians(room_run, tmp_path_factory):
     """The run on its own Gaussians given as a file, and what was told."""

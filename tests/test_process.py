@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from jsecon import process
+from jsecon.errors import InputError
 from jsecon.process import compiling, forget_programs, programs_built, settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -109,3 +111,16 @@ def test_a_compilation_is_told_while_it_lasts():
     looking.join()
     assert any(seen)
     assert not compiling(longer=0.0)
+
+
+def test_room_for_columns_is_half_of_what_is_free_or_what_the_user_says(monkeypatch):
+    monkeypatch.delenv("JSECON_MEMORY", raising=False)
+    monkeypatch.setattr(process, "memory", lambda: (6 << 30, None))
+    assert process.memory_budget() == 3 << 30
+    monkeypatch.setattr(process, "memory", lambda: (None, None))
+    assert process.memory_budget() == float("inf")
+    monkeypatch.setenv("JSECON_MEMORY", "0.5")
+    assert process.memory_budget() == 1 << 29
+    monkeypatch.setenv("JSECON_MEMORY", "a lot")
+    with pytest.raises(InputError, match="export JSECON_MEMORY=4"):
+        process.memory_budget()

@@ -38,7 +38,7 @@ def near():
     return gaussians(arrays | {"means": arrays["means"] / 10})
 
 
-@pytest.mark.parametrize("name", ["scene.ply", "scene.spz"])
+@pytest.mark.parametrize("name", ["scene.ply", "scene.spz", "scene.glb"])
 def test_a_scene_that_nerfstudio_trained_is_carried_back(tmp_path, near, name):
     """Into the world of transforms.json, which is not the source's where an applied_transform made it."""
     applied = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])

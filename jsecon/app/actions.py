@@ -77,34 +77,31 @@ def _query(asked: Query, console: Console) -> Told:
     _check_phrases(asked)
     require_writable(asked.out)
     with console.progress("field"):
-        from jsecon.app import question
+        from jsecon.app import asking
         from jsecon.app.summary import write_answers
         from jsecon.data.gaussian_files import require_written
-        from jsecon.language.field import load_field
+        from jsecon.language.field import check_field, load_field
 
         require_written(asked.out / f"answer.{asked.format}")
-        field = load_field(asked.field)
+        if large := asking.larger_than_memory(asked.field):
+            outlined = bool(asked.mask or boxes or asked.phrases)
+            asking.require_blocks(asked.field, by=asked.by, even=asked.even, outlined=outlined)
+            check_field(asked.field)
+        field = load_field(asked.field, mapped=large)
         texts = asked.texts if asked.phrases is None else []
         embedder = _embedder(field, asked) if texts else None
     by_phrase, unread = ([], []) if asked.phrases is None else _phrases(field, asked, console)
-    asking = question.questions_of(
-        field,
-        embedder,
-        texts=texts,
-        pixels=pixels,
-        masks=asked.mask or (),
-        boxes=boxes,
-        several=asked.all,
-        even=asked.even,
-        by=asked.by,
-        threshold=asked.threshold,
-        outliers=not asked.keep_outliers,
-    )
+    how: dict[str, Any] = {"texts": texts, "pixels": pixels, "several": asked.all, "by": asked.by}
+    how |= {"threshold": asked.threshold, "outliers": not asked.keep_outliers}
     with console.progress("answers"):
-        answers, refused = question.asked_each(asking)
+        if large:
+            answers, refused = asking.answered_in_blocks(field, embedder, **how)
+        else:
+            how |= {"masks": asked.mask or (), "boxes": boxes, "even": asked.even}
+            answers, refused = asking.asked_each(asking.questions_of(field, embedder, **how))
     answers, refused = by_phrase + answers, unread + refused
-    how = {"views": asked.views, "ending": asked.format}
-    told = write_answers(field, answers, asked.out, console, **how) if answers else {"answers": []}
+    files = {"views": asked.views, "ending": asked.format}
+    told = write_answers(field, answers, asked.out, console, **files) if answers else {"answers": []}
     return told | {"refused": refused}
 
 
@@ -168,13 +165,13 @@ def _view(asked: View, console: Console) -> Told:
         raise InputError("--export", str(asked.export), "a file that ends in .html", "For example: --export page.html")
     require_writable(asked.export.parent)
     with console.progress("page"):
-        from jsecon.app import question
+        from jsecon.app import asking
         from jsecon.app.splat_page import write_page
         from jsecon.language.field import load_field
 
         field = load_field(asked.field)
         embedder = _embedder(field, asked) if asked.texts else None
-        answers, refused = question.asked_each(question.questions_of(field, embedder, texts=asked.texts))
+        answers, refused = asking.asked_each(asking.questions_of(field, embedder, texts=asked.texts))
         size = write_page(field, answers, asked.export, title=asked.field.resolve().parent.name)
     console.say(
         f"{(count := field.gaussians.count)} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {asked.export}"

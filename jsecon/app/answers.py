@@ -14,8 +14,8 @@ from jaxtyping import Bool
 from jsecon.app.question import Answer
 from jsecon.app.splat_page import NOWHERE, regions_of
 from jsecon.data.gaussian_files import save_gaussians
-from jsecon.data.ply import save_ply
 from jsecon.files import write_text, written_whole
+from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import transform_gaussians
@@ -42,6 +42,11 @@ def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
         seen = ((u >= 0) & (u < field.cameras.width) & (v >= 0) & (v < field.cameras.height)).sum(1)
     order = np.argsort(-seen, kind="stable")[:count]
     return [int(t) for t in order if seen[t] > 0]
+
+
+def part_of(field: LanguageField, answer: Answer) -> LanguageField:
+    """The field of the Gaussians that an answer speaks of: of all, but where `Answer.rows` names them."""
+    return field if answer.rows is None else field_of_rows(field, answer.rows)
 
 
 def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[str, Any]:
@@ -82,12 +87,14 @@ def write_answer(
     """Writes OUT/<slug>.ply (or .spz, .glb: `ending`), .json, and <slug>-<frame>.png of `masks` (by frame, see
     `masks_of`); returns the figures. An empty selection leaves out the Gaussians and the masks.
     """
-    slug = slug_of(answer.question)
+    slug, count = slug_of(answer.question), field.gaussians.count
+    field = part_of(field, answer)
     chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
-    told = _figures(field, answer, chosen) | {ending: None, "masks": {}}
+    told = _figures(field, answer, chosen) | {"of": count, ending: None, "masks": {}}
     if answer.mask.any():
         told[ending] = f"{slug}.{ending}"
-        _save(field, chosen, answer.mask, out / told[ending])
+        own = {"codes": np.asarray(field.codes), "regions": _regions(field)} if ending == "glb" else {}
+        save_gaussians(out / told[ending], chosen, **{name: table[answer.mask] for name, table in own.items()})
         for t, mask in masks.items():
             told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
             with written_whole(out / told["masks"][field.names[t]]) as temporary:
@@ -97,20 +104,21 @@ def write_answer(
 
 
 def save_scene(field: LanguageField, file: Path) -> None:
-    """Writes all Gaussians in the capture files' own world; with their codes and regions where the file is a .glb. A
-    .ply is written in blocks: a mapped field need not fit into memory."""
-    if file.suffix == ".ply":
-        return save_ply(file, field.gaussians, similarity=field.to_source)
-    _save(field, transform_gaussians(field.gaussians, field.to_source), np.ones(field.gaussians.count, bool), file)
+    """Writes all Gaussians in the capture files' own world, in blocks: a mapped field need not fit into memory. With
+    their codes and regions where the file is a .glb."""
+    own = {"codes": field.codes, "regions": _regions(field)} if file.suffix == ".glb" else {}
+    save_gaussians(file, field.gaussians, similarity=field.to_source, **own)
 
 
-def _save(field: LanguageField, chosen: Gaussians, mask: np.ndarray, file: Path) -> None:
-    regions = regions_of(field)[mask]
-    save_gaussians(file, chosen, codes=np.asarray(field.codes)[mask], regions=np.where(regions == NOWHERE, -1, regions))
+def _regions(field: LanguageField) -> np.ndarray:
+    """(N,) as a .glb holds them: -1 = none."""
+    regions = regions_of(field)
+    return np.where(regions == NOWHERE, -1, regions)
 
 
 def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:
     """frame -> (H, W) bool of the `views` best frames: where the selected Gaussians alone have an alpha above 0.7."""
+    field = part_of(field, answer)
     gaussians, mask = jax.device_put((field.gaussians, answer.mask))
     cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
     frames = best_frames(field, answer, views)

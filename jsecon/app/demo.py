@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jsecon.app import pictures, question, report, summary
+from jsecon.app import asking, pictures, question, report, summary
 from jsecon.app.answers import masks_of, write_answer
 from jsecon.app.film import write_film
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
@@ -110,8 +110,8 @@ def _metrics(results: dict[str, tuple[list[Row], dict[str, Any]]], found: Run, g
 
 def answers_to(field: LanguageField, embedder: Any, texts: Sequence[str]) -> dict[str, question.Answer]:
     """text → its answer, of those that are understood."""
-    questions = question.questions_of(field, embedder, texts=texts)
-    return {answer.question: answer for answer in question.asked_each(questions)[0]}
+    questions = asking.questions_of(field, embedder, texts=texts)
+    return {answer.question: answer for answer in asking.asked_each(questions)[0]}
 
 
 def write_queries(field: LanguageField, answers: Mapping[str, question.Answer], out: Path) -> dict[str, dict[str, Any]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from jsecon.errors import InputError
-from jsecon.process import cores
+from jsecon.process import cgroup_words, cores, memory
 
 LEAST_MEMORY, LEAST_DISK = 2 << 30, 200 << 20
 """bytes that `jsecon demo` takes, rounded up"""
@@ -103,8 +103,8 @@ def _backend() -> list[Check]:
 
 
 def _cores() -> Check:
-    quota = _limit("cpu.max", "cpu/cpu.cfs_quota_us")
-    period = (quota[1:] or _limit("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
+    quota = cgroup_words("cpu.max", "cpu/cpu.cfs_quota_us")
+    period = (quota[1:] or cgroup_words("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
     told = f"{cores()} of {os.cpu_count()} may be used"
     if quota and quota[0].isdecimal() and int(quota[0]) < cores() * int(period):
         told += f", but the time of only {int(quota[0]) / int(period):.3g} (cgroup)"
@@ -112,31 +112,13 @@ def _cores() -> Check:
 
 
 def _memory() -> Check:
-    try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free = 1024 * int(lines["MemAvailable"].split()[0])
-    except (OSError, KeyError, ValueError):
+    free, limit = memory()
+    if free is None:
         return Check("memory", "ok", "this system does not tell how much is free")
-    told, limit = f"{_size(free)} free", _limit("memory.max", "memory/memory.limit_in_bytes")
-    if limit and limit[0].isdecimal() and int(limit[0]) < 1 << 60:  # more is no limit
-        used = _limit("memory.current", "memory/memory.usage_in_bytes") or ["0"]
-        told, free = f"{told}, limit {_size(int(limit[0]))} (cgroup)", min(free, int(limit[0]) - int(used[0]))
+    told = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
     enough = free >= LEAST_MEMORY
     told += "" if enough else f"; jsecon demo takes {_size(LEAST_MEMORY)}"
     return Check("memory", "ok" if enough else "wrong", told, "End other programs, or raise the limit.")
-
-
-def _limit(new: str, old: str) -> list[str]:
-    """The words of a file of this process's cgroup, of version 2 or else 1; none where there is none."""
-    try:
-        own = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
-    except (OSError, ValueError):
-        return []
-    kind, _, name = old.partition("/")
-    group = own.get(kind, "/").lstrip("/")
-    top, at = Path("/sys/fs/cgroup"), own.get("", "/").lstrip("/")
-    places = (top / at / new, top / new, top / kind / group / name, top / kind / name)
-    return next((path.read_text().split() for path in places if path.is_file()), [])
 
 
 def _disk() -> Check:

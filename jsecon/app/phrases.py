@@ -16,7 +16,7 @@ from jsecon.data.frames import Progress, spread
 from jsecon.errors import InputError
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
-from jsecon.query.anchored import nothing
+from jsecon.query.anchored import query_region
 from jsecon.query.lift import lift
 from jsecon.query.outliers import outliers_removed
 from jsecon.types import LanguageField
@@ -94,7 +94,8 @@ def lifted(
     stack = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) >= 0.5 for mask in masks])
     left = {"text encoder": "SAM 3 reads the phrase"}
     if not stack.any():
-        return Answer(phrase, "phrase", nothing(field), np.zeros(field.gaussians.count, bool), left, frames=scores)
+        none = np.zeros(field.gaussians.count, bool)
+        return Answer(phrase, "phrase", query_region(field, -1), none, left, frames=scores)
     selection = lift(field, stack, list(found), threshold=threshold)
     mask, why = np.asarray(selection.mask), "not asked for"
     if outliers:

@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jsecon.splat.banded import render_in_blocks
+from jsecon.splat.bands import block_bounds
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import Array, Camera, Gaussians, LanguageField
 
@@ -138,15 +140,18 @@ def strip(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, gap: int = 6) -> 
 
 
 class Renderer:
-    """Pictures of one scene from its views."""
+    """Pictures of one scene from its views; `in_blocks`, of one larger than memory, in its own colours alone."""
 
-    def __init__(self, gaussians: Gaussians, cameras: Camera):
-        self._gaussians = jax.device_put(gaussians)
+    def __init__(self, gaussians: Gaussians, cameras: Camera, *, in_blocks: bool = False):
+        self._gaussians = gaussians if in_blocks else jax.device_put(gaussians)
+        self._bounds = block_bounds(gaussians) if in_blocks else None
         self._cameras = jax.tree.map(np.asarray, cameras)  # whose items compile nothing
         self.photo = functools.cache(self._photo)
 
     def _photo(self, view: int) -> UInt8[np.ndarray, "h w 3"]:
         """The scene in its own colours."""
+        if self._bounds is not None:
+            return _to_bytes(render_in_blocks(self._gaussians, self._cameras[view], bounds=self._bounds))
         return _to_bytes(render_rgb(self._gaussians, self._cameras[view]).features)
 
     def colours(self, view: int, rgb: Float[Array, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -9,33 +9,30 @@ splat/transform and query/masks the engine, behind `by="silhouette"` query/silho
 """
 
 import dataclasses
-import functools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Float, Int
 
-from jsecon.data.images import read_stored
 from jsecon.errors import InputError, require
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.language.shares import SHARE_THRESHOLD
-from jsecon.query.anchored import query_anchored, query_region
+from jsecon.query.anchored import Found, found_of, members, query_region
 from jsecon.query.direct import query_canonical, query_one_step
-from jsecon.query.lift import box_mask, lift
-from jsecon.query.neighbours import evened, nearest
+from jsecon.query.lift import lift
+from jsecon.query.neighbours import evened
 from jsecon.query.outliers import outliers_removed
 from jsecon.query.parts import query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
-from jsecon.query.several import parts_of_question, query_several
+from jsecon.query.several import found_of_several, parts_of_question
 from jsecon.query.silhouette import silhouette_members
-from jsecon.types import LanguageField, Selection
+from jsecon.types import Array, LanguageField, Selection
 
 METHODS = ("votes", "silhouette", "code", "one_step", "canonical")
 """votes, code: anchored, membership by a Gaussian's votes or its code; silhouette: by votes, then one by one by the
@@ -64,57 +61,13 @@ class Answer:
     embedders without one (`Logits`)."""
     frames: Mapping[str, list[float]] | None = None
     """of a phrase: frame -> the score of each mask found there, best first; None of other questions."""
+    rows: np.ndarray | None = None
+    """(M,) int64 the Gaussians that selection and mask have a row for, where those are not all N of the field."""
 
     @property
     def dropped(self) -> int:
         """Gaussians dropped as outliers."""
         return int(np.asarray(self.selection.mask).sum() - self.mask.sum())
-
-
-def questions_of(
-    field: LanguageField,
-    embedder: Any,
-    *,
-    texts: Sequence[str] = (),
-    pixels: Sequence[tuple[Any, ...]] = (),
-    masks: Sequence[Sequence[str]] = (),
-    boxes: Sequence[tuple[Any, ...]] = (),
-    several: bool = False,
-    even: bool = False,
-    by: str = "votes",
-    threshold: float | None = None,
-    outliers: bool = True,
-) -> list[Callable[[], "Answer"]]:
-    """What the command line asks of a field, each to be called: texts, pixels (frame, column, row), outlines (frame,
-    file, frame, file, ... of one thing), boxes (frame, left, upper, right, lower end)."""
-    shape: dict[str, Any] = {"threshold": threshold, "outliers": outliers}
-    how = shape | {"by": by, "near": nearest(field.gaussians.means) if even else None}
-    found: list[Callable[[], Answer]] = []
-    found += [functools.partial(ask_text, field, embedder, text, several=several, **how) for text in texts]
-    found += [functools.partial(ask_pixel, field, *pixel, **how) for pixel in pixels]
-
-    def outlined(pairs: Sequence[str]) -> Answer:
-        files = dict(zip(pairs[::2], map(Path, pairs[1::2])))
-        outlines = {frame: read_mask(file, field) for frame, file in files.items()}
-        return ask_outline(field, Path(pairs[1]).stem, outlines, **shape)
-
-    def boxed(frame: str, *ends: int) -> Answer:
-        name = f"box {frame} {' '.join(map(str, ends))}"
-        return ask_outline(field, name, {frame: box_mask(field, *ends)}, **shape)
-
-    found += [functools.partial(outlined, pairs) for pairs in masks]
-    return found + [functools.partial(boxed, *box) for box in boxes]
-
-
-def asked_each(questions: Sequence[Callable[[], "Answer"]]) -> tuple[list["Answer"], list[InputError]]:
-    """The answers, and why the other questions have none: one that cannot be understood does not stop the rest."""
-    answers, refused = [], []
-    for ask in questions:
-        try:
-            answers.append(ask())
-        except InputError as error:
-            refused.append(error)
-    return answers, refused
 
 
 def ask_text(
@@ -137,42 +90,74 @@ def ask_text(
     for a part, and for several regions or a composite text by anything but votes.
     """
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
-    if not len(field.canonical):  # its embeddings came from files, without phrases: those of who reads the text
-        field = dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
+    if by in ("one_step", "canonical") and not several and sum(map(len, parts_of_question(text))) == 1:
+        return answer_of(field, text, by, _compared(field, embedder, text, by, threshold), outliers, {})
+    asked = sought(field, embedder, text, by=by, several=several, piece_nearness=piece_nearness)
+    selection = members(field, asked.found, threshold, by=_membership(by))
+    if several and field.parts is not None:
+        selection = query_parts(asked.field, selection, asked.wanted)
+    selection = _shaped(field, selection, by, threshold, near)
+    return dataclasses.replace(answer_of(field, text, by, selection, outliers, {}, keep=asked.keep), there=asked.there)
+
+
+class Sought(NamedTuple):
+    """What a text asks of a field's regions."""
+
+    field: LanguageField
+    """with canonical phrases."""
+    wanted: Float[Array, "q e"]
+    """embeddings of what is wanted."""
+    found: Found
+    keep: str
+    """of the selection's clusters: "largest", or "all" where there may be several things."""
+    there: float | None
+    """as in `Answer`."""
+
+
+def sought(
+    field: LanguageField,
+    embedder: Any,
+    text: str,
+    *,
+    by: str = "votes",
+    several: bool = False,
+    piece_nearness: float = PIECE_NEARNESS,
+) -> Sought:
+    """The regions that a text names; options and errors as for `ask_text`."""
+    field = with_phrases(field, embedder)
     wanted, unwanted = parts_of_question(text)
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
-    logits = getattr(embedder, "logits", None) if by in ("votes", "silhouette", "code") else None
+    how: dict[str, Any] = {"piece_nearness": piece_nearness, "logits": getattr(embedder, "logits", None)}
+    keep = "largest"
     if several or unwanted or len(wanted) > 1:
         if by not in ("votes", "silhouette"):
             remedy = "Leave out --by, or ask for one thing."
             raise InputError(text, f"several regions by {by}", "by votes or silhouette", remedy)
-        given: dict[str, Any] = {} if threshold is None else {"similarity_threshold": threshold}
-        embedded = jax.device_put(embedder.embed_text(wanted + unwanted))
-        split = embedded[: len(wanted)], embedded[len(wanted) :]
-        given |= {"piece_nearness": piece_nearness, "logits": logits}
-        selection = query_several(field, *split, several=several, **given)
-        if several and field.parts is not None:
-            selection = query_parts(field, selection, split[0])
-        answer = _answer(field, text, by, _shaped(field, selection, by, threshold, near), outliers, {}, keep="all")
-        return dataclasses.replace(answer, there=best_presence(field.regions, split[0], selection.region, logits))
-    embedding = jax.device_put(embedder.embed_text([text])[0])
-    if by in ("votes", "silhouette", "code"):
-        shape: dict[str, Any] = {"similarity_threshold": threshold, "piece_nearness": piece_nearness, "logits": logits}
-        selection = query_anchored(field, embedding, by=_membership(by), **shape)
-        selection = _shaped(field, selection, by, threshold, near)
+        embedded, keep = jax.device_put(embedder.embed_text(wanted + unwanted)), "all"
+        texts = embedded[: len(wanted)]
+        found = found_of_several(field, texts, embedded[len(wanted) :], several=several, **how)
     else:
-        from jsecon.language.codes import encode
+        texts = jax.device_put(embedder.embed_text([text]))
+        found = found_of(field, texts[0], **how)
+    return Sought(field, texts, found, keep, best_presence(field.regions, texts, found.region, how["logits"]))
 
-        code = encode(field.autoencoder, embedding)
-        usual = ONE_STEP_THRESHOLD if by == "one_step" else CANONICAL_THRESHOLD
-        least = usual if threshold is None else threshold
-        if by == "one_step":
-            selection = query_one_step(field.codes, code, least)
-        else:
-            canonical = encode(field.autoencoder, jnp.asarray(field.canonical))
-            selection = query_canonical(field.codes, code, canonical, least)
-    answer = _answer(field, text, by, selection, outliers, {})
-    return dataclasses.replace(answer, there=best_presence(field.regions, embedding[None], selection.region, logits))
+
+def _compared(field: LanguageField, embedder: Any, text: str, by: str, threshold: float | None) -> Selection:
+    """The Gaussians whose codes are like the text's."""
+    from jsecon.language.codes import encode
+
+    code = encode(field.autoencoder, jax.device_put(embedder.embed_text([text])[0]))
+    if by == "one_step":
+        return query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
+    canonical = encode(field.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical))
+    return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD if threshold is None else threshold)
+
+
+def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
+    """The field with canonical phrases: those of who reads the text, where its embeddings came from files without."""
+    if len(field.canonical):
+        return field
+    return dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
 
 
 def ask_pixel(
@@ -191,24 +176,32 @@ def ask_pixel(
 
     Raises InputError for a frame or pixel that the field does not have, and where no region lies there.
     """
-    index = frame_index(field, frame)
-    region = region_at(field, index, x, y)
-    name = field.names[index]
-    if region < 0:
-        remedy = "Choose another pixel or frame: report.html of the run shows the regions."
-        raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
+    name, region = region_under(field, frame, x, y)
     by = by if by in ("silhouette", "code") else "votes"
     selection = query_region(field, region, by=_membership(by), similarity_threshold=threshold)
     selection = _shaped(field, selection, by, threshold, near)
-    left = {"text encoder": "the region under the pixel is the anchor"}
-    return _answer(field, f"at {name} {x} {y}", by, selection, outliers, left)
+    return answer_of(field, name, by, selection, outliers, POINTED)
+
+
+POINTED = {"text encoder": "the region under the pixel is the anchor"}
+"""what a pixel leaves out, and why"""
+
+
+def region_under(field: LanguageField, frame: int | str, x: int, y: int) -> tuple[str, int]:
+    """What the question at a pixel is called, and the region there. Raises InputError as `ask_pixel` does."""
+    index = frame_index(field, frame)
+    region, name = region_at(field, index, x, y), field.names[index]
+    if region < 0:
+        remedy = "Choose another pixel or frame: report.html of the run shows the regions."
+        raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
+    return f"at {name} {x} {y}", region
 
 
 def ask_region(field: LanguageField, region: int, *, several: bool = False, **shape: Any) -> Answer:
     """The Gaussians of a region, with `several` of all that are alike; `shape` as for `query_region`."""
     selection = query_region(field, region, alike_threshold=ALIKE_THRESHOLD if several else None, **shape)
     left = {"text encoder": "the region is the anchor"}
-    return _answer(field, f"region {region}", "votes", selection, True, left, keep="all" if several else "largest")
+    return answer_of(field, f"region {region}", "votes", selection, True, left, keep="all" if several else "largest")
 
 
 def ask_outline(
@@ -227,18 +220,7 @@ def ask_outline(
     least = SHARE_THRESHOLD if threshold is None else threshold
     selection = lift(field, np.stack([np.asarray(m).astype(int) for m in outlines.values()]), frames, threshold=least)
     left = {"text encoder": "the outline says what is meant"}
-    return _answer(field, name, "outline", selection, outliers, left)
-
-
-def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
-    """(H, W) bool of an image file, at the size of the field's frames: what is not black. Raises InputError where it is
-    no image, or one of another shape."""
-    image, size = read_stored(Path(file)), (field.cameras.width, field.cameras.height)
-    mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
-    if abs(mask.shape[1] * size[1] - mask.shape[0] * size[0]) > max(size) + max(mask.shape):
-        found, wanted = f"{mask.shape[1]}x{mask.shape[0]}", f"{size[0]}x{size[1]}, or the same shape at another size"
-        raise InputError(file, found, wanted, "Outline the frame as the run used it.")
-    return np.asarray(cv2.resize(np.asarray(mask), size, interpolation=cv2.INTER_NEAREST)) > 0
+    return answer_of(field, name, "outline", selection, outliers, left)
 
 
 def _membership(by: str) -> str:
@@ -282,7 +264,7 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
     raise InputError(f"frame {frame}", "no such frame in the field", known, "report.html of the run shows the frames.")
 
 
-def _answer(
+def answer_of(
     field: LanguageField,
     question: str,
     by: str,
@@ -291,6 +273,7 @@ def _answer(
     left: dict[str, str],
     keep: str = "largest",
 ) -> Answer:
+    """A selection as the answer to a question, without outliers; `left`: what was not needed, and why."""
     mask = np.asarray(selection.mask)
     if outliers:
         mask, why = outliers_removed(field.gaussians.means, mask, keep=keep)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.app.question import Answer
 from jsecon.files import write_text
-from jsecon.language.shares import SHARE_THRESHOLD, vote_shares
+from jsecon.language.shares import SHARE_THRESHOLD, vote_blocks, vote_shares
 from jsecon.numerics import sigmoid
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
@@ -64,12 +64,14 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
 
 
 def regions_of(field: LanguageField) -> Int[np.ndarray, " n"]:
-    """The region that has most of each Gaussian, and at least half; NOWHERE where none has."""
-    share = np.nan_to_num(np.asarray(vote_shares(field.votes)))
-    found = np.asarray(field.votes.regions)
-    best = share.argmax(1)
-    rows = np.arange(len(best))
-    return np.where(share[rows, best] >= SHARE_THRESHOLD, found[rows, best], NOWHERE)
+    """The region that has most of each Gaussian, and at least half; NOWHERE where none has. Read in blocks."""
+    parts = [np.zeros(0, np.int32)]
+    for votes in vote_blocks(field.votes):
+        share, found = np.nan_to_num(np.asarray(vote_shares(votes))), np.asarray(votes.regions)
+        best = share.argmax(1)
+        rows = np.arange(len(best))
+        parts.append(np.where(share[rows, best] >= SHARE_THRESHOLD, found[rows, best], NOWHERE))
+    return np.concatenate(parts)
 
 
 def _told(answer: Answer, kept: Bool[np.ndarray, " n"]) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
 from jsecon.pipeline.pipeline import Run, peak_memory_mib
 from jsecon.pipeline.progress import Listener
-from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -57,7 +56,7 @@ def write_scene(
     gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener
 ) -> dict[str, Any]:
     """The file of a fitted scene, in the world of the capture's files; says the figures, and returns them."""
-    save_gaussians(out, transform_gaussians(gaussians, capture.to_source))
+    save_gaussians(out, gaussians, similarity=capture.to_source)
     say_quality(held_out, listener)
     listener.say(f"{gaussians.count} Gaussians  {out}")
     return {"written": {"scene": out}, "gaussians": gaussians.count} | quality_told(held_out)
@@ -106,7 +105,8 @@ def write_answers(
     ending: str = "ply",
 ) -> dict[str, Any]:
     """The files of each answer, OUT/answers.html, and a line each; returns the files and the figures."""
-    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras), [], []
+    in_blocks = any(item.rows is not None for item in answers)
+    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras, in_blocks=in_blocks), [], []
     with listener.progress("pictures") as progress:
         for n, item in enumerate(answers):
             shown = answers_of.masks_of(field, item, max(views, 1))

@@ -69,7 +69,7 @@ class Fit(SceneOptions):
     """fit Gaussians to a capture, and no more
 
     From posed frames to a scene of 3D Gaussians in the capture's own world, as a .ply (INRIA's layout; SuperSplat opens
-    it), .spz (extra formats) or .glb, with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the
+    it), .spz or .glb, with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the
     same name without the ending, from which it goes on when it was stopped, and `jsecon run` into that folder too.
     """
 
@@ -98,7 +98,9 @@ class Query(Asking):
 
     For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA's layout, in the capture's
     own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames
-    that show it best, and answers.html with the pictures.
+    that show it best, and answers.html with the pictures. A field of more than half of the free memory, or than
+    JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, to the same answers: texts and --at, by
+    votes or code.
     """
 
     texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
@@ -146,7 +148,7 @@ class Query(Asking):
 class Export:
     """write the whole scene of a field for other programs
 
-    As .ply (INRIA's layout), .spz (extra formats) or .glb, in the capture's own world. The .glb is glTF with Khronos'
+    As .ply (INRIA's layout), .spz or .glb, in the capture's own world. The .glb is glTF with Khronos'
     KHR_gaussian_splatting, y up, and holds each Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
     """
 

@@ -1,50 +1,45 @@
 """Gaussians out of a file and into one, whose ending says how: INRIA's .ply and what viewers and phones use.
 
-SuperSplat's compressed .ply, .spz and .sog are read, and .spz is written, by gsply (extra formats).
+SuperSplat's compressed .ply, .spz and .sog are read by gsply (extra formats). What is written is written in blocks.
 """
 
 import importlib.util
-import math
 import zipfile
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.data.gltf import save_glb
+from jsecon.data.gltf import load_glb, save_glb
 from jsecon.data.ply import SH_DC, load_ply, save_ply, sound
-from jsecon.data.ply_file import opened
+from jsecon.data.ply_file import elements_of
+from jsecon.data.spz import AXES as SPZ_AXES, save_spz
 from jsecon.errors import InputError
-from jsecon.files import parsed_json, written_whole
+from jsecon.files import parsed_json
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Array, Gaussians
 
 WRITTEN = (".ply", ".spz", ".glb")
 _GSPLY = {".ply": "plyread", ".spz": "read_spz", ".sog": "sogread"}
-_READ = "Gaussians as .ply (INRIA's or SuperSplat's compressed), .spz, .sog or .splat"
-_SPZ_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""from a .ply's x right, y down, z forward to .spz's x right, y up, z back; and back again"""
-_SPZ_BITS = 16
-"""most of a coordinate's 24 bits behind the point; far Gaussians need more of them before it"""
+_READ = "Gaussians as .ply (INRIA's or SuperSplat's compressed), .glb, .spz, .sog or .splat"
 _CHUNK = 256
 """Gaussians that share their bounds in a compressed .ply"""
 _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
 
 def load_gaussians(path: str | Path) -> Gaussians:
-    """Gaussians from a .ply in INRIA's layout or SuperSplat's compressed one, a .spz, .sog or .splat; N may be 0.
+    """Gaussians from a .ply in INRIA's layout or SuperSplat's compressed one, a .glb (`load_glb`), .spz, .sog or
+    .splat; N may be 0.
 
-    All come in the world of the .ply that they were made from: .spz has y up by its makers' definition, and is turned
-    back (x, -y, -z), as by splat-transform; the others are not turned. Raises InputError on other formats, damaged
-    files, numbers that are not finite, and where gsply is needed and not installed.
+    All come in the world of the .ply that they were made from: .spz and .glb have y up by their makers' definition, and
+    are turned back, (x, -y, -z) and (-x, -y, z), as by splat-transform; the others are not turned. Raises InputError on
+    other formats, damaged files, numbers that are not finite, and where gsply is needed and not installed.
     """
     path = Path(path)
     kind = path.suffix.lower()
-    if kind not in (*_GSPLY, ".splat"):
-        other = "Export the scene as one of them."
-        remedy = other if kind == ".glb" else f"Run: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
+    if kind not in (*_GSPLY, ".splat", ".glb"):
+        remedy = f"Run: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
         raise InputError(path, f"a file that ends in {kind or 'nothing'}", _READ, remedy)
     try:
         with path.open("rb") as file:
@@ -53,9 +48,11 @@ def load_gaussians(path: str | Path) -> Gaussians:
         raise InputError(path, error.strerror or "an error on reading", _READ, "Check the path.") from error
     if kind == ".ply" and b"packed_position" not in head:
         return load_ply(path)
+    if kind == ".glb":
+        return load_glb(path)
     arrays = _read_splat(path) if kind == ".splat" else _read_by_gsply(path, kind)
     gaussians = sound(path, {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()})
-    return transform_gaussians(gaussians, _SPZ_AXES) if kind == ".spz" else gaussians
+    return transform_gaussians(gaussians, SPZ_AXES) if kind == ".spz" else gaussians
 
 
 def save_gaussians(
@@ -64,9 +61,11 @@ def save_gaussians(
     *,
     codes: Float[Array, "n d"] | None = None,
     regions: Int[Array, " n"] | None = None,
+    similarity: Float[Array, "4 4"] | None = None,
 ) -> None:
     """Writes Gaussians as a .ply (INRIA's layout, exact), a .spz (version 3) or a .glb, which alone takes codes and
-    regions (`save_glb`).
+    regions (`save_glb`); carried by `similarity` (4, 4) into another world, in blocks: mapped columns need not fit into
+    memory.
 
     A .spz holds places in 24 bits to 2^-16 units or, in scenes beyond 128 units, to 2^-23 of its extent; sizes to 3 %
     and from exp(-10) to exp(5.9) units, opacities and colours in 8 bits, turns in 32. Raises InputError where
@@ -75,11 +74,11 @@ def save_gaussians(
     path = Path(path)
     require_written(path)
     if path.suffix == ".glb":
-        save_glb(path, gaussians, codes=codes, regions=regions)
+        save_glb(path, gaussians, codes=codes, regions=regions, similarity=similarity)
     elif path.suffix == ".spz":
-        _save_spz(path, gaussians)
+        save_spz(path, gaussians, similarity=similarity)
     else:
-        save_ply(path, gaussians)
+        save_ply(path, gaussians, similarity=similarity)
 
 
 def require_written(path: Path) -> None:
@@ -87,8 +86,6 @@ def require_written(path: Path) -> None:
     if path.suffix not in WRITTEN:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."
         raise InputError(path, f"the ending {path.suffix or 'of nothing'}", " or ".join(WRITTEN), remedy)
-    if path.suffix == ".spz":
-        _require_gsply(path)
 
 
 def _require_gsply(path: Path) -> None:
@@ -103,7 +100,7 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
 
     remedy = f"Export it again, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
     if kind == ".ply":  # gsply looks up a chunk that is not there without an error, as it does a .sog's codebook
-        counts = {element.name: element.count for element in opened(path)[2]}
+        counts = {element.name: element.count for element in elements_of(path)[1]}
         if counts.get("chunk", 0) * _CHUNK < counts.get("vertex", 0):
             found = f"{counts.get('chunk', 0)} chunks for {counts['vertex']} Gaussians"
             raise InputError(path, f"a compressed .ply of {found}", f"a chunk for every {_CHUNK}", remedy)
@@ -140,18 +137,3 @@ def _read_splat(path: Path) -> dict[str, np.ndarray]:
         "opacity_logits": np.log(alpha / (1 - alpha)),
         "sh": ((rows["rgba"][:, None, :3] / 255.0) - 0.5) / SH_DC,
     }
-
-
-def _save_spz(path: Path, gaussians: Gaussians) -> None:
-    import gsply
-
-    turned = jax.tree.map(lambda a: np.asarray(a, np.float32), transform_gaussians(gaussians, _SPZ_AXES))
-    reach = float(np.abs(turned.means).max(initial=1.0))
-    bits = min(_SPZ_BITS, 23 - math.ceil(math.log2(reach)))
-    if bits < 1:
-        found, wanted = f"a Gaussian {reach:.3g} units from the origin", "at most 4,000,000"
-        raise InputError(path, found, wanted, "Write a .ply, or bring the scene nearer to its origin.")
-    shape, logits = (turned.means, turned.log_scales, turned.quaternions), np.clip(turned.opacity_logits, -30, 30)
-    data = gsply.GSData.from_arrays(*shape, logits, turned.sh[:, 0], turned.sh[:, 1:], format="ply")
-    with written_whole(path) as temporary:
-        gsply.write_spz(temporary, data, version=3, fractional_bits=bits)

@@ -5,26 +5,37 @@ opacities between 0 and 1, quaternions xyzw of length 1; one attribute for each 
 order and with the signs of INRIA's layout. Viewers without the extension show COLOR_0, a cloud of coloured points.
 """
 
+import dataclasses
 import json
 import math
 import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
+from jsecon.data.ply import sound
 from jsecon.errors import InputError
-from jsecon.files import written_whole
+from jsecon.files import UNREADABLE, parsed_json, written_whole
 from jsecon.splat.sh import C0
-from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.transform import transform_gaussians, transformed_blocks
 from jsecon.types import Array, Gaussians
 
 _NAME = "KHR_gaussian_splatting"
 _AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""from a .ply's x right, y down, z forward to glTF's x left, y up, z forward"""
-_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+"""from a .ply's x right, y down, z forward to glTF's x left, y up, z forward; and back again"""
+_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_TYPES = {size: name for name, size in _COMPONENTS.items()}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
+_READ = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_MOST = (1 << 32) - 1
+"""bytes of a .glb"""
+_WANTED, _REMEDY = f"a .glb of Gaussians ({_NAME})", "Export the scene again, or as a .ply."
 
 
 def save_glb(
@@ -33,49 +44,66 @@ def save_glb(
     *,
     codes: Float[Array, "n d"] | None = None,
     regions: Int[Array, " n"] | None = None,
+    similarity: Float[Array, "4 4"] | None = None,
 ) -> None:
-    """Writes Gaussians in float32, turned to glTF's axes: (x, y, z) becomes (-x, -y, z), y up.
+    """Writes Gaussians in float32, carried by `similarity` (4, 4) into another world and turned to glTF's axes:
+    (x, y, z) becomes (-x, -y, z), y up. In blocks: mapped columns need not fit into memory.
 
     `codes` become the application's attributes _CODE_0, _CODE_1 ..., four numbers in each; `regions` (-1 = none)
-    _REGION. Raises InputError where there is no Gaussian, which glTF has no form for, and where the folder cannot be
-    written.
+    _REGION. Raises InputError where there is no Gaussian, which glTF has no form for, where they fill more than 4 GiB,
+    and where the folder cannot be written.
     """
-    if not gaussians.count:
+    count, carried = gaussians.count, _AXES if similarity is None else _AXES @ np.asarray(similarity, np.float64)
+    if not count:
         raise InputError(path, "no Gaussians", "at least one in a .glb", "Write a .ply, which may be empty.")
-    attributes = _attributes(gaussians)
-    if codes is not None:
-        table = np.asarray(codes)
-        attributes |= {f"_CODE_{n // 4}": table[:, n : n + 4] for n in range(0, table.shape[1], 4)}
-    if regions is not None:
-        attributes["_REGION"] = np.asarray(regions)[:, None]
-    views, accessors, parts, offset = [], [], [], 0
-    for name, array in attributes.items():
-        kind = np.dtype(np.uint8 if name == "COLOR_0" else "<f4")
-        data = np.ascontiguousarray(array, kind)
-        accessor = {"bufferView": len(views), "count": len(data), "type": _KINDS[data.shape[1]]}
+
+    def blocks(of: Gaussians) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        for own, part in transformed_blocks(of, carried):
+            attributes = _attributes(part)
+            if codes is not None:
+                table = np.asarray(codes[own])
+                attributes |= {f"_CODE_{n // 4}": table[:, n : n + 4] for n in range(0, table.shape[1], 4)}
+            if regions is not None:
+                attributes["_REGION"] = np.asarray(regions[own])[:, None]
+            kinds = {name: np.uint8 if name == "COLOR_0" else "<f4" for name in attributes}
+            yield own.start, {name: np.ascontiguousarray(a, kinds[name]) for name, a in attributes.items()}
+
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for _, part in blocks(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])):
+        low, high = np.minimum(low, part["POSITION"].min(0)), np.maximum(high, part["POSITION"].max(0))
+    views, accessors, offset = [], [], 0
+    first = next(blocks(jax.tree.map(lambda a: a[:1], gaussians)))[1]
+    for name, array in first.items():
+        accessor = {"bufferView": len(views), "count": count, "type": _TYPES[array.shape[1]]}
         if name == "POSITION":
-            accessor |= {"min": data.min(0).tolist(), "max": data.max(0).tolist()}
-        number = {"componentType": _FLOAT} if kind == "<f4" else {"componentType": _BYTE, "normalized": True}
+            accessor |= {"min": low.tolist(), "max": high.tolist()}
+        number = {"componentType": _FLOAT} if array.dtype == "<f4" else {"componentType": _BYTE, "normalized": True}
         accessors.append(accessor | number)
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": data.nbytes, "target": _VERTICES})
-        parts.append(data.tobytes())
-        offset += data.nbytes
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": count * array.nbytes, "target": _VERTICES})
+        offset += count * array.nbytes
     splats = {_NAME: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
-    primitive = {"mode": _POINTS, "attributes": dict(zip(attributes, range(len(views)))), "extensions": splats}
+    primitive = {"mode": _POINTS, "attributes": dict(zip(first, range(len(views)))), "extensions": splats}
     told = {"asset": {"version": "2.0", "generator": "jsecon"}, "extensionsUsed": [_NAME]}
     told |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]}
     told |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": offset}]}
     text = json.dumps(told, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
+    if (length := 12 + 8 + len(text) + 8 + offset) > _MOST:
+        found, remedy = f"{count} Gaussians of {length / 2**30:.3g} GiB", "Write a .ply, or without harmonics or codes."
+        raise InputError(path, found, "at most 4 GiB in a .glb", remedy)
     with written_whole(path) as temporary, temporary.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + offset))
+        file.write(struct.pack("<4sII", b"glTF", 2, length))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", offset, b"BIN\0"))
-        file.writelines(parts)
+        body = file.tell()
+        for start, part in blocks(gaussians):
+            for view, array in zip(views, part.values(), strict=True):
+                file.seek(body + view["byteOffset"] + start * array[:1].nbytes)
+                file.write(array.tobytes())
 
 
-def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """What the extension stores of each Gaussian, (N, components)."""
-    turned = jax.tree.map(lambda a: np.asarray(a, np.float64), transform_gaussians(gaussians, _AXES))
+def _attributes(part: Gaussians) -> dict[str, np.ndarray]:
+    """What the extension stores of each Gaussian of a block in glTF's axes, (N, components)."""
+    turned = jax.tree.map(lambda a: np.asarray(a, np.float64), part)
     with np.errstate(over="ignore"):
         opacity = 1 / (1 + np.exp(-turned.opacity_logits))[:, None]
     shown = np.clip(0.5 + C0 * turned.sh[:, 0], 0, 1)
@@ -92,3 +120,128 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         for degree in range(math.isqrt(turned.sh.shape[1]))
         for n in range(2 * degree + 1)
     }
+
+
+def load_glb(path: str | Path) -> Gaussians:
+    """The Gaussians of all primitives of the scene that have the extension, in the world of the .ply that they were
+    made from: carried by their nodes, then turned back from glTF's axes.
+
+    Numbers may be float32, or normalised bytes and shorts; harmonics of degree 0 to 3. Codes and regions (`save_glb`)
+    are not read. Raises InputError on a file that is damaged, or asks for what is not known here: other extensions,
+    other files, kernels but ellipses, colours but sRGB, nodes that are no similarities; and as `load_ply` does on
+    numbers.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            told, start, length = _container(file, path.stat().st_size)
+            found, count = [], 0
+            for matrix, primitive in _primitives(told):
+                arrays = _arrays(lambda index: _column(file, told, index, start, length), primitive)
+                count += len(arrays["means"])
+                if 12 * count > length:
+                    raise ValueError(f"{count} Gaussians in {length} bytes")
+                part = jax.tree.map(np.asarray, sound(path, arrays))
+                found.append(transform_gaussians(part, _AXES @ matrix))
+            if not found:
+                raise ValueError("no primitive with the extension in its scene")
+            if len({part.sh.shape[1] for part in found}) > 1:
+                raise ValueError("primitives with harmonics of several degrees")
+            return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), *found)
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(path, error.strerror or "an error on reading", _WANTED, "Check the path.") from error
+    except (*UNREADABLE, struct.error) as error:
+        raise InputError(path, f"what is none ({type(error).__name__}: {error})", _WANTED, _REMEDY) from error
+
+
+def _container(file: BinaryIO, size: int) -> tuple[Any, int, int]:
+    """The JSON, and where the binary chunk begins and how long it is. Raises ValueError, as those below do."""
+    magic, version, length = struct.unpack("<4sII", file.read(12))
+    if (magic, version, length) != (b"glTF", 2, size):
+        raise ValueError(f"{magic} of version {version}, {size} bytes of {length}")
+    text, kind = struct.unpack("<I4s", file.read(8))
+    if kind != b"JSON" or text > size - 20:
+        raise ValueError("no JSON at its begin")
+    told, start, length = parsed_json(file.read(text)), 28 + text, 0
+    if start <= size:
+        length, kind = struct.unpack("<I4s", file.read(8))
+        if kind != b"BIN\0" or start + length > size:
+            raise ValueError("a binary chunk that is cut short")
+    if others := set(told.get("extensionsRequired", ())) - {_NAME}:
+        raise ValueError(f"extensions {', '.join(sorted(map(str, others)))}, which it requires")
+    return told, start, length
+
+
+def _primitives(told: Any) -> Iterator[tuple[np.ndarray, Any]]:
+    """(4, 4) world of a node, and a primitive with Gaussians in it."""
+    wanted, seen = [(index, np.eye(4)) for index in told["scenes"][told.get("scene", 0)].get("nodes", ())], set()
+    while wanted:
+        index, above = wanted.pop(0)
+        if index in seen:
+            raise ValueError(f"node {index} twice in a scene")
+        seen.add(index)
+        node = told["nodes"][index]
+        matrix = above @ _matrix(node)
+        wanted += [(child, matrix) for child in node.get("children", ())]
+        for primitive in told["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            if (how := primitive.get("extensions", {}).get(_NAME)) is not None:
+                kernel, colours = how.get("kernel", "ellipse"), how.get("colorSpace", "srgb_rec709_display")
+                if (kernel, colours, set(how.get("extensions", ()))) != ("ellipse", "srgb_rec709_display", set()):
+                    raise ValueError(
+                        f"kernel {kernel}, colours {colours}, extensions {list(how.get('extensions', ()))}"
+                    )
+                yield matrix, primitive
+
+
+def _matrix(node: Any) -> np.ndarray:
+    if "matrix" in node:
+        return np.asarray(node["matrix"], np.float64).reshape(4, 4).T
+    matrix, turn = np.eye(4), Rotation.from_quat(np.asarray(node.get("rotation", (0, 0, 0, 1)), np.float64))
+    matrix[:3, :3] = turn.as_matrix() * np.asarray(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _arrays(column: Callable[[int], np.ndarray], primitive: Any) -> dict[str, np.ndarray]:
+    """The fields of `Gaussians` out of a primitive's attributes."""
+    attributes = primitive["attributes"]
+    harmonics = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)]
+    there = [name in attributes for name in harmonics]
+    if (bands := sum(there)) not in (1, 4, 9, 16) or not all(there[:bands]):
+        raise ValueError(f"{bands} coefficients of harmonics")
+    names = {"means": "POSITION"} | {name: f"{_NAME}:{name.upper()}" for name in ("rotation", "scale", "opacity")}
+    sizes = {"means": 3, "rotation": 4, "scale": 3, "opacity": 1} | dict.fromkeys(harmonics[:bands], 3)
+    found = {name: column(attributes[names.get(name, name)]) for name in sizes}
+    shapes = {name: (len(found["means"]), size) for name, size in sizes.items()}
+    if wrong := [name for name in sizes if found[name].shape != shapes[name]]:
+        raise ValueError(f"{wrong[0]} of shape {found[wrong[0]].shape}, not {shapes[wrong[0]]}")
+    with np.errstate(all="ignore"):  # what is not finite then is told by its name
+        alpha = found["opacity"][:, 0].astype(np.float64)
+        arrays = {"means": found["means"], "log_scales": np.log(found["scale"], dtype=np.float64)}
+        arrays |= {"quaternions": np.roll(found["rotation"], 1, axis=1), "opacity_logits": np.log(alpha / (1 - alpha))}
+    arrays["sh"] = np.stack([found[name] for name in harmonics[:bands]], axis=1)
+    return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+
+
+def _column(file: BinaryIO, told: Any, index: int, start: int, length: int) -> np.ndarray:
+    """(N, components) float32 of an accessor. Nothing is read, and no room made, beyond the binary chunk."""
+    accessor = told["accessors"][index]
+    view, count = told["bufferViews"][accessor["bufferView"]], int(accessor["count"])
+    kind, size = np.dtype(_READ[accessor["componentType"]]), _COMPONENTS[accessor["type"]]
+    row = kind.itemsize * size
+    stride = int(view.get("byteStride", row))
+    offset = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    needed = (count - 1) * stride + row if count else 0
+    if view["buffer"] != 0 or "uri" in told["buffers"][0] or "sparse" in accessor:
+        raise ValueError("numbers in another file, or sparse ones")
+    if count < 0 or stride < row or offset < 0 or offset + needed > length:
+        raise ValueError(f"{count} rows of {stride} bytes from {offset} on, in {length}")
+    file.seek(start + offset)
+    array = np.ndarray((count, size), kind, file.read(needed), strides=(stride, kind.itemsize))
+    if kind.kind == "f":
+        return array.astype(np.float32)
+    if accessor.get("normalized") is not True:
+        raise ValueError("whole numbers that are not normalised")
+    return np.maximum(array.astype(np.float32) / np.iinfo(kind).max, -1)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jsecon.data.ply_file import bad_ply, read_vertices
+from jsecon.data.ply_file import bad_ply, read_vertices, vertex_blocks
 from jsecon.errors import require_shape
 from jsecon.files import written_whole
 from jsecon.numerics import sane
-from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.transform import transformed_blocks
 from jsecon.types import Array, Gaussians
 
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -26,7 +25,8 @@ _DC, _SCALE = (tuple(f"{kind}_{axis}" for axis in range(3)) for kind in ("f_dc",
 _ROTATION = tuple(f"rot_{axis}" for axis in range(4))
 _GAUSSIAN = (*_POSITION, *_DC, *_OPACITY, *_SCALE, *_ROTATION)
 _ROWS = 1 << 18
-"""Gaussians written at a time"""
+"""Gaussians read at a time"""
+_SIZES = {"means": 3, "log_scales": 3, "quaternions": 4}
 _REST_COUNTS = (0, 9, 24, 45)
 _WANTED = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
 
@@ -49,13 +49,13 @@ def load_ply(path: str | Path) -> Gaussians:
     N may be 0.
 
     The degree of the spherical harmonics follows from the number of f_rest properties (0, 9, 24, 45; channel-major).
-    Other properties (normals, OpenGaussian's ins_feat, Gaussian Grouping's obj_dc) are ignored. Raises InputError on a
+    Other properties (normals, OpenGaussian's ins_feat, Gaussian Grouping's obj_dc) are ignored. Read in blocks: a
+    binary file is never in memory as a whole beside the arrays. Raises InputError on a
     compressed file, missing properties, a file cut short, numbers that are not finite (but infinite opacity logits,
     opacities of exactly 0 or 1, are kept), and zero quaternions.
     """
     path = Path(path)
-    vertices = read_vertices(path)
-    names = vertices.dtype.names or ()
+    count, names, blocks = vertex_blocks(path, _ROWS)
     if missing := [name for name in _GAUSSIAN if name not in names]:
         remedy = "A plain point cloud or a 2D Gaussian file won't do: export 3D Gaussians as an uncompressed PLY."
         raise bad_ply(path, f"no properties {', '.join(missing)}", _WANTED, remedy)
@@ -64,15 +64,18 @@ def load_ply(path: str | Path) -> Gaussians:
     if rest not in _REST_COUNTS or any(name not in names for name in rest_names):
         wanted = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
         raise bad_ply(path, f"{rest} properties f_rest", wanted)
-    first = _columns(vertices, _DC)[:, None]
-    others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
-    arrays = {
-        "means": _columns(vertices, _POSITION),
-        "log_scales": _columns(vertices, _SCALE),
-        "quaternions": _columns(vertices, _ROTATION),
-        "opacity_logits": _columns(vertices, _OPACITY)[:, 0],
-        "sh": np.concatenate([first, others], axis=1),
-    }
+    arrays = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
+    arrays |= {"opacity_logits": np.empty(count, np.float32), "sh": np.empty((count, 1 + rest // 3, 3), np.float32)}
+    first = 0
+    for vertices in blocks:
+        own, first = slice(first, first + len(vertices)), first + len(vertices)
+        arrays["means"][own] = _columns(vertices, _POSITION)
+        arrays["log_scales"][own] = _columns(vertices, _SCALE)
+        arrays["quaternions"][own] = _columns(vertices, _ROTATION)
+        arrays["opacity_logits"][own] = _columns(vertices, _OPACITY)[:, 0]
+        arrays["sh"][own, 0] = _columns(vertices, _DC)
+        others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3)
+        arrays["sh"][own, 1:] = others.transpose(0, 2, 1)
     return sound(path, arrays)
 
 
@@ -118,14 +121,8 @@ def save_ply(
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
-        for first in range(0, count, _ROWS):
-            part = jax.tree.map(lambda a, rows=slice(first, first + _ROWS): np.asarray(a[rows]), gaussians)
-            part = part if similarity is None else transform_gaussians(part, similarity)
-            colours = (
-                part.sh
-                if rgb is None
-                else ((np.asarray(rgb[first : first + _ROWS], np.float64) - 0.5) / SH_DC)[:, None]
-            )
+        for own, part in transformed_blocks(gaussians, similarity):
+            colours = part.sh if rgb is None else ((np.asarray(rgb[own], np.float64) - 0.5) / SH_DC)[:, None]
             file.write(_table(part, np.asarray(colours, np.float32)).tobytes())  # tofile would not tell a full disk
 
 

@@ -6,8 +6,12 @@ Read here, since the package plyfile is under GPLv3+ and jsecon under Apache-2.0
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -16,6 +20,8 @@ from jsecon.errors import InputError
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
 TYPES = {name: kind for kind, old in (_NAMES | {"f8": "double"}).items() for name in (old, np.dtype(kind).name)}
 """a property's type, by its old name or with its size (uchar, uint8) -> NumPy's"""
+_LONGEST = 1 << 24
+"""bytes in which a header's end is looked for"""
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -74,16 +80,40 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 def opened(path: Path) -> tuple[bytes, str, list[_Element], int]:
     """The file, and what `_header` says of it."""
+    with _reading(path) as file:
+        data = file.read()
+    return data, *_header(path, data)
+
+
+def elements_of(path: Path) -> tuple[str, list[_Element], int]:
+    """What `_header` says of the file, of which no more is read."""
+    with _reading(path) as file:
+        data = file.read(1 << 16)
+        while b"end_header" not in data and len(data) < _LONGEST and (more := file.read(len(data))):
+            data += more
+        return _header(path, data + file.readline())
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[BinaryIO]:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            yield file
     except OSError as error:
         raise bad_ply(path, error.strerror or "an error on reading", "a .ply file", "Check the path.") from error
-    return data, *_header(path, data)
 
 
 def read_vertices(path: Path) -> np.ndarray:
     """The vertex element as a structured array."""
-    data, form, elements, offset = opened(path)
+    blocks = list(vertex_blocks(path, sys.maxsize)[2])
+    return blocks[0]
+
+
+def vertex_blocks(path: Path, rows: int) -> tuple[int, tuple[str, ...], Iterator[np.ndarray]]:
+    """How many vertices there are, the names of their properties, and the vertices as structured arrays of at most
+    `rows`, one at least; of a binary file no more is read at once. Raises InputError on what is wrong, before the first
+    of them where the file tells."""
+    form, elements, offset = elements_of(path)
     names = [element.name for element in elements]
     if "chunk" in names or any(name == "packed_position" for element in elements for name, _ in element.fields):
         remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
@@ -98,14 +128,31 @@ def read_vertices(path: Path) -> np.ndarray:
         raise bad_ply(path, "an element vertex without properties", "x y z and more")
     if len({name for name, _ in vertex.fields}) < len(vertex.fields):
         raise bad_ply(path, "a vertex property that is there twice", "distinct names")
+    properties = tuple(name for name, _ in vertex.fields)
     if form == "ascii":
-        return _ascii_vertices(path, data[offset:], sum(element.count for element in before), vertex)
+        body = opened(path)[0][offset:]
+        whole = _ascii_vertices(path, body, sum(element.count for element in before), vertex)
+        return vertex.count, properties, (whole[n : n + rows] for n in range(0, max(vertex.count, 1), rows))
     offset += sum(element.count * element.dtype(ORDERS[form]).itemsize for element in before)
-    dtype = vertex.dtype(ORDERS[form])
-    if offset + vertex.count * dtype.itemsize > len(data):
-        there = max(0, len(data) - offset) // max(1, dtype.itemsize)
-        raise bad_ply(path, f"{there} of {vertex.count} vertices: the file is cut short")
-    return np.frombuffer(data, dtype, vertex.count, offset)
+    dtype, size = vertex.dtype(ORDERS[form]), path.stat().st_size
+    if offset + vertex.count * dtype.itemsize > size:
+        raise _cut(path, (size - offset) // dtype.itemsize, vertex.count)
+    return vertex.count, properties, _binary_vertices(path, offset, dtype, vertex.count, rows)
+
+
+def _cut(path: Path, there: int, count: int) -> InputError:
+    return bad_ply(path, f"{max(there, 0)} of {count} vertices: the file is cut short")
+
+
+def _binary_vertices(path: Path, offset: int, dtype: np.dtype, count: int, rows: int) -> Iterator[np.ndarray]:
+    with _reading(path) as file:
+        file.seek(offset)
+        for first in range(0, max(count, 1), rows):
+            wanted = min(rows, count - first) * dtype.itemsize
+            data = file.read(wanted)
+            if len(data) < wanted:  # cut since its size was looked at
+                raise _cut(path, first + len(data) // dtype.itemsize, count)
+            yield np.frombuffer(data, dtype)
 
 
 def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: _Element) -> np.ndarray:

@@ -9,7 +9,6 @@ views are summed.
 import contextlib
 import dataclasses
 import functools
-import math
 import os
 import shutil
 import tempfile
@@ -29,16 +28,19 @@ from jsecon.language.distill import LEAST_LABELLED, distill_votes
 from jsecon.language.records import append, summed_columns
 from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import MIN_TRANSMITTANCE, NEAR
+from jsecon.numerics import NEAR
+from jsecon.splat.banded import listed, still_open
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
 from jsecon.splat.fusion import stored
-from jsecon.splat.project import Projection
-from jsecon.splat.tiles import TILE, TileLists, grid, tile_lists
+from jsecon.splat.tiles import TILE, TileLists, grid
 from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
 from jsecon.types import Array, Camera, Gaussians, Regions, Votes
 
 _SLOTS = 4
 """distinct labels of a tile that one walk counts; where a tile shows more, it is walked again for the rest"""
+
+_MOST_SEEN = 1 << 26
+"""weights, each of a view on a Gaussian, of a block that is summed with `by_view`"""
 
 
 @runtime_checkable
@@ -58,6 +60,7 @@ def region_votes_in_blocks(
     *,
     folder: str | os.PathLike,
     top: int = 8,
+    by_view: bool = False,
     centre: float = 0.0,
     near: float = NEAR,
     regions: Regions | None = None,
@@ -70,14 +73,15 @@ def region_votes_in_blocks(
     labels: T label images (H, W; -1 = none), read one at a time: a memory map (T, H, W), or what gives one by its index
     and has a length. The votes come back as memory maps of files in `folder`, which must be empty or new; they stay as
     long as the files do. The strongest `top` regions are those of the sums over all views; the rest is counted
-    (`Votes.cut`). In place of each view's total, `regions` (of the same labels) gives `Votes.shown`, as `with_shown`
-    makes it.
+    (`Votes.cut`). `by_view` is as in `region_votes`, and `with_shown` reads it in blocks; in its place `regions` (of
+    the same labels) gives `Votes.shown` at once.
 
     Equal to `region_votes` up to float32's rounding, which here and there takes a pixel's last weight, of at most
     0.01, to the other side of the transmittance at which it stops. Memory: `most_held` visible splats of a view, 150
     bytes each at the peak, a band, and one block of `rows` Gaussians with its votes. Disk, until it returns: 12 bytes a
-    (tile, Gaussian, region) with weight and 16 a Gaussian, for each view. One device, host code. Raises ValueError on
-    shapes that disagree, InputError where `folder` cannot be written or is not empty.
+    (tile, Gaussian, region) with weight and 16 a Gaussian, for each view; `by_view` keeps 4 for every view and
+    Gaussian. One device, host code. Raises ValueError on shapes that disagree, InputError where `folder` cannot be
+    written or is not empty.
     """
     count, views = gaussians.count, len(cameras.world_to_camera)
     poses, remedy = cameras.world_to_camera, "Add a leading axis to all arrays of a single camera."
@@ -88,7 +92,10 @@ def region_votes_in_blocks(
     shows = None if regions is None else np.asarray(views_that_show(regions))
     if shows is not None:
         require_shape("regions.pixels", shows, (num_regions, views), "Give the regions made from these labels.")
-    cameras = jax.tree.map(np.asarray, cameras)
+    cameras, rows = (
+        jax.tree.map(np.asarray, cameras),
+        min(rows, max(_MOST_SEEN // max(views, 1), 1)) if by_view else rows,
+    )
     bounds, size = block_bounds(gaussians, rows), band_size(count, cameras.width, cameras.height)
     with _spool(Path(folder)) as spool:
         overflow = 0
@@ -104,7 +111,8 @@ def region_votes_in_blocks(
                 append(spool, "votes", rows, band.ids[votes[0]], *votes[1:])
             if progress is not None:
                 progress(t + 1, views)
-        columns = summed_columns(spool, Path(folder), count, num_regions, rows, min(top, max(num_regions, 1)), shows)
+        sizes = count, num_regions, rows, min(top, max(num_regions, 1))
+        columns = summed_columns(spool, Path(folder), *sizes, shows, views if by_view else 0)
     return Votes(**columns, overflow=np.asarray(overflow, np.int32), num_regions=num_regions)
 
 
@@ -159,12 +167,6 @@ def _prepared(labels: Array) -> _View:
     return _View(tiles, distinct_labels(tiles, _SLOTS), to_tiles(jnp.ones(labels.shape, jnp.float32), TILE))
 
 
-@jax.jit
-def _open(left: Array) -> Array:
-    """(tiles,) whether a pixel has not stopped."""
-    return left[:-1].max(1) > MIN_TRANSMITTANCE
-
-
 def _cast_view(
     gaussians: Gaussians,
     bounds: Bounds,
@@ -182,9 +184,9 @@ def _cast_view(
     across, down = grid(camera.width, camera.height, TILE)
     names = np.asarray(view.distinct)
     several = (names >= 0).sum(1)
-    is_open = lambda: np.asarray(_open(left)).reshape(down, across)
+    is_open = lambda: np.asarray(still_open(left)).reshape(down, across)
     for band in bands(gaussians, bounds, camera, is_open, near=near, size=size, most_held=most_held):
-        splats, lists = _listed(band.splats, camera.width, camera.height, size)
+        splats, lists = listed(band.splats, camera.width, camera.height, size)
         starts, lengths = np.asarray(lists.starts), np.asarray(lists.lengths)
         used = int((starts + lengths).max(initial=0))
         room = size * next(times for times in (1, 2, 4, 8, 16) if used <= times * size)
@@ -208,13 +210,6 @@ def _cast_view(
         yield band, int(lists.overflow.sum()), seen, tuple(np.concatenate(column) for column in zip(*votes))
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _listed(projection: Projection, width: int, height: int, capacity: int) -> tuple[Array, TileLists]:
-    columns = projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]
-    splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
-    return splats, tile_lists(projection, width, height, capacity=capacity)
-
-
 @functools.partial(jax.jit, static_argnums=(6, 7, 8))
 def _cast_band(
     splats: Array,
@@ -232,7 +227,7 @@ def _cast_band(
 
     Tiles that are not `wanted` (tiles + 1,), or have stopped, are passed over.
     """
-    runs = wanted[:-1] & _open(left)
+    runs = wanted[:-1] & still_open(left)
     lists = dataclasses.replace(lists, lengths=jnp.where(runs, lists.lengths, 0))
     batches, table = make_batches(lists, width), make_table(splats)
     slots = lax.dynamic_slice_in_dim(view.distinct, first, _SLOTS, axis=1)

@@ -17,12 +17,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from jsecon.data.images import MOST_PIXELS
 from jsecon.errors import InputError, require
 from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, write_arrays, written_whole
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
+from jsecon.language.shares import votes_of_rows
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT, VERSION = "jsecon-field", 1
@@ -88,6 +90,15 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
     inconsistent.
     """
     return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
+
+
+def field_of_rows(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
+    """The field of some of its Gaussians (M,), their columns NumPy's; of mapped ones no others are read."""
+    take = lambda a: np.asarray(a)[rows]
+    parts = None if field.parts is None else dataclasses.replace(field.parts, part=take(field.parts.part))
+    own = {"gaussians": jax.tree.map(take, field.gaussians), "codes": take(field.codes), "parts": parts}
+    votes = dataclasses.replace(votes_of_rows(field.votes, rows), overlap=field.votes.overlap)
+    return dataclasses.replace(field, votes=votes, **own)
 
 
 def check_field(path: str | os.PathLike) -> None:

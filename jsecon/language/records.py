@@ -49,26 +49,37 @@ def _pieces(spool: Path, kind: str, block: int) -> Iterator[np.ndarray]:
 
 
 def summed_columns(
-    spool: Path, folder: Path, count: int, regions: int, rows: int, top: int, shows: Bool[np.ndarray, "r t"] | None
+    spool: Path,
+    folder: Path,
+    count: int,
+    regions: int,
+    rows: int,
+    top: int,
+    shows: Bool[np.ndarray, "r t"] | None,
+    views: int = 0,
 ) -> dict[str, Any]:
     """The columns of `Votes` by name, as memory maps of FOLDER/<name>.npy: summed block after block; `shown` where
-    `shows`, which views show which region, is given."""
+    `shows`, which views show which region, is given, and `by_view` of so many views."""
     kinds = {"regions": ("<i4", (top,)), "weights": ("<f4", (top,)), "labelled": ("<f4", ()), "total": ("<f4", ())}
     kinds |= {"peak": ("<f4", ()), "views": ("<i4", ())} | ({} if shows is None else {"shown": ("<f4", (top,))})
+    kinds |= (
+        {"by_view": ("<f4", (views,))} if views else {}
+    )  # written Gaussian after Gaussian: (T, N) in Fortran's order
     # Written, not mapped: a disk that is full is an error then, and no signal.
     with contextlib.ExitStack() as stack:
         files = {name: stack.enter_context(open(folder / f"{name}.npy", "wb")) for name in kinds}
         for name, (dtype, rest) in kinds.items():
-            header = {"descr": dtype, "fortran_order": False, "shape": (count, *rest)}
+            turned = name == "by_view"
+            header = {"descr": dtype, "fortran_order": turned, "shape": (*rest, count) if turned else (count, *rest)}
             np.lib.format.write_array_header_1_0(files[name], header)
         for first in range(0, count, rows):
-            own = _block(spool, first // rows, min(rows, count - first), regions, top, shows)
+            own = _block(spool, first // rows, min(rows, count - first), regions, top, shows, views)
             for name, (dtype, _) in kinds.items():
                 files[name].write(np.ascontiguousarray(own[name], dtype).tobytes())
-    return {"shown": None} | {name: map_array(folder / f"{name}.npy") for name in kinds}
+    return {"shown": None, "by_view": None} | {name: map_array(folder / f"{name}.npy") for name in kinds}
 
 
-def _block(spool: Path, block: int, count: int, regions: int, top: int, shows: np.ndarray | None):
+def _block(spool: Path, block: int, count: int, regions: int, top: int, shows: np.ndarray | None, views: int):
     """The columns of one block."""
     cast: Any = sparse.csr_array((count, max(regions, 1)), dtype=np.float64)
     for piece in _pieces(spool, "votes", block):
@@ -77,11 +88,14 @@ def _block(spool: Path, block: int, count: int, regions: int, top: int, shows: n
     own = dict(zip(("regions", "weights"), strongest(cast, top)))
     own |= {"labelled": np.asarray(cast.sum(1)).reshape(-1), "total": np.zeros(count), "views": np.zeros(count, int)}
     own |= {"peak": np.zeros(count, np.float32), "shown": np.zeros((count, top))}
+    own["by_view"] = np.zeros((count, views), np.float32)
     for piece in _pieces(spool, "seen", block):
         gaussian, weight = piece["gaussian"].astype(np.int64), piece["weight"]
         own["total"] += np.bincount(gaussian, weight, count)
         own["views"] += np.bincount(gaussian, minlength=count)
         np.maximum.at(own["peak"], gaussian, piece["peak"])
+        if views:
+            own["by_view"][gaussian, piece["view"]] = weight  # a Gaussian is in one band of a view
         for k in range(0 if shows is None else top):
             region = own["regions"][gaussian, k]
             shown = (region >= 0) & np.asarray(shows)[np.maximum(region, 0), piece["view"]]

@@ -59,8 +59,8 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
 
     Regions whose embeddings have a cosine of at least `alike_threshold` are shown together, as queries join them. The
     share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
-    contain the object. Pure. Raises ValueError where the votes were cast without `by_view`, or over other views than
-    `regions` knows.
+    contain the object. Pure; `by_view` that is mapped is read in blocks. Raises ValueError where the votes were cast
+    without `by_view`, or over other views than `regions` knows.
     """
     views = None if votes.by_view is None else votes.by_view.shape[0]
     remedy = "Cast them with region_votes(..., by_view=True)."
@@ -70,7 +70,14 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     same = views == regions.pixels.shape[1] and votes.num_regions == regions.count
     require(same, "with_shown", found, expected, "Give the regions that were made from the labels that voted.")
     shows = views_that_show(regions, alike_threshold=alike_threshold)
-    return _with_shown(votes, shows, min(_BLOCK, max(votes.regions.shape[0], 1)))
+    count, top = votes.regions.shape
+    if not isinstance(votes.by_view, np.memmap):
+        return _with_shown(votes, shows, min(_BLOCK, max(count, 1)))
+    parts = [np.zeros((0, top), np.float32)]
+    for rows in (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK)):
+        part = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(votes.by_view[:, rows]))
+        parts.append(np.asarray(_with_shown(part, shows, min(_BLOCK, count - rows.start)).shown))
+    return dataclasses.replace(votes, by_view=None, shown=np.concatenate(parts))
 
 
 def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
@@ -120,11 +127,16 @@ def with_overlap(votes: Votes) -> Votes:
 
 def vote_blocks(votes: Votes) -> Iterator[Votes]:
     """The votes of ROWS Gaussians after the other, on jax's device; without `by_view` and `overlap`."""
-    columns = [own.name for own in dataclasses.fields(votes) if own.name not in _NO_COLUMNS]
     for first in range(0, votes.regions.shape[0], ROWS):
-        own = {name: getattr(votes, name) for name in columns}
-        own = {name: None if a is None else jnp.asarray(a[first : first + ROWS]) for name, a in own.items()}
-        yield dataclasses.replace(votes, **own, by_view=None, overlap=None)
+        yield jax.tree.map(jnp.asarray, votes_of_rows(votes, slice(first, first + ROWS)))
+
+
+def votes_of_rows(votes: Votes, rows: slice | Int[np.ndarray, " m"]) -> Votes:
+    """The votes of some Gaussians, NumPy; without `by_view` and `overlap`."""
+    columns = [own.name for own in dataclasses.fields(votes) if own.name not in _NO_COLUMNS]
+    own = {name: getattr(votes, name) for name in columns}
+    own = {name: None if a is None else np.asarray(a)[rows] for name, a in own.items()}
+    return dataclasses.replace(votes, **own, by_view=None, overlap=None)
 
 
 @functools.partial(jax.jit, static_argnums=2)

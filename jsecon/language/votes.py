@@ -99,6 +99,11 @@ def region_votes(
     )
 
 
+def bytes_of_votes(count: int, views: int, regions: int) -> int:
+    """What `region_votes` with `by_view` takes in memory beside what it is given, about."""
+    return 8 * views * count + 2 * min(4 * regions * count, _DENSE_BYTES)
+
+
 def _empty(xp: Any, count: int, regions: int, dtype) -> dict[str, Array]:
     return {
         "votes": xp.zeros((count, regions), dtype),

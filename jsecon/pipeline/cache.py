@@ -180,7 +180,8 @@ def fetch(
     """A stage's result: read where `path` holds it, else computed, after `begin`, and kept there.
 
     A file that cannot be read is said through `note` and computed again. A fresh result is passed through the same
-    packing as a stored one, so that what follows sees the same arrays whether the run was stopped here or not.
+    packing as a stored one, so that what follows sees the same arrays whether the run was stopped here or not; one that
+    lies in files of its own is read back, so that they may go.
     """
     if path.exists():
         try:
@@ -197,7 +198,8 @@ def fetch(
     seconds = time.monotonic() - started
     tree, arrays = pack(value)
     _write(path, tree, arrays, seconds)
-    return Kept(unpack(tree, arrays), seconds, fresh=True)
+    mapped = any(isinstance(array, np.memmap) for array in arrays.values())
+    return Kept(_read(path)[0] if mapped else unpack(tree, arrays), seconds, fresh=True)
 
 
 def save(path: Path, value: Any) -> None:

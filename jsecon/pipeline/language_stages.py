@@ -3,6 +3,7 @@
 Frames that are held out are read by none of them.
 """
 
+import shutil
 from collections.abc import Callable
 from typing import Any
 
@@ -138,18 +139,29 @@ def codes(work: Work) -> Stage:
 
 
 def votes(work: Work) -> Stage:
-    """The weight that each region casts on each Gaussian over the training frames, with each frame's total."""
+    """The weight that each region casts on each Gaussian over the training frames, with each frame's total. Where
+    memory has no room for that (`memory_budget`) it is cast in blocks, to the same up to float32's rounding."""
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.language.votes import region_votes
+        from jsecon.language.blocks import region_votes_in_blocks
+        from jsecon.language.votes import bytes_of_votes, region_votes
+        from jsecon.process import memory_budget
 
         capture, scene, labels = results["load"], results["gaussians"], results["masklets"]
         cameras = capture.cameras[training_frames(capture)]
-        count, how = int(labels.max()) + 1, work.given("top", "centre")
-        cast = region_votes(scene, cameras, labels, count, by_view=True, progress=progress, **how)
+        count, how, notes = int(labels.max()) + 1, work.given("top", "centre"), ()
+        needed, room = bytes_of_votes(scene.count, len(labels), count), memory_budget()
+        if needed > room and jax.process_count() == 1:  # several processes cast them together, each its own views
+            shutil.rmtree(record.folder, ignore_errors=True)  # what a stopped run left
+            how |= {"folder": record.folder}
+            cast = region_votes_in_blocks(scene, cameras, labels, count, by_view=True, progress=progress, **how)
+            told = f"{needed / 2**30:.2g} GiB otherwise, where memory has room for {room / 2**30:.2g}"
+            notes = (f"votes are cast in blocks: {told}",)
+        else:
+            cast = region_votes(scene, cameras, labels, count, by_view=True, progress=progress, **how)
         unseen = int((np.asarray(cast.views) == 0).sum())
         left = {"unseen Gaussians": f"{unseen} of {scene.count} that no frame sees get no code"} if unseen else {}
-        return Outcome(cast, left)
+        return Outcome(cast, left, notes)
 
     return Stage(
         "votes",
@@ -167,8 +179,12 @@ def distil(work: Work) -> Stage:
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.language.distill import distill_votes
 
-        table = results["codes"][0]
-        return Outcome(distill_votes(results["votes"], table, reduce=work.options.reduce))
+        table, cast = results["codes"][0], results["votes"]
+        if isinstance(cast.regions, np.memmap):
+            from jsecon.language.blocks import codes_in_blocks
+
+            return Outcome(codes_in_blocks(cast, table, record.folder / "codes.npy", work.options.reduce))
+        return Outcome(distill_votes(cast, table, reduce=work.options.reduce))
 
     how = f"a Gaussian's code is its votes' {work.options.reduce}"
     return Stage("distil", how, compute, after=("votes", "codes"), given=work.given("reduce"))

@@ -57,8 +57,9 @@ class Options(SceneOptions):
     """All that the result of a run depends on, but for the files themselves."""
 
     gaussians: Annotated[Path | None, {"metavar": "FILE"}] = None
-    """a scene of 3D Gaussians in the capture's world: .ply (INRIA's layout, or compressed), .spz, .sog, .splat (extra
-    formats), or nerfstudio's beside its dataparser_transforms.json; without it, Gaussians are fitted to the frames"""
+    """a scene of 3D Gaussians in the capture's world: .ply (INRIA's layout), .glb, .splat, with the extra formats
+    compressed .ply, .spz, .sog; or nerfstudio's beside its dataparser_transforms.json; without it, Gaussians are fitted
+    to the frames"""
     masks: Folder = None
     """instance masks, one integer PNG per frame under the frame's name (0 = none), <id>/<frame>.png, or LangSplat's
     _s.npy; without it, they are found in the frames"""

@@ -45,6 +45,10 @@ class Found(NamedTuple):
     """similarity of the best region, chosen or not; 0 where nothing is known."""
 
 
+NOTHING = Found(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
+"""of a field without regions"""
+
+
 def query_anchored(
     field: LanguageField,
     text_embedding: Float[Array, " e"],
@@ -77,13 +81,8 @@ def query_anchored(
     an embedding. Pure: jit it or vmap it over texts, with the field closed over. Raises ValueError on a text of
     another size.
     """
-    size = field.regions.embeddings.shape[1]
-    remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
-    require_shape("query_anchored", text_embedding, (size,), remedy)
     require_one_of("query_anchored", by, THRESHOLDS, "'votes' is the default.")
     threshold_of(retrieval, retrieval_threshold, "query_anchored", logits)
-    if field.regions.count == 0:
-        return nothing(field)
     how = {"alike_threshold": alike_threshold, "piece_nearness": piece_nearness, "logits": logits}
     found = found_of(field, text_embedding, retrieval_threshold=retrieval_threshold, retrieval=retrieval, **how)
     return members(field, found, similarity_threshold, by=by, codes=codes)
@@ -99,8 +98,14 @@ def found_of(
     piece_nearness: Number | None = PIECE_NEARNESS,
     logits: Logits | None = None,
 ) -> Found:
-    """The regions of a field that answer a text's embedding (E,), by the rules of `query_anchored`."""
+    """The regions of a field that answer a text's embedding (E,), by the rules of `query_anchored`, whose errors it
+    raises."""
+    size = field.regions.embeddings.shape[1]
+    remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
+    require_shape("text_embedding", text_embedding, (size,), remedy)
     least = threshold_of(retrieval, retrieval_threshold, "found_of", logits)
+    if field.regions.count == 0:
+        return NOTHING
     given = field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels, field.votes.overlap
     return _retrieve(*jax.tree.map(jnp.asarray, given), least, alike_threshold, piece_nearness, logits, retrieval)
 
@@ -122,17 +127,30 @@ def query_region(
     Nothing for region -1 (or any other id that the field does not have): Selection.region is then -1 and its score 0.
     """
     require_one_of("query_region", by, THRESHOLDS, "'votes' is the default.")
-    if field.regions.count == 0:
-        return nothing(field)
-    known = jnp.asarray(field.regions.embeddings), field.votes.overlap
-    found = _found_region(*known, jnp.asarray(region), alike_threshold, piece_nearness)
+    found = found_region(field, region, alike_threshold=alike_threshold, piece_nearness=piece_nearness)
     return members(field, found, similarity_threshold, by=by)
+
+
+def found_region(
+    field: LanguageField,
+    region: int | Int[Array, ""],
+    *,
+    alike_threshold: Number | None = None,
+    piece_nearness: Number | None = None,
+) -> Found:
+    """Region `region` and what is joined to it, by the rules of `query_region`."""
+    if field.regions.count == 0:
+        return NOTHING
+    known = jnp.asarray(field.regions.embeddings), field.votes.overlap
+    return _found_region(*known, jnp.asarray(region), alike_threshold, piece_nearness)
 
 
 def members(
     field: LanguageField, found: Found, threshold: Number | None, *, by: str = "votes", codes: UnitCodes | None = None
 ) -> Selection:
     """The Gaussians of the regions found: "votes", of all that were chosen, or "code", of the best of them."""
+    if field.regions.count == 0:
+        return _nothing(field)
     threshold = THRESHOLDS[by] if threshold is None else threshold
     if isinstance(field.votes.regions, np.memmap) and codes is None:
         parts = [jax.tree.map(np.asarray, part) for part in members_by_block(field, [found], threshold, by=by)]
@@ -160,7 +178,7 @@ def members_by_block(
         yield [_by_code(codes, table, votes.views > 0, found, threshold) for found in several]
 
 
-def nothing(field: LanguageField) -> Selection:
+def _nothing(field: LanguageField) -> Selection:
     """The answer of a field without regions."""
     count, dtype = field.codes.shape[0], jnp.asarray(field.codes).dtype
     return Selection(jnp.zeros(count, bool), jnp.zeros(count, dtype), jnp.asarray(-1, jnp.int32), jnp.zeros((), dtype))

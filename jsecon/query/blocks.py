@@ -1,5 +1,6 @@
 """Many questions to a field larger than memory: its columns are read once, and a selection is a list of Gaussians."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require_one_of, require_shape
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.query.anchored import THRESHOLDS, found_of, members_by_block
+from jsecon.query.anchored import THRESHOLDS, Found, found_of, members_by_block
 from jsecon.query.direct import Number
 from jsecon.query.retrieval import PIECE_NEARNESS
 from jsecon.types import Array, LanguageField
@@ -49,18 +50,23 @@ def query_in_blocks(
         "query_in_blocks", text_embeddings, ("Q", field.regions.embeddings.shape[1]), "Give a row for a text."
     )
     require_one_of("query_in_blocks", by, THRESHOLDS, "'votes' is the default.")
-    if field.regions.count == 0:
-        return [Chosen(np.zeros(0, np.int64), np.zeros(0, np.float32), -1, 0.0) for _ in text_embeddings]
     how = {"retrieval_threshold": retrieval_threshold, "retrieval": retrieval}
     how |= {"alike_threshold": alike_threshold, "piece_nearness": piece_nearness, "logits": logits}
     found = [found_of(field, jnp.asarray(text), **how) for text in text_embeddings]
+    return chosen_in_blocks(field, found, similarity_threshold, by=by)
+
+
+def chosen_in_blocks(
+    field: LanguageField, found: Sequence[Found], threshold: Number | None = None, *, by: str = "votes"
+) -> list[Chosen]:
+    """`members` of what each of several questions found, in one pass over the columns."""
     empty = np.zeros(0, np.int64), np.zeros(0, np.float32)
     parts: list[list[tuple[np.ndarray, np.ndarray]]] = [[empty] for _ in found]
     first = 0
-    for selections in members_by_block(field, found, similarity_threshold, by=by):
+    for selections in members_by_block(field, found, threshold, by=by) if field.regions.count and found else ():
         for own, selection in zip(parts, selections):
             places = np.flatnonzero(np.asarray(selection.mask))
             own.append((places + first, np.asarray(selection.similarity)[places]))
-        first += len(selections[0].mask) if selections else 0
+        first += len(selections[0].mask)
     joined = [[np.concatenate(column) for column in zip(*own)] for own in parts]
     return [Chosen(own[0], own[1], int(each.region), float(each.score)) for own, each in zip(joined, found)]

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.language.shares import vote_shares
+from jsecon.language.shares import ROWS, vote_shares, votes_of_rows
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.project import project
 from jsecon.types import Array, Camera, Gaussians, LanguageField
@@ -21,15 +21,22 @@ def pixel_weights(
     """Ids (M,) front to back and weights alpha T (M,) of the Gaussians that make up pixel (column x, row y) of a view.
 
     By the definition of the image (jsecon.splat.render), without tiles: O(N) for one pixel, where a render is O(N) too
-    and would have to carry every region as a channel. Host code.
+    and would have to carry every region as a channel. Host code; columns that are mapped are read in blocks.
     """
-    alpha, depths = (np.asarray(a) for a in _alphas(gaussians, camera, x + 0.5, y + 0.5))
-    ids = np.flatnonzero(alpha)
-    ids = ids[np.argsort(depths[ids], kind="stable")]  # ties in depth keep index order
-    after = np.cumprod(1.0 - alpha[ids].astype(np.float64))
-    ids = ids[after > MIN_TRANSMITTANCE]
-    before = np.concatenate([[1.0], after])[: len(ids)]
-    return ids, alpha[ids] * before
+    mapped = any(isinstance(column, np.memmap) for column in jax.tree.leaves(gaussians))
+    rows, found = ROWS if mapped else max(gaussians.count, 1), []
+    for first in range(0, gaussians.count, rows):
+        block = jax.tree.map(lambda a, own=slice(first, first + rows): jnp.asarray(a[own]), gaussians)
+        alpha, depths = (np.asarray(a) for a in _alphas(block, camera, x + 0.5, y + 0.5))
+        own = np.flatnonzero(alpha)
+        found.append((own + first, alpha[own], depths[own]))
+    ids, alpha, depths = (np.concatenate(column) for column in zip(*found)) if found else np.zeros((3, 0))
+    order = np.argsort(depths, kind="stable")  # ties in depth keep index order
+    ids, alpha = ids[order].astype(np.int64), alpha[order]
+    after = np.cumprod(1.0 - alpha.astype(np.float64))
+    seen = after > MIN_TRANSMITTANCE
+    before = np.concatenate([[1.0], after])[: seen.sum()]
+    return ids[seen], alpha[seen] * before
 
 
 @jax.jit
@@ -61,10 +68,13 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
 
 def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
     """`region_shares_at` for a camera that is none of the field's."""
-    ids, weights = pixel_weights(jax.tree.map(jnp.asarray, field.gaussians), camera, x, y)
-    regions = np.asarray(field.votes.regions)[ids]
-    share = np.nan_to_num(np.asarray(vote_shares(field.votes))[ids].astype(np.float64))
+    ids, weights = pixel_weights(field.gaussians, camera, x, y)
     shares = np.zeros(field.regions.count)
+    if not len(ids):
+        return shares
+    votes = votes_of_rows(field.votes, np.resize(ids, 1 << (len(ids) - 1).bit_length()))  # few sizes to compile for
+    regions = votes.regions[: len(ids)]
+    share = np.nan_to_num(np.asarray(vote_shares(votes))[: len(ids)].astype(np.float64))
     np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
     return shares
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
-from jsecon.query.anchored import Found, members, nothing
+from jsecon.query.anchored import NOTHING, Found, members
 from jsecon.query.direct import Number
 from jsecon.query.retrieval import NEARNESS, PIECE_NEARNESS, answers, evidence, presence, regions_of_text, threshold_of
 from jsecon.types import Array, LanguageField, Selection
@@ -40,6 +40,25 @@ def query_several(
     of the chosen, -1 where there is none; Selection.score its similarity. Pure: jit it or vmap it over texts. Raises
     ValueError on texts of another size.
     """
+    how = {"nearness": nearness, "piece_nearness": piece_nearness, "retrieval": retrieval, "logits": logits}
+    found = found_of_several(field, wanted, unwanted, several=several, retrieval_threshold=retrieval_threshold, **how)
+    return members(field, found, similarity_threshold)
+
+
+def found_of_several(
+    field: LanguageField,
+    wanted: Float[Array, "q e"],
+    unwanted: Float[Array, "u e"] | None = None,
+    *,
+    several: bool = True,
+    nearness: Number = NEARNESS,
+    piece_nearness: Number = PIECE_NEARNESS,
+    retrieval: str = "contrast",
+    retrieval_threshold: Number | None = None,
+    logits: Logits | None = None,
+) -> Found:
+    """The regions of a field that answer any of the wanted texts and none of the unwanted, by the rules of
+    `query_several`, whose errors it raises."""
     size = field.regions.embeddings.shape[1]
     unwanted = jnp.zeros((0, size)) if unwanted is None else jnp.asarray(unwanted)
     fit = wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1
@@ -47,11 +66,10 @@ def query_several(
     require(fit, "query_several", found, expected, "Embed the texts with the field's embedder.")
     least = threshold_of(retrieval, retrieval_threshold, "query_several", logits)
     if field.regions.count == 0:
-        return nothing(field)
+        return NOTHING
     known = field.regions.embeddings, field.canonical, field.regions.pixels, field.votes.overlap
     given = jax.tree.map(jnp.asarray, (*known, wanted, unwanted))
-    found = _retrieve(*given, nearness, piece_nearness, least, logits, several, retrieval)
-    return members(field, found, similarity_threshold)
+    return _retrieve(*given, nearness, piece_nearness, least, logits, several, retrieval)
 
 
 def _retrieve_body(

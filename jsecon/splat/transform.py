@@ -1,7 +1,9 @@
 """Gaussians carried from one world into another by a similarity: turned, scaled and shifted, colours included."""
 
 import dataclasses
+from collections.abc import Iterator
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +11,9 @@ from jaxtyping import Float
 from jsecon.errors import require
 from jsecon.splat.sh import sh_basis
 from jsecon.types import Array, Camera, Gaussians
+
+ROWS = 1 << 18
+"""Gaussians carried at a time"""
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
@@ -36,6 +41,17 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         opacity_logits=gaussians.opacity_logits,
         sh=cast(_sh_rotation(rotation, gaussians.sh.shape[1])) @ gaussians.sh,
     )
+
+
+def transformed_blocks(
+    gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
+) -> Iterator[tuple[slice, Gaussians]]:
+    """`transform_gaussians` of ROWS Gaussians after the other, NumPy, and which they are: mapped columns need not fit
+    into memory."""
+    for first in range(0, gaussians.count, ROWS):
+        own = slice(first, min(first + ROWS, gaussians.count))
+        part = jax.tree.map(lambda a, own=own: np.asarray(a[own]), gaussians)
+        yield own, part if similarity is None else transform_gaussians(part, similarity)
 
 
 def recentred(

@@ -1,0 +1,97 @@
+"""A field larger than memory is asked in blocks, to the same answers and the same files."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from jsecon.app import asking, command_line
+from jsecon.language import field as field_file, shares
+from jsecon.language.field import field_of_rows, load_field, save_field
+from jsecon.query import pixel
+from jsecon.types import Parts
+from jsecon.vision.colours import ColourEmbedder
+
+TEXTS = ("red", "blue or green but not red", "tea")
+
+
+@pytest.fixture
+def forced(monkeypatch):
+    """No room in memory, every column on disk, a handful of blocks."""
+    monkeypatch.setenv("JSECON_MEMORY", "1e-9")
+    monkeypatch.setattr(field_file, "MAPPED", 0)
+    monkeypatch.setattr(shares, "ROWS", 700)
+    monkeypatch.setattr(pixel, "ROWS", 700)
+
+
+def _query(field, out, *more):
+    return command_line.main([str(word) for word in ("query", field, *more, "--out", out, "--views", 1)])
+
+
+@pytest.mark.parametrize("more", [(), ("--by", "code", "--format", "glb"), ("--all", "--keep-outliers")])
+def test_the_same_files_as_in_memory(room_run, tmp_path, forced, monkeypatch, capsys, more):
+    run, out = room_run
+    texts = [text for text in TEXTS if " " not in text or "code" not in more]
+    asked = out / "field.npz", *texts, "--at", run.capture.names[1], 80, 60, *more
+    codes, told = [], []
+    for name, budget in (("blocks", "1e-9"), ("memory", "1000")):
+        monkeypatch.setenv("JSECON_MEMORY", budget)
+        codes.append(_query(asked[0], tmp_path / name, *asked[1:]))
+        told.append(capsys.readouterr().out.replace(name, ""))
+    assert codes == [2, 2]  # nothing is known of tea
+    assert told[0] == told[1]
+    files = sorted(file.name for file in (tmp_path / "memory").iterdir())
+    assert {"red.json", "answers.html"} < set(files)
+    assert sorted(file.name for file in (tmp_path / "blocks").iterdir()) == files
+    assert json.loads((tmp_path / "blocks" / "red.json").read_text())["count"] > 0
+    for name in set(files) - {"answers.html"}:  # whose photographs may differ in a pixel's last weight
+        assert (tmp_path / "blocks" / name).read_bytes() == (tmp_path / "memory" / name).read_bytes(), name
+
+
+def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
+    """The parts of a field of `--parts` divide an answer alike; an answer of nothing is one in blocks too."""
+    _, out = room_run
+    rng, field = np.random.default_rng(0), load_field(out / "field.npz")
+    rows = rng.normal(size=(20, field.canonical.shape[1])).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    parts = Parts(rng.integers(-1, 20, field.gaussians.count).astype(np.int32), rows, np.ones(20, np.float32))
+    field = dataclasses.replace(field, parts=parts)
+    save_field(tmp_path / "field.npz", field)
+    mapped, how = load_field(tmp_path / "field.npz", mapped=True), {"texts": ("red", "magenta"), "several": True}
+    assert isinstance(mapped.parts.part, np.memmap)
+    for threshold in (None, 2.0):
+        how["threshold"] = threshold
+        answers, _ = asking.asked_each(asking.questions_of(field, ColourEmbedder(), **how))
+        blocks, _ = asking.answered_in_blocks(mapped, ColourEmbedder(), **how)
+        for memory, own in zip(answers, blocks, strict=True):
+            np.testing.assert_array_equal(own.rows[own.mask], np.flatnonzero(memory.mask))
+            np.testing.assert_array_equal(own.selection.similarity[own.mask], memory.selection.similarity[memory.mask])
+            assert own.dropped == memory.dropped
+    few = field_of_rows(mapped, np.array([3, 5]))
+    np.testing.assert_array_equal(few.gaussians.means, np.asarray(field.gaussians.means)[[3, 5]])
+    assert few.votes.overlap.shape == field.votes.overlap.shape
+
+
+@pytest.mark.parametrize(
+    "more", [("--by", "silhouette"), ("--by", "one_step"), ("--even",), ("--box", "#1", 2, 2, 9, 9)]
+)
+def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
+    _, out = room_run
+    assert _query(out / "field.npz", tmp_path / "answers", "red", *more) == 2
+    told = capsys.readouterr().err
+    assert more[0] in told
+    assert "JSECON_MEMORY=" in told
+    assert not list((tmp_path / "answers").glob("*"))
+
+
+def test_a_damaged_field_and_a_budget_that_is_none(room_run, tmp_path, forced, monkeypatch, capsys):
+    _, out = room_run
+    whole = bytearray((out / "field.npz").read_bytes())
+    whole[len(whole) // 2] ^= 255
+    (tmp_path / "field.npz").write_bytes(whole)
+    assert _query(tmp_path / "field.npz", tmp_path, "red") == 2
+    assert "damaged" in capsys.readouterr().err
+    monkeypatch.setenv("JSECON_MEMORY", "much")
+    assert _query(out / "field.npz", tmp_path, "red") == 2
+    assert "JSECON_MEMORY: found 'much'; expected GiB" in capsys.readouterr().err
