@@ -62,6 +62,10 @@ FIND = """[...document.querySelectorAll('input')].find(e => {
   for (let p = e, k = 0; k < 6 && p; k++, p = p.parentElement) if (p.innerText?.trim() === 'find') return true; })"""
 
 
+UPLOAD_SECONDS = 15.0
+"""after the server's answer, after which the page has nothing to draw"""
+
+
 def opening(file: Path) -> float:
     """Seconds until `jsecon view` says its address, when it can be asked and its page be loaded."""
     port, began = free_port(), time.perf_counter()
@@ -87,7 +91,8 @@ def quiet(page: Page) -> None:
 
 
 def asked(page: Page, viewer: Viewer, text: str) -> dict[str, float]:
-    """Milliseconds of one question, from enter: the server's share, the upload, the first picture that it changed."""
+    """Milliseconds of one question, from enter: the server's share, the upload, the first picture that it changed.
+    Nothing where the answer is the one before, which changes no picture."""
     quiet(page)
     page.js("seen.upload = seen.enter = 0, seen.first = null")
     told: dict[str, float] = {}
@@ -106,8 +111,12 @@ def asked(page: Page, viewer: Viewer, text: str) -> dict[str, float]:
     page.type(FIND, text)
     until(lambda: "sent" in told, "the answer is sent", 60)
     cpu = 1000 * (time.process_time() - cpu)
-    began, drawn = page.until("seen.first", 600)
     viewer.layers.paint, viewer.then = paint, then
+    try:
+        page.until("seen.upload", UPLOAD_SECONDS)
+    except TimeoutError:
+        return {}
+    began, drawn = page.until("seen.first", 600)
     enter, upload = page.js("[seen.enter, seen.upload]")
     return {
         "server": told["sent"] - told["heard"],
@@ -144,7 +153,7 @@ def main() -> None:
             print("canvas", page.js(f"{HOOK}({str(given.undrawn).lower()})"), flush=True)
             texts = [f"{shade} {word}" for shade in SHADES for word in WORDS][: given.asks]
             for name in ("new", "known"):
-                rows = [asked(page, viewer, text) for text in texts]
+                rows = [row for text in texts if (row := asked(page, viewer, text))]
                 for key in rows[0]:
                     values = [row[key] for row in rows]
                     print(f"{name:6} {key:16} median {np.median(values):7.1f} ms, worst {max(values):7.1f}", flush=True)

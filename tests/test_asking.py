@@ -29,7 +29,7 @@ def _query(field, out, *more):
     return command_line.main([str(word) for word in ("query", field, *more, "--out", out, "--views", 1)])
 
 
-@pytest.mark.parametrize("more", [(), ("--by", "code", "--format", "glb"), ("--all", "--keep-outliers")])
+@pytest.mark.parametrize("more", [(), ("--by", "code", "--format", "glb")])
 def test_the_same_files_as_in_memory(room_run, tmp_path, forced, monkeypatch, capsys, more):
     run, out = room_run
     texts = [text for text in TEXTS if " " not in text or "code" not in more]
@@ -74,7 +74,8 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
 
 
 @pytest.mark.parametrize(
-    "more", [("--by", "silhouette"), ("--by", "one_step"), ("--even",), ("--box", "#1", 2, 2, 9, 9)]
+    "more",
+    [("--by", "silhouette"), ("--by", "one_step"), ("--even",), ("--box", "#1", 2, 2, 9, 9), ("--phrases", "sam3")],
 )
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run
