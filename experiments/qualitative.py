@@ -3,8 +3,9 @@
     python -m experiments.qualitative [--table lerf|ovs3d|replica] [--quick] [--root FOLDER] [--out FOLDER]
 
 A column per method: first its features, by their three principal directions, then what it selects for each text,
-rendered alone, with its IoU: of pixels, or of points on Replica, whose truth lies there and whose frame was seen. On
-real data the picture shows the capture's own pixels and goes to pictures/, which git ignores; a twin's is figure.png.
+rendered alone, with its IoU: of pixels, or, on Replica, of the points that have a label, each of the class that it
+answers best, in a frame that was seen. On real data the picture shows the capture's own pixels and goes to pictures/,
+which git ignores; a twin's is figure.png.
 """
 
 import argparse
@@ -78,7 +79,8 @@ def seen(setting: Setting) -> Seen:
     t = len(setting.names) // 2
     camera = setting.evidence.cameras[t]
     true = {text: shown(setting.evidence.gaussians, camera, own) for text, own in at_points.items() if own.any()}
-    by_class = lambda answers, k: answers.classes() == k
+    labelled = np.asarray(bench.point_classes) >= 0  # the others are nobody's in Table 3
+    by_class = lambda answers, k: (answers.classes() == k) & labelled
     return Seen(setting.names[t], camera, setting.frames[t], largest(true), by_class, at_points)
 
 
