@@ -92,10 +92,9 @@ def region_votes_in_blocks(
     shows = None if regions is None else np.asarray(views_that_show(regions))
     if shows is not None:
         require_shape("regions.pixels", shows, (num_regions, views), "Give the regions made from these labels.")
-    cameras, rows = (
-        jax.tree.map(np.asarray, cameras),
-        min(rows, max(_MOST_SEEN // max(views, 1), 1)) if by_view else rows,
-    )
+    cameras = jax.tree.map(np.asarray, cameras)
+    if by_view:
+        rows = min(rows, max(_MOST_SEEN // max(views, 1), 1))
     bounds, size = block_bounds(gaussians, rows), band_size(count, cameras.width, cameras.height)
     with _spool(Path(folder)) as spool:
         overflow = 0

@@ -62,9 +62,8 @@ def summed_columns(
     `shows`, which views show which region, is given, and `by_view` of so many views."""
     kinds = {"regions": ("<i4", (top,)), "weights": ("<f4", (top,)), "labelled": ("<f4", ()), "total": ("<f4", ())}
     kinds |= {"peak": ("<f4", ()), "views": ("<i4", ())} | ({} if shows is None else {"shown": ("<f4", (top,))})
-    kinds |= (
-        {"by_view": ("<f4", (views,))} if views else {}
-    )  # written Gaussian after Gaussian: (T, N) in Fortran's order
+    if views:  # written Gaussian after Gaussian: (T, N) in Fortran's order
+        kinds["by_view"] = "<f4", (views,)
     # Written, not mapped: a disk that is full is an error then, and no signal.
     with contextlib.ExitStack() as stack:
         files = {name: stack.enter_context(open(folder / f"{name}.npy", "wb")) for name in kinds}
