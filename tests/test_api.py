@@ -128,13 +128,13 @@ def test_modules_are_short_enough_to_be_read_whole():
 
 
 CORE = ("splat", "fit", "association", "language", "query")
-CORE_LINES, ALL_LINES = 7_000 + 3_170, 16_500 + 9_010
+CORE_LINES, ALL_LINES = 7_000 + 3_170, 16_500 + 9_030
 """What a reader may be asked to read. A feature that needs more raises both by its own lines, and says here which it is
 and how many: fitting photographs 1,350 (steps on all devices, schedule and growth 400, the dense start 300, poses,
 exposures, depth and masks 450, quality 60, SSIM over a mesh 85, colours 30), and with it structure from motion and
 videos 570, `jsecon fit` and its options 230. Parts of the scene, which tell apart what masks took for one, 150, and
 their stage 50. Weights at the centre alone 20. Shares evened out over neighbours 80. What somebody outlined 100, its
-options 130. Places 110. The server 420. Reading without trust, and faults of the machine, 230 in the core and 410 in
+options 130. Places 110. The server 420. Reading without trust, and faults of the machine, 230 in the core and 430 in
 all. The viewer 1,030. Doctor, dry runs, JSON, completion and clocks 710. Other formats of Gaussians, posed RGB-D and
 HEIC 570. The demo's harder room, its film and report, notebooks 590. Several processes 110 in the core and 360
 in all. SigLIP with its texts, scale and bias, MobileCLIP, SAM 2.1 and 3 for transformers.js: 40 in the core, 420 in

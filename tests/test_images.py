@@ -1,6 +1,8 @@
 """Image files and lenses: what is read is what was stored, and damage is told."""
 
+import struct
 import sys
+import zlib
 
 import cv2
 import numpy as np
@@ -42,6 +44,34 @@ def test_grey_16_bits_and_transparency(tmp_path):
     image, transparent = read_image(tmp_path / "clear.png")
     assert transparent
     np.testing.assert_array_equal(image, FRAME * (alpha > 0)[..., None])
+
+
+def chunk(kind, body):
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def deep_png(rows, *, woven=0, behind=b""):
+    """16 bits of colour; `rows` as PNG filters them, each behind a zero."""
+    header = struct.pack(">IIBBBBB", 17, 13, 16, 2, 0, 0, woven)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), behind, chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def test_16_bits_of_colour_are_read_whole_or_refused_in_silence(tmp_path, capfd):
+    """libpng, by which they are read, would tell of these on stderr, and leave pixels black."""
+    deep, file = FRAME.astype(">u2") * np.array(257, ">u2"), tmp_path / "deep.png"
+    rows = b"".join(b"\0" + row.tobytes() for row in deep)
+    passes = (0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)
+    woven = b"".join(b"\0" + row.tobytes() for x, y, across, down in passes for row in deep[y::down, x::across])
+    for whole in (deep_png(rows), deep_png(woven, woven=1)):
+        file.write_bytes(whole)
+        np.testing.assert_array_equal(read_image(file)[0], FRAME)
+    late = deep_png(rows, behind=chunk(b"tRNS", bytes(6)))
+    for wrong in (deep_png(rows[:-40]), deep_png(rows, woven=1), deep_png(woven[:-1], woven=1), late):
+        file.write_bytes(wrong)
+        with pytest.raises(InputError, match=r"deep\.png"):
+            read_image(file)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_exif_orientation_is_ignored(tmp_path):
@@ -129,15 +159,15 @@ def test_depth(tmp_path):
 
 
 BROWN = Lens(160, 120, 130.0, 128.0, 83.0, 58.0, (-0.21, 0.06, 0.002, -0.001))
-PINCUSHION = Lens(160, 120, 130.0, 128.0, 80.0, 60.0, (0.15, 0.02, 0.0, 0.0, 0.01))
+PINCUSHION = Lens(160, 120, 130.0, 128.0, 80.0, 60.0, (0.15, 0.02, 0.0, 0.0, 0.01, 0.02))
 FISHEYE = Lens(160, 120, 70.0, 71.0, 79.0, 61.0, (0.02, -0.01, 0.003, 0.0), fisheye=True)
 
 
 def brown(lens, x, y):
     """Brown's model, written out."""
-    k1, k2, p1, p2, k3 = (*lens.distortion, 0.0)[:5]
+    k1, k2, p1, p2, k3, k4 = (*lens.distortion, 0.0, 0.0)[:6]
     r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2)
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     return lens.fx * u + lens.cx, lens.fy * v + lens.cy

@@ -29,6 +29,8 @@ _MODES = {"1": "L", "L": "L", "I;16": "I;16", "RGB": "RGB", "RGBA": "RGBA", "P":
 """Pillow's mode of a file -> that of its pixels here"""
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """of a PNG, by its colour type"""
+_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+"""first column, first row and steps of each pass of an interlaced PNG"""
 MOST_PIXELS = 1 << 27
 """of an image: 134 million"""
 
@@ -120,8 +122,8 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
     kind = PngImageFile if data.startswith(_PNG) else JpegImageFile if data.startswith(_JPEG) else None
     try:
         deep = kind is PngImageFile and data[24] == 16 and data[25] > 0
-        if deep:  # or libpng would say on stderr that its checksum is wrong
-            zlib.decompress(b"".join(body for name, body in _png_chunks(path, data) if name == b"IDAT"))
+        if deep:
+            _check_deep(list(_png_chunks(path, data)))
         if kind is not None:
             with kind(io.BytesIO(data)) as image:
                 mode = "RGBA" if "transparency" in image.info else _MODES.get(image.mode, "RGB")
@@ -135,6 +137,22 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
         return image if image.ndim == 2 else cv2.cvtColor(image, order[image.shape[2]])
     except Exception as error:  # Pillow's and OpenCV's own kinds have no common base but this
         raise _unreadable(path, f"what cannot be decoded ({error or type(error).__name__})") from error
+
+
+def _check_deep(chunks: list[tuple[bytes, bytes]]) -> None:
+    """Raises where libpng, by which OpenCV reads 16 bits of colour, would say on stderr what is wrong."""
+    kinds = [kind for kind, _ in chunks]
+    first, behind = kinds[: kinds.index(b"IDAT")], kinds[kinds.index(b"IDAT") :]
+    for kind, size in ((b"tRNS", {6}), (b"PLTE", range(3, 769, 3))):
+        if kind in behind or first.count(kind) > 1 or any(len(b) not in size for k, b in chunks if k == kind):
+            raise ValueError(f"a {kind.decode()} out of place")
+    width, height, bits, colour_type, _, _, woven = struct.unpack(">IIBBBBB", chunks[0][1])
+    passes = _ADAM7 if woven else ((0, 0, 1, 1),)
+    sizes = [(-((x - width) // across), -((y - height) // down)) for x, y, across, down in passes]
+    needed = sum(rows * (1 + columns * _CHANNELS[colour_type] * bits // 8) for columns, rows in sizes if columns > 0)
+    found = len(zlib.decompress(b"".join(body for kind, body in chunks if kind == b"IDAT")))
+    if found != needed:
+        raise ValueError(f"{found} bytes of pixels, where {width}x{height} of {bits} bits have {needed}")
 
 
 def _decode_heic(path: Path, data: bytes) -> np.ndarray:

@@ -56,7 +56,7 @@ class Lens:
 
 def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
-    size = 4 if lens.fisheye else max(4, len(lens.distortion))
+    size = 4 if lens.fisheye else next(n for n in (4, 5, 8) if n >= len(lens.distortion))
     return matrix, np.pad(np.array(lens.distortion, np.float64), (0, size - len(lens.distortion)))
 
 

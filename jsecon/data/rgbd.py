@@ -147,6 +147,8 @@ def _tum(path: Path) -> Posed:
         raise InputError(file, "nothing there", wanted, remedy)
     with _reading(file):
         fx, fy, cx, cy, *distortion = map(float, _words(file)[0]) if file.is_file() or not known else _TUM[known[1]]
+        if len(distortion) > 8:
+            raise ValueError(f"{len(distortion)} numbers behind fx fy cx cy, at most k1 k2 p1 p2 k3 k4 k5 k6 can be")
         seen = _listed(path / "depth.txt") if (path / "depth.txt").is_file() else (np.zeros(0), [])
         lens = Lens(*image_size(images[0]), fx, fy, cx + 0.5, cy + 0.5, tuple(distortion))
     shots = []
