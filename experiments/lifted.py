@@ -1,6 +1,6 @@
 """From an outline to Gaussians: what one mask, and three, find in the other views, beside the answer to the name.
 
-    python -m experiments.lifted [ROOMS] [--seeds 0 1 2 3 4]
+    python -m experiments.lifted [ROOMS] [--seeds 0 1 2 3 4] [--crowded]
 
 ROOMS as for `experiments.places`. The masks are the true ones of frames held out, as another tool might outline a thing
 there; each is lifted from one frame, or from three, and judged in the others (alpha > 0.7). PRIOR_PX of

@@ -1,13 +1,14 @@
 """Where a thing is: centres and boxes of the answers in the demo's rooms, against the rooms themselves.
 
-    python -m experiments.places [ROOMS] [--seeds 0 1 2 3 4]
+    python -m experiments.places [ROOMS] [--seeds 0 1 2 3 4] [--crowded]
 
-ROOMS holds a folder <seed> for each room, as `demo` with PLAIN leaves it, made where it is
-missing. Every thing is asked for by its name. The true box is that of all its surface that any of the 30 views shows,
-by ray casting.
+ROOMS holds a folder <seed> for each room, made where it is missing: with --crowded as `jsecon demo` leaves it, else as
+`demo` with PLAIN does. Every thing is asked for by its name, which no other has. The true box is that of all its
+surface that any of the 30 views shows, by ray casting.
 """
 
 import argparse
+import collections
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ from experiments import results
 from jsecon.app.demo import PLAIN, demo
 from jsecon.app.place import locate
 from jsecon.app.verbs import Demo
+from jsecon.data.synthetic.crowd import crowded_room
 from jsecon.data.synthetic.raycast import trace
 from jsecon.data.synthetic.room import Room, make_room
 from jsecon.errors import InputError
@@ -33,11 +35,13 @@ class Options:
 
     rooms: str = "rooms"
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    crowded: bool = False
     out: str = str(results.HOME / "results" / "places")
 
 
 def true_boxes(room: Room, cameras: Camera) -> dict[str, np.ndarray]:
-    """name -> (2, 3) lowest and highest corner of what the views show of each thing, m."""
+    """name -> (2, 3) lowest and highest corner of what the views show of each thing that alone has its name, m."""
+    count = collections.Counter(item.name.strip() for item in room.objects)
     owners = np.array([part.owner for part in room.parts])
     found: dict[str, list[np.ndarray]] = {}
     for t in range(len(np.asarray(cameras.fx))):
@@ -49,7 +53,7 @@ def true_boxes(room: Room, cameras: Camera) -> dict[str, np.ndarray]:
         world = (np.stack([x, y, np.ones_like(x)], -1) * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
         owner = np.where(part >= 0, owners[np.maximum(part, 0)], -1)
         for k, item in enumerate(room.objects):
-            if (owner == k).any():
+            if item.name and count[item.name] == 1 and (owner == k).any():
                 found.setdefault(item.name, []).append(world[owner == k])
     return {name: np.stack([np.concatenate(p).min(0), np.concatenate(p).max(0)]) for name, p in found.items()}
 
@@ -66,7 +70,7 @@ def fields_of(options: Options) -> Iterator[tuple[int, Path, LanguageField]]:
     for seed in options.seeds:
         folder = Path(options.rooms) / str(seed)
         if not (folder / "field.npz").exists():
-            demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
+            demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=None if options.crowded else PLAIN)
         yield seed, folder, load_field(folder / "field.npz")
 
 
@@ -75,8 +79,9 @@ def asked_for(kind: type[Options]) -> Options:
     parser = argparse.ArgumentParser()
     parser.add_argument("rooms", nargs="?", default=kind.rooms)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(kind.seeds))
+    parser.add_argument("--crowded", action="store_true", help="the demo's rooms instead of plain ones")
     given = parser.parse_args()
-    return kind(given.rooms, tuple(given.seeds))
+    return kind(given.rooms, tuple(given.seeds), given.crowded, kind.out + "_crowded" * given.crowded)
 
 
 def main(options: Options) -> str:
@@ -84,7 +89,8 @@ def main(options: Options) -> str:
     rows = []
     for seed, _, field in fields_of(options):
         embedder = embedder_of_field(field)
-        for name, box in true_boxes(make_room(seed), field.cameras).items():
+        room = crowded_room(seed) if options.crowded else make_room(seed)
+        for name, box in true_boxes(room, field.cameras).items():
             try:
                 place = locate(field, name, embedder)
             except InputError:
