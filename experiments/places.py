@@ -41,7 +41,7 @@ class Options:
 
 def true_boxes(room: Room, cameras: Camera) -> dict[str, np.ndarray]:
     """name -> (2, 3) lowest and highest corner of what the views show of each thing that alone has its name, m."""
-    count = collections.Counter(item.name.strip() for item in room.objects)
+    count = collections.Counter(item.name for item in room.objects)
     owners = np.array([part.owner for part in room.parts])
     found: dict[str, list[np.ndarray]] = {}
     for t in range(len(np.asarray(cameras.fx))):
@@ -53,7 +53,7 @@ def true_boxes(room: Room, cameras: Camera) -> dict[str, np.ndarray]:
         world = (np.stack([x, y, np.ones_like(x)], -1) * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
         owner = np.where(part >= 0, owners[np.maximum(part, 0)], -1)
         for k, item in enumerate(room.objects):
-            if item.name and count[item.name] == 1 and (owner == k).any():
+            if count[item.name] == 1 and (owner == k).any():
                 found.setdefault(item.name, []).append(world[owner == k])
     return {name: np.stack([np.concatenate(p).min(0), np.concatenate(p).max(0)]) for name, p in found.items()}
 
