@@ -74,6 +74,11 @@ def fields_of(options: Options) -> Iterator[tuple[int, Path, LanguageField]]:
         yield seed, folder, load_field(folder / "field.npz")
 
 
+def room_of(seed: int, options: Options) -> Room:
+    """The room that a field was made of."""
+    return crowded_room(seed) if options.crowded else make_room(seed)
+
+
 def asked_for(kind: type[Options]) -> Options:
     """The options of the command line."""
     parser = argparse.ArgumentParser()
@@ -89,8 +94,7 @@ def main(options: Options) -> str:
     rows = []
     for seed, _, field in fields_of(options):
         embedder = embedder_of_field(field)
-        room = crowded_room(seed) if options.crowded else make_room(seed)
-        for name, box in true_boxes(room, field.cameras).items():
+        for name, box in true_boxes(room_of(seed, options), field.cameras).items():
             try:
                 place = locate(field, name, embedder)
             except InputError:

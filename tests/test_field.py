@@ -155,6 +155,12 @@ def rewritten(path, change):
         np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
+def exchanged(header, record, name, other):
+    """A field of one of the header's records is another of its records, whole."""
+    fields = header["field"]["fields"]
+    fields[record]["fields"][name] = fields[other]
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -166,6 +172,9 @@ def rewritten(path, change):
         (lambda h, a: h["field"].update(record="Popen"), "damaged"),
         (lambda h, a: h.update(field={"value": 3}), "no field at its root"),
         (lambda h, a: h["field"]["fields"].update(gaussians={"value": None}), "damaged"),
+        (lambda h, a: exchanged(h, "gaussians", "sh", "cameras"), "damaged"),
+        (lambda h, a: exchanged(h, "cameras", "fy", "gaussians"), "damaged"),
+        (lambda h, a: exchanged(h, "votes", "overflow", "regions"), "damaged"),
         (lambda h, a: h["field"]["fields"]["names"].update(value=["one"]), "1 frame names"),
         (lambda h, a: h["field"]["fields"]["votes"]["fields"]["num_regions"].update(value=4), "votes over 4 regions"),
     ],

@@ -193,6 +193,8 @@ SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
         (_put(SCALED, "frames", 3, "transform_matrix"), "not rigid"),
         (_put(0.0, "applied_scale"), "cannot be inverted"),
         (_put("gone.ply", "ply_file_path"), "gone.ply"),
+        (_put("spar\0se.ply", "ply_file_path"), "no such file"),
+        (_put(["sparse.ply"], "ply_file_path"), "'ply_file_path' of type list"),
     ],
 )
 def test_damage_is_told(tmp_path, change, said):

@@ -26,7 +26,7 @@ from jsecon.pipeline.progress import Listener
 from jsecon.types import LanguageField
 
 HOLDOUT = 5
-PLAIN = {"crowded": False}
+PLAIN: dict[str, int] = {"crowded": False}
 """`room` of experiments that want one thing of each colour, on a bare table"""
 
 

@@ -66,8 +66,12 @@ def read_nerfstudio(file: Path) -> Posed:
         raise _bad(file, found, f"{wanted}, relative to this file", "Copy the images beside it.")
     if any("mask_path" in entry for entry in entries):
         notes.append("The masks named by mask_path (pixels to ignore) were not used.")
-    to_source, cloud = _to_source(file, scene, scale), scene.get("ply_file_path")
-    points = load_points_ply(file.parent / str(cloud)) if cloud else ()
+    to_source, points = _to_source(file, scene, scale), ()
+    if scene.get("ply_file_path"):
+        cloud = file.parent / _key(file, scene, "ply_file_path", "the file", str)
+        if not os.path.isfile(cloud):  # False also for a name that no file can have
+            raise _bad(cloud, "no such file", "the ply_file_path of transforms.json", "Check the path.")
+        points = load_points_ply(cloud)
     return Posed(shots, file, *points, to_source=to_source, notes=tuple(notes))
 
 

@@ -46,11 +46,13 @@ _LETTERS = {
     "k": ("votes.regions", -1),
     "c": ("canonical", 0),
     "p": ("parts.weight", 0),
+    "b": ("gaussians.sh", 1),
 }
 """where a field's sizes are read off: array and axis"""
 _SHAPES = {
     ("n", 3): "gaussians.means gaussians.log_scales",
     ("n", 4): "gaussians.quaternions",
+    ("n", "b", 3): "gaussians.sh",
     ("n",): "gaussians.opacity_logits votes.labelled votes.total votes.peak votes.views parts.part",
     ("n", "d"): "codes",
     ("n", "k"): "votes.regions votes.weights votes.shown",
@@ -58,7 +60,8 @@ _SHAPES = {
     ("r", "d"): "region_codes",
     ("r", "r"): "votes.overlap",
     ("t", 4, 4): "cameras.world_to_camera",
-    ("t",): "cameras.fx",
+    ("t",): "cameras.fx cameras.fy cameras.cx cameras.cy",
+    (): "votes.overflow",
     ("c", "e"): "canonical",
     ("p", "e"): "parts.embeddings",
     (4, 4): "to_source",
@@ -187,6 +190,8 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
                 return f"{name} with numbers that are not finite"
             if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
                 return f"{name} with numbers of none of {sizes[name]}"
+    if field.gaussians.sh.shape[1] not in (1, 4, 9, 16):
+        return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parsed_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"
