@@ -22,7 +22,7 @@ from jsecon.query.anchored import query_anchored
 from jsecon.query.classes import query_classes
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import query_parts
+from jsecon.query.parts import parts_instead, query_parts
 from jsecon.query.retrieval import PIECE_NEARNESS
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
@@ -139,12 +139,13 @@ def ask_field(
     clean: bool = True,
     threshold: float | None = None,
     pieces: bool = False,
+    instead: bool = False,
     retrieval_threshold: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code,
     probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that answer)
     and parts (of them the parts that do). `clean` drops outliers, `pieces` joins the regions that are pieces of what
-    the text found (not by lead)."""
+    the text found (not by lead); `instead`: by votes, parts answer where no region does (`parts_instead`)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases = jnp.asarray(field.canonical)
@@ -176,6 +177,9 @@ def ask_field(
             options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_nearness": nearness}
             options["retrieval_threshold"] = retrieval_threshold
             found = query_anchored(field, text, by=by, **options)
+            whole = dataclasses.replace(field, parts=parts_of(setting)) if instead else field
+            if instead and (other := parts_instead(whole, text, found.score)) is not None:
+                found = other.selection
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 

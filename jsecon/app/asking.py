@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Bool
 
 from jsecon.app.question import (
     POINTED,
+    UNHELD,
     Answer,
     Sought,
     answer_of,
@@ -20,6 +22,7 @@ from jsecon.app.question import (
     ask_text,
     region_under,
     sought,
+    unheld,
 )
 from jsecon.data.images import read_stored
 from jsecon.errors import InputError
@@ -29,7 +32,7 @@ from jsecon.query.anchored import Found, found_region
 from jsecon.query.blocks import Chosen, chosen_in_blocks
 from jsecon.query.lift import box_mask
 from jsecon.query.neighbours import nearest
-from jsecon.query.parts import query_parts
+from jsecon.query.parts import InParts, query_parts
 from jsecon.types import LanguageField, Selection
 
 _T = TypeVar("_T")
@@ -145,10 +148,17 @@ def answered_in_blocks(
     asking = [functools.partial(of_text, text) for text in texts]
     asked, refused = asked_each(asking + [functools.partial(at_pixel, *pixel) for pixel in pixels])
     chosen = chosen_in_blocks(field, [each.found for each in asked], threshold, by=by)
-    return [_answered(field, *each, several, outliers) for each in zip(asked, chosen)], refused
+    instead = [None if each.text is None else unheld(each.text, by, threshold) for each in asked]
+    return [_answered(field, *each, several, outliers) for each in zip(asked, chosen, instead)], refused
 
 
-def _answered(field: LanguageField, asked: _Asked, chosen: Chosen, several: bool, outliers: bool) -> Answer:
+def _answered(
+    field: LanguageField, asked: _Asked, chosen: Chosen, instead: InParts | None, several: bool, outliers: bool
+) -> Answer:
+    if instead is not None:
+        whole = jax.tree.map(np.asarray, instead.selection)
+        rows = np.flatnonzero(whole.mask)
+        chosen = Chosen(rows, whole.similarity[rows], -1, float(whole.score))
     count = len(chosen.gaussians)
     size = min(max(1 << max(count - 1, 0).bit_length(), _LEAST), field.gaussians.count)  # few sizes to compile for
     rows, similarity = np.zeros(size, np.int64), np.zeros(size, np.float32)
@@ -162,5 +172,6 @@ def _answered(field: LanguageField, asked: _Asked, chosen: Chosen, several: bool
         selection = query_parts(
             dataclasses.replace(own, canonical=asked.text.field.canonical), selection, asked.text.wanted
         )
-    answer = answer_of(own, asked.name, asked.by, selection, outliers, {}, keep=asked.text.keep)
-    return dataclasses.replace(answer, rows=rows, there=asked.text.there)
+    there, left = (asked.text.there, {}) if instead is None else (instead.there, UNHELD)
+    answer = answer_of(own, asked.name, asked.by, selection, outliers, left, keep=asked.text.keep)
+    return dataclasses.replace(answer, rows=rows, there=there)

@@ -176,7 +176,7 @@ def told(field: LanguageField, state: ViewState, answers: Sequence[Answer | Inpu
             lines.append(_box(f"{head}: {_error(found)}"))
             continue
         score, count = float(found.selection.score), int(found.mask.sum())
-        if int(found.selection.region) < 0:
+        if int(found.selection.region) < 0 and not np.asarray(found.selection.mask).any():
             best, least = f"the best score is {score:.2f}", CONTRAST_THRESHOLD
             if found.there is not None:
                 best, least = f"it is there with a probability of {found.there:.2g}", PRESENCE_THRESHOLD
@@ -188,7 +188,10 @@ def told(field: LanguageField, state: ViewState, answers: Sequence[Answer | Inpu
             sure = probability_inside(found.selection.similarity, field.votes, found.mask).mean()
             kind = f"score {score:.2f}, " if isinstance(thing, str) else ""
             lines.append(f'<div style="margin:0 .8em .4em;font-size:.85em">{head}: {count} Gaussians, {kind}')
-            lines[-1] += f"sure to {100 * sure:.0f} %</div>"
+            lines[-1] += (
+                "by its parts, as no region holds it" if "regions" in found.left_out else f"sure to {100 * sure:.0f} %"
+            )
+            lines[-1] += "</div>"
     return "".join(lines)
 
 

@@ -27,7 +27,7 @@ from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.lift import lift
 from jsecon.query.neighbours import evened
 from jsecon.query.outliers import outliers_removed
-from jsecon.query.parts import query_parts
+from jsecon.query.parts import InParts, parts_instead, query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
 from jsecon.query.several import found_of_several, parts_of_question
@@ -86,18 +86,23 @@ def ask_text(
     With `near` (N, K), the `nearest` of each Gaussian, shares of votes are evened out over them before they are cut.
     `piece_nearness`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`).
 
-    A text may be composite: `"red mug" or "bowl" but not "handle"`. Raises InputError where the embedder has no words
-    for a part, and for several regions or a composite text by anything but votes.
+    A text may be composite: `"red mug" or "bowl" but not "handle"`. Of a field with parts, those answer a plain text
+    that no region does (`parts_instead`). Raises InputError where the embedder has no words for a part, and for several
+    regions or a composite text by anything but votes.
     """
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
     if by in ("one_step", "canonical") and not several and sum(map(len, parts_of_question(text))) == 1:
         return answer_of(field, text, by, _compared(field, embedder, text, by, threshold), outliers, {})
     asked = sought(field, embedder, text, by=by, several=several, piece_nearness=piece_nearness)
-    selection = members(field, asked.found, threshold, by=_membership(by))
-    if several and field.parts is not None:
-        selection = query_parts(asked.field, selection, asked.wanted)
+    if (found := unheld(asked, by, threshold)) is not None:
+        selection, asked, left = found.selection, asked._replace(there=found.there), UNHELD
+    else:
+        selection, left = members(field, asked.found, threshold, by=_membership(by)), {}
+        if several and field.parts is not None:
+            selection = query_parts(asked.field, selection, asked.wanted)
     selection = _shaped(field, selection, by, threshold, near)
-    return dataclasses.replace(answer_of(field, text, by, selection, outliers, {}, keep=asked.keep), there=asked.there)
+    answer = answer_of(field, text, by, selection, outliers, left, keep=asked.keep)
+    return dataclasses.replace(answer, there=asked.there)
 
 
 class Sought(NamedTuple):
@@ -112,6 +117,18 @@ class Sought(NamedTuple):
     """of the selection's clusters: "largest", or "all" where there may be several things."""
     there: float | None
     """as in `Answer`."""
+    logits: Any = None
+
+
+UNHELD = {"regions": "none holds what the text names: the parts that answer it were taken"}
+
+
+def unheld(asked: Sought, by: str, threshold: float | None) -> InParts | None:
+    """`parts_instead` for a plain text by votes; None of other questions, and where the field has no parts."""
+    if asked.field.parts is None or asked.keep != "largest" or by not in ("votes", "silhouette"):
+        return None
+    how: dict[str, Any] = {"similarity_threshold": threshold, "logits": asked.logits}
+    return parts_instead(asked.field, asked.wanted[0], asked.found.score, **how)
 
 
 def sought(
@@ -139,7 +156,8 @@ def sought(
     else:
         texts = jax.device_put(embedder.embed_text([text]))
         found = found_of(field, texts[0], **how)
-    return Sought(field, texts, found, keep, best_presence(field.regions, texts, found.region, how["logits"]))
+    there = best_presence(field.regions, texts, found.region, how["logits"])
+    return Sought(field, texts, found, keep, there, how["logits"])
 
 
 def _compared(field: LanguageField, embedder: Any, text: str, by: str, threshold: float | None) -> Selection:
@@ -184,7 +202,6 @@ def ask_pixel(
 
 
 POINTED = {"text encoder": "the region under the pixel is the anchor"}
-"""what a pixel leaves out, and why"""
 
 
 def region_under(field: LanguageField, frame: int | str, x: int, y: int) -> tuple[str, int]:
@@ -235,12 +252,12 @@ def _shaped(
     least = SHARE_THRESHOLD if threshold is None else threshold
     if near is not None and by in ("votes", "silhouette"):
         share = evened(jnp.asarray(selection.similarity), jnp.asarray(near))
-        inside = (share >= least) & (selection.region >= 0)
+        inside = (share >= least) & jnp.any(selection.mask)
         selection = dataclasses.replace(selection, mask=inside, similarity=share)
     if by != "silhouette":
         return selection
     mask = silhouette_members(field.gaussians, field.cameras, selection.similarity, threshold=least)
-    return dataclasses.replace(selection, mask=mask & (selection.region >= 0))
+    return dataclasses.replace(selection, mask=mask & jnp.any(selection.mask))
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:

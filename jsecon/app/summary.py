@@ -120,9 +120,11 @@ def write_answers(
             else:
                 place = "nothing selected"
             count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
-            listener.say(f"{item.question!r}: {count}, {score}, region {told['region']}, {place}")
+            unheld = "regions" in told["left_out"]
+            where = "its parts, as no region holds it" if unheld else f"region {told['region']}"
+            listener.say(f"{item.question!r}: {count}, {score}, {where}, {place}")
             dropped = f"{told['outliers_dropped']} outliers dropped"
-            words = f"{count} by {item.by}; {score}; region {told['region']}; {dropped}; {place}."
+            words = f"{count} by {item.by}; {score}; {where}; {dropped}; {place}."
             overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
             figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
             parts.append(report.section(item.question, words, report.grid(figures, 3)))

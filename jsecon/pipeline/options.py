@@ -94,8 +94,8 @@ class Options(SceneOptions):
     weighting: Literal["pixels", "uniform"] = "pixels"
     """of the views in a region's embedding"""
     parts: bool = False
-    """embed each frame's own masks too, so that `query --all` leaves out what they took for one with its neighbour in
-    most views; takes twice as many embeddings"""
+    """embed each frame's own masks too, so that `query` finds what no region holds, and `query --all` leaves out what
+    most views took for one with its neighbour; takes twice as many embeddings"""
     latent: Annotated[int | Literal["auto"], {"metavar": "D", "least": 1}] = 16
     """most numbers a code may have; 3 as in the paper; auto for as few as keep the regions apart"""
     reduce: Literal["mode", "median", "mean"] = "mode"
