@@ -141,6 +141,7 @@ ROWS: dict[str, Method] = {
     "outliers stay": row_of(choose=lambda setting, found: np.asarray(found.mask)),
     "every cluster stays": row_of(choose=_cleaned(keep="all")),
     "parts that answer": own("consensus", "contrast", "threshold", way="parts"),
+    "parts where no region answers": own("consensus", "contrast", "threshold", instead=True),
     "expected IoU": own("consensus", "contrast", "silhouette"),
     "expected IoU at 10/255": own("consensus", "contrast", "lenient silhouette"),
     "core and cover": row_of(
