@@ -6,6 +6,7 @@ whole gains, in expectation, over the views.
 """
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import require_shape
 from jsecon.fit.schedule import resized
 from jsecon.language.shares import SHARE_THRESHOLD
+from jsecon.process import cores
 from jsecon.query.masks import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import pixel_alphas, to_tiles
@@ -121,9 +123,9 @@ def footprints(
     own = _rows(gaussians, open_to, rows)
     rest = np.flatnonzero(certain)
     rest_of = _rows(gaussians, rest, _padded(len(rest))) if len(rest) else None
-    values, tiles, owners, inside, outside, base = [], [], [], [], [], []
     shares = jnp.broadcast_to(jnp.asarray(share)[:, None], (len(share), 3))
-    for t in range(len(views.fx)):
+
+    def seen_from(t: int) -> tuple[np.ndarray, ...]:
         camera = jax.tree.map(jnp.asarray, views[t])
         image = jnp.clip(render_plan(plan_view(gaussians, camera), shares).features[..., 0], 0.0, 1.0)
         tile = plan_view(own, camera)
@@ -136,18 +138,16 @@ def footprints(
         pairs = (np.pad(a, (0, size - len(a))) for a in (ids, of_tile))
         absorbed = np.asarray(_absorbed(tile.splats, *pairs, -(-views.width // edge), edge))[: len(ids)]
         seen = absorbed.max(1, initial=0) > 0
-        values.append(absorbed[seen])
-        tiles.append(of_tile[seen] + t * number)
-        owners.append(ids[seen])
         there = np.asarray(to_tiles(jnp.ones_like(image), edge))[:-1]
         expected = np.asarray(to_tiles(image, edge))[:-1]
-        inside.append(expected)
-        outside.append(there - expected)
         certainly = np.zeros_like(expected)
         if rest_of is not None:
             alpha = render_plan(plan_view(rest_of, camera), jnp.zeros((rest_of.count, 1), jnp.float32)).alpha
             certainly = np.asarray(to_tiles(-jnp.log(jnp.maximum(1 - alpha, 1e-6)), edge))[:-1]
-        base.append(certainly)
+        return absorbed[seen], of_tile[seen] + t * number, ids[seen], expected, there - expected, certainly
+
+    with ThreadPoolExecutor(cores()) as pool:  # a view's lists are sorted on one core
+        values, tiles, owners, inside, outside, base = zip(*pool.map(seen_from, range(len(views.fx))), strict=True)
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
     begin = np.searchsorted(owner[order], np.arange(rows + 1)).astype(np.int32)
