@@ -149,3 +149,12 @@ def test_a_thing_that_no_camera_sees_is_left_as_it_is(world):
 def test_shares_of_another_scene_are_refused(world):
     with pytest.raises(ValueError, match="silhouette_members"):
         silhouette_members(world[0], world[1], world[2][1:])
+
+
+def test_float64_in_this_thread_alone_changes_nothing(world):
+    gaussians, cameras, share = world
+    found = silhouette_members(gaussians, cameras, share)
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (gaussians, cameras))
+        again = silhouette_members(*double, share)
+    np.testing.assert_array_equal(np.asarray(again), np.asarray(found))

@@ -75,8 +75,8 @@ def silhouette_members(
     with `weights` (a, b); (0, 1) is for who must not touch a thing, (1, 0) for its solid core. E is the expected IoU
     but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > LEAST_SHARE are taken in or left
     out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a batch of views of the
-    scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most. Host code around compiled parts;
-    not differentiable. Raises ValueError on a share of another length.
+    scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most, in float32. Host code around
+    compiled parts; not differentiable. Raises ValueError on a share of another length.
     """
     require_shape("silhouette_members", share, (gaussians.count,), "Give one share per Gaussian.")
     share = np.asarray(share, np.float32)
@@ -117,6 +117,8 @@ def footprints(
 ) -> Footprints:
     """What the Gaussians `open_to` (C,) absorb in `views`, padded so that texts share their programs; `chosen` (N,) of
     the others are taken for certain."""
+    # One precision for all: jax.enable_x64 holds in its own thread alone, and views are planned in several.
+    gaussians, views = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (gaussians, views))
     rows = _padded(len(open_to))
     certain = chosen.copy()
     certain[open_to] = False
@@ -126,7 +128,7 @@ def footprints(
     shares = jnp.broadcast_to(jnp.asarray(share)[:, None], (len(share), 3))
 
     def seen_from(t: int) -> tuple[np.ndarray, ...]:
-        camera = jax.tree.map(jnp.asarray, views[t])
+        camera = views[t]
         image = jnp.clip(render_plan(plan_view(gaussians, camera), shares).features[..., 0], 0.0, 1.0)
         tile = plan_view(own, camera)
         edge, number = tile.lists.tile, len(tile.lists.lengths)
