@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from jsecon.app import command_line, verbs
+from jsecon.app.question import BY_VOTES, METHODS
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.pipeline import pipeline
 from jsecon.pipeline.arguments import parsed
@@ -81,7 +82,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
     assert "expected .ply or .spz or .glb" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("by", ["votes", "silhouette", "code", "one_step", "canonical"])
+@pytest.mark.parametrize("by", METHODS)
 def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, capsys, by):
     run, out = room_run
     names = list(json.loads((run.options.capture / "scene.json").read_text())["objects"].values())[:2]
@@ -93,7 +94,7 @@ def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, c
         assert answer["query"] == name
         assert answer["by"] == by
         assert repr(name) in told
-        if by in ("votes", "silhouette"):
+        if by in BY_VOTES:
             assert 0 < answer["count"] < answer["of"]
         if answer["count"]:
             chosen = load_ply(tmp_path / answer["ply"])

@@ -18,13 +18,12 @@ from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.query.direct import relevancies
-from jsecon.query.silhouette import WEIGHTS, silhouette_members
+from jsecon.query.silhouette import OUTLINES, silhouette_members
 from jsecon.types import Selection
 
 RULES = ("cosine", "relevancy", "contrast")
-CHOOSERS = {"threshold": None, "silhouette": WEIGHTS, "lenient silhouette": (0.0, 1.0)}
-"""a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha: of both, or of 10/255
-alone"""
+CHOOSERS = {"threshold": None} | {name.replace("_", " "): weights for name, weights in OUTLINES.items()}
+"""a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha"""
 
 
 def scores(

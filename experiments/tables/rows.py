@@ -70,7 +70,12 @@ NEARLY = (0.9, 1.0)
 """Gaussian Grouping: the first view's masks that are nearly as similar as the best, or that one alone"""
 TRAINED = ("LangSplat-m", "Gaussian Grouping-m", "OpenGaussian", "the paper's path")
 """methods of a minute or more for each setting"""
-_ASCENTS = (("contrast", "silhouette"), ("contrast", "lenient silhouette"), ("relevancy", "lenient silhouette"))
+_ASCENTS = (
+    ("contrast", "silhouette"),
+    ("contrast", "strict silhouette"),
+    ("contrast", "lenient silhouette"),
+    ("relevancy", "lenient silhouette"),
+)
 """readings by the expected IoU that trained features have, beside a threshold by every rule"""
 _PROBABILITY = 0.3
 """of Gaussian Grouping's ids, from which a Gaussian is selected"""
@@ -224,18 +229,18 @@ def rows_of(points: bool) -> dict[str, Method]:
         found[f"LangSplat-m: {told}"] = _langsplat_row(rule, chooser)
         for codebook in CODEBOOKS if points else tuple(CODEBOOKS)[:2]:
             found[f"OpenGaussian: {codebook}{told}"] = _opengaussian_row(codebook, rule, chooser)
-    ascent = () if points else ("lenient silhouette",)
+    ascents = () if points else ("strict silhouette", "lenient silhouette")
     for nearly in NEARLY:
         found[f"Gaussian Grouping-m: {'one mask' if nearly == 1 else 'as published'}"] = _grouping_row(
             nearly, "", "threshold"
         )
-        for chooser in ("threshold", *ascent):
+        for chooser in ("threshold", *ascents):
             found[f"Gaussian Grouping-m: contrast, {chooser}{', one mask' if nearly == 1 else ''}"] = _grouping_row(
                 nearly, "contrast", chooser
             )
     found["the paper's path: as published"] = METHODS["the paper's path"]
     for threshold in CODE_THRESHOLDS:
         for rule in ("cosine", "contrast"):
-            for chooser in ("threshold", *ascent):
+            for chooser in ("threshold", *ascents):
                 found[f"the paper's path: {rule}, {chooser} {threshold:g}"] = _paper_row(rule, threshold, chooser)
     return found

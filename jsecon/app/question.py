@@ -1,7 +1,7 @@
 """One question put to a field: a text, a pixel, or what somebody outlined. Its answer becomes files in app/answers.
 
 Read on the way from a text to its .ply, without the ground; behind each file lies more of its own room, behind
-splat/transform and query/masks the engine, behind `by="silhouette"` query/silhouette:
+splat/transform and query/masks the engine, behind silhouettes query/silhouette:
 
     ask     app/question, language/field, vision/colours, query/several, query/anchored, query/retrieval
     clean   language/shares, query/outliers
@@ -31,12 +31,13 @@ from jsecon.query.parts import InParts, parts_instead, query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
 from jsecon.query.several import found_of_several, parts_of_question
-from jsecon.query.silhouette import silhouette_members
+from jsecon.query.silhouette import OUTLINES, silhouette_members
 from jsecon.types import Array, LanguageField, Selection
 
-METHODS = ("votes", "silhouette", "code", "one_step", "canonical")
-"""votes, code: anchored, membership by a Gaussian's votes or its code; silhouette: by votes, then one by one by the
-outline that they make; one_step, canonical: codes against the text"""
+BY_VOTES = ("votes", *OUTLINES)
+"""anchored, membership by a Gaussian's votes; of OUTLINES then one by one by the outline that they make"""
+METHODS = (*BY_VOTES, "code", "one_step", "canonical")
+"""code: anchored, membership by a Gaussian's code; one_step, canonical: codes against the text"""
 ONE_STEP_THRESHOLD = 0.8
 """on the cosine of a Gaussian's code and the text's"""
 CANONICAL_THRESHOLD = 0.5
@@ -97,7 +98,7 @@ def ask_text(
     if (found := unheld(asked, by, threshold)) is not None:
         selection, asked, left = found.selection, asked._replace(there=found.there), UNHELD
     else:
-        selection, left = members(field, asked.found, threshold, by=_membership(by)), {}
+        selection, left = members(field, asked.found, threshold, by="code" if by == "code" else "votes"), {}
         if several and field.parts is not None:
             selection = query_parts(asked.field, selection, asked.wanted)
     selection = _shaped(field, selection, by, threshold, near)
@@ -125,7 +126,7 @@ UNHELD = {"regions": "none holds what the text names: the parts that answer it w
 
 def unheld(asked: Sought, by: str, threshold: float | None) -> InParts | None:
     """`parts_instead` for a plain text by votes; None of other questions, and where the field has no parts."""
-    if asked.field.parts is None or asked.keep != "largest" or by not in ("votes", "silhouette"):
+    if asked.field.parts is None or asked.keep != "largest" or by not in BY_VOTES:
         return None
     how: dict[str, Any] = {"similarity_threshold": threshold, "logits": asked.logits}
     return parts_instead(asked.field, asked.wanted[0], asked.found.score, **how)
@@ -147,9 +148,9 @@ def sought(
     how: dict[str, Any] = {"piece_nearness": piece_nearness, "logits": getattr(embedder, "logits", None)}
     keep = "largest"
     if several or unwanted or len(wanted) > 1:
-        if by not in ("votes", "silhouette"):
+        if by not in BY_VOTES:
             remedy = "Leave out --by, or ask for one thing."
-            raise InputError(text, f"several regions by {by}", "by votes or silhouette", remedy)
+            raise InputError(text, f"several regions by {by}", "by votes or a silhouette", remedy)
         embedded, keep = jax.device_put(embedder.embed_text(wanted + unwanted)), "all"
         texts = embedded[: len(wanted)]
         found = found_of_several(field, texts, embedded[len(wanted) :], several=several, **how)
@@ -195,8 +196,8 @@ def ask_pixel(
     Raises InputError for a frame or pixel that the field does not have, and where no region lies there.
     """
     name, region = region_under(field, frame, x, y)
-    by = by if by in ("silhouette", "code") else "votes"
-    selection = query_region(field, region, by=_membership(by), similarity_threshold=threshold)
+    by = by if by in (*OUTLINES, "code") else "votes"
+    selection = query_region(field, region, by="code" if by == "code" else "votes", similarity_threshold=threshold)
     selection = _shaped(field, selection, by, threshold, near)
     return answer_of(field, name, by, selection, outliers, POINTED)
 
@@ -240,23 +241,19 @@ def ask_outline(
     return answer_of(field, name, "outline", selection, outliers, left)
 
 
-def _membership(by: str) -> str:
-    return "code" if by == "code" else "votes"
-
-
 def _shaped(
     field: LanguageField, selection: Selection, by: str, threshold: float | None, near: np.ndarray | None
 ) -> Selection:
-    """By votes as it is, by "silhouette" the Gaussians whose outline fits the shares best in the field's views; with
-    `near` the shares are evened out over these neighbours first."""
+    """As it is, or of OUTLINES what fits the shares best in the views; with `near` shares are evened out first."""
     least = SHARE_THRESHOLD if threshold is None else threshold
-    if near is not None and by in ("votes", "silhouette"):
+    if near is not None and by in BY_VOTES:
         share = evened(jnp.asarray(selection.similarity), jnp.asarray(near))
         inside = (share >= least) & jnp.any(selection.mask)
         selection = dataclasses.replace(selection, mask=inside, similarity=share)
-    if by != "silhouette":
+    if by not in OUTLINES:
         return selection
-    mask = silhouette_members(field.gaussians, field.cameras, selection.similarity, threshold=least)
+    given = field.gaussians, field.cameras, selection.similarity
+    mask = silhouette_members(*given, threshold=least, weights=OUTLINES[by])
     return dataclasses.replace(selection, mask=mask & jnp.any(selection.mask))
 
 

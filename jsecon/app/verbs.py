@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from jsecon.pipeline.options import Folder, Options, SceneOptions
 
+By = Literal["votes", "silhouette", "strict_silhouette", "lenient_silhouette", "code", "one_step", "canonical"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Output:
@@ -116,16 +118,16 @@ class Query(Asking):
     """what lies in a box of a frame: the regions that are seen there by more than half"""
     out: Path
     """folder for the answers"""
-    by: Literal["votes", "silhouette", "code", "one_step", "canonical"] = "votes"
+    by: By = "votes"
     """votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; silhouette: by
-    votes, then each taken or left by what the outline of all gains in the views; one_step, canonical: each Gaussian's
-    code against the text"""
+    votes, then each taken or left by what the outline of all gains in the views: strict where it is opaque, lenient
+    where it is there at all; one_step, canonical: each Gaussian's code against the text"""
     threshold: float | None = None
-    """on what --by measures (default: 0.5 votes and silhouette, 0.9 code, 0.8 one_step, too high
+    """on what --by measures (default: 0.5 votes and silhouettes, 0.9 code, 0.8 one_step, too high
     for CLIP, 0.5 canonical)"""
     all: bool = False
     """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.75
-    of the way from the middle region's to the best one's (by votes or silhouette)"""
+    of the way from the middle region's to the best one's (by votes or a silhouette)"""
     even: bool = False
     """even the votes out over each Gaussian's ten neighbours before they are cut: sharper rims where masks are noisy"""
     keep_outliers: bool = False

@@ -24,8 +24,9 @@ from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import pixel_alphas, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
-WEIGHTS = 2.0, 1.0
-"""of the expected IoU at ALPHA_THRESHOLD and at VALA_THRESHOLD"""
+OUTLINES = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}
+"""weights of the expected IoU at ALPHA_THRESHOLD, of what is opaque, and at VALA_THRESHOLD, of all that is there"""
+WEIGHTS = OUTLINES["silhouette"]
 LEAST_SHARE = 0.1
 """of a Gaussian that may be taken"""
 SWEEPS = 3
