@@ -143,6 +143,7 @@ ROWS: dict[str, Method] = {
     "parts that answer": own("consensus", "contrast", "threshold", way="parts"),
     "parts where no region answers": own("consensus", "contrast", "threshold", instead=True),
     "expected IoU": own("consensus", "contrast", "silhouette"),
+    "expected IoU at 0.7": own("consensus", "contrast", "strict silhouette"),
     "expected IoU at 10/255": own("consensus", "contrast", "lenient silhouette"),
     "core and cover": row_of(
         choose=lambda setting, found: core_and_cover(

@@ -24,6 +24,10 @@ from jsecon.types import Selection
 RULES = ("cosine", "relevancy", "contrast")
 CHOOSERS = {"threshold": None} | {name.replace("_", " "): weights for name, weights in OUTLINES.items()}
 """a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha"""
+SHARP = ", sharp"
+"""behind a chooser: the ascent is given the similarities as sharp shares (`as_share`)"""
+SHARPENED = tuple((rule, f"{name} silhouette{SHARP}") for rule in RULES[1:] for name in ("strict", "lenient"))
+"""readings by sharp shares"""
 
 
 def scores(
@@ -53,15 +57,20 @@ def scores(
     return np.where(known, found, np.nan)
 
 
-def as_share(similarity: Float[np.ndarray, " n"], cut: float = lifting.READOUT) -> Float[np.ndarray, " n"]:
-    """A similarity as a share: linear from 0 to 1/2 at the threshold `cut`, and from there to 1."""
+def as_share(
+    similarity: Float[np.ndarray, " n"], cut: float = lifting.READOUT, *, sharp: bool = False
+) -> Float[np.ndarray, " n"]:
+    """A similarity as a share, 1/2 at the threshold `cut`: linear from 0 to there, and from there to 1. What is far
+    below the threshold then counts as a little of the thing; `sharp`, twice as steep, it does not."""
+    if sharp:
+        return np.clip(0.5 + (similarity - cut) / (1 - cut), 0, 1).astype(np.float32)
     share = np.where(similarity <= cut, 0.5 * similarity / cut, 0.5 + 0.5 * (similarity - cut) / (1 - cut))
     return np.clip(share, 0, 1).astype(np.float32)
 
 
 def chosen_by(setting: Setting, chooser: str, found: Selection, share: Float[np.ndarray, " n"]) -> Selection:
     """`found`, its Gaussians chosen anew by `share` (N,) of each; a threshold has chosen already."""
-    weights = CHOOSERS[chooser]
+    weights = CHOOSERS[chooser.removesuffix(SHARP)]
     if weights is None:
         return found
     mask = silhouette_members(setting.evidence.gaussians, setting.evidence.cameras, share, weights=weights)
@@ -81,7 +90,8 @@ def read(setting: Setting, features: Sequence[Float[np.ndarray, "n e"]], rule: s
         similarity = lifting.smoothed(means, score)
         place, mask = jnp.asarray(-1, jnp.int32), jnp.asarray(similarity > lifting.READOUT)
         best = jnp.asarray(best if np.isfinite(best) else 0.0, jnp.float32)
-        return chosen_by(setting, chooser, Selection(mask, jnp.asarray(similarity), place, best), as_share(similarity))
+        share = as_share(similarity, sharp=chooser.endswith(SHARP))
+        return chosen_by(setting, chooser, Selection(mask, jnp.asarray(similarity), place, best), share)
 
     most = filled.max(0)
     labels = np.where(np.isfinite(most).any(0), np.argmax(most, axis=0), -1)

@@ -23,7 +23,7 @@ from experiments.tables.methods import (
     opengaussian_of,
 )
 from experiments.tables.ours import ask_field, field_of
-from experiments.tables.readings import CHOOSERS, RULES, as_share, chosen_by, read, scores
+from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.neighbours import evened, nearest
@@ -75,6 +75,8 @@ _ASCENTS = (
     ("contrast", "strict silhouette"),
     ("contrast", "lenient silhouette"),
     ("relevancy", "lenient silhouette"),
+    ("contrast", f"strict silhouette{SHARP}"),
+    ("contrast", f"lenient silhouette{SHARP}"),
 )
 """readings by the expected IoU that trained features have, beside a threshold by every rule"""
 _PROBABILITY = 0.3
@@ -134,7 +136,8 @@ def _chosen(setting: Setting, answers: Answers, chooser: str, cut: float | None)
         if found is None or chooser == "threshold":
             return found
         similarity = np.asarray(found.similarity, np.float32)
-        return chosen_by(setting, chooser, found, similarity if cut is None else as_share(similarity, cut))
+        share = similarity if cut is None else as_share(similarity, cut, sharp=chooser.endswith(SHARP))
+        return chosen_by(setting, chooser, found, share)
 
     return dataclasses.replace(answers, select=select)
 
@@ -208,7 +211,7 @@ def rows_of(points: bool) -> dict[str, Method]:
     for name, ways in lifted.items():
         found[f"{name}: as published"] = METHODS[name]
         for way, features in ways.items():
-            for rule, chooser in every:
+            for rule, chooser in every + (() if points else SHARPENED):
                 found[f"{name}: {way}{rule}, {chooser}"] = reading((name, way), features, rule, chooser)
     for name, association in OURS.items():
         for rule in ("cosine", "contrast"):
@@ -229,7 +232,7 @@ def rows_of(points: bool) -> dict[str, Method]:
         found[f"LangSplat-m: {told}"] = _langsplat_row(rule, chooser)
         for codebook in CODEBOOKS if points else tuple(CODEBOOKS)[:2]:
             found[f"OpenGaussian: {codebook}{told}"] = _opengaussian_row(codebook, rule, chooser)
-    ascents = () if points else ("strict silhouette", "lenient silhouette")
+    ascents = () if points else ("strict silhouette", "lenient silhouette", f"strict silhouette{SHARP}")
     for nearly in NEARLY:
         found[f"Gaussian Grouping-m: {'one mask' if nearly == 1 else 'as published'}"] = _grouping_row(
             nearly, "", "threshold"

@@ -19,6 +19,9 @@ def test_a_share_is_one_half_where_the_readout_cuts():
     share = as_share(similarity)
     assert (np.diff(share) > 0).all()
     np.testing.assert_allclose(share[[0, 60, 100]], [0, 0.5, 1], atol=1e-6)
+    sharp = as_share(similarity, sharp=True)
+    np.testing.assert_allclose(sharp[[0, 40, 50, 60, 80, 100]], [0, 0, 0.25, 0.5, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(as_share(similarity, 0.9, sharp=True)[[80, 90, 95]], [0, 0.5, 1], atol=1e-6)
 
 
 def test_smoothing_fills_the_range_and_leaves_out_what_is_unknown():
@@ -84,7 +87,7 @@ def test_the_interval_is_of_pairs():
 
 def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F811
     rows = rows_of(points=False)
-    few = ("VALA: contrast, lenient silhouette", "ours, tracks: contrast, silhouette")
+    few = ("VALA: contrast, lenient silhouette, sharp", "ours, tracks: contrast, silhouette")
     plan = with_gaussians(small(lerf.QUICK, folder, "readings", methods=few), "perfect")
     plan = dataclasses.replace(plan, level="perfect")
     cells = fill.fill(plan, rows, tell=lambda _: None)
