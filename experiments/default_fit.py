@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 
 from experiments import lerf, ovs3d, results
-from experiments.tables.fill import Plan, fill, options_of
+from experiments.tables.fill import Plan, fill, options_of, totals
 from experiments.tables.methods import METHODS
 from experiments.tables.setting import Fitted
 from jsecon.pipeline.options import Options
@@ -56,8 +56,7 @@ def main(asked: Plan, tables: tuple[Plan, ...]) -> str:
                 cells[fitted] = fill(plan_of(table, asked, fitted), METHODS, tell=lambda line: print(line, flush=True))
         if len(cells) == len(FITS):
             parts.append(table_of(table.data.dataset, cells))
-            told = [cell for fitted in FITS[1:] for cell in cells[fitted]]
-            kept[table.data.dataset] = [{k: v for k, v in cell.items() if k != "texts"} for cell in told]
+            kept[table.data.dataset] = totals([cell for fitted in FITS[1:] for cell in cells[fitted]])
     text = "\n\n".join(parts)
     if parts:
         results.save(Path(asked.out), asked, kept, text)

@@ -14,7 +14,7 @@ import numpy as np
 
 from experiments import lerf, results
 from experiments.tables import layout
-from experiments.tables.fill import Plan, fill, options_of
+from experiments.tables.fill import Plan, fill, options_of, totals
 from experiments.tables.ours import ask_field, field_of
 
 WAYS = ("one_step", "canonical", "code", "votes", "probability", "lead")
@@ -67,7 +67,8 @@ def main(plan: Sweep) -> str:
         text += "\n\nQuery by query, where single texts are kept:\n\n"
         text += results.table(columns, [(way, *told) for way, told in apart.items()])
     figure = _figure(plan.thresholds, curves, each)
-    results.save(Path(plan.out), plan, {"curves": curves, "best thresholds": apart, "cells": cells}, text, figure)
+    told = {"curves": curves, "best thresholds": apart, "cells": totals(cells)}
+    results.save(Path(plan.out), plan, told, text, figure)
     print(text)
     return text
 

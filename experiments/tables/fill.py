@@ -152,6 +152,11 @@ def _key(plan: Plan, scene: str, seed: int, level: str, method: str) -> str:
     return f"{scene}-{seed}-{level}-{digest}"
 
 
+def totals(cells: list[dict]) -> list[dict]:
+    """The cells without the figures of single texts, which the file of cells keeps."""
+    return [{name: told for name, told in cell.items() if name != "texts"} for cell in cells]
+
+
 def measure(setting: Setting, answers: Answers) -> dict:
     """The figures of one method on one setting, under the dataset's protocol; denominators checked."""
     bench: Benchmark = setting.bench

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments import results
 from experiments.tables.answers import Method
-from experiments.tables.fill import Plan, fill
+from experiments.tables.fill import Plan, fill, totals
 
 
 def summarise(cells: list[dict], scenes: tuple[str, ...], level: str, figures: tuple[str, ...]) -> str:
@@ -133,5 +133,5 @@ def write(
     figure.axes[0].get_legend().remove()
     for label in figure.axes[0].get_xticklabels():
         label.set(rotation=20, ha="right", rotation_mode="anchor")
-    results.save(Path(plan.out), plan, {"means": averages, "cells": cells}, text, figure)
+    results.save(Path(plan.out), plan, {"means": averages, "cells": totals(cells)}, text, figure)
     return text

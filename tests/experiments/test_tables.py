@@ -151,7 +151,8 @@ def test_threshold_sweep(folder):
     metrics, _ = read(folder, "sweep")
     assert set(metrics["curves"]) == set(threshold_sweep.WAYS)
     assert all(len(curve) == 2 and np.isfinite(curve).all() for curve in metrics["curves"].values())
-    texts = {text for cell in metrics["cells"] for text in cell["texts"]}
+    cells = read_cells(folder / "sweep" / "cells.jsonl").values()
+    texts = {text for cell in cells for text in cell["texts"]}
     assert all(told[0] == len(texts) for told in metrics["best thresholds"].values())
 
 
