@@ -143,9 +143,12 @@ def curves(found: dict[tuple[str, float], dict[str, dict[str, float]]], trained:
         for method in sorted(set(ends[0]) & set(ends[1]) - set(found["none", 0.0])):
             told = [end[method]["miou"] for end in ends]
             axes.plot([0.0, HARD], told, "s--", markersize=3, label=method)
-        if n == 0:
-            axes.legend(fontsize=5)
+        if n % across == 0:
+            axes.set_ylabel("mIoU at alpha > 0.7")
+        axes.set_xlabel("how hard")
+    lines = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
     figure.tight_layout()
+    figure.legend(lines.values(), lines, loc="upper left", bbox_to_anchor=(1, 1), fontsize=8)  # beside them
     return figure
 
 
