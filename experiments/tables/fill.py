@@ -98,9 +98,8 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
     known = read_cells(_file(plan))
     todo = [where for where in wanted if not known.keys() >= set(keys[where].values())]
     if plan.processes == 0:
-        for wait in (False, True):  # what is free, then what others left undone: all is there at the end
-            for where in todo:
-                _complete(plan, methods, where, keys[where], tell, wait=wait)
+        for where in todo:  # what is free: what another process is at, or leaves undone, the caller sees to
+            _complete(plan, methods, where, keys[where], tell, wait=False)
         raise SystemExit(0)
     if min(plan.processes, len(todo)) > 1:
         helped(min(plan.processes, len(todo)))

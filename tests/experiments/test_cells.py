@@ -135,18 +135,18 @@ def test_a_lock_is_held_by_one_and_freed_with_its_holder(tmp_path):
         assert free
 
 
+def table(place, processes):
+    (script := place / "table.py").write_text(TABLE)
+    command = [sys.executable, str(script), "--out", str(place), "--processes", str(processes)]
+    environment = {"PYTHONPATH": str(ROOT)}
+    told = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert told.returncode == 0, told.stderr
+    return told.stdout.splitlines()
+
+
 def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
-    script, file = tmp_path / "table.py", tmp_path / "cells.jsonl"
-    script.write_text(TABLE)
-
-    def table(processes):
-        command = [sys.executable, str(script), "--out", str(tmp_path), "--processes", str(processes)]
-        environment = {"PYTHONPATH": str(ROOT)}
-        told = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
-        assert told.returncode == 0, told.stderr
-        return told.stdout.splitlines()
-
-    lines = table(2)
+    file = tmp_path / "cells.jsonl"
+    lines = table(tmp_path, 2)
     assert lines.count("whole") == 1, lines  # the processes that share it end without one
     found = read_cells(file)
     assert len(file.read_text().splitlines()) == len(found) == len(lines) - 1 == 4, lines
@@ -156,9 +156,22 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
     append_cell(file, "of another table", {"miou": 1})  # is left alone
     lost, *kept = file.read_text().splitlines(keepends=True)
     file.write_text("".join(kept) + lost[:20])  # as a killed process leaves it
-    lines = table(2)
+    lines = table(tmp_path, 2)
     assert len(lines) == 2, lines  # the lost cell alone was computed again, and nobody asked for help
     assert read_cells(file).keys() == {*found, "of another table"}
+
+
+def test_a_helper_goes_on_where_another_process_is_at_a_setting(tmp_path):
+    (tmp_path / "other.here").touch()
+    with alone(tmp_path / "a-1-medium.lock", wait=False) as free:  # longer than the helper lives
+        assert free
+        lines = table(tmp_path, 0)
+    assert len(lines) == 3, lines
+    assert {(cell["scene"], cell["seed"]) for cell in read_cells(tmp_path / "cells.jsonl").values()} == {
+        ("a", 0),
+        ("b", 0),
+        ("b", 1),
+    }
 
 
 def test_cores_are_shared_out():
