@@ -174,7 +174,7 @@ def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
     def filled(rows: list[str], seeds: tuple[int, ...]) -> list[dict]:
         plan = plan_of(name, level, asked, processes, seeds, rows)
         tell = lambda line: print(line, flush=True)
-        with contextlib.suppress(SystemExit):  # of a helper: what it was for is there
+        with contextlib.suppress(SystemExit):  # of a helper: what others are at is waited for below
             fill(plan, methods, tell=tell)
         return fill(dataclasses.replace(plan, processes=1), methods, tell=tell)
 
