@@ -21,6 +21,8 @@ from jsecon.types import Array
 
 LLOYD = 5
 """rounds of each k-means"""
+_GROUPS = 64
+"""groups are counted in multiples of this, so that few shapes are compiled"""
 
 
 @jax.jit
@@ -105,3 +107,22 @@ def silhouette_overlaps(
     shown = ((logs < jnp.log1p(-jnp.asarray(threshold, start.dtype))) & inside).reshape(groups, -1).astype(start.dtype)
     of_mask = (masks.reshape(-1, 1) == jnp.arange(slots)).astype(start.dtype)
     return shown @ of_mask, shown.sum(1), of_mask.sum(0)
+
+
+def view_overlaps(
+    views: tuple[ViewPlan, Int[Array, "t h w"]],
+    group_of: Int[Array, " n"],
+    threshold: float,
+    *,
+    groups: int,
+    slots: int,
+) -> tuple[Float[np.ndarray, "t groups slots"], Float[np.ndarray, "t groups"], Float[np.ndarray, "t slots"]]:
+    """`silhouette_overlaps` of each view, by its plan and ids."""
+    both, area, pixels = _of_views(views, group_of, threshold, _GROUPS * -(-groups // _GROUPS), slots)
+    return np.asarray(both)[:, :groups], np.asarray(area)[:, :groups], np.asarray(pixels)
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+def _of_views(views, group_of, threshold, groups, slots):
+    one = lambda view: silhouette_overlaps(view[0], group_of, view[1], threshold, groups=groups, slots=slots)
+    return lax.map(one, views)

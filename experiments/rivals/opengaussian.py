@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from experiments.rivals.descent import descend
 from experiments.rivals.evidence import Evidence, local_masks, only, view_plans
-from experiments.rivals.leaves import assign_to_centres, cluster_means, silhouette_overlaps, split_roots
+from experiments.rivals.leaves import assign_to_centres, cluster_means, split_roots, view_overlaps
 from jsecon.numerics import normalize, safe_norm
 from jsecon.splat.plan import ViewPlan, render_plan
 from jsecon.types import Array
@@ -35,8 +35,6 @@ MATCH_SILHOUETTE, MATCH_SCORE = 0.8, 0.2
 MOST_VARIANCE, LARGE = 0.006, 0.8
 """a mask whose features vary more is no pseudo label, unless it is this large a part of the view's largest"""
 _ADAM = optax.scale_by_adam(eps=1e-15)
-_LEAVES = 64
-"""roots, and leaves in use, are counted in multiples of this, so that few shapes are compiled"""
 
 
 @jax.tree_util.register_dataclass
@@ -77,37 +75,50 @@ class Schedule:
     coarse_rate: float = 1e-4
 
 
-def train_opengaussian(
-    evidence: Evidence,
-    *,
-    key: Array,
-    schedule: Schedule = Schedule(),
-) -> tuple[OpenGaussian, Array]:
-    """Trains the three stages; returns the model and the loss of the first before each step."""
-    init_key, first_key, centre_key, coarse_key, fine_key = jax.random.split(key, 5)
+@dataclasses.dataclass(frozen=True)
+class Instances:
+    """What the first stage leaves to the others: codebooks of different sizes may share it."""
+
+    features: Array
+    """(N, 6)."""
+    history: Array
+    """(steps,) the loss before each step."""
+    data: Any
+    """the plans of all views, and the masks (T, H, W) counted from 0 in each."""
+    names: Int[np.ndarray, "t k"]
+    """rows of the evidence that the counts stand for, -1 = none."""
+    labels: tuple[Array, Array]
+    """the masks' pseudo labels (T, K, 6), and (T, K) whether each is one."""
+
+
+def train_instances(evidence: Evidence, *, key: Array, schedule: Schedule = Schedule()) -> Instances:
+    """The first stage: features (N, 6) whose renderings are alike within a mask and apart between masks."""
+    init_key, first_key, *_ = jax.random.split(key, 5)
     local, names = local_masks(evidence)
     data = view_plans(evidence), jnp.asarray(local)
     views, slots = names.shape
     start = jax.random.uniform(init_key, (evidence.gaussians.count, SIZE))
     loss = _instance_loss_of(slots, schedule.instance_steps // 2)
-    features, history = descend(
-        loss,
-        start,
-        data,
-        views=views,
-        steps=schedule.instance_steps,
-        optimizer=_ADAM,
-        scale=-schedule.rate,
-        key=first_key,
-    )
-    labels = _pseudo_labels(features, data, slots)
+    given = {"views": views, "steps": schedule.instance_steps, "scale": -schedule.rate, "key": first_key}
+    features, history = descend(loss, start, data, optimizer=_ADAM, **given)
+    return Instances(features, history, data, names, _pseudo_labels(features, data, slots))
+
+
+def train_opengaussian(
+    evidence: Evidence, *, key: Array, schedule: Schedule = Schedule(), instances: Instances | None = None
+) -> tuple[OpenGaussian, Array]:
+    """Trains the three stages; returns the model and the loss of the first before each step. `instances`: the first
+    stage of the same evidence, key and schedule, where it is there already."""
+    first = train_instances(evidence, key=key, schedule=schedule) if instances is None else instances
+    *_, centre_key, coarse_key, fine_key = jax.random.split(key, 5)
+    data, labels, names = first.data, first.labels, first.names
     means = jnp.asarray(evidence.gaussians.means)
     scaled = (means - means.min(0)) / jnp.maximum(jnp.ptp(means), 1e-9)
-    features, root_of = _coarse(features, scaled, data, labels, schedule, centre_key, coarse_key)
+    features, root_of = _coarse(first.features, scaled, data, labels, schedule, centre_key, coarse_key)
     features, leaf_of, codes = _fine(features, root_of, data, labels, schedule, fine_key)
     leaf_features, matches = _associate(leaf_of, codes, data, labels, names, np.asarray(evidence.embeddings))
     leaf_features = jnp.where((matches >= schedule.min_views)[:, None], leaf_features, 0.0)
-    return OpenGaussian(normalize(features), leaf_of, codes, leaf_features, matches, schedule.leaves), history
+    return OpenGaussian(normalize(features), leaf_of, codes, leaf_features, matches, schedule.leaves), first.history
 
 
 def _draw(plan: ViewPlan, features: Array) -> tuple[Array, Array]:
@@ -251,17 +262,9 @@ def _clustered(
 def _leaves_wanted(root_of, data, labels, roots: int, leaves: int) -> Int[np.ndarray, " k"]:
     """1 + the largest number of a view's labels that match the root: half of the label's pixels are the root's."""
     valid = np.asarray(labels[1])
-    both, _, pixels = (np.asarray(a) for a in _overlaps(data, root_of, _LEAVES * -(-roots // _LEAVES), valid.shape[1]))
-    matched = (both[:, :roots] > 0.5 * pixels[:, None]) & valid[:, None] & (pixels[:, None] > 0)
-    most = matched.sum(2).max(0)
-    return np.minimum(1 + most, leaves)
-
-
-@functools.partial(jax.jit, static_argnums=(2, 3))
-def _overlaps(data: Any, group_of: Array, groups: int, slots: int) -> tuple[Array, Array, Array]:
-    """`silhouette_overlaps` of all views: (T, G, K), (T, G), (T, K)."""
-    one = lambda view: silhouette_overlaps(view[0], group_of, view[1], MATCH_SILHOUETTE, groups=groups, slots=slots)
-    return jax.lax.map(one, data)
+    both, _, pixels = view_overlaps(data, root_of, MATCH_SILHOUETTE, groups=roots, slots=valid.shape[1])
+    matched = (both > 0.5 * pixels[:, None]) & valid[:, None] & (pixels[:, None] > 0)
+    return np.minimum(1 + matched.sum(2).max(0), leaves)
 
 
 def _associate(
@@ -273,14 +276,14 @@ def _associate(
     best counts where it is above 0.2 (equation 5 of the paper).
     """
     used, place = np.unique(np.asarray(leaf_of), return_inverse=True)
-    groups = _LEAVES * -(-len(used) // _LEAVES)
-    both, area, pixels = (np.asarray(a) for a in _overlaps(data, jnp.asarray(place, jnp.int32), groups, names.shape[1]))
+    group_of, slots = jnp.asarray(place, jnp.int32), names.shape[1]
+    both, area, pixels = view_overlaps(data, group_of, MATCH_SILHOUETTE, groups=len(used), slots=slots)
     means, valid = (np.asarray(a) for a in labels)
     summed = np.zeros((len(codes), embeddings.shape[1]), np.float64)
     matches = np.zeros(len(codes), np.int32)
     own = (np.asarray(codes)[used] + 1) / 2
     for t in range(len(both)):
-        overlap = both[t, : len(used)] / np.maximum(pixels[t] + area[t, : len(used), None] - both[t, : len(used)], 1)
+        overlap = both[t] / np.maximum(pixels[t] + area[t, :, None] - both[t], 1)
         distance = np.abs(means[t][None] - own[:, None]).mean(-1)
         score = np.where(valid[t] & (pixels[t] > 0), overlap * (1 - distance), 0.0)
         found = score.argmax(1)

@@ -18,7 +18,7 @@ from experiments.rivals.gaussian_grouping import (
     train_gaussian_grouping,
 )
 from experiments.rivals.langsplat import LangSplat, train_langsplat
-from experiments.rivals.opengaussian import OpenGaussian, Schedule, train_opengaussian
+from experiments.rivals.opengaussian import OpenGaussian, Schedule, train_instances, train_opengaussian
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.ours import asked, paper
 from experiments.tables.setting import Setting
@@ -68,8 +68,9 @@ def opengaussian(setting: Setting, steps: Steps) -> Answers:
 
 
 def opengaussian_of(setting: Setting, steps: Steps, **codebook: Any) -> OpenGaussian:
-    """OpenGaussian trained, its codebook's `roots`, `leaves` and `position_weight` as for LERF or as given."""
-    views = len(setting.names)
+    """OpenGaussian trained once a setting for each codebook, its `roots`, `leaves` and `position_weight` as for LERF or
+    as given; codebooks share the first stage."""
+    views, evidence, shared = len(setting.names), setting.evidence, setting.shared
     schedule = Schedule(
         steps.instance,
         steps.coarse,
@@ -79,7 +80,10 @@ def opengaussian_of(setting: Setting, steps: Steps, **codebook: Any) -> OpenGaus
         rate=steps.opengaussian_rate,
         coarse_rate=steps.opengaussian_rate / 10,
     )
-    return train_opengaussian(setting.evidence, key=jax.random.key(setting.seed), schedule=schedule)[0]
+    given: Any = {"key": jax.random.key(setting.seed), "schedule": schedule}
+    instances = shared.get(("instances", setting.seed), lambda: train_instances(evidence, **given))
+    train = lambda: train_opengaussian(evidence, **given, instances=instances)[0]
+    return shared.get(("OpenGaussian", setting.seed, *sorted(codebook.items())), train)
 
 
 def by_leaves(setting: Setting, model: OpenGaussian) -> Answers:

@@ -206,4 +206,10 @@ def untracked(setting: Setting, steps: Steps) -> Answers:
 def paper(setting: Setting, steps: Steps) -> Answers:
     """The paper's own path: tracks, phi_bar, 3-d codes trained on the rendered L1, the region of the largest cosine,
     anchored by code, DBSCAN."""
-    return ask_field(setting, field_of(setting, latent=3, steps=steps), "code", retrieval="cosine")
+    return ask_field(setting, paper_field(setting, steps), "code", retrieval="cosine")
+
+
+def paper_field(setting: Setting, steps: Steps) -> LanguageField:
+    """What the paper's own path trains, once a setting and seed."""
+    key = "the paper's path", setting.seed
+    return setting.shared.get(key, lambda: field_of(setting, latent=3, steps=steps))

@@ -22,7 +22,7 @@ from experiments.tables.methods import (
     langsplat_of,
     opengaussian_of,
 )
-from experiments.tables.ours import ask_field, field_of
+from experiments.tables.ours import ask_field, field_of, paper_field
 from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
 from jsecon.language.shares import SHARE_THRESHOLD
@@ -155,8 +155,7 @@ def _langsplat_row(rule: str, chooser: str) -> Method:
 
 def _opengaussian_row(codebook: str, rule: str, chooser: str) -> Method:
     def row(setting: Setting, steps: Steps) -> Answers:
-        make = lambda: opengaussian_of(setting, steps, **CODEBOOKS[codebook])
-        model = setting.shared.get(f"OpenGaussian {codebook}", make)
+        model = opengaussian_of(setting, steps, **CODEBOOKS[codebook])
         if not rule:
             return by_leaves(setting, model)
         return read(setting, [np.asarray(model.leaf_features)[np.asarray(model.leaf_of)]], rule, chooser)
@@ -184,7 +183,7 @@ def _grouping_row(nearly: float, rule: str, chooser: str) -> Method:
 
 def _paper_row(retrieval: str, threshold: float, chooser: str) -> Method:
     def row(setting: Setting, steps: Steps) -> Answers:
-        field = setting.shared.get("the paper's path", lambda: field_of(setting, latent=3, steps=steps))
+        field = paper_field(setting, steps)
         options = {"retrieval": retrieval, "threshold": threshold, "retrieval_threshold": NO_REFUSAL}
         answers = ask_field(setting, field, "code", clean=chooser == "threshold", **options)
         return by_selection(setting, _chosen(setting, answers, chooser, threshold).select)
