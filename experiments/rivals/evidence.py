@@ -15,6 +15,9 @@ from jsecon.splat.plan import ViewPlan, plan_views
 from jsecon.types import Array, Camera, Gaussians
 
 _SLOTS = 8
+_ROWS = 2048
+_INVISIBLE = -100.0
+"""logit of an opacity far below 1/255"""
 
 
 @jax.tree_util.register_dataclass
@@ -78,9 +81,21 @@ def local_masks(evidence: Evidence) -> tuple[Int[np.ndarray, "t h w"], Int[np.nd
     return local, names
 
 
+def with_room(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians, and behind them invisible ones up to a multiple of 2,048: scenes share their compiled programs.
+
+    The first rows of what is drawn at random for all rows are those drawn for the Gaussians alone (jax's threefry).
+    """
+    count = gaussians.count
+    filled = jax.tree.map(lambda a: np.pad(a, ((0, -count % _ROWS), *[(0, 0)] * (a.ndim - 1)), mode="edge"), gaussians)
+    filled.opacity_logits[count:] = _INVISIBLE
+    return jax.tree.map(jnp.asarray, filled)
+
+
 def view_plans(evidence: Evidence) -> ViewPlan:
-    """The plans of all views, stacked on a leading axis: the geometry is frozen, so each is made once."""
-    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
+    """The plans of all views of the Gaussians `with_room`, stacked on a leading axis: the geometry is frozen, so each
+    is made once."""
+    gaussians, cameras = with_room(evidence.gaussians), jax.tree.map(jnp.asarray, evidence.cameras)
     plans = plan_views(gaussians, cameras, most_bytes=sys.maxsize)
     assert plans is not None
     return plans

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from experiments.rivals.descent import descend
-from experiments.rivals.evidence import Evidence, view_plans
+from experiments.rivals.evidence import Evidence, view_plans, with_room
 from jsecon.errors import InputError
 from jsecon.query.direct import relevancies
 from jsecon.splat.plan import plan_view, render_plan
@@ -85,17 +85,19 @@ def train_gaussian_grouping(
     most = int(np.asarray(evidence.tracks).max(initial=-1)) + 1
     if most >= classes:
         raise InputError("tracks", f"{most} ids", f"at most {classes - 1}", "Leave small regions out.")
-    count = evidence.gaussians.count
+    plans, count = view_plans(evidence), evidence.gaussians.count
+    rows = plans.splats.shape[1]
     init_key, kernel_key, bias_key, key = jax.random.split(key, 4)
     bound = 1 / math.sqrt(SIZE)
     params = {
-        "identity": (jax.random.uniform(init_key, (count, SIZE)) - 0.5) / C0,
+        "identity": (jax.random.uniform(init_key, (rows, SIZE)) - 0.5) / C0,
         "kernel": jax.random.uniform(kernel_key, (SIZE, classes), minval=-bound, maxval=bound),
         "bias": jax.random.uniform(bias_key, (classes,), minval=-bound, maxval=bound),
     }
     means = np.asarray(evidence.gaussians.means, np.float64)
     nearest = KDTree(means).query(means, k=min(KL_NEIGHBOURS, count))[1].reshape(count, -1).astype(np.int32)
-    data = view_plans(evidence), jnp.asarray(evidence.tracks) + 1, jnp.asarray(nearest)
+    nearest = np.pad(nearest, ((0, rows - count), (0, 0)))
+    data = plans, jnp.asarray(evidence.tracks) + 1, jnp.asarray(nearest), jnp.asarray(count)
     params, history = descend(
         _loss,
         params,
@@ -105,7 +107,7 @@ def train_gaussian_grouping(
         optimizer=_optimizer(identity_rate, classifier_rate),
         key=key,
     )
-    return GaussianGrouping(**params), history
+    return GaussianGrouping(**params | {"identity": params["identity"][:count]}), history
 
 
 @functools.cache
@@ -118,13 +120,13 @@ def _optimizer(identity: float, classifier: float) -> optax.GradientTransformati
 
 
 def _loss(params: Any, data: Any, view: Array, step: Array, key: Array) -> Array:
-    plans, ids, nearest = data
+    plans, ids, nearest, count = data
     rendered = render_plan(jax.tree.map(lambda a: a[view], plans), params["identity"]).features
     logits = rendered @ params["kernel"] + params["bias"]
     entropy = optax.softmax_cross_entropy_with_integer_labels(logits, ids[view]).mean() / math.log(CLASSES)
 
     def spatial(params):
-        chosen = jax.random.randint(key, (KL_SAMPLES,), 0, nearest.shape[0])
+        chosen = jax.random.randint(key, (KL_SAMPLES,), 0, count)
         logs = lambda rows: jax.nn.log_softmax(params["identity"][rows] @ params["kernel"] + params["bias"])
         own, others = logs(chosen), logs(nearest[chosen])
         divergence = jnp.sum(jnp.exp(own)[:, None] * (own[:, None] - others), axis=-1)
@@ -163,9 +165,9 @@ def query_gaussian_grouping(
     best = int(jnp.argmax(relevancy))
     if not relevancy[best] >= least:
         return Selection(nothing > 0, nothing, jnp.asarray(-1, jnp.int32), relevancy[best])
-    gaussians, cameras = jax.tree.map(jnp.asarray, (evidence.gaussians, evidence.cameras))
-    plan = plan_view(gaussians, cameras[0])
-    predicted = np.asarray(model.probabilities(render_plan(plan, model.identity).features)).argmax(-1)
+    plan = plan_view(with_room(evidence.gaussians), jax.tree.map(jnp.asarray, evidence.cameras)[0])
+    identity = jnp.pad(model.identity, ((0, len(plan.splats) - len(model.identity)), (0, 0)))
+    predicted = np.asarray(model.probabilities(render_plan(plan, identity).features)).argmax(-1)
     meant = np.asarray(relevancy) >= max(least, nearly * float(relevancy[best]))
     mask = np.isin(np.asarray(evidence.masks[0]), here[meant])
     classes = len(model.bias)

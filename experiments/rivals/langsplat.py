@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from experiments.rivals.evidence import Evidence
+from experiments.rivals.evidence import Evidence, with_room
 from jsecon.language.autoencoder import Autoencoder, train_autoencoder
 from jsecon.language.distill import distill_l1
 from jsecon.types import Array
@@ -63,7 +63,7 @@ def train_langsplat(
     autoencoder = train_autoencoder(jnp.asarray(evidence.embeddings), latent=latent, key=coder_key, **training)
     table = autoencoder.encode(jnp.asarray(evidence.embeddings))
     codes, history = distill_l1(
-        evidence.gaussians,
+        with_room(evidence.gaussians),
         evidence.cameras,
         jnp.asarray(evidence.masks),
         table,
@@ -72,4 +72,4 @@ def train_langsplat(
         init=init,
         learning_rate=learning_rate,
     )
-    return LangSplat(codes, autoencoder, history)
+    return LangSplat(codes[: evidence.gaussians.count], autoencoder, history)

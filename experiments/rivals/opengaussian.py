@@ -80,7 +80,7 @@ class Instances:
     """What the first stage leaves to the others: codebooks of different sizes may share it."""
 
     features: Array
-    """(N, 6)."""
+    """(M, 6): of the N Gaussians, and of those that make room behind them (`evidence.with_room`)."""
     history: Array
     """(steps,) the loss before each step."""
     data: Any
@@ -92,14 +92,14 @@ class Instances:
 
 
 def train_instances(evidence: Evidence, *, key: Array, schedule: Schedule = Schedule()) -> Instances:
-    """The first stage: features (N, 6) whose renderings are alike within a mask and apart between masks."""
+    """The first stage: features whose renderings are alike within a mask and apart between masks."""
     init_key, first_key, *_ = jax.random.split(key, 5)
     local, names = local_masks(evidence)
-    data = view_plans(evidence), jnp.asarray(local)
-    views, slots = names.shape
-    start = jax.random.uniform(init_key, (evidence.gaussians.count, SIZE))
+    plans, (views, slots) = view_plans(evidence), names.shape
+    data = plans, jnp.asarray(local)
+    start = jax.random.uniform(init_key, (plans.splats.shape[1], SIZE))
     loss = _instance_loss_of(slots, schedule.instance_steps // 2)
-    given = {"views": views, "steps": schedule.instance_steps, "scale": -schedule.rate, "key": first_key}
+    given: Any = {"views": views, "steps": schedule.instance_steps, "scale": -schedule.rate, "key": first_key}
     features, history = descend(loss, start, data, optimizer=_ADAM, **given)
     return Instances(features, history, data, names, _pseudo_labels(features, data, slots))
 
@@ -118,7 +118,8 @@ def train_opengaussian(
     features, leaf_of, codes = _fine(features, root_of, data, labels, schedule, fine_key)
     leaf_features, matches = _associate(leaf_of, codes, data, labels, names, np.asarray(evidence.embeddings))
     leaf_features = jnp.where((matches >= schedule.min_views)[:, None], leaf_features, 0.0)
-    return OpenGaussian(normalize(features), leaf_of, codes, leaf_features, matches, schedule.leaves), first.history
+    units = normalize(features[: len(means)])
+    return OpenGaussian(units, leaf_of, codes, leaf_features, matches, schedule.leaves), first.history
 
 
 def _draw(plan: ViewPlan, features: Array) -> tuple[Array, Array]:
@@ -184,17 +185,17 @@ def _pseudo_labels(features: Array, data: Any, slots: int) -> tuple[Array, Array
 def _through(features: Array, of: Array, count: int) -> Array:
     """Each Gaussian's cluster mean forward, its own feature backward."""
     units = normalize(features)
-    means = cluster_means(units, of, jnp.zeros((count, SIZE)))
-    return units + jax.lax.stop_gradient(means[of] - units)
+    means = cluster_means(units, jnp.where(of >= 0, of, count), jnp.zeros((count, SIZE)))
+    return units + jax.lax.stop_gradient(means[jnp.maximum(of, 0)] - units)
 
 
 def _quantised_loss(features: Array, data: Any, view: Array, step: Array, key: Array, *, clusters: int) -> Array:
     """Rendered cluster means against the pseudo labels: L1 over the labelled silhouette, or, where `fine`, L2 of one
     root alone. One program for both stages."""
     del step
-    plans, local, (means, valid), of, root_of, fine = data
+    plans, local, (means, valid), of, root_of, count, fine = data
     # A root drawn by its Gaussians: each takes its turn as often as it is large.
-    root = root_of[jax.random.randint(key, (), 0, len(root_of))]
+    root = root_of[jax.random.randint(key, (), 0, count)]
     plan = only(jax.tree.map(lambda a: a[view], plans), ~fine | (root_of == root))
     image, alpha = _draw(plan, _through(features, of, clusters))
     ids = local[view].reshape(-1)
@@ -211,9 +212,9 @@ def _quantised_loss_of(clusters: int) -> Callable:
 
 def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key) -> tuple[Array, Array]:
     """Features trained through their roots' means, and the root of each Gaussian."""
-    roots = min(schedule.roots, len(features))
-    points = lambda f: jnp.concatenate([normalize(f), schedule.position_weight * scaled], axis=1)
-    centres = points(features)[jax.random.choice(centre_key, len(features), (roots,), replace=False)]
+    roots = min(schedule.roots, count := len(scaled))
+    points = lambda f: jnp.concatenate([normalize(f[:count]), schedule.position_weight * scaled], axis=1)
+    centres = points(features)[jax.random.choice(centre_key, count, (roots,), replace=False)]
 
     def assign(features):
         nonlocal centres
@@ -221,21 +222,28 @@ def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key)
         return of
 
     loss = _quantised_loss_of(roots * schedule.leaves)  # as many as the fine stage has; no Gaussian is of the others
-    given = lambda of: (*data, labels, of, of, jnp.asarray(False))
+    room = _room(features, count)
+    given = lambda of: (*data, labels, room(of), room(of), jnp.asarray(count), jnp.asarray(False))
     steps, rate = schedule.coarse_steps, schedule.coarse_rate
     return _clustered(loss, features, assign, given, steps=steps, refresh=REFRESH_COARSE, rate=rate, key=key)
 
 
 def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Array, Array, Array]:
     """Features, leaves and the leaves' codes; a root has one leaf more than the most masks that it meets in a view."""
-    roots, leaves = min(schedule.roots, len(features)), schedule.leaves
-    number = _leaves_wanted(root_of, data, labels, roots, leaves)
-    split = lambda f: split_roots(normalize(f), root_of, number, leaves)
+    count = len(root_of)
+    roots, leaves, room = min(schedule.roots, count), schedule.leaves, _room(features, count)
+    number = _leaves_wanted(room(root_of), data, labels, roots, leaves)
+    split = lambda f: split_roots(normalize(f[:count]), root_of, number, leaves)
     loss = _quantised_loss_of(roots * leaves)
-    given = lambda of: (*data, labels, of, root_of, jnp.asarray(True))
+    given = lambda of: (*data, labels, room(of), room(root_of), jnp.asarray(count), jnp.asarray(True))
     steps, rate = schedule.fine_steps, schedule.rate
     features, of = _clustered(loss, features, split, given, steps=steps, refresh=REFRESH_FINE, rate=rate, key=key)
-    return features, of, cluster_means(normalize(features), of, jnp.zeros((roots * leaves, SIZE)))
+    return features, of, cluster_means(normalize(features[:count]), of, jnp.zeros((roots * leaves, SIZE)))
+
+
+def _room(features: Array, count: int) -> Callable[[Array], Array]:
+    """Clusters of `count` Gaussians -> of all rows of `features`, -1 = none."""
+    return lambda of: jnp.asarray(np.pad(of, (0, len(features) - count), constant_values=-1))
 
 
 def _clustered(
@@ -245,16 +253,8 @@ def _clustered(
     of = assign(features)
     for start in range(0, steps, refresh):
         data = given(of)
-        features, _ = descend(
-            loss,
-            features,
-            data,
-            views=len(data[1]),
-            steps=min(refresh, steps - start),
-            optimizer=_ADAM,
-            scale=-rate,
-            key=jax.random.fold_in(key, start),
-        )
+        how: Any = {"views": len(data[1]), "steps": min(refresh, steps - start), "scale": -rate}
+        features, _ = descend(loss, features, data, optimizer=_ADAM, key=jax.random.fold_in(key, start), **how)
         of = assign(features)
     return features, of
 
@@ -276,7 +276,8 @@ def _associate(
     best counts where it is above 0.2 (equation 5 of the paper).
     """
     used, place = np.unique(np.asarray(leaf_of), return_inverse=True)
-    group_of, slots = jnp.asarray(place, jnp.int32), names.shape[1]
+    room, slots = data[0].splats.shape[1] - len(place), names.shape[1]
+    group_of = jnp.asarray(np.pad(place, (0, room), constant_values=-1), jnp.int32)
     both, area, pixels = view_overlaps(data, group_of, MATCH_SILHOUETTE, groups=len(used), slots=slots)
     means, valid = (np.asarray(a) for a in labels)
     summed = np.zeros((len(codes), embeddings.shape[1]), np.float64)

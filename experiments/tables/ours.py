@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.rivals.evidence import with_room
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.association import Association, associated, by_algorithm1, by_consensus, proposals
 from experiments.tables.memberships import by_lead, of_all_views
@@ -95,7 +96,7 @@ def field_of(
         codes = distill_votes(votes, table)
     else:
         codes, _ = distill_l1(
-            evidence.gaussians,
+            with_room(evidence.gaussians),
             evidence.cameras,
             found,
             table,
@@ -103,6 +104,7 @@ def field_of(
             key=key,
             init="random",
         )
+        codes = codes[: evidence.gaussians.count]
     return LanguageField(
         evidence.gaussians,
         codes,
