@@ -10,11 +10,11 @@ from balls import HEIGHT, WIDTH, ring_of_balls
 
 from experiments.datasets.ovs3d import box_of
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text
-from experiments.rivals import lifting
-from experiments.rivals.evidence import evidence_of_tracks, local_masks
+from experiments.rivals import evidence as evidence_module, lifting
+from experiments.rivals.evidence import evidence_of_tracks, local_masks, with_room
 from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
 from experiments.rivals.langsplat import train_langsplat
-from experiments.rivals.opengaussian import Schedule, train_opengaussian
+from experiments.rivals.opengaussian import Schedule, train_instances, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
@@ -100,9 +100,11 @@ def test_gaussian_grouping_has_eight_bits_for_ids(world):
         train_gaussian_grouping(many, key=jax.random.key(0), steps=1)
 
 
+SCHEDULE = Schedule(instance_steps=100, coarse_steps=20, fine_steps=20, roots=8, leaves=3, min_views=3, rate=0.05)
+
+
 def test_opengaussian(world):
-    schedule = Schedule(instance_steps=100, coarse_steps=20, fine_steps=20, roots=8, leaves=3, min_views=3, rate=0.05)
-    model, history = train_opengaussian(world[0], key=jax.random.key(0), schedule=schedule)
+    model, history = train_opengaussian(world[0], key=jax.random.key(0), schedule=SCHEDULE)
     assert np.isfinite(history).all()
     assert history[-20:].mean() < history[:5].mean()
     ask = lambda query: select_leaf(
@@ -113,6 +115,48 @@ def test_opengaussian(world):
     assert leaf_of.max() < 24
     unmatched = np.asarray(model.matches) < 3
     assert not np.asarray(model.leaf_features)[unmatched].any()
+
+
+def test_codebooks_share_their_first_stage(world):
+    """The model is that of all stages at once, and what is shared is left as it was."""
+    key, short = jax.random.key(0), dataclasses.replace(SCHEDULE, instance_steps=6, coarse_steps=2, fine_steps=2)
+    instances = train_instances(world[0], key=key, schedule=short)
+    other, _ = train_opengaussian(
+        world[0], key=key, schedule=dataclasses.replace(short, position_weight=1.0), instances=instances
+    )
+    shared, history = train_opengaussian(world[0], key=key, schedule=short, instances=instances)
+    alone, expected = train_opengaussian(world[0], key=key, schedule=short)
+    jax.tree.map(np.testing.assert_array_equal, (shared, history), (alone, expected))
+    assert (np.asarray(other.leaf_of) != np.asarray(shared.leaf_of)).any()
+
+
+ROOMY = {
+    "langsplat": lambda world: train_langsplat(world[0], key=jax.random.key(0), steps=8, init="random", epochs=3),
+    "grouping": lambda world: train_gaussian_grouping(world[0], key=jax.random.key(0), steps=8, classes=32),
+    "opengaussian": lambda world: train_opengaussian(
+        world[0],
+        key=jax.random.key(0),
+        schedule=dataclasses.replace(SCHEDULE, instance_steps=8, coarse_steps=4, fine_steps=4),
+    ),
+}
+
+
+@pytest.mark.parametrize("train", ROOMY.values(), ids=ROOMY)
+def test_room_behind_the_gaussians_changes_nothing(world, train, monkeypatch):
+    assert world[0].gaussians.count % 2048
+    with_it = train(world)
+    monkeypatch.setattr(evidence_module, "_ROWS", 1)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), with_it, train(world))
+
+
+def test_room_is_invisible(world):
+    gaussians, camera = world[0].gaussians, world[0].cameras[0]
+    roomy = with_room(gaussians)
+    assert roomy.count % 2048 == 0
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[: len(b)], b), roomy, gaussians)
+    visible = np.asarray(jax.jit(project)(roomy, camera).visible)
+    np.testing.assert_array_equal(visible[: gaussians.count], jax.jit(project)(gaussians, camera).visible)
+    assert not visible[gaussians.count :].any()
 
 
 @pytest.mark.parametrize("train", [lifting.train_occam, lifting.train_backprojection, lifting.train_vala])
