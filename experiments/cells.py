@@ -16,6 +16,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -89,21 +90,24 @@ def helped(count: int) -> None:
     """`count` processes of this command with `--processes 0`, each with cores of its own, waited for; they are stopped
     where this one is interrupted. What one that failed has left undone is left to the caller.
 
-    XLA has a thread for each core that it sees: two processes with all cores for each take 1.4 times as long.
+    XLA has a thread for each core that it sees: two processes with all cores for each take 1.4 times as long. What one
+    of them compiles the others read from disk.
     """
     command = [sys.executable, *sys.orig_argv[1:], "--processes", "0"]
     started = []
-    try:
-        for cores in shares(available(), count):
-            with _on(cores):
-                started.append(subprocess.Popen(command))
-        for process in started:
-            process.wait()
-    finally:
-        for process in started:
-            process.terminate()
-        for process in started:
-            process.wait()
+    with tempfile.TemporaryDirectory(prefix="jsecon-programs-", ignore_cleanup_errors=True) as programs:
+        kept = {"JAX_COMPILATION_CACHE_DIR": programs, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        try:
+            for cores in shares(available(), count):
+                with _on(cores):
+                    started.append(subprocess.Popen(command, env=kept | os.environ))
+            for process in started:
+                process.wait()
+        finally:
+            for process in started:
+                process.terminate()
+            for process in started:
+                process.wait()
 
 
 def available() -> list[int]:

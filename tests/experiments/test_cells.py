@@ -51,7 +51,9 @@ def figures(setting, answers):
     (here / f"{os.getpid()}.here").touch()
     while len(list(here.glob("*.here"))) < 2:  # for the other process, however long its start takes
         time.sleep(0.05)
-    return {"miou": 0.5, "process": os.getpid(), "cores": sorted(os.sched_getaffinity(0))}
+    programs = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
+    told = {"miou": 0.5, "process": os.getpid(), "cores": sorted(os.sched_getaffinity(0))}
+    return told | {"programs": programs, "kept": os.path.isdir(programs)}
 
 fill.prepare = lambda *a, **k: SimpleNamespace(bench=SimpleNamespace(twin=True), shared=SimpleNamespace(settle=float))
 fill.measure = figures
@@ -153,6 +155,10 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
     assert not list(tmp_path.glob("*.lock"))
     assert len({cell["process"] for cell in found.values()}) == 2
     assert {tuple(cell["cores"]) for cell in found.values()} == {tuple(share) for share in shares(available(), 2)}
+    (programs,) = {cell["programs"] for cell in found.values()}  # one folder for both, while they run
+    assert all(cell["kept"] for cell in found.values())
+    assert programs
+    assert not Path(programs).exists()
     append_cell(file, "of another table", {"miou": 1})  # is left alone
     lost, *kept = file.read_text().splitlines(keepends=True)
     file.write_text("".join(kept) + lost[:20])  # as a killed process leaves it
