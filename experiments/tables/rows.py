@@ -69,7 +69,7 @@ CODE_THRESHOLDS = (0.9, 0.95, 0.98)
 NEARLY = (0.9, 1.0)
 """Gaussian Grouping: the first view's masks that are nearly as similar as the best, or that one alone"""
 TRAINED = ("LangSplat-m", "Gaussian Grouping-m", "OpenGaussian", "the paper's path")
-"""methods of a minute or more for each setting"""
+"""methods that train, each for tens of seconds a setting"""
 _ASCENTS = (
     ("contrast", "silhouette"),
     ("contrast", "strict silhouette"),
