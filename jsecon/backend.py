@@ -14,7 +14,7 @@ float32)"""
 
 REMEDY = (
     "Set XLA_FLAGS=--xla_cpu_experimental_ynn_fusion_type= (empty value) before jax starts, or use jax 0.11 or newer "
-    "(Python 3.12 or newer)."
+    "(Python 3.12 or newer). Where the device is not a CPU, set JAX_PLATFORMS=cpu."
 )
 """measured: issue 39103 is in 0.10.2, the newest for Python 3.11, and in none of 0.11.0 to 0.12.0.1"""
 

@@ -45,7 +45,8 @@ def install() -> None:
     def chosen(backend, computation, devices, options, *rest):
         name = str(computation.operation.attributes["sym_name"]).strip('"')
         mine = SHIPPED if _state["shipped"] else LOOPS if name in RUN_OFTEN and _state["loops"] else {}
-        options.env_option_overrides = list((mine | dict(options.env_option_overrides)).items())
+        if backend.platform == "cpu":  # a GPU's compiler does not know them
+            options.env_option_overrides = list((mine | dict(options.env_option_overrides)).items())
         return compile_or_read(backend, computation, devices, options, *rest)
 
     compiler.compile_or_get_cached = chosen

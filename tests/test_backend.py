@@ -1,8 +1,16 @@
 """The check of the backend, and jax issue 39103 as it stands in the jax that is installed."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
+import jsecon
 import jsecon.backend as backend
+from jsecon.language.codes import Rotation
+from jsecon.numerics import WHOLE, cosine_matrix
+from jsecon.query.direct import similarities, unit_codes
 
 pytestmark = pytest.mark.as_shipped
 
@@ -23,3 +31,30 @@ def test_wrong_cosines_raise(monkeypatch):
     monkeypatch.setattr(backend, "cosine_matrix", lambda f, t: f @ t.T)
     with pytest.raises(RuntimeError, match="cosines are off"):
         backend.check_backend()
+
+
+def products(jaxpr):
+    """The precisions of all products of matrices in a program, those of the programs inside it too."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation.params["precision"]
+        for inner in jaxprs_in_params(equation.params):
+            yield from products(inner)
+
+
+def test_no_product_of_matrices_is_left_to_the_device(scene, cameras):
+    """A GPU keeps 10 bits of a factor that nobody asks it to keep whole."""
+    rows, coder = jnp.ones((9, 40)), Rotation(jnp.ones((40, 5)))
+    image = lambda g, c, f: (jsecon.render(g, c[0], f, capacity=4096).features ** 2).sum()
+    programs = {
+        "cosines": lambda *_: cosine_matrix(rows, rows),
+        "similarities": lambda *_: similarities(unit_codes(rows), rows[0])[0],
+        "code": lambda *_: coder.decode(coder.encode(rows)),
+        "gradients": lambda g, c, _: jax.grad(image, argnums=(0, 2))(g, c, jnp.ones((64, 40))),
+        "votes": lambda g, c, x: jsecon.region_votes(g, c, x, 3, capacity=4096).weights,
+    }
+    labels = np.zeros((4, cameras.height, cameras.width), np.int32)
+    for name, program in programs.items():
+        found = list(products(jax.make_jaxpr(program)(scene, cameras, labels).jaxpr))
+        assert found, name
+        assert set(found) == {(WHOLE, WHOLE)}, (name, found)

@@ -28,7 +28,7 @@ from jsecon.language.distill import LEAST_LABELLED, distill_votes
 from jsecon.language.records import append, summed_columns
 from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import NEAR
+from jsecon.numerics import NEAR, WHOLE
 from jsecon.splat.banded import listed, still_open
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
 from jsecon.splat.fusion import stored
@@ -244,7 +244,7 @@ def _cast_band(
             weight = weight * covered[:, None]
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-            own = jnp.einsum("bcp,bps->bcs", weight, columns)
+            own = jnp.einsum("bcp,bps->bcs", weight, columns, precision=WHOLE)
             own = jnp.concatenate([own, weight.max(-1)[..., None]], axis=2)
             return transmittance, (cast.at[chunk.places].set(own, mode="drop"), transmittance)
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from jsecon.errors import require
 from jsecon.language.autoencoder import require_finite, train_autoencoder
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.numerics import cosine_matrix, normalize
+from jsecon.numerics import WHOLE, cosine_matrix, normalize
 from jsecon.types import Array, Key
 
 MAX_COSINE_LOSS = 1e-4
@@ -45,11 +45,11 @@ class Rotation:
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
         """(..., E) -> (..., d) unit codes: the part of the embedding inside the span, brought to unit length."""
-        return normalize(normalize(jnp.asarray(embeddings)) @ self.basis)
+        return normalize(jnp.matmul(normalize(jnp.asarray(embeddings)), self.basis, precision=WHOLE))
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
         """(..., d) -> (..., E) unit embeddings inside the span."""
-        return normalize(jnp.asarray(codes) @ jnp.asarray(self.basis).T)
+        return normalize(jnp.matmul(jnp.asarray(codes), jnp.asarray(self.basis).T, precision=WHOLE))
 
 
 @jax.tree_util.register_dataclass
@@ -79,7 +79,7 @@ def _among(x: Array, keys: Array, values: Array) -> Array:
     similarity = jnp.where(known[None], SHARPNESS * cosine_matrix(rows, keys), -jnp.inf)
     share = jax.nn.softmax(similarity, axis=-1)
     share = jnp.where(jnp.any(known), share, 0.0)
-    found = normalize(share @ values)
+    found = normalize(jnp.matmul(share, values, precision=WHOLE))
     found = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), found, 0.0)
     return found.reshape(*x.shape[:-1], values.shape[-1])
 
@@ -200,7 +200,7 @@ def _spread(start: Array, target: Array, distinct: Array, alike: Array, separati
 
     def loss(points):
         codes = normalize(points)
-        cosines = codes @ codes.T
+        cosines = jnp.matmul(codes, codes.T, precision=WHOLE)
         error = jnp.where(distinct | alike, cosines - target, 0.0)
         too_near = jnp.where(distinct, jnp.maximum(cosines - (separation - 0.03), 0.0), 0.0)
         too_far = jnp.where(alike, jnp.maximum(separation + 0.03 - cosines, 0.0), 0.0)

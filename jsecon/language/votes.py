@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import NEAR, is_traced
+from jsecon.numerics import NEAR, WHOLE, is_traced
 from jsecon.parallel import spread_over_devices
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.fusion import stored
@@ -175,7 +175,7 @@ def _add_plan(
                 weight = weight * covered[:, None]
                 if centre:
                     weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-                cast = jnp.einsum("bcp,bps->bcs", weight, is_slot)
+                cast = jnp.einsum("bcp,bps->bcs", weight, is_slot, precision=WHOLE)
                 target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped
                 votes = votes.at[chunk.ids[:, :, None], target[:, None]].add(cast, mode="drop")
                 total = total.at[chunk.ids].add(jnp.where(first_pass, weight.sum(-1), 0.0))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import into_range, normalize
+from jsecon.numerics import WHOLE, into_range, normalize
 from jsecon.types import Array, Leaf, Selection
 
 NARROW = 32
@@ -127,7 +127,7 @@ def _product(rows: Array, unit: Array) -> Array:
         columns = (rows[:, k] * unit[k] for k in range(rows.shape[1]))
         return sum(columns, start=jnp.zeros(rows.shape[0], rows.dtype))
     # One column of a product of matrices: matrix times vector can be silently wrong (jax issue 39103).
-    return (rows @ unit[:, None])[:, 0]
+    return jnp.matmul(rows, unit[:, None], precision=WHOLE)[:, 0]
 
 
 def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:

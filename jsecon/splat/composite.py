@@ -8,7 +8,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
-from jsecon.numerics import MIN_TRANSMITTANCE
+from jsecon.numerics import MIN_TRANSMITTANCE, WHOLE
 from jsecon.splat.fusion import stored
 from jsecon.splat.strips import join, over_strips, split
 from jsecon.splat.tiles import TileLists
@@ -91,7 +91,8 @@ def composite_features_vjp(
 
             def body(transmittance, gradient, chunk):
                 weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
-                return transmittance, gradient.at[chunk.ids].add(jnp.einsum("bcp,bdp->bcd", weight, values))
+                own = jnp.einsum("bcp,bdp->bcd", weight, values, precision=WHOLE)
+                return transmittance, gradient.at[chunk.ids].add(own)
 
             return walk(table, lists, batches, tiles, body, gradient)[0], None
 

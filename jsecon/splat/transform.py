@@ -34,13 +34,14 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     require(similar, "similarity", matrix.tolist(), expected, remedy)
     xp, dtype = gaussians.means.__array_namespace__(), gaussians.means.dtype
     cast = lambda array: xp.asarray(array, dtype)
-    return Gaussians(
-        means=gaussians.means @ cast(scale * rotation.T) + cast(matrix[:3, 3]),
-        log_scales=gaussians.log_scales + cast(np.log(scale)),
-        quaternions=gaussians.quaternions @ cast(_product_matrix(quaternion_of(rotation))),
-        opacity_logits=gaussians.opacity_logits,
-        sh=cast(_sh_rotation(rotation, gaussians.sh.shape[1])) @ gaussians.sh,
-    )
+    with jax.default_matmul_precision("highest"):  # WHOLE, for NumPy arrays too
+        return Gaussians(
+            means=gaussians.means @ cast(scale * rotation.T) + cast(matrix[:3, 3]),
+            log_scales=gaussians.log_scales + cast(np.log(scale)),
+            quaternions=gaussians.quaternions @ cast(_product_matrix(quaternion_of(rotation))),
+            opacity_logits=gaussians.opacity_logits,
+            sh=cast(_sh_rotation(rotation, gaussians.sh.shape[1])) @ gaussians.sh,
+        )
 
 
 def transformed_blocks(
