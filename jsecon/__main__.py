@@ -2,11 +2,13 @@
 
 import io
 import os
-import signal
 import sys
 import traceback
 
-from jsecon.process import member, prepare_member, prepare_process
+from jsecon.process import member, prepare_member, prepare_process, stop_by_signals
+
+STOPPED = 130
+"""exit code of a program that the user stopped"""
 
 
 def main() -> int:
@@ -18,19 +20,24 @@ def main() -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a letter that the terminal lacks ends nothing
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as by Ctrl-C: what is half written is removed
-    from jsecon.app.command_line import main as run
-
-    if not several:
-        return run(sys.argv[1:])
+    stop_by_signals()
     code = 1
     try:
+        from jsecon.app.command_line import main as run
+
         code = run(sys.argv[1:])
+    except KeyboardInterrupt:  # amid the imports: nothing has begun
+        print("\njsecon: stopped.", file=sys.stderr)
+        code = STOPPED
     except Exception:
+        if not several:
+            raise
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        os._exit(code)  # jax would wait for the other processes
+        if several or code == STOPPED:  # jax would wait for the other processes; and end by SIGSEGV, as Python takes
+            sys.stdout.flush()  # itself apart, where a stop fell into a compilation
+            os._exit(code)
+    return code
 
 
 if __name__ == "__main__":

@@ -10,12 +10,14 @@ both cores and the speed of benchmarks/results.md does the same:
 From time to time, where it lives long and sees many scenes: `forget_programs()`.
 """
 
+import _thread
 import contextlib
 import ctypes
 import gc
 import hashlib
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -35,6 +37,8 @@ MEMBER = "JSECON_MEMBER"
 """environment variable of a process that is one of several (pipeline/processes.py), see `member`"""
 MEMORY = "JSECON_MEMORY"
 """environment variable: GiB that a scene's columns may take, in place of half of the memory that is free"""
+AGAIN_SECONDS = 0.05
+"""after which a stop that Python dropped is raised again: the destructor has ended"""
 _UNKEPT = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
 """how jax warns of a program that it cannot read from disk, or keep there"""
 _built: dict[str, int] = {}
@@ -94,6 +98,23 @@ def prepare_member() -> None:
         kept = os.dup(number)
         os.dup2(os.open(os.devnull, os.O_WRONLY), number)
         setattr(sys, name, os.fdopen(kept, "w", buffering=1))
+
+
+def stop_by_signals() -> None:
+    """SIGTERM raises KeyboardInterrupt, as Ctrl-C does, so that what is half written is removed. One that Python drops
+    (it fell into a destructor, or a callback of the garbage collector, as jax has one) is raised again soon after."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    show = sys.unraisablehook
+
+    def shown(dropped: Any) -> None:
+        if dropped.exc_type is not KeyboardInterrupt:
+            return show(dropped)
+        by = [signal.SIGTERM]  # SIGINT may be ignored, as in a shell's background
+        again = threading.Timer(AGAIN_SECONDS, _thread.interrupt_main, by)
+        again.daemon = True
+        again.start()
+
+    sys.unraisablehook = shown
 
 
 def cores() -> int:

@@ -71,8 +71,17 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monke
         monkeypatch.setitem(command_line._VERBS, "models", (act, verbs.Models))
         return command_line.main(["models", "check", str(tmp_path), "--json"])
 
-    assert fails(KeyboardInterrupt()) == 130
-    assert json.loads(capsys.readouterr().out)["error"]["found"] == "a stop by the user"
+    def within(stop):  # as a library that tidies up after a stop, and fails in that
+        error = InputError("a file", "half of it", "all of it", "Fetch it again.")
+        error.__context__ = RuntimeError("cannot release un-acquired lock")
+        error.__context__.__context__ = stop
+        return error
+
+    for error in (KeyboardInterrupt(), within(KeyboardInterrupt())):
+        assert fails(error) == 130
+        assert json.loads(capsys.readouterr().out)["error"]["found"] == "a stop by the user"
+    assert fails(within(None)) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["found"] == "half of it"
     with pytest.raises(ZeroDivisionError):
         fails(ZeroDivisionError("a bug"))
     assert json.loads(capsys.readouterr().out)["error"]["found"] == "ZeroDivisionError: a bug"

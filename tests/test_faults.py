@@ -1,6 +1,7 @@
 """Faults of the machine end in one message: no room, no memory, another run in the same folder, a request to stop."""
 
 import contextlib
+import os
 import resource
 import signal
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import refused, small_capture, write_transforms
+from capture_files import refused, small_capture, write_images, write_text_model, write_transforms
 from fuzz_readers import _field
 
 from jsecon.data import frames
@@ -118,16 +119,40 @@ def test_two_runs_in_one_folder_are_told_apart(capture, tmp_path):
         pass
 
 
-def test_a_program_that_is_told_to_end_says_how_to_go_on(capture, tmp_path):
-    out = tmp_path / "Ausgabe für Ä"
-    command = [sys.executable, "-m", "jsecon", "run", str(capture), "--out", str(out), "--steps", "100000"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as run:
+@pytest.mark.parametrize("moment", ["load ", "gaussians: "])
+def test_a_program_that_is_told_to_end_says_how_to_go_on(tmp_path, moment):
+    """At its first word; and amid the fit, that jax compiles and computes in threads of its own."""
+    capture, folder, out = small_capture(), tmp_path / "Fotos aus Köln 日本 #1 %20", tmp_path / "Ausgabe für Ä"
+    write_images(capture, folder / "images")
+    write_text_model(capture, folder / "sparse" / "0")
+    command = [sys.executable, "-m", "jsecon", "run", str(folder), "--out", str(out), "--steps", "100000"]
+    environ = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
+    to = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "env": environ | {"XDG_CACHE_HOME": str(tmp_path)}}
+    with subprocess.Popen(command, text=True, cwd=ROOT, **to) as run:
         assert run.stdout is not None
         for line in run.stdout:
-            if "load " in line:
+            if moment in line:
                 break
         run.send_signal(signal.SIGTERM)
-        _, told = run.communicate(timeout=60)
-    assert run.returncode == 130
+        told, _ = run.communicate(timeout=60)
+    assert run.returncode == 130, told
     assert "goes on where it stopped" in told
     assert not list(out.rglob("*.partial*"))
+
+
+def test_a_stop_is_exit_code_130_wherever_it_falls(tmp_path):
+    """Amid the imports, when nothing has begun; and within an exec, for which CPython would end by SIGINT. Python does
+    not take itself apart, in which jax may end by SIGSEGV."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import atexit, os, signal, sys\n"
+        "atexit.register(lambda: print('taken apart', file=sys.stderr))\n"
+        "class Import:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'jsecon.app.command_line':\n"
+        "            exec('os.kill(os.getpid(), signal.SIGTERM)')\n"
+        "sys.meta_path.insert(0, Import())"
+    )
+    command = [sys.executable, "-m", "jsecon", "doctor"]
+    environ = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environ)
+    assert (done.returncode, done.stderr) == (130, "\njsecon: stopped.\n")

@@ -5,7 +5,7 @@ import argparse
 import contextlib
 import inspect
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 import jsecon
@@ -55,13 +55,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         told = act(parsed(kind, arguments), console)
     except SystemExit as stop:  # --help, --version
         return int(stop.code or 0)
-    except InputError as error:
-        return ended(output, {"refused": [error]})
-    except KeyboardInterrupt:
-        remedy = "Give the same command again and it goes on where it stopped."
-        print(f"\njsecon: stopped. {remedy}", file=sys.stderr)
-        return ended(output, {"error": InputError("jsecon", "a stop by the user", "the end of the work", remedy)}, 130)
-    except Exception as error:  # a bug, whose trace the interpreter prints
+    except (KeyboardInterrupt, Exception) as error:
+        if any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):  # libraries make errors of stops
+            remedy = "Give the same command again and it goes on where it stopped."
+            print(f"\njsecon: stopped. {remedy}", file=sys.stderr)
+            told = {"error": InputError("jsecon", "a stop by the user", "the end of the work", remedy)}
+            return ended(output, told, 130)
+        if isinstance(error, InputError):
+            return ended(output, {"refused": [error]})
+        # a bug, whose trace the interpreter prints
         found, remedy = f"{type(error).__name__}: {error}", "Report it with the trace on standard error."
         ended(output, {"error": InputError("jsecon", found, "no such error: it is a bug", remedy)})
         raise
@@ -70,6 +72,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     with contextlib.suppress(KeyboardInterrupt):  # so a server ends
         then()
     return code
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, and those amid which it was raised."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 class _Parser(argparse.ArgumentParser):

@@ -54,6 +54,11 @@ class Listener:
         yield lambda done, total: None
 
 
+class _Tqdm(tqdm):
+    """A bar whose lock is one of C: a stop could leave tqdm's own, two in Python, half taken."""
+
+
+_Tqdm.set_lock(threading.RLock())
 QUIET_SECONDS = 2.0
 """a step shorter than this shows nothing"""
 LINE_SECONDS = 15.0
@@ -92,7 +97,7 @@ class Console(Listener):
             self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
 
     def say(self, text: str) -> None:
-        with tqdm.external_write_mode(file=self._out):
+        with _Tqdm.external_write_mode(file=self._out):
             print(text, file=self._out, flush=True)
 
     def note(self, text: str) -> None:
@@ -130,7 +135,7 @@ class _Bar:
 
     def __init__(self, name: str, err: Stream):
         self._name, self._started, self._bar, self._alone = name, time.monotonic(), None, threading.Lock()
-        self._new = functools.partial(tqdm, file=err, leave=False, dynamic_ncols=True)
+        self._new = functools.partial(_Tqdm, file=err, leave=False, dynamic_ncols=True)
 
     def update(self, done: int, total: int) -> None:
         with self._alone:
