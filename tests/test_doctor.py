@@ -60,6 +60,10 @@ def test_a_package_that_cannot_be_imported(monkeypatch):
     assert check.status == "missing"
     assert "no_such_module (ModuleNotFoundError" in check.told
     assert [error.where for error in doctor.wrong([check])] == ["packages"]
+    monkeypatch.setattr(doctor, "PACKAGES", ("cv2",))
+    assert doctor._packages().status == "ok"
+    monkeypatch.delattr("cv2.ximgproc.createSuperpixelSLIC")
+    assert "without ximgproc" in doctor._packages().told
 
 
 def test_it_knows_the_packages_and_extras_of_the_project():

@@ -66,6 +66,13 @@ def test_want_of_memory_names_the_stage_and_what_helps(capture, tmp_path):
         pipeline.run(pipeline.Options(capture), tmp_path / "out", load=lambda: np.ones(1 << 50))
 
 
+def test_an_opencv_without_its_contrib_modules_is_told_before_anything_runs(capture, tmp_path, monkeypatch):
+    monkeypatch.delattr("cv2.ximgproc")
+    with refused("OpenCV", "without ximgproc", "--force-reinstall opencv-contrib-python-headless"):
+        pipeline.run(pipeline.Options(capture), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_frames_that_lie_on_a_full_disk_are_told(no_room, monkeypatch):
     """They are mapped: a page without a place on the disk would end the process."""
     monkeypatch.setattr(frames, "IN_MEMORY", 500)

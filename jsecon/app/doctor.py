@@ -72,6 +72,8 @@ def _packages() -> Check:
     for name in PACKAGES:
         try:
             importlib.import_module(name)
+            if name == "cv2":
+                importlib.import_module("jsecon.vision.classical").require_contrib()
         except Exception as error:  # a broken wheel raises anything
             broken[name] = f"{name} ({type(error).__name__}: {error})"
     if not broken:

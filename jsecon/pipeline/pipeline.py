@@ -48,6 +48,7 @@ from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
 from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
+from jsecon.vision.classical import require_contrib
 
 FIELD_FILE = "field.npz"
 SMALLER = "Take smaller frames (--long-side), fewer (--frames), or fewer Gaussians (--gaussians-at-most)."
@@ -120,6 +121,7 @@ def _planned(work: Work, stages: list[Stage], folder: Path) -> _Plan:
         found = "the capture's own folder as the output folder"
         raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
     require_inputs(options)
+    require_contrib()
     for stage in stages:
         files[stage.name] = stage.files_digest(work)
         keys[stage.name] = stage.key(work, keys, files[stage.name])

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from jsecon.errors import require, require_shape
+from jsecon.errors import InputError, require, require_shape
 from jsecon.vision.region_graph import borders, merge
 from jsecon.vision.surfaces import Surface, log_depth
 
@@ -23,6 +23,17 @@ GRANULARITIES: dict[str, dict[str, Any]] = {
 }
 """settings of ClassicalSegmenter by how large its regions are; the coarse one joins the colours of one thing, and so
 needs depth to part things"""
+
+
+def require_contrib() -> None:
+    """Raises InputError where OpenCV has no contrib modules: its packages write to one folder, one over the other."""
+    if not hasattr(getattr(cv2, "ximgproc", None), "createSuperpixelSLIC"):
+        remedy = (
+            "Run: pip uninstall opencv-python opencv-python-headless opencv-contrib-python; then: "
+            "pip install --force-reinstall opencv-contrib-python-headless"
+        )
+        found = f"version {cv2.__version__} without ximgproc, as another of its packages leaves it"
+        raise InputError("OpenCV", found, "the package opencv-contrib-python-headless alone", remedy)
 
 
 @dataclasses.dataclass(frozen=True)
