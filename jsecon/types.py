@@ -99,6 +99,19 @@ class Camera:
         return -(rotation * translation[..., :, None]).sum(-2)
 
 
+@dataclasses.dataclass(frozen=True)
+class ImageFile:
+    """The image that a frame was made of."""
+
+    path: str
+    """As the capture names it, with "/": its folders tell cameras apart."""
+    width: int
+    """px of the image as it was read: upright, unless its pose belongs to the stored pixels."""
+    height: int
+    orientation: int = 1
+    """EXIF's, 1 to 8, that was applied to the stored pixels."""
+
+
 @record
 class Capture(_Shown):
     """A posed set of frames, as every loader returns it. Arrays are NumPy on the host."""
@@ -123,6 +136,8 @@ class Capture(_Shown):
     """What the loader left out or changed, a sentence each."""
     ignored: Array | None = None
     """(T, H, W) bool: what a fit shall not look at, as what moved; or None."""
+    files: tuple[ImageFile, ...] = static(default=())
+    """T images, or () where the frames were made of none. Masks, proposals and depth follow their folders."""
 
 
 @record

@@ -6,10 +6,12 @@ import zlib
 
 import cv2
 import numpy as np
+import PIL.Image
+import PIL.ImageOps
 import pytest
 from capture_files import png, refused
 
-from jsecon.data.images import image_size, read_depth, read_ids, read_image, write_image
+from jsecon.data.images import image_size, read_depth, read_ids, read_image, turned, write_image
 from jsecon.data.lens import Lens, distort, undistorted, undistortion_maps
 from jsecon.errors import InputError
 
@@ -74,15 +76,96 @@ def test_16_bits_of_colour_are_read_whole_or_refused_in_silence(tmp_path, capfd)
     assert capfd.readouterr() == ("", "")
 
 
-def test_exif_orientation_is_ignored(tmp_path):
-    """Poses are estimated on the stored pixels; OpenCV would turn them by this tag."""
+def corners(width=48, height=32):
+    """An image whose orientation shows: smooth, and different in each corner."""
+    y, x = np.mgrid[:height, :width]
+    return np.stack([255 * x // width, 255 * y // height, 255 * (x > y)], -1).astype(np.uint8)
+
+
+def stored_as(image, orientation, path):
+    """Writes an image so that `orientation` of EXIF turns it upright again."""
+    image = np.asarray(with_orientation(image, {6: 8, 8: 6}.get(orientation, orientation)))
+    tags = PIL.Image.Exif()
+    tags[0x0112] = orientation
+    lossless = {"lossless": True} if path.suffix == ".webp" else {"quality": 95}
+    PIL.Image.fromarray(np.ascontiguousarray(image)).save(path, exif=tags, **lossless)
+
+
+def with_orientation(image, orientation):
+    """By Pillow: what viewers show of pixels with this tag."""
+    shown = PIL.Image.fromarray(np.ascontiguousarray(image))
+    shown.getexif()[0x0112] = orientation
+    return PIL.ImageOps.exif_transpose(shown)
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".png", ".webp", ".tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_images_come_upright(tmp_path, ending, orientation):
+    file, image = tmp_path / f"a{ending}", corners()
+    stored_as(image, orientation, file)
+    assert image_size(file) == (48, 32)
+    read, _ = read_image(file)
+    assert np.abs(read.astype(int) - image).mean() < (6 if ending == ".jpg" else 0.1)
+    stored, _ = read_image(file, upright=False)
+    np.testing.assert_array_equal(turned(stored, orientation), read)
+    assert stored.shape[:2] == ((48, 32) if orientation > 4 else (32, 48))
+
+
+def test_a_heic_is_turned_once(tmp_path):
+    """Its decoder applies the file's own rotation; EXIF's must not be applied again."""
+    import pillow_heif
+
+    tags = PIL.Image.Exif()
+    tags[0x0112] = 6
+    stored = np.rot90(corners(96, 64))
+    photo = pillow_heif.from_pillow(PIL.Image.fromarray(np.ascontiguousarray(stored)))
+    photo.save(tmp_path / "a.heic", quality=95, exif=tags.tobytes())
+    assert image_size(tmp_path / "a.heic") == (96, 64)
+    assert np.abs(read_image(tmp_path / "a.heic")[0].astype(int) - corners(96, 64)).mean() < 6
+
+
+@pytest.mark.parametrize("cut", [0, 3, 8, 9, 14, 20])
+def test_damaged_exif_turns_nothing(tmp_path, cut):
     stored = cv2.imencode(".jpg", FRAME)[1].tobytes()
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
-    turned = stored[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + stored[2:]
-    (tmp_path / "a.jpg").write_bytes(turned)
-    assert cv2.imread(str(tmp_path / "a.jpg")).shape == (17, 13, 3), "the tag must be one that OpenCV obeys"
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x09\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"[: 6 + cut]
+    (tmp_path / "a.jpg").write_bytes(stored[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + stored[2:])
     assert read_image(tmp_path / "a.jpg")[0].shape == (13, 17, 3)
-    assert image_size(tmp_path / "a.jpg") == (17, 13)
+
+
+def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
+    """144 million pixels, as phones write them; of a JPEG beyond the limit a half is read."""
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 16000, 9000, 8, 2, 0, 0, 0))
+    (tmp_path / "big.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", bytes(99)) + chunk(b"IEND", b""))
+    with refused("big.png", "16000x9000", "134 million", "Shrink"):
+        read_image(tmp_path / "big.png")
+    monkeypatch.setattr("jsecon.data.images.MOST_PIXELS", 101 * 61)
+    PIL.Image.fromarray(corners(201, 121)).save(tmp_path / "big.jpg", quality=95)
+    assert image_size(tmp_path / "big.jpg") == (101, 61)
+    image, _ = read_image(tmp_path / "big.jpg")
+    assert image.shape == (61, 101, 3)
+    assert np.abs(image[:60, :100].astype(int) - corners(100, 60)).mean() < 6
+
+
+def test_odd_kinds_of_images_are_read_right(tmp_path):
+    """CMYK, 16 bit grey of a TIFF, grey with alpha, an animation (its first frame)."""
+    image = PIL.Image.fromarray(corners())
+    image.convert("CMYK").save(tmp_path / "a.jpg", quality=95)
+    assert np.abs(read_image(tmp_path / "a.jpg")[0].astype(int) - corners()).mean() < 6
+    grey = corners()[..., 0]
+    PIL.Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif")[0], np.repeat(grey[..., None], 3, -1))
+    alpha = np.where(np.arange(48) < 20, 0, 255).astype(np.uint8) * np.ones((32, 1), np.uint8)
+    PIL.Image.fromarray(np.stack([grey, alpha], -1), "LA").save(tmp_path / "a.png")
+    shown, transparent = read_image(tmp_path / "a.png")
+    assert transparent
+    np.testing.assert_array_equal(shown[..., 1], np.where(alpha > 0, grey, 0))
+    for ending in (".webp", ".png"):
+        image.save(tmp_path / f"b{ending}", save_all=True, append_images=[image.rotate(180)], lossless=True)
+        np.testing.assert_array_equal(read_image(tmp_path / f"b{ending}")[0], corners())
+    for ending in (".webp", ".tif", ".bmp", ".heic"):
+        (tmp_path / f"cut{ending}").write_bytes(b"")
+        with refused(f"cut{ending}", "empty"):
+            read_image(tmp_path / f"cut{ending}")
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg"])
@@ -140,11 +223,38 @@ def test_label_colours_and_refusals(tmp_path):
     assert coloured
     np.testing.assert_array_equal(ids, FRAME.astype(int) @ [65536, 256, 1])
     cv2.imwrite(str(tmp_path / "four.png"), np.dstack([FRAME, FRAME[..., 0]]))
-    with refused("four.png", "4 channels"):
+    with refused("four.png", "half transparent"):
         read_ids(tmp_path / "four.png")
+    cv2.imwrite(str(tmp_path / "deep.png"), FRAME.astype(np.uint16) * 257)
+    with refused("deep.png", "16 bits", "3 channels"):
+        read_ids(tmp_path / "deep.png")
     write_image(tmp_path / "a.jpg", FRAME)
     with refused("a.jpg", "no PNG"):
         read_ids(tmp_path / "a.jpg")
+
+
+def test_label_transparency(tmp_path):
+    """What is transparent has no id; where all is black, the mask is what is opaque."""
+    opaque = np.where(np.arange(17) < 5, 0, 255).astype(np.uint8) * np.ones((13, 1), np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), np.dstack([FRAME[..., ::-1], opaque]))
+    expected = np.where(opaque > 0, FRAME.astype(int) @ [65536, 256, 1], 0)
+    np.testing.assert_array_equal(read_ids(tmp_path / "a.png")[0], expected)
+    cv2.imwrite(str(tmp_path / "b.png"), np.dstack([FRAME * 0, opaque]))
+    np.testing.assert_array_equal(read_ids(tmp_path / "b.png")[0], opaque > 0)
+    PIL.Image.fromarray(np.stack([FRAME[..., 0], opaque], -1), "LA").save(tmp_path / "c.png")
+    np.testing.assert_array_equal(read_ids(tmp_path / "c.png")[0], np.where(opaque > 0, FRAME[..., 0], 0))
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32, np.int64, np.float32])
+def test_label_arrays(tmp_path, dtype):
+    ids = RNG.integers(0, 2 if dtype is bool else 200, (9, 11)).astype(dtype)
+    for shape in (ids, ids[None], ids[..., None]):
+        np.save(tmp_path / "a.npy", shape)
+        np.testing.assert_array_equal(read_ids(tmp_path / "a.npy")[0], ids)
+    for wrong, words in ((np.zeros((3, 9, 11)), "stack"), (ids + 0.5, "no ids"), (ids[0], "shape")):
+        np.save(tmp_path / "a.npy", wrong)
+        with refused("a.npy", words):
+            read_ids(tmp_path / "a.npy")
 
 
 def test_depth(tmp_path):

@@ -18,17 +18,21 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.data.images import image_size, read_depth, read_image
-from jsecon.data.lens import Lens, seen_through, undistorted, undistortion_maps
+from jsecon.data.images import TRANSPOSED, image_header, read_depth, read_image, turned
+from jsecon.data.lens import Lens, distort, seen_through, undistorted, undistortion_maps
 from jsecon.data.poses import camera_jumps, rigid
 from jsecon.errors import InputError
 from jsecon.numerics import sane
-from jsecon.types import Camera, Capture
+from jsecon.types import Camera, Capture, ImageFile
 
 Progress = Callable[[int, int], None] | None
 
 LEAST_FOCAL = 1e-3
 """px: the least focal length that is one"""
+EXIF_LOOKS = 4
+"""images, at most, that the colours of sparse points are compared with to tell which way up their cameras are"""
+WIDE = 2.0
+"""x/z and y/z up to which points are looked at there"""
 IN_MEMORY = 1 << 30
 """bytes of frames that are kept in memory; more are kept in a temporary file"""
 
@@ -103,19 +107,84 @@ def _short_names(shots: Sequence[Shot], where: object) -> tuple[str, ...]:
     raise InputError(where, f"two frames called {twice!r}", expected, remedy)
 
 
-def _true_lens(shot: Shot) -> Lens:
-    """The lens at the size that the file really has (a folder of smaller images is common)."""
-    width, height = image_size(shot.image)
+def _as_read(
+    shots: Sequence[Shot], points: np.ndarray | None = None, colours: np.ndarray | None = None
+) -> tuple[list[Lens], list[int], list[str]]:
+    """How each shot's image is read: the lens at the size that it really has (a folder of smaller images is common),
+    the EXIF orientation that is applied to its pixels, 1 where they are taken as stored; and notes.
+
+    A camera model belongs to the stored pixels or to the upright image: COLMAP ignores EXIF, other programs apply it.
+    Where only one of the two has the model's aspect, it is that one. Where both have it (a square, or a turn by 180
+    degrees), the other images decide, else the colours of the sparse points, else EXIF is applied.
+    """
+    headers = [image_header(shot.image) for shot in shots]
+    tagged = [n for n, header in enumerate(headers) if header.orientation != 1]
+    as_stored = {n for n in tagged if _fits(shots[n].lens, *headers[n].stored)}
+    as_upright = {n for n in tagged if _fits(shots[n].lens, *headers[n].upright)}
+    kept, unsure = as_stored - as_upright, sorted(as_stored & as_upright)
+    undecided = [shots[n] for n in unsure] if not as_upright - as_stored else []
+    if undecided and (kept or (points is not None and _stored_explains(undecided, points, colours))):
+        kept |= set(unsure)
+    notes = []
+    if kept:
+        told = f"{len(kept)} images have an EXIF orientation that their camera models leave out"
+        notes.append(f"{told} (the first: {shots[min(kept)].name}); they are taken as they are stored.")
+    if applied := [n for n in tagged if n not in kept]:
+        first = f"the first: {shots[applied[0]].name}"
+        notes.append(f"{len(applied)} images were turned upright, as their EXIF orientation says ({first}).")
+    lenses = [
+        _true_lens(shot, *(header.stored if n in kept else header.upright))
+        for n, (shot, header) in enumerate(zip(shots, headers))
+    ]
+    return lenses, [1 if n in kept else header.orientation for n, header in enumerate(headers)], notes
+
+
+def _fits(lens: Lens, width: int, height: int) -> bool:
+    """Whether an image of this size has the lens's aspect, to a pixel of the coarser of the two."""
+    return min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) <= 1
+
+
+def _stored_explains(shots: Sequence[Shot], points: np.ndarray, colours: np.ndarray | None) -> bool:
+    """Whether the colours of the sparse points agree better with the stored pixels than with the upright images, in
+    most of EXIF_LOOKS shots; False where there are no colours to compare."""
+    if colours is None or not len(colours) or (colours == colours[0]).all():
+        return False
+    better = 0
+    for shot in shots[:: -(-len(shots) // EXIF_LOOKS)]:
+        errors = [_colour_error(shot, points, colours, upright=upright) for upright in (False, True)]
+        better += int(np.sign(errors[1] - errors[0]))
+    return better > 0
+
+
+def _colour_error(shot: Shot, points: np.ndarray, colours: np.ndarray, *, upright: bool) -> float:
+    """Mean absolute difference between the points' colours and the pixels that they are seen at; 255 of none."""
+    image, _ = read_image(shot.image, upright=upright)
+    seen = np.asarray(points, np.float64) @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
+    front = seen[:, 2] > 0
+    directions = seen[front, :2] / seen[front, 2:]
+    # A wide view only: a polynomial lens folds back beyond its range.
+    near = np.abs(directions).max(1, initial=0) < WIDE
+    pixels = np.floor(distort(shot.lens.resized(image.shape[1], image.shape[0]), directions[near])).astype(int)
+    inside = ((pixels >= 0) & (pixels < image.shape[1::-1])).all(1)
+    if not inside.any():
+        return 255.0
+    shown = image[pixels[inside, 1], pixels[inside, 0]].astype(np.float64)
+    return float(np.abs(shown - colours[front][near][inside]).mean())
+
+
+def _true_lens(shot: Shot, width: int, height: int) -> Lens:
+    """The lens of a shot at the size that its image is read at."""
     lens = shot.lens
     if not sane((lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)) or min(lens.fx, lens.fy) < LEAST_FOCAL:
-        found = f"focal lengths {lens.fx:g}, {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}, distortion {lens.distortion}"
-        raise InputError(shot.image, f"a lens of {found}", "px", "Estimate the cameras again.")
+        problem = f"its camera has focal lengths {lens.fx:g}, {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}"
+        problem += f" and distortion {lens.distortion}"
+        raise InputError(shot.image, problem, "finite pixels", "Estimate the cameras again.")
     if (width, height) == (lens.width, lens.height):
         return lens
-    if min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) > 1:
+    if not _fits(lens, width, height):
         remedy = "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them."
-        wanted = f"{lens.width}x{lens.height}, or that aspect"
-        raise InputError(shot.image, f"an image of {width}x{height}", wanted, remedy)
+        wanted = f"{lens.width}x{lens.height} of its camera, or that aspect"
+        raise InputError(shot.image, f"the image is {width}x{height}", wanted, remedy)
     return lens.resized(width, height)
 
 
@@ -155,7 +224,7 @@ class Extent(NamedTuple):
 
 def extent_of(posed: Posed, downscale: float | int | None, long_side: int | None, frames: int | None) -> Extent:
     """What `assemble` would make of it; of the images, only the headers are read."""
-    source = _commonest([_true_lens(shot) for shot in posed.shots])
+    source = _commonest(_as_read(posed.shots)[0])
     return Extent(
         len(spread(len(posed.shots), frames)), shrunk(source, downscale, long_side), source, len(posed.points)
     )
@@ -210,8 +279,11 @@ def assemble(
         notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
     shots, poses, names = [shots[i] for i in chosen], poses[chosen], tuple(names[i] for i in chosen)
 
-    lenses = [_true_lens(shot) for shot in shots]
-    rescaled = sum(lens != shot.lens for lens, shot in zip(lenses, shots))
+    lenses, orientations, told = _as_read(shots, posed.points, posed.colours)
+    notes += told
+    rescaled = sum(
+        (lens.width, lens.height) != (shot.lens.width, shot.lens.height) for lens, shot in zip(lenses, shots)
+    )
     if rescaled:
         notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
     pinholes = {lens: undistorted(lens, where) for lens in set(lenses)}
@@ -232,7 +304,7 @@ def assemble(
 
     def read(index: int) -> bool:
         shot, lens = shots[index], lenses[index]
-        image, transparent = read_image(shot.image)
+        image, transparent = read_image(shot.image, upright=orientations[index] != 1)
         if lens.distorted:
             image = cv2.remap(image, *maps(lens, pinholes[lens]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         result[index] = _resize(image, width, height)
@@ -240,10 +312,12 @@ def assemble(
             depth = read_depth(shot.depth, shot.depth_unit)
             if shot.depth_lens is not None:
                 depth = seen_through(depth, shot.depth_lens, lens)
+            elif not _fits(lens, *depth.shape[1::-1]) and orientations[index] in TRANSPOSED:
+                depth = turned(depth, orientations[index])  # measured like the stored pixels
             if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
-                found = f"a depth map of {depth.shape[1]}x{depth.shape[0]}"
+                problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
                 wanted = f"the aspect of its image, {lens.width}x{lens.height}"
-                raise InputError(shot.depth, found, wanted, "Register it to the image.")
+                raise InputError(shot.depth, problem, wanted, "Register it to the image.")
             # Nearest throughout: the mean of two depths lies on neither surface.
             if lens.distorted:
                 depth = cv2.resize(depth, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST_EXACT)
@@ -278,4 +352,8 @@ def assemble(
         to_source=np.asarray(posed.to_source, np.float64),
         names=names,
         notes=tuple(notes),
+        files=tuple(
+            ImageFile(shot.name, lens.width, lens.height, orientation)
+            for shot, lens, orientation in zip(shots, lenses, orientations)
+        ),
     )

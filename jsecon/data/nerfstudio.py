@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.data.frames import Posed, Shot
-from jsecon.data.images import IMAGE_ENDINGS, image_size
+from jsecon.data.images import IMAGE_ENDINGS, image_header
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
 from jsecon.data.poses import inverse_pose, rigid
@@ -160,7 +160,7 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     width, height = (keys.get("w"), keys.get("h"))
     if width is None or height is None:
-        width, height = image_size(image)
+        width, height = image_header(image).about(keys.get("cx"), keys.get("cy"))
     width, height = (round(_number(file, {key: value}, key, 0.0)) for key, value in (("w", width), ("h", height)))
     fx = _focal(file, keys, "fl_x", "camera_angle_x", width)
     fy = _focal(file, keys, "fl_y", "camera_angle_y", height)

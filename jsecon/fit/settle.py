@@ -184,5 +184,6 @@ def _without(capture: Capture, left: np.ndarray) -> Capture:
         depths=take(capture.depths),
         ignored=take(capture.ignored),
         names=tuple(capture.names[t] for t in keep),
+        files=tuple(capture.files[t] for t in keep) if capture.files else (),
         notes=(*capture.notes, f"left out, as a probe fit does not explain them: {told}"),
     )

@@ -1,0 +1,53 @@
+"""EXIF orientation: photographs come upright, and poses keep the pixels that they were estimated on."""
+
+import dataclasses
+import json
+
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+import pytest
+from capture_files import small_capture, transforms, write_text_model
+
+import jsecon
+
+
+def write_turned(capture, folder, orientations, *, upright):
+    """The capture's images with EXIF orientations; the frames are what is upright, or else what is stored."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, frame, orientation in zip(capture.names, capture.frames, orientations):
+        tags, stored = PIL.Image.Exif(), PIL.Image.fromarray(frame)
+        if upright:
+            stored.getexif()[0x0112] = {6: 8, 8: 6}.get(orientation, orientation)
+            stored = PIL.ImageOps.exif_transpose(stored)
+        tags[0x0112] = orientation
+        stored.save(folder / f"{name}.png", exif=tags)
+
+
+def test_mixed_exif_orientations_come_upright(tmp_path):
+    capture = small_capture(8)
+    write_turned(capture, tmp_path / "images", range(1, 9), upright=True)
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms(capture)))
+    read = jsecon.load_capture(tmp_path)
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    assert [file.orientation for file in read.files] == list(range(1, 9))
+    assert {(file.width, file.height) for file in read.files} == {(24, 16)}
+    assert any("7 images were turned upright" in note for note in read.notes)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+@pytest.mark.parametrize("upright", [False, True])
+def test_poses_of_stored_pixels_keep_them(tmp_path, orientation, upright):
+    """By the size of the camera model; where that cannot tell, by the colours of the sparse points."""
+    capture = small_capture(3, points=400)
+    camera, frame = capture.cameras[0], capture.frames[0]
+    seen = capture.points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    x, y = (seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).astype(int).T
+    colours = frame[np.clip(y, 0, 15), np.clip(x, 0, 23)]
+    capture = dataclasses.replace(capture, point_colors=colours)
+    write_text_model(capture, tmp_path / "sparse/0")
+    write_turned(capture, tmp_path / "images", [orientation, 1, 1], upright=upright)
+    read = jsecon.load_capture(tmp_path)
+    np.testing.assert_array_equal(read.frames, capture.frames)
+    assert read.files[0].orientation == (orientation if upright else 1)
+    assert any(("turned upright" if upright else "as they are stored") in note for note in read.notes)
