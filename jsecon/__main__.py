@@ -27,7 +27,7 @@ def main() -> int:
 
         code = run(sys.argv[1:])
     except KeyboardInterrupt:  # amid the imports: nothing has begun
-        print("\njsecon: stopped.", file=sys.stderr)
+        print("\njsecon: interrupted.", file=sys.stderr)
         code = STOPPED
     except Exception:
         if not several:

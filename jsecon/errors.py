@@ -1,23 +1,50 @@
-"""The one error that a user sees for bad input: what was wrong, where, and what mends it."""
+"""The one error that a user sees for bad input: what is wrong, where, and what to do about it."""
 
 from collections.abc import Iterable
 from typing import Any
 
 LONGEST = 600
-"""characters of a place, and of what was found there, that an error quotes: of more, the beginning and the end"""
+"""characters of a place, and of what is wrong there, that an error quotes: of more, the beginning and the end"""
 
 
 class InputError(ValueError):
     """Bad input from outside: a file, an option, a capture. The command line prints it and exits with code 2.
 
-    `where` is the file or argument, `found` what is there, `expected` what should be, `remedy` what to do about it.
+    It prints as "WHERE: FOUND, expected EXPECTED. REMEDY", for example "images.txt: line 7 has 9 fields, expected 10.
+    Export the model again."; without `expected` as "WHERE: FOUND. REMEDY". `why` has a Python exception's words for it.
+
+    Args:
+      where: The file or argument; empty where `found` names it.
+      found: What is wrong there: a clause without a full stop, or what is there in place of `expected`.
+      expected: What should be there.
+      remedy: What to do about it, a sentence.
     """
 
-    def __init__(self, where: object, found: str, expected: str, remedy: str):
+    def __init__(self, where: object, found: str, expected: str = "", remedy: str = ""):
         half = LONGEST // 2
         where, found = (t if len(t) <= LONGEST else f"{t[:half]} ... {t[-half:]}" for t in (str(where), found))
         self.where, self.found, self.expected, self.remedy = where, found, expected, remedy
-        super().__init__(f"{where}: found {found}; expected {expected}. {remedy}")
+        super().__init__(f"{where}: {self.problem} {remedy}".removeprefix(": ").rstrip())
+
+    @property
+    def problem(self) -> str:
+        """What is wrong, as a sentence, without where and without the remedy."""
+        return f"{self.found.rstrip('.')}{f', expected {self.expected}' if self.expected else ''}."
+
+
+def why(error: BaseException) -> str:
+    """Why something failed, in words that a user knows: without the name of a Python exception, on one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.partition(" (")[0]
+    if isinstance(error, KeyError) and error.args:
+        return f"{error.args[0]!r} is missing"
+    if isinstance(error, UnicodeDecodeError):
+        return "its text is not UTF-8"
+    if isinstance(error, MemoryError):
+        return "memory has no room for it"
+    if isinstance(error, TypeError | AttributeError | LookupError):
+        return "its values are of another kind or number"
+    return (str(error).strip().splitlines() or ["it ends early"])[0].rstrip(".")
 
 
 def require(condition: bool, name: str, got: object, expected: str, remedy: str) -> None:

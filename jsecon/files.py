@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError, require, why
 
 UNREADABLE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
@@ -64,7 +64,7 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
 
 def _unwritten(path: Path, error: OSError) -> InputError:
     remedy = "Choose another, mend its permissions, or free some room."
-    found = f"{error.strerror or error} on writing to {path.parent}"
+    found = f"{why(error)} on writing to {path.parent}"
     return InputError(path, found, "a folder that can be written", remedy)
 
 
@@ -105,9 +105,9 @@ def read_json(path: Path, expected: str, remedy: str) -> Any:
     try:
         return parsed_json(path.read_bytes())
     except OSError as error:
-        raise InputError(path, error.strerror or "an error on reading", expected, remedy) from error
+        raise InputError(path, why(error), expected, remedy) from error
     except ValueError as error:
-        raise InputError(path, f"text that is no JSON ({error})", expected, remedy) from error
+        raise InputError(path, f"it is not JSON ({why(error)})", expected, remedy) from error
 
 
 def array_layout(stream: Any, size: int) -> tuple[tuple[int, ...], np.dtype, bool]:

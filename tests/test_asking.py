@@ -95,4 +95,4 @@ def test_a_damaged_field_and_a_budget_that_is_none(room_run, tmp_path, forced, m
     assert "damaged" in capsys.readouterr().err
     monkeypatch.setenv("JSECON_MEMORY", "much")
     assert _query(out / "field.npz", tmp_path, "red") == 2
-    assert "JSECON_MEMORY: found 'much'; expected GiB" in capsys.readouterr().err
+    assert "JSECON_MEMORY: 'much', expected GiB" in capsys.readouterr().err

@@ -9,13 +9,14 @@ import pytest
 from jsecon.app import command_line, verbs
 from jsecon.app.ending import ended
 from jsecon.app.verbs import Output
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 
-ERROR = {"name": "mug.png", "found": "text", "expected": "a picture", "remedy": "Draw one."}
+PARTS = {"name": "mug.png", "found": "text", "expected": "a picture", "remedy": "Draw one."}
+ERROR = PARTS | {"message": "mug.png: text, expected a picture. Draw one."}
 
 
 def _errors():
-    return [InputError("cup.png", "nothing", "a picture", "Draw it."), InputError(*ERROR.values())]
+    return [InputError("cup.png", "nothing", "a picture", "Draw it."), InputError(*PARTS.values())]
 
 
 def test_figures_and_paths_are_one_object(capsys):
@@ -43,7 +44,7 @@ def test_what_was_refused_is_told_beside_what_was_not(capsys):
 def test_wrong_usage_is_an_error_object_too(capsys, line):
     assert command_line.main(line) == 2
     out, err = capsys.readouterr()
-    assert json.loads(out)["error"]["found"].startswith("wrong usage")
+    assert json.loads(out)["error"]["message"].endswith("--help lists the options.")
     assert err.startswith("usage: jsecon")
 
 
@@ -79,9 +80,43 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monke
 
     for error in (KeyboardInterrupt(), within(KeyboardInterrupt())):
         assert fails(error) == 130
-        assert json.loads(capsys.readouterr().out)["error"]["found"] == "a stop by the user"
+        assert (
+            json.loads(capsys.readouterr().out)["error"]["message"]
+            == "interrupted. Run the same command again to resume."
+        )
     assert fails(within(None)) == 2
     assert json.loads(capsys.readouterr().out)["error"]["found"] == "half of it"
     with pytest.raises(ZeroDivisionError):
         fails(ZeroDivisionError("a bug"))
-    assert json.loads(capsys.readouterr().out)["error"]["found"] == "ZeroDivisionError: a bug"
+    assert json.loads(capsys.readouterr().out)["error"]["found"] == "internal error: a bug"
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            InputError("images.txt", "line 7 has 9 fields", "10", "Export it again."),
+            "line 7 has 9 fields, expected 10.",
+        ),
+        (InputError("mug.png", "the file is cut short.", remedy="Copy it again."), "mug.png: the file is cut short. C"),
+        (InputError("", "interrupted", remedy="Run it again."), "interrupted. Run it again."),
+    ],
+)
+def test_an_error_reads_as_sentences(error, message):
+    assert message in str(error)
+    assert ";" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (KeyError("counts"), "'counts' is missing"),
+        (TypeError("'NoneType' object is not subscriptable"), "its values are of another kind or number"),
+        (EOFError(), "it ends early"),
+        (UnicodeDecodeError("utf-8", b"\xe9", 0, 1, "invalid"), "its text is not UTF-8"),
+        (ValueError("odd header.\n  at line 3"), "odd header"),
+    ],
+)
+def test_the_reason_of_a_failure_is_in_words(error, words):
+    assert why(error) == words

@@ -143,7 +143,7 @@ def test_a_program_that_is_told_to_end_says_how_to_go_on(tmp_path, moment):
         run.send_signal(signal.SIGTERM)
         told, _ = run.communicate(timeout=60)
     assert run.returncode == 130, told
-    assert "goes on where it stopped" in told
+    assert "again to resume" in told
     assert not list(out.rglob("*.partial*"))
 
 
@@ -162,4 +162,4 @@ def test_a_stop_is_exit_code_130_wherever_it_falls(tmp_path):
     command = [sys.executable, "-m", "jsecon", "doctor"]
     environ = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environ)
-    assert (done.returncode, done.stderr) == (130, "\njsecon: stopped.\n")
+    assert (done.returncode, done.stderr) == (130, "\njsecon: interrupted.\n")

@@ -156,7 +156,7 @@ def test_no_labels_and_no_json(tmp_path):
     with refused(tmp_path, "no .json file"):
         load_lerf_labels(tmp_path)
     (tmp_path / "a.json").write_text("{")
-    with refused("a.json", "no JSON"):
+    with refused("a.json", "not JSON"):
         load_lerf_labels(tmp_path)
     (tmp_path / "file").write_text("")
     frame = LabelledFrame("a", 5, 4, {})

@@ -171,7 +171,7 @@ def test_wrong_denominators_names_and_sizes_are_told(scene, views, labelled):
     def run(frames, **options):
         return evaluate_point_level_rendered(scene, views, frames, lambda query: None, **options)
 
-    with pytest.raises(InputError, match=r"5 \(frame, query\) pairs; expected 56"):
+    with pytest.raises(InputError, match=r"5 \(frame, query\) pairs, expected 56"):
         run(labelled, expected_pairs=LERF_PAIRS["figurines"])
     with pytest.raises(InputError, match="at least one"):
         run([])

@@ -215,7 +215,7 @@ def test_no_focal_length(tmp_path):
 
 def test_not_json(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(CAPTURE))[:-9])
-    with refused("transforms.json", "no JSON"):
+    with refused("transforms.json", "not JSON"):
         load_capture(tmp_path)
     (tmp_path / "transforms.json").write_text("[1]")
     with refused("transforms.json", "JSON without keys"):

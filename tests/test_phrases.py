@@ -86,10 +86,10 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
     (tmp_path / "poses").mkdir()
     assert capture_of(field, tmp_path) == tmp_path / "poses"
     another = dataclasses.replace(field, names=(*field.names[:7], "another"))
-    with pytest.raises(InputError, match=f"found 8 frames, {field.names[0]} .*expected one called another"):
+    with pytest.raises(InputError, match=f"8 frames, {field.names[0]} .*expected one called another"):
         frames_of(another, room, 3)
     wide = dataclasses.replace(field, cameras=dataclasses.replace(field.cameras, width=200))
-    with pytest.raises(InputError, match="frames of 160x120; expected 200x120, or the same shape"):
+    with pytest.raises(InputError, match="frames of 160x120, expected 200x120, or the same shape"):
         frames_of(wide, room, 3)
     moved = dataclasses.replace(field, provenance="{}")
     with pytest.raises(InputError, match="--images DIR"):
@@ -102,12 +102,12 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
     ("options", "says"),
     [
         (["--phrases", "MODEL"], "nothing to find"),
-        (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: found no text"),
+        (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: no text"),
         (["red", "--phrases", "MODEL", "--all", "--by", "code"], "found --by --all"),
-        (["red", "--images", "x"], "--images: found no --phrases"),
-        (["red", "--looks", "3"], "--looks: found no --phrases"),
+        (["red", "--images", "x"], "--images: no --phrases"),
+        (["red", "--looks", "3"], "--looks: no --phrases"),
         (["red", "--phrases", "nowhere"], "no such folder; expected SAM 3's graphs"),
-        (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: found nothing there"),
+        (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: nothing there"),
     ],
 )
 def test_phrases_that_cannot_be_asked(room_run, model, tmp_path, capsys, options, says):

@@ -119,7 +119,7 @@ def test_folders_that_lack_something(folder, tmp_path):
         with pytest.raises(InputError, match=rf"{told}.*expected SAM 3's graphs, one \*image_encoder.onnx"):
             find_sam3(other)
     (folder / "tokenizer.json").rename(folder / "vocabulary.json")
-    with pytest.raises(InputError, match=r"without a tokenizer; expected CLIP's tokenizer\.json"):
+    with pytest.raises(InputError, match=r"without a tokenizer, expected CLIP's tokenizer\.json"):
         find_sam3(folder)
     (folder / "vocabulary.json").rename(folder / "tokenizer.json")
     shutil.copy(folder / "sam3_decoder.onnx", folder / "second_decoder.onnx")
@@ -177,7 +177,7 @@ def test_graphs_of_another_kind_are_refused_by_the_tensor(folder, file, edit, sa
 
 
 def test_an_encoder_that_scales_no_colours_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"found image float32\[3, 112, 112\]; expected image uint8"):
+    with pytest.raises(InputError, match=r"image float32\[3, 112, 112\], expected image uint8"):
         Sam3(write_sam3(tmp_path, image="float32"), threads=1).check()
 
 

@@ -73,5 +73,5 @@ def test_what_a_trained_world_must_be(tmp_path):
         with refused(file.name, says):
             trained_to_source(file)
     file.write_text("{")
-    with refused(file.name, "no JSON"):
+    with refused(file.name, "not JSON"):
         trained_to_source(file)

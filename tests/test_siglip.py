@@ -117,7 +117,7 @@ def test_mobileclip_s_images_are_not_normalised(tmp_path):
     [
         ("immich", "visual/preprocess_cfg.json", None, "does not say how it takes images.*huggingface"),
         ("immich", "visual/preprocess_cfg.json", {"mean": None}, r"preprocess_cfg\.json.*cannot be read"),
-        ("immich", "textual/tokenizer_config.json", None, r"tokenizer_config\.json: found No such file"),
+        ("immich", "textual/tokenizer_config.json", None, r"tokenizer_config\.json: No such file"),
         ("immich", "textual/tokenizer_config.json", {"pad_token": None}, "pad_token None.*fills short texts"),
         ("immich", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),
         ("immich", "config.json", [], "JSON of list"),
@@ -303,5 +303,5 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
 def test_an_unreadable_vocabulary_is_named(tmp_path):
     path = write_unigram(tmp_path)
     path.write_text(path.read_text()[:200], encoding="utf-8")
-    with pytest.raises(InputError, match=r"tokenizer\.json: found no such tokenizer"):
+    with pytest.raises(InputError, match=r"tokenizer\.json: no such tokenizer"):
         FileTokenizer(path, TextRules(LENGTH, "</s>", "lower"))

@@ -12,7 +12,7 @@ import jsecon
 from jsecon.app.actions import VERBS
 from jsecon.app.ending import Told, ended
 from jsecon.app.verbs import Completion, Output, Run
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.pipeline.arguments import add_arguments, parsed
 from jsecon.pipeline.progress import Console
 from jsecon.process import show_whole_traces
@@ -57,15 +57,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(stop.code or 0)
     except (KeyboardInterrupt, Exception) as error:
         if any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):  # libraries make errors of stops
-            remedy = "Give the same command again and it goes on where it stopped."
-            print(f"\njsecon: stopped. {remedy}", file=sys.stderr)
-            told = {"error": InputError("jsecon", "a stop by the user", "the end of the work", remedy)}
+            remedy = "Run the same command again to resume."
+            print(f"\njsecon: interrupted. {remedy}", file=sys.stderr)
+            told = {"error": InputError("", "interrupted", remedy=remedy)}
             return ended(output, told, 130)
         if isinstance(error, InputError):
             return ended(output, {"refused": [error]})
         # a bug, whose trace the interpreter prints
-        found, remedy = f"{type(error).__name__}: {error}", "Report it with the trace on standard error."
-        ended(output, {"error": InputError("jsecon", found, "no such error: it is a bug", remedy)})
+        remedy = "Report it with the trace on standard error."
+        ended(output, {"error": InputError("jsecon", f"internal error: {why(error)}", remedy=remedy)})
         raise
     then = told.pop("then", lambda: None)
     code = ended(output, told)
@@ -86,7 +86,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
-        raise InputError(self.prog, f"wrong usage ({message})", "what the usage says", f"See: {self.prog} --help")
+        raise InputError(self.prog, message, remedy=f"{self.prog} --help lists the options.")
 
 
 def parser() -> argparse.ArgumentParser:

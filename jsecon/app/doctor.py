@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.process import cgroup_words, cores, memory
 
 LEAST_MEMORY, LEAST_DISK = 2 << 30, 200 << 20
@@ -75,7 +75,7 @@ def _packages() -> Check:
             if name == "cv2":
                 importlib.import_module("jsecon.vision.classical").require_contrib()
         except Exception as error:  # a broken wheel raises anything
-            broken[name] = f"{name} ({type(error).__name__}: {error})"
+            broken[name] = f"{name} ({error})"
     if not broken:
         return Check("packages", "ok", f"{len(PACKAGES)} that jsecon is built on can be imported")
     return Check("packages", "missing", ", ".join(broken.values()), 'Run: pip install --force-reinstall "jsecon"')
@@ -91,7 +91,7 @@ def _backend() -> list[Check]:
         kinds = [device.platform for device in jax.devices()]
         devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     except Exception as error:  # whatever a driver or a wheel raises
-        told = f"{type(error).__name__}: {error}"
+        told = str(error) or why(error)
         return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.13"')]
     found = [Check("jax", "ok", f"{jax.__version__}, devices: {devices}")]
     try:

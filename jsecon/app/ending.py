@@ -31,5 +31,6 @@ def ended(output: Output, told: Told, code: int = 0) -> int:
 def _plain(value: Any) -> Any:
     """What JSON takes of an error, a record, a path."""
     if isinstance(value, InputError):
-        return {"name": value.where, "found": value.found, "expected": value.expected, "remedy": value.remedy}
+        parts = {"name": value.where, "found": value.found, "expected": value.expected, "remedy": value.remedy}
+        return {"message": str(value)} | parts
     return vars(value) if dataclasses.is_dataclass(value) else str(value)

@@ -149,7 +149,7 @@ def _later(act: Any) -> Any:
 
 
 def _error(error: InputError) -> str:
-    told, remedy = f"found {error.found}; expected {error.expected}.", error.remedy
+    told, remedy = error.problem, error.remedy
     return f"<details><summary>{html.escape(told)}</summary>{html.escape(remedy)}</details>"
 
 

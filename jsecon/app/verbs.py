@@ -14,8 +14,8 @@ class Output:
     """What every verb takes."""
 
     json: bool = False
-    """one JSON object on standard output at the end, {"error": ...} with name, found, expected and remedy where it went
-    wrong; all else on standard error"""
+    """print one JSON object on standard output at the end, {"error": ...} with message, name, found, expected and
+    remedy where it went wrong; all else goes to standard error"""
     debug: bool = False
     """the whole trace of an error"""
 

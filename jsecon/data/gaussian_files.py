@@ -15,7 +15,7 @@ from jsecon.data.gltf import load_glb, save_glb
 from jsecon.data.ply import SH_DC, load_ply, save_ply, sound
 from jsecon.data.ply_file import elements_of
 from jsecon.data.spz import AXES as SPZ_AXES, save_spz
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import parsed_json
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Array, Gaussians
@@ -45,7 +45,7 @@ def load_gaussians(path: str | Path) -> Gaussians:
         with path.open("rb") as file:
             head = file.read(16384)
     except OSError as error:
-        raise InputError(path, error.strerror or "an error on reading", _READ, "Check the path.") from error
+        raise InputError(path, why(error), _READ, "Check the path.") from error
     if kind == ".ply" and b"packed_position" not in head:
         return load_ply(path)
     if kind == ".glb":
@@ -114,7 +114,7 @@ def _read_by_gsply(path: Path, kind: str) -> dict[str, np.ndarray]:
         if (rest := 0 if data.shN is None else data.shN.shape[1]) not in (0, 3, 8, 15):
             raise ValueError(f"{rest} harmonics above the constant")
     except Exception as error:  # whatever a decoder says of damaged bytes
-        raise InputError(path, f"what gsply cannot read ({error})", f"a whole {kind}", remedy) from error
+        raise InputError(path, f"gsply cannot read it ({why(error)})", f"a whole {kind}", remedy) from error
     sh = [np.asarray(data.sh0)[:, None], *([] if data.shN is None else [data.shN])]
     given = {"means": data.means, "log_scales": data.scales, "quaternions": data.quats}
     return given | {"opacity_logits": np.reshape(data.opacities, -1), "sh": np.concatenate(sh, axis=1)}

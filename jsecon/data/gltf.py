@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jsecon.data.ply import sound
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import UNREADABLE, parsed_json, written_whole
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians, transformed_blocks
@@ -151,9 +151,9 @@ def load_glb(path: str | Path) -> Gaussians:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(path, error.strerror or "an error on reading", _WANTED, "Check the path.") from error
+        raise InputError(path, why(error), _WANTED, "Check the path.") from error
     except (*UNREADABLE, struct.error) as error:
-        raise InputError(path, f"what is none ({type(error).__name__}: {error})", _WANTED, _REMEDY) from error
+        raise InputError(path, f"it cannot be read ({why(error)})", _WANTED, _REMEDY) from error
 
 
 def _container(file: BinaryIO, size: int) -> tuple[Any, int, int]:

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int64, UInt8
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import MOST_DEFLATED, UNREADABLE, map_array, written_whole
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".HEIC")
@@ -225,7 +225,7 @@ def _decode(path: Path, data: bytes) -> np.ndarray:
         order = {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
         return image if image.ndim == 2 else cv2.cvtColor(image, order[image.shape[2]])
     except Exception as error:  # Pillow's and OpenCV's own kinds have no common base but this
-        raise _unreadable(path, f"the file cannot be decoded: {error or 'it ends early'}") from error
+        raise _unreadable(path, f"the image cannot be decoded ({why(error)})") from error
 
 
 def _check_deep(chunks: list[tuple[bytes, bytes]]) -> None:

@@ -20,7 +20,7 @@ from jaxtyping import Bool
 
 from jsecon.data.images import MOST_PIXELS, read_ids
 from jsecon.data.mask_files import fitted_to_frame, read_level
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import read_json
 
 ENDINGS = (".json", "_s.npy", ".png")
@@ -35,7 +35,7 @@ def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
         counts = rle["counts"]
         runs = np.asarray(_numbers(counts) if isinstance(counts, str) else counts, np.int64)
     except (TypeError, KeyError, ValueError, IndexError, OverflowError) as error:
-        raise InputError(where, f"a mask that cannot be read ({error!r})", *_RLE) from error
+        raise InputError(where, f"the mask cannot be read ({why(error)})", *_RLE) from error
     fits = runs.ndim == 1 and ((runs >= 0) & (runs <= MOST_PIXELS)).all() and min(height, width) > 0
     if not fits or height * width > MOST_PIXELS or runs.sum() != height * width:
         raise InputError(where, f"runs that fill {int(runs.sum())} of {height}x{width} pixels", *_RLE)
@@ -111,5 +111,5 @@ def _read_json(file: Path) -> list[np.ndarray]:
         coded = [record["segmentation"] for record in records]
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(file, f"what is no list of masks ({error!r})", wanted, _REMEDY) from error
+        raise InputError(file, f"it is not a list of masks ({why(error)})", wanted, _REMEDY) from error
     return [decode_rle(coded[i], f"{file}, mask {i}") for i in np.argsort(-np.asarray(scores), kind="stable")]

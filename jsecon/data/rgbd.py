@@ -20,7 +20,7 @@ from jsecon.data.frames import LEAST_FOCAL, Posed, Shot
 from jsecon.data.images import MOST_PIXELS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.poses import inverse_pose
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import UNREADABLE, parsed_json
 from jsecon.numerics import sane
 
@@ -58,7 +58,7 @@ def _reading(file: Path) -> Iterator[None]:
     except InputError:
         raise
     except UNREADABLE as error:
-        found = f"{type(error).__name__}: {error}"
+        found = f"it cannot be read ({why(error)})"
         raise InputError(file, found, "the numbers of its format", "Export the capture again.") from error
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jsecon.data.images import MOST_PIXELS
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError, require, why
 from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, write_arrays, written_whole
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
@@ -133,7 +133,7 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     except InputError:
         raise
     except UNREADABLE as error:
-        found = f"a damaged field file ({type(error).__name__}: {error})"
+        found = f"the field file is damaged ({why(error)})"
         raise InputError(path, found, "a whole one", changed) from error
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)

@@ -12,7 +12,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import read_json
 from jsecon.networks.file_tokenizer import TextRules
 from jsecon.networks.onnx_graph import Graph, content_digest, describe, graph_files
@@ -142,7 +142,7 @@ def read_preprocessing(path: Path, *, whole: bool = False) -> tuple[tuple[float,
         size = _side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-        raise InputError(path, f"what cannot be read ({error!r})", expected, "Fetch the file again.") from error
+        raise InputError(path, f"it cannot be read ({why(error)})", expected, "Fetch the file again.") from error
     if len(mean) != 3 or len(std) != 3 or not sane(mean, std) or min(std) < 1e-6 or not 1 <= (size or 1) <= MOST_SIDE:
         raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, "Fetch the file again.")
     return mean, std, size

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import parsed_json
 from jsecon.networks.tokenizer import cleaned, mended
 
@@ -91,5 +91,5 @@ def _read(path: Path, expected: str) -> Iterator[None]:
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # an abort in its Rust
             raise
-        found = f"no such tokenizer ({type(error).__name__}: {error})"
+        found = f"no such tokenizer ({why(error)})"
         raise InputError(path, found, expected, "Fetch tokenizer.json and tokenizer_config.json again.") from error

@@ -98,7 +98,7 @@ class Graph:
             self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
             self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
         except Exception as error:  # ONNX Runtime's own kinds have no common base but this
-            found = f"what ONNX Runtime {onnxruntime.__version__} cannot open ({_reason(error)})"
+            found = f"ONNX Runtime {onnxruntime.__version__} cannot open it ({_reason(error)})"
             expected = "a whole ONNX graph, with its external data files beside it"
             raise InputError(self.path, found, expected, "Fetch or export the file again.") from error
         self._run_options = onnxruntime.RunOptions()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import read_json
 from jsecon.networks.onnx_graph import Graph, describe
 from jsecon.numerics import sane
@@ -36,7 +36,7 @@ def read_logits(path: Path) -> Logits:
     try:
         found = Logits(float(content["scale"]), float(content["bias"]))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"what cannot be read ({error!r})", expected, REMEDY) from error
+        raise InputError(path, f"it cannot be read ({why(error)})", expected, REMEDY) from error
     return _checked(found, path, expected)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import parsed_json
 
 CONTEXT_LENGTH = 77
@@ -84,7 +84,7 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
     except Exception as error:  # of the package tokenizers, whose own have no other base
         expected = "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
         expected += f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}"
-        found = f"no tokenizer of CLIP's kind ({type(error).__name__}: {error})"
+        found = f"no tokenizer of CLIP's kind ({why(error)})"
         remedy = "Fetch the file again, from a CLIP model; for SigLIP with the model's config.json in the folder."
         raise InputError(path, found, expected, remedy) from error
 

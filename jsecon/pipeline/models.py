@@ -72,7 +72,7 @@ def _signature(path: Path) -> str:
     try:
         graph = Graph(path, threads=1, optimise=False)
     except InputError as error:
-        return f"cannot be opened: found {error.found}; expected {error.expected}"
+        return f"cannot be opened: {error.problem}"
     return f"in   {describe(graph.inputs.values())}\nout  {describe(graph.outputs.values())}"
 
 

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.pipeline.arguments import arguments_of
 
 Folder = Annotated[Path | None, {"metavar": "DIR"}]
@@ -137,5 +137,5 @@ def require_writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        found, remedy = error.strerror or type(error).__name__, "Choose another output folder, or mend its permissions."
+        found, remedy = why(error), "Choose another output folder, or mend its permissions."
         raise InputError(folder, found, "a folder that can be written", remedy) from error

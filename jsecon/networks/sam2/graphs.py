@@ -158,7 +158,7 @@ def _read_constants(path: Path) -> dict[str, np.ndarray]:
         if not all(np.isfinite(array).all() and array.size for array in constants.values()):
             raise ValueError("arrays without numbers, or numbers that are not finite")
     except UNREADABLE as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else f"what cannot be read ({error})"
+        found = "no such file" if isinstance(error, FileNotFoundError) else f"it cannot be read ({error})"
         raise _bad(path, found, f"the arrays {', '.join(CONSTANTS)}") from error
     return constants
 
