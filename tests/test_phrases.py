@@ -103,10 +103,10 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
     [
         (["--phrases", "MODEL"], "nothing to find"),
         (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: no text"),
-        (["red", "--phrases", "MODEL", "--all", "--by", "code"], "found --by --all"),
+        (["red", "--phrases", "MODEL", "--all", "--by", "code"], "--by --all"),
         (["red", "--images", "x"], "--images: no --phrases"),
         (["red", "--looks", "3"], "--looks: no --phrases"),
-        (["red", "--phrases", "nowhere"], "no such folder; expected SAM 3's graphs"),
+        (["red", "--phrases", "nowhere"], "no such folder, expected SAM 3's graphs"),
         (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: nothing there"),
     ],
 )

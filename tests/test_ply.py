@@ -143,7 +143,7 @@ def test_missing_properties(tmp_path, missing):
     given = columns()
     del given[missing]
     write(tmp_path / "a.ply", given)
-    with refused("a.ply", f"no properties {missing};"):
+    with refused("a.ply", f"no properties {missing},"):
         load_ply(tmp_path / "a.ply")
 
 
