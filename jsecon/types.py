@@ -10,6 +10,7 @@ channels.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, TypeAlias, dataclass_transform
 
 import jax
@@ -91,6 +92,16 @@ class Camera:
     def __getitem__(self, index) -> Camera:
         """The camera(s) at `index` of the leading axis."""
         return jax.tree.map(lambda a: a[index], self)
+
+    def __len__(self) -> int:
+        """Number of cameras along the leading axis. Raises TypeError for a single camera."""
+        if self.world_to_camera.ndim < 3:
+            raise TypeError("a single camera has no length: give it a leading axis to make a batch of one")
+        return self.world_to_camera.shape[0]
+
+    def __iter__(self) -> Iterator[Camera]:
+        """Goes over the cameras of the leading axis. Raises TypeError for a single camera."""
+        return (self[index] for index in range(len(self)))
 
     @property
     def centres(self) -> Array:

@@ -22,6 +22,10 @@ DIM, SHINE = 0.35, 0.12
 """what is left of the grey of what no text has lit, and the part of white in what one has"""
 FAR = 0.75
 """part of the cameras that stand nearer"""
+PARALLEL = 1e-6
+"""part of a length below which what is left of it across a direction is rounding"""
+STEEPEST = 0.1
+"""radius of the way by its height over what it looks at, at least: from straight above nothing is upright"""
 WIDE, QUALITY = 480, 70
 """px of its longer side, at most twice that of the frames"""
 
@@ -64,22 +68,32 @@ def orbit(cameras: Camera, count: int) -> Camera:
     poses = np.asarray(cameras.world_to_camera, np.float64)
     eyes, forward = -np.einsum("tij,ti->tj", poses[:, :3, :3], poses[:, :3, 3]), poses[:, 2, :3]
     up = -poses[:, 1, :3].mean(0)
+    if np.linalg.norm(up) < PARALLEL:  # the cameras are rolled all ways
+        up = -poses[0, 1, :3]
     up /= np.linalg.norm(up)
     across = np.eye(3) - forward[:, :, None] * forward[:, None]
     target = np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0])[0]
     away = eyes - target
     lift = away @ up
     flat = away - lift[:, None] * up
-    first = flat[0] / np.linalg.norm(flat[0])
+    radii = np.linalg.norm(flat, axis=1)
+    # Cameras on the axis stand at no angle around it.
+    aside = flat[radii > PARALLEL * np.linalg.norm(away, axis=1)]
+    if not len(aside):
+        aside = np.eye(3)[[np.abs(up).argmin()]]
+        aside = aside - (aside @ up)[:, None] * up
+    first = aside[0] / np.linalg.norm(aside[0])
     second = np.cross(up, first)
-    angles = np.sort(np.arctan2(flat @ second, flat @ first))
+    angles = np.sort(np.arctan2(aside @ second, aside @ first))
     gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest, part = int(gaps.argmax()), np.arange(count) / count
     if gaps[widest] > WIDE_GAP:
         part = (2 * np.pi - gaps[widest]) / (2 * np.pi) * (0.5 - 0.5 * np.cos(2 * np.pi * part))
     turn = angles[(widest + 1) % len(angles)] + 2 * np.pi * part
     out = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
-    places = target + np.quantile(np.linalg.norm(flat, axis=1), FAR) * out + np.median(lift) * up
+    radius, height = np.quantile(radii, FAR), np.median(lift)
+    radius = max(radius, STEEPEST * abs(height)) or 1.0  # cameras that look around from one place have no distance
+    places = target + radius * out + height * up
     placed = np.stack([look_at(eye, target, up) for eye in places])
     lens = (np.full(count, np.asarray(a)[0], np.float32) for a in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
     return Camera(placed, *lens, width=cameras.width, height=cameras.height)

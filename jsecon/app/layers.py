@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jsecon.app.splat_page import regions_of
 from jsecon.numerics import sigmoid
+from jsecon.splat.project import usable
 from jsecon.splat.sh import C0
 from jsecon.types import LanguageField
 
@@ -28,11 +29,12 @@ class Layers:
 
     def __init__(self, server: Any, field: LanguageField):
         gaussians = field.gaussians
-        shape = [np.asarray(a) for a in (gaussians.means, gaussians.log_scales, gaussians.quaternions)]
-        sound = np.logical_and.reduce(np.isfinite(np.concatenate(shape, axis=1)), axis=1)
+        sound = np.asarray(usable(gaussians))
         finite = lambda a: np.where(sound[:, None], a, np.float32(1))
         sizes = np.exp(np.asarray(finite(gaussians.log_scales), np.float64))
-        self.scale = 1 / float(np.median(sizes[sound])) if sound.any() else 1.0
+        there = sizes[sound]
+        there = there[there > 0]  # a flat Gaussian has a size of 0 along its normal
+        self.scale = 1 / float(np.median(there)) if len(there) else 1.0
         """of the window's unit, per unit of the field"""
         self.photo = (255 * np.clip(0.5 + C0 * np.asarray(gaussians.sh)[:, 0], 0, 1)).astype(np.uint8)
         """(N, 3) colours as photographed, of degree 0."""

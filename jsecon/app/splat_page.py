@@ -103,7 +103,8 @@ def _packed(
     """The columns that the page reads, and the ends of the logarithms of sizes."""
     means = (np.asarray(gaussians.means, np.float64)[kept] - low) / np.maximum(high - low, 1e-12)
     sizes = np.asarray(gaussians.log_scales, np.float64)[kept]
-    least, most = (float(np.quantile(sizes, q)) for q in (0.001, 1.0)) if len(sizes) else (0.0, 1.0)
+    there = sizes[np.isfinite(sizes)]  # a flat Gaussian, of size 0, is packed as the least of them
+    least, most = (float(np.quantile(there, q)) for q in (0.001, 1.0)) if len(there) else (0.0, 1.0)
     span = max(most - least, 1e-6)
     turns = np.asarray(gaussians.quaternions, np.float64)[kept]
     turns = turns / np.maximum(np.linalg.norm(turns, axis=1, keepdims=True), 1e-12)

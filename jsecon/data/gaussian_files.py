@@ -36,6 +36,11 @@ def load_gaussians(path: str | Path) -> Gaussians:
     are turned back, (x, -y, -z) and (-x, -y, z), as by splat-transform; the others are not turned. Raises InputError on
     other formats, damaged files, numbers that are not finite, and where gsply is needed and not installed.
     """
+    return read_gaussians(path)[0]
+
+
+def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
+    """As `load_gaussians`, and sentences about what the file says that is not done."""
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in (*_GSPLY, ".splat", ".glb"):
@@ -47,12 +52,12 @@ def load_gaussians(path: str | Path) -> Gaussians:
     except OSError as error:
         raise InputError(path, why(error), _READ, "Check the path.") from error
     if kind == ".ply" and b"packed_position" not in head:
-        return load_ply(path)
+        return load_ply(path), ()
     if kind == ".glb":
-        return load_glb(path)
+        return load_glb(path), ()
     arrays = _read_splat(path) if kind == ".splat" else _read_by_gsply(path, kind)
     gaussians = sound(path, {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()})
-    return transform_gaussians(gaussians, SPZ_AXES) if kind == ".spz" else gaussians
+    return (transform_gaussians(gaussians, SPZ_AXES) if kind == ".spz" else gaussians), ()
 
 
 def save_gaussians(

@@ -25,6 +25,8 @@ from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked,
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
 from jsecon.language.shares import votes_of_rows
+from jsecon.splat.project import unusable_rows
+from jsecon.splat.sh import BANDS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT, VERSION = "jsecon-field", 1
@@ -72,11 +74,12 @@ _OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings")
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     """Writes `field` to `path`, whole or not at all. Equal fields give equal bytes.
 
-    Raises ValueError for arrays whose shapes disagree or that are not plain numbers, InputError where the folder cannot
-    be written.
+    Raises ValueError for what `load_field` would refuse: arrays whose shapes disagree, that are not plain numbers, or
+    that hold NaN or infinity. Log scales of -inf (flat Gaussians) and opacity logits of -inf and inf are kept: they can
+    be drawn. Raises InputError where the folder cannot be written.
     """
-    problem, arrays = _disagreement(field), {}
-    require(problem is None, "save_field", problem, "arrays of one N, R, d, E and T", "Build the field from one run.")
+    problem, arrays = _disagreement(field) or _oddity(field), {}
+    require(problem is None, "save_field", problem, "what load_field reads", "Build the field from one run.")
     tree = packed(field, "", arrays, lambda kind: kind.__name__ if kind in _RECORDS.values() else None)
     header = {"format": FORMAT, "version": VERSION, "field": tree}
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -186,11 +189,13 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
             continue
         name, column = jax.tree_util.keystr(place).lstrip("."), np.atleast_1d(np.asarray(leaf))
         for numbers in (column[first : first + _ROWS] for first in range(0, len(column), _ROWS)):
-            if (np.isnan(numbers) if name == "gaussians.opacity_logits" else ~np.isfinite(numbers)).any():
-                return f"{name} with numbers that are not finite"
+            own = name.removeprefix("gaussians.")
+            wrong = unusable_rows(own, numbers) if own != name else ~np.isfinite(numbers)
+            if wrong.any():
+                return f"{name} with numbers that are not finite{' or zero' if own == 'quaternions' else ''}"
             if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
                 return f"{name} with numbers of none of {sizes[name]}"
-    if field.gaussians.sh.shape[1] not in (1, 4, 9, 16):
+    if field.gaussians.sh.shape[1] not in BANDS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parsed_json(field.provenance), dict):

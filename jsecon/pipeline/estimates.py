@@ -112,9 +112,9 @@ def estimates(work: Work, steps: Sequence[Step], place: Mapping[str, Path], slow
     if "gaussians" not in running:
         gaussians = cache.load(place["gaussians"]).value.count
     elif options.gaussians is not None:
-        from jsecon.data.ply import load_ply
+        from jsecon.pipeline.scene_stages import given_gaussians
 
-        gaussians = load_ply(options.gaussians).count
+        gaussians = given_gaussians(options.gaussians)[0].count
     else:
         pixels = extent.size[0] * extent.size[1]
         most = options.gaussians_at_most or gaussians_for(pixels, steps=options.steps, minutes=options.minutes)

@@ -145,14 +145,13 @@ def _read(work: Work) -> Stage:
     trained = path.parent / "dataparser_transforms.json"
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
-        from jsecon.data.gaussian_files import load_gaussians
         from jsecon.data.nerfstudio import trained_to_source
         from jsecon.splat.transform import transform_gaussians
 
-        capture, found, notes = results["load"], load_gaussians(path), ()
+        capture, (found, notes) = results["load"], given_gaussians(path)
         if trained.is_file():
             found = transform_gaussians(found, np.linalg.inv(capture.to_source) @ trained_to_source(trained))
-            notes = (f"The Gaussians were carried back from nerfstudio's world by {trained.name}.",)
+            notes = (*notes, f"The Gaussians were carried back from nerfstudio's world by {trained.name}.",)
         check_overlap(found, capture.cameras[training_frames(capture)], str(path))
         return Outcome(found, notes=notes)
 
@@ -161,6 +160,16 @@ def _read(work: Work) -> Stage:
     return Stage(
         "gaussians", f"read from {path.name}", compute, after=("load",), given=given, files=path, left_out=left
     )
+
+
+def given_gaussians(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
+    """The Gaussians of a file, and what its reader has to say of them. Raises InputError where there is none."""
+    from jsecon.data.gaussian_files import read_gaussians
+
+    found, notes = read_gaussians(path)
+    if not found.count:
+        raise InputError(path, "the file holds no Gaussians", "at least one", "Export the scene again.")
+    return found, notes
 
 
 def _fitted(work: Work) -> Stage:

@@ -7,11 +7,13 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jsecon.errors import require_shape
+from jsecon.errors import require, require_shape
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, finite, normalize, sigmoid
 from jsecon.splat.fusion import stored, surely
+from jsecon.splat.sh import BANDS
 from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
 
@@ -24,6 +26,24 @@ def usable(gaussians: Gaussians) -> Bool[Array, " n"]:
     geometry = jnp.concatenate([gaussians.means, gaussians.quaternions], axis=1)
     sizes = jnp.isnan(gaussians.log_scales) | jnp.isposinf(gaussians.log_scales)
     return jnp.isfinite(geometry).all(1) & ~sizes.any(1) & ~jnp.isnan(gaussians.opacity_logits)
+
+
+def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
+    """(M,) rows of one of the fields of `Gaussians` that no file holds, on the host: what `usable` excludes, colours
+    that are not finite, and quaternions of length 0.
+
+    Args:
+      name: The field, "log_scales" for example.
+      numbers: (M, ...) its values.
+    """
+    if name == "opacity_logits":
+        wrong = np.isnan(numbers)
+    elif name == "log_scales":
+        wrong = np.isnan(numbers) | np.isposinf(numbers)
+    else:
+        wrong = ~np.isfinite(numbers)
+    rows = wrong.reshape(len(numbers), -1).any(axis=1)
+    return rows | (numbers == 0).all(axis=1) if name == "quaternions" else rows
 
 
 def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None = None) -> Int[Array, ""]:
@@ -112,11 +132,28 @@ def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
 
 
 def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
-    """Raises ValueError where the arrays of `gaussians` disagree or `camera` is a batch."""
+    """Raises ValueError where the arrays of `gaussians` disagree, spherical harmonics included, or `camera` is a
+    batch."""
+    check_gaussians(gaussians)
+    _check_camera(camera)
+
+
+def check_gaussians(gaussians: Gaussians) -> None:
+    """Raises ValueError where the arrays of `gaussians` disagree, or its spherical harmonics are of no whole degree."""
+    _check_geometry(gaussians)
+    require_shape("gaussians.sh", gaussians.sh, (gaussians.count, "K", 3), "Give one row for each of the means.")
+    shape = tuple(gaussians.sh.shape)
+    require(shape[1] in BANDS, "gaussians.sh", shape, "(N, K, 3) with K of 1, 4, 9 or 16", "Pad it with zeros.")
+
+
+def _check_geometry(gaussians: Gaussians) -> None:
     require_shape("gaussians.means", gaussians.means, ("N", 3), "Give one centre per Gaussian.")
     for name, rest in (("log_scales", (3,)), ("quaternions", (4,)), ("opacity_logits", ())):
         expected = gaussians.count, *rest
         require_shape(f"gaussians.{name}", getattr(gaussians, name), expected, "Give one row for each of the means.")
+
+
+def _check_camera(camera: Camera) -> None:
     remedy = "Give a single camera: index the batch (cameras[t]) or use jax.vmap over it."
     require_shape("camera.world_to_camera", camera.world_to_camera, (4, 4), remedy)
 
@@ -127,7 +164,8 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     Differentiable in every array of both. Raises ValueError on shapes that disagree. Gaussians that are not usable
     (NaN, infinite) come back invisible, with gradient zero; before a camera that is not finite, all do.
     """
-    check_shapes(gaussians, camera)
+    _check_geometry(gaussians)  # colours have no part in it: planning leaves them out
+    _check_camera(camera)
     gaussians, camera, drawn = _guarded(*jax.tree.map(jnp.asarray, (gaussians, camera)))
     w2c = camera.world_to_camera
     width, height = camera.width, camera.height

@@ -16,9 +16,13 @@ C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.37317633259
       1.445305721320277, -0.5900435899266435)  # fmt: skip
 
 
+BANDS = (1, 4, 9, 16)
+"""numbers of coefficients that spherical harmonics of degree 0, 1, 2 and 3 have"""
+
+
 def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]:
     """The first `bands` (1, 4, 9 or 16) basis functions at unit `directions`."""
-    require(bands in (1, 4, 9, 16), "bands", bands, "1, 4, 9 or 16", "Pad sh to a whole degree.")
+    require(bands in BANDS, "bands", bands, "1, 4, 9 or 16", "Pad sh to a whole degree.")
     return jnp.stack(_basis(directions[:, 0], directions[:, 1], directions[:, 2], bands), axis=-1)
 
 
@@ -66,6 +70,7 @@ def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]
     its Gaussian is hidden anyway, and its gradient must not reach the camera.
     """
     bands = gaussians.sh.shape[1]
+    require(bands in BANDS, "gaussians.sh", gaussians.sh.shape, "(N, 1, 4, 9 or 16, 3)", "Pad sh to a whole degree.")
     sound = jnp.isfinite(gaussians.sh).all((1, 2))[:, None]
     sh = jnp.where(sound[:, :, None], gaussians.sh, 0.0)
     if bands == 1 or not len(sh):

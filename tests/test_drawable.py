@@ -1,0 +1,121 @@
+"""Whatever can be drawn can be stored, and nothing else: one check for the renderer, for files and for fields."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_field import make_field
+
+import jsecon
+from jsecon.splat.project import check_shapes, usable
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    return jax.tree.map(np.asarray, make_field(scene, cameras)[0])
+
+
+def with_coefficients(scene, count):
+    sh = np.resize(scene.sh, (scene.count, count, 3))
+    return dataclasses.replace(scene, sh=sh)
+
+
+def changed(scene, **columns):
+    """The scene with the first Gaussian's numbers replaced."""
+    given = {}
+    for name, value in columns.items():
+        column = np.array(getattr(scene, name))
+        column[0] = value
+        given[name] = column
+    return dataclasses.replace(scene, **given)
+
+
+@pytest.mark.parametrize("count", [0, 2, 3, 5, 25])
+def test_harmonics_of_no_whole_degree_are_refused_everywhere(scene, camera, field, tmp_path, count):
+    odd = with_coefficients(scene, count)
+    ways = [
+        lambda: check_shapes(odd, camera),
+        lambda: jsecon.render_rgb(odd, camera),
+        lambda: jax.jit(jsecon.render_rgb)(odd, camera),
+        lambda: jsecon.render(odd, camera, np.ones((odd.count, 1), np.float32)),
+        lambda: jsecon.save_field(tmp_path / "f.npz", dataclasses.replace(field, gaussians=odd)),
+        *(lambda ending=e: jsecon.save_gaussians(tmp_path / f"a.{ending}", odd) for e in ("ply", "spz", "glb")),
+    ]
+    for way in ways:
+        with pytest.raises(ValueError, match="sh|harmonics"):
+            way()
+    assert not list(tmp_path.iterdir())
+
+
+FLAT = {"log_scales": [-1.5, -1.0, -np.inf]}
+HELD = {
+    "flat": FLAT,
+    "a point": {"log_scales": -np.inf},
+    "opaque": {"opacity_logits": np.inf},
+    "transparent": {"opacity_logits": -np.inf},
+}
+REFUSED = {
+    "nowhere": {"means": np.nan},
+    "far": {"means": np.inf},
+    "endless": {"log_scales": np.inf},
+    "no size": {"log_scales": np.nan},
+    "no turn": {"quaternions": 0.0},
+    "a turn that is not finite": {"quaternions": np.nan},
+    "no opacity": {"opacity_logits": np.nan},
+    "no colour": {"sh": np.nan},
+}
+
+
+@pytest.mark.parametrize("how", HELD)
+def test_what_can_be_drawn_comes_back_from_fields_and_files(scene, camera, field, tmp_path, how):
+    odd = changed(scene, **HELD[how])
+    assert bool(usable(odd).all())
+    drawn = jsecon.render_rgb(odd, camera).features
+    assert np.isfinite(np.asarray(drawn)).all()
+    jsecon.save_field(tmp_path / "f.npz", dataclasses.replace(field, gaussians=odd))
+    jsecon.check_field(tmp_path / "f.npz")
+    jsecon.save_gaussians(tmp_path / "a.ply", odd)
+    for found in (jsecon.load_field(tmp_path / "f.npz").gaussians, jsecon.load_gaussians(tmp_path / "a.ply")):
+        jax.tree.map(np.testing.assert_array_equal, found, odd)
+    for ending in ("glb", "spz"):
+        jsecon.save_gaussians(tmp_path / f"a.{ending}", odd)
+        found = jsecon.load_gaussians(tmp_path / f"a.{ending}")
+        np.testing.assert_allclose(jsecon.render_rgb(found, camera).features, drawn, atol=0.05)
+
+
+def test_a_flat_gaussian_is_one_of_no_thickness_in_value_and_gradient(scene, camera):
+    flat, thin = changed(scene, **FLAT), changed(scene, log_scales=[-1.5, -1.0, np.log(1e-6)])
+    loss = jax.jit(jax.value_and_grad(lambda g: (jsecon.render_rgb(g, camera).features ** 2).sum(), allow_int=True))
+    (value, gradient), (expected, slopes) = (loss(jax.tree.map(jnp.asarray, g)) for g in (flat, thin))
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        size = np.abs(getattr(slopes, name)).max()
+        np.testing.assert_allclose(getattr(gradient, name), getattr(slopes, name), atol=1e-4 * size)
+
+
+@pytest.mark.parametrize("how", REFUSED)
+def test_what_load_refuses_is_not_written(scene, field, tmp_path, how):
+    odd = changed(scene, **REFUSED[how])
+    (name,) = REFUSED[how]
+    with pytest.raises(ValueError, match=name):
+        jsecon.save_field(tmp_path / "f.npz", dataclasses.replace(field, gaussians=odd))
+    for ending in ("ply", "spz", "glb"):
+        with pytest.raises(jsecon.InputError, match=name):
+            jsecon.save_gaussians(tmp_path / f"a.{ending}", odd)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_batch_of_cameras_is_gone_over_and_a_single_one_is_not(cameras):
+    for batch in (cameras, jax.tree.map(jnp.asarray, cameras)):
+        assert len(batch) == 4
+        views = list(batch)
+        assert len(views) == 4
+        for t, view in enumerate(views):
+            np.testing.assert_array_equal(view.world_to_camera, cameras.world_to_camera[t])
+            assert (float(view.fx), view.width) == (float(cameras.fx[t]), cameras.width)
+        for act in (iter, len):
+            with pytest.raises(TypeError, match="single camera"):
+                act(batch[0])
+    assert [len(part) for part in jax.tree.map(lambda a: np.stack([a, a]), cameras)] == [4, 4]
