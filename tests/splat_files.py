@@ -51,8 +51,8 @@ def _three(values: np.ndarray) -> np.ndarray:
     return _bits(x, 11) << 21 | _bits(y, 10) << 11 | _bits(z, 11)
 
 
-def compressed_ply(arrays: dict) -> bytes:
-    """SuperSplat's: 256 Gaussians share the bounds of places, sizes and colours."""
+def compressed_ply(arrays: dict, *, colours: bool = True) -> bytes:
+    """SuperSplat's: 256 Gaussians share the bounds of places, sizes and, but in version 1, colours."""
     count, rest = len(arrays["means"]), arrays["sh"][:, 1:]
     colour = 0.5 + C0 * arrays["sh"][:, 0]
     chunks, vertices = [], np.zeros((count, 4), "<u4")
@@ -60,6 +60,9 @@ def compressed_ply(arrays: dict) -> bytes:
         part, bounds, packed = slice(start, start + 256), [], []
         for values in (arrays["means"][part], arrays["log_scales"][part], colour[part]):
             low, high = values.min(0), values.max(0)
+            if values.shape == colour[part].shape and not colours and len(packed) == 2:
+                packed.append(values)
+                continue
             bounds += [low, high]
             packed.append((values - low) / np.where(high > low, high - low, 1))
         chunks.append(np.concatenate(bounds))
@@ -72,7 +75,7 @@ def compressed_ply(arrays: dict) -> bytes:
         vertices[part, 3] = red << 24 | green << 16 | blue << 8 | alpha
     ends = [
         f"{end}{kind}_{a}"
-        for kind, axes in (("", "xyz"), ("_scale", "xyz"), ("", "rgb"))
+        for kind, axes in (("", "xyz"), ("_scale", "xyz"), ("", "rgb"))[: 3 if colours else 2]
         for end in ("min", "max")
         for a in axes
     ]
@@ -88,11 +91,17 @@ def compressed_ply(arrays: dict) -> bytes:
     return "\n".join([*lines, "end_header\n"]).encode() + body
 
 
-def _spz_sections(arrays: dict, version: int, fraction: int) -> list[bytes]:
-    fixed = np.round(arrays["means"] * RUB * 2**fraction).astype("<i4")
-    wxyz = arrays["quaternions"] * [1, *RUB]
-    xyzw = np.roll(wxyz, -1, axis=1)
-    if version == 2:
+def _signs(basis: int, axes: np.ndarray) -> np.ndarray:
+    """(K - 1,) of the harmonics of degree 1, y, z, x, where axes change their signs."""
+    return np.array([axes[1], axes[2], axes[0]][: basis - 1])
+
+
+def _spz_sections(arrays: dict, version: int, fraction: int, axes: np.ndarray) -> list[bytes]:
+    places = arrays["means"] * axes
+    fixed = np.round(places * 2**fraction).astype("<i4")
+    about = np.array([axes[1] * axes[2], axes[0] * axes[2], axes[0] * axes[1]])  # a turn's axis, mirrored or not
+    xyzw = np.roll(arrays["quaternions"] * [1, *about], -1, axis=1)
+    if version < 3:
         upper = xyzw * np.sign(xyzw[:, 3:])
         turns = np.round((upper[:, :3] + 1) * 127.5).astype("u1").tobytes()
     else:
@@ -100,10 +109,9 @@ def _spz_sections(arrays: dict, version: int, fraction: int) -> list[bytes]:
         sizes = np.round(np.abs(others) * np.sqrt(2) * 511).astype(np.uint32)
         a, b, c = (sizes | (others < 0).astype(np.uint32) << 9).T
         turns = (largest.astype(np.uint32) << 30 | a << 20 | b << 10 | c).astype("<u4").tobytes()
-    signs = np.array([RUB[1], RUB[2], RUB[0]])[:, None]  # of the harmonics of degree 1: y, z, x
-    rest = np.round(arrays["sh"][:, 1:] * signs * 128 + 128) if arrays["sh"].shape[1] > 1 else np.zeros(0)
+    rest = np.round(arrays["sh"][:, 1:] * _signs(arrays["sh"].shape[1], axes)[:, None] * 128 + 128)
     return [
-        fixed.view("u1").reshape(len(fixed), 3, 4)[:, :, :3].tobytes(),
+        places.astype("<f2").tobytes() if version == 1 else fixed.view("u1").reshape(-1, 3, 4)[:, :, :3].tobytes(),
         np.round(opacity(arrays) * 255).astype("u1").tobytes(),
         np.clip(np.round((arrays["sh"][:, 0] * 0.15 + 0.5) * 255), 0, 255).astype("u1").tobytes(),
         np.round((arrays["log_scales"] + 10) * 16).astype("u1").tobytes(),
@@ -112,20 +120,35 @@ def _spz_sections(arrays: dict, version: int, fraction: int) -> list[bytes]:
     ]
 
 
-def spz(arrays: dict, version: int, *, fraction: int = 12) -> bytes:
-    """Niantic's, of degree 0 or 1: y up, one gzip stream (versions 2 and 3) or one zstd stream for each section (4)."""
-    count, degree = len(arrays["means"]), {1: 0, 4: 1}[arrays["sh"].shape[1]]
-    sections = _spz_sections(arrays, version, fraction)
+def spz(
+    arrays: dict,
+    version: int,
+    *,
+    fraction: int = 12,
+    axes: np.ndarray = RUB,
+    flags: int = 0,
+    records: bytes = b"",
+    degree: int | None = None,
+) -> bytes:
+    """Niantic's, of degree 0 or 1: one gzip stream (versions 1 to 3) or one zstd stream for each section (4).
+
+    `axes`: the signs of x, y, z between a .ply's axes and those that the numbers are stored in. `records` stand behind
+    the numbers (1 to 3) or the header (4); `degree` is announced in place of the true one.
+    """
+    count = len(arrays["means"])
+    degree = {1: 0, 4: 1}[arrays["sh"].shape[1]] if degree is None else degree
+    sections = _spz_sections(arrays, version, fraction, axes)
+    flags |= 2 if records else 0
     if version < 4:
-        return gzip.compress(
-            struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, fraction, 0, 0) + b"".join(sections)
-        )
+        head = struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, fraction, flags, 0)
+        return gzip.compress(head + b"".join(sections) + records)
     import zstandard
 
     streams = [(zstandard.compress(section), len(section)) for section in sections if section]
-    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, fraction, 0, len(streams), 32)
+    begin = 32 + len(records)
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", version, count, degree, fraction, flags, len(streams), begin)
     table = b"".join(struct.pack("<QQ", len(stream), size) for stream, size in streams)
-    return head + table + b"".join(stream for stream, _ in streams)
+    return head + records + table + b"".join(stream for stream, _ in streams)
 
 
 def _webp(pixels: np.ndarray) -> bytes:

@@ -162,7 +162,7 @@ def test_spoilt_files_are_refused(tmp_path, name):
 def test_a_compressed_ply_with_too_few_chunks(tmp_path):
     whole = splat_files.compressed_ply(SCENE).replace(b"element chunk 3", b"element chunk 2")
     (tmp_path / "a.ply").write_bytes(whole)
-    with refused("a.ply", "2 chunks for 600 Gaussians", "splat-transform"):
+    with refused("a.ply", "2 chunks for 600 Gaussians"):
         load_gaussians(tmp_path / "a.ply")
 
 
@@ -186,6 +186,8 @@ def test_a_sog_with_a_short_codebook(tmp_path):
         ("scene.ksplat", "npx @playcanvas/splat-transform scene.ksplat scene.ply"),
         ("meta.json", "npx @playcanvas/splat-transform meta.json meta.ply"),
         ("scene", "ends in nothing"),
+        ("scene.gltf", "one .glb file"),
+        ("scene.obj", "Export the scene as a .ply"),
     ],
 )
 def test_other_formats_say_what_to_run(tmp_path, name, says):
@@ -200,11 +202,13 @@ def test_missing_files_endings_and_packages(tmp_path, monkeypatch):
             load_gaussians(tmp_path / name)
     with refused("scene.sog", ".ply or .spz or .glb", "splat-transform"):
         save_gaussians(tmp_path / "scene.sog", gaussians(SCENE))
-    (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, 3))
+    (tmp_path / "a.sog").write_bytes(splat_files.sog(PLAIN))
     monkeypatch.setattr(gaussian_files.importlib.util, "find_spec", lambda name: None)
     with refused("no package gsply", "pip install 'jsecon[formats]'"):
-        load_gaussians(tmp_path / "a.spz")
-    save_gaussians(tmp_path / "b.spz", gaussians(SCENE))  # which takes no package
+        load_gaussians(tmp_path / "a.sog")
+    for name in ("three.spz", "a.compressed.ply", "a.splat"):  # which take no package
+        (tmp_path / name).write_bytes(FILES[name][0](FILES[name][1]))
+        assert load_gaussians(tmp_path / name).count == 600
     save_ply(tmp_path / "a.ply", gaussians(SCENE))
     assert load_gaussians(tmp_path / "a.ply").count == 600
 
@@ -213,10 +217,13 @@ def test_a_splat_without_size_or_turn(tmp_path):
     whole = bytearray(splat_files.splat(PLAIN))
     whole[12:16] = bytes(4)
     (tmp_path / "a.splat").write_bytes(whole)
-    with refused("1 Gaussians of 600 whose log_scales"):
+    assert np.isneginf(load_gaussians(tmp_path / "a.splat").log_scales[0, 0])  # flat
+    whole[12:16] = np.float32(-1).tobytes()
+    (tmp_path / "a.splat").write_bytes(whole)
+    with refused("log_scales of 1 of 600"):
         load_gaussians(tmp_path / "a.splat")
     whole = bytearray(splat_files.splat(PLAIN))
     whole[28:32] = bytes([128] * 4)
     (tmp_path / "a.splat").write_bytes(whole)
-    with refused("without rotation"):
+    with refused("quaternions of 1 of 600", "zero"):
         load_gaussians(tmp_path / "a.splat")

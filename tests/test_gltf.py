@@ -114,6 +114,10 @@ def rewritten(file, change):
     file.write_bytes(head + text + behind)
 
 
+def extension(told):
+    return told["meshes"][0]["primitives"][0]["extensions"][NAME]
+
+
 def test_other_writers_ways(tmp_path):
     """Two primitives, under nodes of which one turns and the other is a matrix; rows apart; opacities of 8 bits."""
     given, turn = gaussians(scene(30, 4)), Rotation.from_rotvec([0.1, -0.5, 0.3])
@@ -148,13 +152,27 @@ def test_other_writers_ways(tmp_path):
         (lambda told: told["accessors"][0].update(sparse={}), "sparse"),
         (lambda told: told["bufferViews"][0].update(byteOffset=-4), "from -4 on"),
         (lambda told: told["bufferViews"][0].update(byteStride=0), "rows of 0 bytes"),
-        (lambda told: told["meshes"][0]["primitives"][0]["extensions"].clear(), "no primitive with the extension"),
-        (lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"), "is missing"),
+        (lambda told: told["meshes"][0]["primitives"][0]["extensions"].clear(), "no primitive of its scene"),
+        (
+            lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"),
+            f"no attribute {NAME}:SCALE",
+        ),
         (lambda told: told["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "3 coeff"),
-        (lambda told: told["nodes"][0].update(children=[0]), "node 0 twice"),
-        (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "similarity"),
-        (lambda told: told["meshes"][0]["primitives"][0]["extensions"][NAME].update(kernel="cube"), "kernel cube"),
+        (lambda told: told["nodes"][0].update(children=[0]), "node 0 is in its scene twice"),
+        (lambda told: told["nodes"][0].update(scale=[1, 2, 1]), "node 0 scales its axes unequally, by 1, 2, 1"),
+        (lambda told: told["nodes"][0].update(scale=[1, 1, -1]), "mirrors"),
+        (lambda told: told["nodes"][0].update(scale=[0, 0, 0]), "by 0"),
+        (lambda told: told["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "axes"),
+        (lambda told: extension(told).update(colorSpace="lin_rec709_display"), "lin_rec709_display (linear light)"),
+        (lambda told: extension(told).update(projection="fisheye"), "projection of its Gaussians is fisheye"),
+        (lambda told: extension(told).update(extensions={"EXT_x": {}}), "use the extension EXT_x"),
+        (lambda told: told["accessors"][2].update(componentType=5121), "not normalised"),
+        (
+            lambda told: told["meshes"][0]["primitives"][0]["extensions"][NAME].update(kernel="cube"),
+            "kernel of its Gaussians is cube",
+        ),
         (lambda told: told["accessors"][4].update(bufferView=0, byteOffset=0), "not finite"),
+        (lambda told: told.update(extensionsRequired=["KHR_materials_unlit", NAME, "KHR_x"]), "extension KHR_x"),
     ],
 )
 def test_what_is_none_or_not_known(tmp_path, change, says):
@@ -195,7 +213,7 @@ def test_codes_and_regions_are_the_applications(tmp_path, size):
 
 
 def test_nothing_to_write_and_nowhere_to_write_it(tmp_path, monkeypatch):
-    with refused("a.glb", "no Gaussians"):
+    with refused("a.glb", "no Gaussians to write"):
         save_glb(tmp_path / "a.glb", gaussians(scene(0, 1)))
     (tmp_path / "file").write_text("in the way")
     with monkeypatch.context() as patched, refused("a.glb", "at most 4 GiB"):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.ply_file import ORDERS, TYPES, bad_ply, opened
+from jsecon.data.ply_file import ORDERS, bad_ply, opened
 from jsecon.files import written_whole
 
 
@@ -15,12 +15,13 @@ def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     on any other, and on indices beyond the vertices.
     """
     path = Path(path)
-    data, form, elements, offset = opened(path)
+    data, header = opened(path)
+    form, elements, offset = header.form, header.elements, header.start
     names = [element.name for element in elements]
     if form == "ascii" or "face" not in names or "vertex" not in names:
         raise bad_ply(path, f"{form} elements {', '.join(names) or 'none'}", "binary elements vertex and face")
     before, face = elements[: names.index("face")], elements[names.index("face")]
-    kinds = _list_types(data[: data.find(b"end_header")])
+    kinds = [kind for element in elements for kind in element.lists.values()]
     if not all(element.fixed for element in before) or len(kinds) != 1 or face.fixed:
         raise bad_ply(path, "list properties elsewhere than in one property of the faces", "faces with one list")
     offset += sum(element.count * element.dtype(ORDERS[form]).itemsize for element in before)
@@ -45,12 +46,6 @@ def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if vertices.min() < 0 or vertices.max() >= count:
         raise bad_ply(path, f"a face with vertex {vertices.max()}", f"vertices 0 to {count - 1}")
     return vertices, {name: table[name] for name, kind in face.fields if kind != "list"}
-
-
-def _list_types(header: bytes) -> list[tuple[str, str]]:
-    """(type of the length, type of the entries) of each list property of the header."""
-    words = (line.split() for line in header.decode("ascii", "replace").splitlines())
-    return [(TYPES[w[2]], TYPES[w[3]]) for w in words if w[:2] == ["property", "list"] and len(w) == 5]
 
 
 def write_mesh(

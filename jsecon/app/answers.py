@@ -106,7 +106,7 @@ def write_answer(
 def save_scene(field: LanguageField, file: Path) -> None:
     """Writes all Gaussians in the capture files' own world, in blocks: a mapped field need not fit into memory. With
     their codes and regions where the file is a .glb."""
-    own = {"codes": field.codes, "regions": _regions(field)} if file.suffix == ".glb" else {}
+    own = {"codes": field.codes, "regions": _regions(field)} if file.suffix.lower() == ".glb" else {}
     save_gaussians(file, field.gaussians, similarity=field.to_source, **own)
 
 

@@ -1,8 +1,8 @@
-"""Gaussians and point clouds as .ply files, in the layout of INRIA's 3D Gaussian Splatting."""
+"""Gaussians and point clouds as .ply files, in the layout of INRIA's 3D Gaussian Splatting and its relatives'."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jsecon.data.ply_file import bad_ply, read_vertices, vertex_blocks
-from jsecon.errors import require_shape
+from jsecon.errors import InputError, require_shape
 from jsecon.files import written_whole
 from jsecon.numerics import sane
+from jsecon.splat.project import check_gaussians, unusable_rows
 from jsecon.splat.transform import transformed_blocks
 from jsecon.types import Array, Gaussians
 
@@ -20,10 +21,11 @@ SH_DC = 0.5 / np.sqrt(np.pi)
 """the constant basis function of spherical harmonics: rgb = 0.5 + SH_DC f_dc"""
 GREY = 128
 """colour of points whose file has none"""
-_POSITION, _OPACITY = ("x", "y", "z"), ("opacity",)
+_POSITION, _OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blue")
 _DC, _SCALE = (tuple(f"{kind}_{axis}" for axis in range(3)) for kind in ("f_dc", "scale"))
 _ROTATION = tuple(f"rot_{axis}" for axis in range(4))
-_GAUSSIAN = (*_POSITION, *_DC, *_OPACITY, *_SCALE, *_ROTATION)
+_FILTERS = ("filter_3D", "filter_3d")
+"""standard deviation of Mip-Splatting's 3D filter, world units: of its own training, and of other programs"""
 _ROWS = 1 << 18
 """Gaussians read at a time"""
 _SIZES = {"means": 3, "log_scales": 3, "quaternions": 4}
@@ -45,55 +47,115 @@ def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str]) -> np.nda
 
 
 def load_ply(path: str | Path) -> Gaussians:
-    """Gaussians from a .ply in INRIA's layout (graphdeco-inria/gaussian-splatting, gaussian_model.py), binary or ascii;
-    N may be 0.
+    """Reads Gaussians from a .ply in INRIA's layout (graphdeco-inria/gaussian-splatting, gaussian_model.py).
 
     The degree of the spherical harmonics follows from the number of f_rest properties (0, 9, 24, 45; channel-major).
-    Other properties (normals, OpenGaussian's ins_feat, Gaussian Grouping's obj_dc) are ignored. Read in blocks: a
-    binary file is never in memory as a whole beside the arrays. Raises InputError on a
-    compressed file, missing properties, a file cut short, numbers that are not finite (but infinite opacity logits,
-    opacities of exactly 0 or 1, are kept), and zero quaternions.
+    Also read, each as the program that wrote it draws it:
+
+    - 2D Gaussians: without scale_2, or with -inf there, they are flat.
+    - Mip-Splatting: `filter_3D` is fused into sizes and opacities, as its own create_fused_ply.py does.
+    - Colours red, green, blue in place of f_dc (nerfstudio's --ply-color-mode rgb): whole numbers of 8 or 16 bits, or
+      floats (0..1, or 0..255 where any is above 1).
+
+    Other properties (normals, OpenGaussian's ins_feat, Gaussian Grouping's obj_dc) and other elements are passed over.
+    Text, either order of bytes and any type of number are read. A binary file is read in blocks and never is in memory
+    as a whole beside the arrays, unless it holds lists before its vertices or in them.
+
+    Args:
+      path: The .ply file.
+
+    Returns:
+      Its Gaussians, float32; N may be 0.
+
+    Raises:
+      InputError: The file is compressed or cut short, a property is missing, a number is NaN or infinite (other than
+        log scales of -inf and opacity logits of -inf and inf, which can be drawn), or a quaternion is zero.
     """
     path = Path(path)
     count, names, blocks = vertex_blocks(path, _ROWS)
-    if missing := [name for name in _GAUSSIAN if name not in names]:
-        remedy = "A plain point cloud or a 2D Gaussian file won't do: export 3D Gaussians as an uncompressed PLY."
-        raise bad_ply(path, f"no properties {', '.join(missing)}", _WANTED, remedy)
+    scales = _SCALE[:2] if "scale_2" not in names else _SCALE
+    colours = _RGB if not any(name in names for name in _DC) and all(name in names for name in _RGB) else _DC
+    if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
+        remedy = "A plain point cloud won't do: export the trained Gaussians as an uncompressed .ply."
+        raise bad_ply(path, f"its vertices have no {', '.join(missing)}", _WANTED, remedy)
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in _REST_COUNTS or any(name not in names for name in rest_names):
         wanted = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
-        raise bad_ply(path, f"{rest} properties f_rest", wanted)
+        remedy = "Export the file again, with harmonics of degree 3 or less."
+        raise bad_ply(path, f"its vertices have {rest} properties f_rest", wanted, remedy)
+    filters = [name for name in _FILTERS if name in names][:1]
     arrays = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
     arrays |= {"opacity_logits": np.empty(count, np.float32), "sh": np.empty((count, 1 + rest // 3, 3), np.float32)}
-    first = 0
+    first, unit = 0, 1.0
     for vertices in blocks:
         own, first = slice(first, first + len(vertices)), first + len(vertices)
         arrays["means"][own] = _columns(vertices, _POSITION)
-        arrays["log_scales"][own] = _columns(vertices, _SCALE)
+        arrays["log_scales"][own, 2] = -np.inf
+        arrays["log_scales"][own, : len(scales)] = _columns(vertices, scales)
         arrays["quaternions"][own] = _columns(vertices, _ROTATION)
         arrays["opacity_logits"][own] = _columns(vertices, _OPACITY)[:, 0]
-        arrays["sh"][own, 0] = _columns(vertices, _DC)
+        arrays["sh"][own, 0] = _columns(vertices, colours)
         others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3)
         arrays["sh"][own, 1:] = others.transpose(0, 2, 1)
+        if filters:
+            _fuse(path, {name: arrays[name][own] for name in arrays}, _columns(vertices, filters)[:, 0])
+        if colours == _RGB:
+            unit = max(unit, _unit(vertices))
+    if colours == _RGB:
+        arrays["sh"][:, 0] = (arrays["sh"][:, 0].astype(np.float64) / unit - 0.5) / SH_DC
     return sound(path, arrays)
 
 
+def _unit(vertices: np.ndarray) -> float:
+    """The number that stands for the brightest red, green or blue: of these vertices, where they are floats."""
+    kinds = [vertices.dtype[name] for name in _RGB]
+    if all(kind.kind == "f" for kind in kinds):
+        return 255.0 if max(np.nanmax(vertices[name], initial=0) for name in _RGB) > 1 else 1.0
+    return 65535.0 if max(kind.itemsize for kind in kinds) == 2 else 255.0
+
+
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")
+def _fuse(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> None:
+    """Widens Gaussians, in place, by a filter of the given standard deviations (M,): sizes become sqrt(s^2 + f^2),
+    opacities shrink by the ratio of the volumes (Mip-Splatting, get_opacity_with_3D_filter)."""
+    if not (np.isfinite(deviation) & (deviation >= 0)).all():
+        raise bad_ply(path, "numbers of filter_3D are negative or not finite", "standard deviations", "Train again.")
+    before = arrays["log_scales"].astype(np.float64)
+    after = 0.5 * np.logaddexp(2 * before, 2 * np.log(deviation.astype(np.float64))[:, None])
+    shrink = np.exp(np.where(after == before, 0.0, before - after).sum(axis=1))
+    opacity = shrink / (1 + np.exp(-arrays["opacity_logits"].astype(np.float64)))
+    arrays["log_scales"][:] = after
+    arrays["opacity_logits"][:] = np.log(opacity) - np.log1p(-opacity)
+
+
 def sound(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
-    """The Gaussians of a file's float32 arrays, by their fields. Raises InputError on numbers that are not finite (but
-    infinite opacity logits, opacities of exactly 0 or 1, are kept), and on zero quaternions."""
-    clean = "Remove these Gaussians (SuperSplat drops them on loading), or train again."
-    for name, array in arrays.items():
-        wrong = np.isnan(array) if name == "opacity_logits" else ~np.isfinite(array)
-        rows = np.asarray(wrong.any(axis=tuple(range(1, wrong.ndim))))
-        if rows.any():
-            found = f"{rows.sum()} Gaussians of {len(rows)} whose {name} are not finite (the first: {rows.argmax()})"
-            raise bad_ply(path, found, "finite numbers", clean)
-    zero = (arrays["quaternions"] == 0).all(axis=1)
-    if zero.any():
-        found = f"{zero.sum()} Gaussians of {len(zero)} without rotation (the first: {zero.argmax()})"
-        raise bad_ply(path, found, "quaternions that are not 0", clean)
+    """The Gaussians of a file's float32 arrays, by their fields. Raises InputError where one of them cannot be drawn:
+    see `unusable_rows`."""
+    _require_usable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
     return Gaussians(**{name: jnp.asarray(array) for name, array in arrays.items()})
+
+
+def usable_blocks(
+    path: str | Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
+) -> Iterator[tuple[slice, Gaussians]]:
+    """`transformed_blocks` of Gaussians that are to be written to a file. Raises ValueError where their shapes
+    disagree, and InputError where `load_gaussians` would refuse them."""
+    check_gaussians(gaussians)
+    for own, part in transformed_blocks(gaussians, similarity):
+        columns = {name: getattr(part, name) for name in (*_SIZES, "opacity_logits", "sh")}
+        _require_usable(path, columns, own.start, "Remove these Gaussians first.")
+        yield own, part
+
+
+def _require_usable(path: str | Path, arrays: Mapping[str, np.ndarray], first: int, remedy: str) -> None:
+    """Raises InputError where Gaussians, counted from `first`, cannot be drawn."""
+    for name, array in arrays.items():
+        rows = unusable_rows(name, array)
+        if rows.any():
+            what = "are not finite" if name != "quaternions" else "are not finite or zero"
+            found = f"{name} of {rows.sum()} of {len(rows)} Gaussians {what} (the first: {first + rows.argmax()})"
+            raise InputError(path, found, "numbers that can be drawn", remedy)
 
 
 def save_ply(
@@ -110,8 +172,10 @@ def save_ply(
 
     Float32 Gaussians come back bit by bit from `load_ply`. `rgb` (0..1) replaces the spherical harmonics by one
     colour a Gaussian, for showing codes or similarities; viewers such as SuperSplat open either. A selection is
-    written by giving its subset. Raises InputError where the folder cannot be written.
+    written by giving its subset. Raises ValueError where shapes disagree, InputError where a Gaussian cannot be drawn
+    (`load_ply` would refuse it) and where the folder cannot be written.
     """
+    check_gaussians(gaussians)
     count = gaussians.count
     if rgb is not None:
         require_shape("rgb", rgb, (count, 3), "Give one colour per Gaussian.")
@@ -121,7 +185,7 @@ def save_ply(
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
-        for own, part in transformed_blocks(gaussians, similarity):
+        for own, part in usable_blocks(path, gaussians, similarity):
             colours = part.sh if rgb is None else ((np.asarray(rgb[own], np.float64) - 0.5) / SH_DC)[:, None]
             file.write(_table(part, np.asarray(colours, np.float32)).tobytes())  # tofile would not tell a full disk
 
@@ -145,14 +209,13 @@ def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[n
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
-        raise bad_ply(path, f"no properties {', '.join(missing)}", "a point cloud with x y z")
+        raise bad_ply(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION)
     if not sane(points):
-        raise bad_ply(path, "points with NaN, infinite or absurd coordinates", "finite points")
-    channels = ("red", "green", "blue")
-    if not all(name in names for name in channels):
+        raise bad_ply(path, "its points have NaN, infinite or absurd coordinates", "finite points")
+    if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), GREY, np.uint8)
-    colours = np.stack([vertices[name] for name in channels], axis=-1)
+    colours = np.stack([vertices[name] for name in _RGB], axis=-1)
     if colours.dtype.kind == "f":
         scale = 255 if np.nanmax(colours, initial=0) <= 1 else 1
         colours = np.clip(np.nan_to_num(colours) * scale, 0, 255).round()

@@ -151,7 +151,10 @@ def _read(work: Work) -> Stage:
         capture, (found, notes) = results["load"], given_gaussians(path)
         if trained.is_file():
             found = transform_gaussians(found, np.linalg.inv(capture.to_source) @ trained_to_source(trained))
-            notes = (*notes, f"The Gaussians were carried back from nerfstudio's world by {trained.name}.",)
+            notes = (
+                *notes,
+                f"The Gaussians were carried back from nerfstudio's world by {trained.name}.",
+            )
         check_overlap(found, capture.cameras[training_frames(capture)], str(path))
         return Outcome(found, notes=notes)
 

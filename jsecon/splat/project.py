@@ -42,8 +42,9 @@ def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
         wrong = np.isnan(numbers) | np.isposinf(numbers)
     else:
         wrong = ~np.isfinite(numbers)
-    rows = wrong.reshape(len(numbers), -1).any(axis=1)
-    return rows | (numbers == 0).all(axis=1) if name == "quaternions" else rows
+    if name == "quaternions":
+        wrong = wrong | (numbers == 0).all(axis=1, keepdims=True)
+    return np.asarray(wrong.any(axis=tuple(range(1, wrong.ndim))))
 
 
 def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None = None) -> Int[Array, ""]:

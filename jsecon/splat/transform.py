@@ -44,6 +44,28 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         )
 
 
+def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians:
+    """`transform_gaussians` between right-handed or left-handed axes: `axes` (4, 4) may also mirror.
+
+    A Gaussian is its own mirror image along its axes, so that a mirrored one is a turned one.
+    """
+    matrix = np.asarray(axes, np.float64)
+    if np.linalg.det(matrix[:3, :3]) > 0:
+        return transform_gaussians(gaussians, matrix)
+    flip = np.array([-1.0, 1.0, 1.0])
+    directions = np.random.default_rng(0).normal(size=(8, 3))
+    bands = gaussians.sh.shape[1]
+    before, after = (np.asarray(sh_basis(jnp.asarray(d), bands), np.float64) for d in (directions, directions * flip))
+    signs = np.sign((before * after).sum(0))  # each basis function is even or odd in x
+    mirrored = dataclasses.replace(
+        gaussians,
+        means=gaussians.means * flip.astype(np.float32),
+        quaternions=gaussians.quaternions * np.array([1, 1, -1, -1], np.float32),
+        sh=gaussians.sh * signs.astype(np.float32)[:, None],
+    )
+    return transform_gaussians(mirrored, matrix @ np.diag([*flip, 1.0]))
+
+
 def transformed_blocks(
     gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
 ) -> Iterator[tuple[slice, Gaussians]]:

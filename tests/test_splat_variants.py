@@ -1,0 +1,406 @@
+"""Gaussians as many programs write them: each variant gives the right numbers, or one sentence that names it."""
+
+import dataclasses
+import itertools
+import struct
+
+import numpy as np
+import pytest
+import splat_files
+from capture_files import refused
+from scipy.spatial.transform import Rotation
+from splat_files import C0, opacity, scene
+from test_gaussian_files import STEPS, compare, gaussians
+from test_gltf import NAME, rewritten
+from test_ply import columns, write
+
+import jsecon
+from jsecon.app import command_line
+
+SCENE = scene(300, 4)
+SYSTEMS = ("LDB RDB LUB RUB LDF RDF LUF RUF", "LFD RFD LFU RFU LBD RBD LBU RBU")
+TOWARDS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}
+"""a direction -> the axis of a .ply that it lies along, and its sign there"""
+
+
+def spread(found, given):
+    """The largest distance of covariances (N, 3, 3), which know no sign or order of axes."""
+    parts = []
+    for log_scales, quaternions in ((found.log_scales, found.quaternions), (given["log_scales"], given["quaternions"])):
+        turns = Rotation.from_quat(np.roll(np.asarray(quaternions, np.float64), -1, axis=1)).as_matrix()
+        shapes = turns * np.exp(np.asarray(log_scales, np.float64))[:, None]
+        parts.append(shapes @ shapes.transpose(0, 2, 1))
+    return np.abs(parts[0] - parts[1]).max()
+
+
+# --- places in .spz: the bits behind the point
+
+
+@pytest.mark.parametrize("reach", [*(10.0**n for n in range(-6, 7)), 127.99999, 128, 256, 512, 2**22 - 0.5])
+def test_a_spz_places_gaussians_within_half_a_step_at_any_magnitude(tmp_path, reach):
+    given = scene(60, 1)
+    rng = np.random.default_rng(0)
+    given["means"] = rng.uniform(-reach, reach, (60, 3)) * 10 ** rng.uniform(-3, 0, (60, 1))
+    given["means"][:3] = np.diag([reach, -reach, reach])
+    written = gaussians(given)
+    jsecon.save_gaussians(tmp_path / "a.spz", written)
+    found = jsecon.load_gaussians(tmp_path / "a.spz")
+    most = float(np.abs(written.means).max())
+    step = 2.0**-16 if most > 1 else 2.0**-24
+    while most / step > 2**23 - 1:
+        step *= 2
+    error = np.abs(np.asarray(found.means, np.float64) - np.asarray(written.means, np.float64))
+    assert error.max() <= step / 2
+    if reach >= 1e-2:
+        assert error.max() < reach / 2**16
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"means": 1e7}, ("10,000,000 units from the origin", "Write a .ply")),
+        ({"means": 2**22 + 1.0}, ("4,194,305 units from the origin",)),
+        ({"log_scales": 6.5}, ("665 units large", "at most 379")),
+        ({"log_scales": -12.0}, ("60 of 60 Gaussians are smaller",)),
+    ],
+)
+def test_a_spz_refuses_what_it_cannot_hold(tmp_path, changes, says):
+    given = scene(60, 1)
+    for name, value in changes.items():
+        given[name] = np.full_like(given[name], value)
+    with refused("a.spz", *says):
+        jsecon.save_gaussians(tmp_path / "a.spz", gaussians(given))
+    assert not list(tmp_path.iterdir())
+    jsecon.save_gaussians(tmp_path / "a.ply", gaussians(given))
+    if "means" in changes:
+        jsecon.save_gaussians(tmp_path / "a.glb", gaussians(given))
+        np.testing.assert_array_equal(jsecon.load_gaussians(tmp_path / "a.glb").means, gaussians(given).means)
+
+
+def test_a_glb_refuses_sizes_beyond_float32(tmp_path):
+    given = scene(60, 1)
+    given["log_scales"][7] = 89
+    with refused("a.glb", "exp(89) units large"):
+        jsecon.save_gaussians(tmp_path / "a.glb", gaussians(given))
+
+
+# --- .spz: versions, axes, flags
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+def test_every_version_of_spz(tmp_path, version):
+    (tmp_path / "a.SPZ").write_bytes(splat_files.spz(SCENE, version))
+    place = 2**-8 if version == 1 else 2**-12
+    turn = 0.97 if version < 3 else 0.99999
+    compare(jsecon.load_gaussians(tmp_path / "a.SPZ"), SCENE, (place, *STEPS["four.spz"][1:5], turn))
+
+
+def record(kind, body):
+    return struct.pack("<II", kind, len(body)) + body
+
+
+@pytest.mark.parametrize(("number", "name"), [*enumerate(SYSTEMS[0].split(), 1)])
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_spz_is_turned_from_the_axes_that_it_names(tmp_path, number, name, version):
+    """Left-handed ones too, in which the scene stands mirrored."""
+    axes = np.array([TOWARDS[letter][1] for letter in name])
+    records = record(0xADBE0002, bytes(12)) + record(0xADBE0003, struct.pack("<I", number))
+    (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, version, axes=axes, records=records))
+    found = jsecon.load_gaussians(tmp_path / "a.spz")
+    compare(found, SCENE, STEPS["four.spz"])
+
+
+@pytest.mark.parametrize(("number", "name"), [*enumerate(SYSTEMS[1].split(), 9)])
+def test_a_spz_whose_second_axis_is_depth(tmp_path, number, name):
+    """Right-handed of them: the scene carried there by hand; left-handed: mirrored by hand before."""
+    matrix = np.zeros((4, 4))
+    for column, letter in enumerate(name):
+        matrix[TOWARDS[letter][0], column] = TOWARDS[letter][1]
+    matrix[3, 3] = 1
+    given = {key: value.copy() for key, value in SCENE.items()}
+    if np.linalg.det(matrix) < 0:  # x of the stored numbers changes its sign
+        matrix[:, 0] *= -1
+    stored = jsecon.data.spz.transform_axes(gaussians(given), np.linalg.inv(matrix))
+    arrays = {field.name: np.asarray(getattr(stored, field.name), np.float64) for field in dataclasses.fields(stored)}
+    sign = -1 if matrix[TOWARDS[name[0]][0], 0] != TOWARDS[name[0]][1] else 1
+    data = splat_files.spz(
+        arrays, 4, axes=np.array([sign, 1, 1]), records=record(0xADBE0003, struct.pack("<I", number))
+    )
+    (tmp_path / "a.spz").write_bytes(data)
+    found = jsecon.load_gaussians(tmp_path / "a.spz")
+    np.testing.assert_allclose(found.means, SCENE["means"], atol=2**-12)
+    assert spread(found, SCENE) < 0.07
+    np.testing.assert_allclose(found.sh, SCENE["sh"], atol=1 / 64)
+
+
+def test_what_a_spz_says_and_is_not_done_is_told(tmp_path):
+    for version, flags in itertools.product((2, 4), (0, 1)):
+        (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, version, flags=flags))
+        if flags:
+            with pytest.warns(UserWarning, match="antialiasing"):
+                jsecon.load_gaussians(tmp_path / "a.spz")
+        else:
+            jsecon.load_gaussians(tmp_path / "a.spz")
+    (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, 4, records=record(0x12345678, b"abc")))
+    with pytest.warns(UserWarning, match="0x12345678"):
+        jsecon.load_gaussians(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ({"degree": 4}, ("degree 4", "degree of 0 to 3")),
+        ({"version": 5}, ("version 5",)),
+        ({"records": record(0xADBE0003, struct.pack("<I", 17))}, ("unknown number 17",)),
+        ({"records": record(0xADBE0003, b"")[:-1] + b"\1"}, ("damaged",)),
+        ({"fraction": 31}, ("31 bits",)),
+    ],
+)
+def test_a_spz_of_another_kind_is_refused_by_name(tmp_path, how, says):
+    how = {"version": 4, **how}
+    data = splat_files.spz(SCENE | {"means": 0 * SCENE["means"]}, how.pop("version"), **how)
+    (tmp_path / "a.spz").write_bytes(data)
+    with refused("a.spz", *says):
+        jsecon.load_gaussians(tmp_path / "a.spz")
+
+
+# --- .ply
+
+
+def plys(given, **more):
+    """Columns of a .ply out of arrays, and `more` of them; None leaves a column out."""
+    own = {axis: given["means"][:, n] for n, axis in enumerate("xyz")}
+    own |= {f"scale_{n}": given["log_scales"][:, n] for n in range(3)}
+    own |= {f"rot_{n}": given["quaternions"][:, n] for n in range(4)}
+    own |= {f"f_dc_{n}": given["sh"][:, 0, n] for n in range(3)} | {"opacity": given["opacity_logits"]}
+    own |= more
+    return {name: column for name, column in own.items() if column is not None}
+
+
+PLAIN = scene(40, 1)
+RGB = ("red", "green", "blue")
+
+
+@pytest.mark.parametrize("third", [None, np.full(40, -np.inf)])
+def test_a_flat_gaussian_has_no_thickness(tmp_path, third):
+    write(tmp_path / "a.PLY", plys(PLAIN, scale_2=third))
+    found = jsecon.load_gaussians(tmp_path / "a.PLY")
+    assert np.isneginf(found.log_scales[:, 2]).all()
+    np.testing.assert_array_equal(found.log_scales[:, :2], PLAIN["log_scales"][:, :2].astype(np.float32))
+
+
+@pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])
+def test_mip_splattings_filter_is_fused_as_it_fuses_it(tmp_path, name):
+    width = np.random.default_rng(0).uniform(0.001, 0.3, 40)
+    width[:2] = 0
+    given = PLAIN | {"log_scales": PLAIN["log_scales"].copy()}
+    given["log_scales"][:2, 2] = -np.inf
+    write(tmp_path / "a.ply", plys(given, **{name: width}))
+    found = jsecon.load_gaussians(tmp_path / "a.ply")
+    squares = np.exp(given["log_scales"]) ** 2
+    fused = squares + width[:, None] ** 2
+    np.testing.assert_allclose(np.exp(np.asarray(found.log_scales)), np.sqrt(fused), rtol=1e-5)
+    ratio = np.where(width > 0, np.sqrt(squares.prod(1) / np.where(width > 0, fused.prod(1), 1)), 1)
+    alpha = opacity({"opacity_logits": np.asarray(found.opacity_logits, np.float64)})
+    np.testing.assert_allclose(alpha, opacity(PLAIN) * ratio, rtol=1e-4, atol=1e-9)
+    write(tmp_path / "a.ply", plys(PLAIN, **{name: np.where(np.arange(40) == 3, -1, width)}))
+    with refused("a.ply", "filter_3D are negative"):
+        jsecon.load_gaussians(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("kind", "most"), [("uchar", 255), ("ushort", 65535), ("float", 1.0), ("float", 255.0), ("double", 1.0)]
+)
+def test_colours_in_place_of_coefficients(tmp_path, kind, most):
+    rgb = np.random.default_rng(0).integers(0, 256, (40, 3)) / 255
+    numbers = {name: np.rint(rgb[:, n] * most) if "u" in kind[:2] else rgb[:, n] * most for n, name in enumerate(RGB)}
+    without = dict.fromkeys(("f_dc_0", "f_dc_1", "f_dc_2"))
+    write(tmp_path / "a.ply", plys(PLAIN, **without, **numbers), types=dict.fromkeys(RGB, kind))
+    found = jsecon.load_gaussians(tmp_path / "a.ply")
+    np.testing.assert_allclose(found.sh[:, 0], (rgb - 0.5) / C0, atol=1e-5)
+    # Beside coefficients, they are a viewer's.
+    write(tmp_path / "a.ply", plys(PLAIN, **numbers), types=dict.fromkeys(RGB, kind))
+    np.testing.assert_array_equal(jsecon.load_gaussians(tmp_path / "a.ply").sh, PLAIN["sh"].astype(np.float32))
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_lists_and_elements_before_the_vertices_and_any_ends_of_lines(tmp_path, form, ends):
+    given = columns(rest=9)
+    order, rows, body = {"b": "<", "a": ""}.get(form[0], "<"), [], b""
+    order = ">" if "big" in form else order
+    names = list(given)
+    header = ["ply", f"format {form} 1.0", "comment end_header of \xfcmlauts", "element face 2"]
+    header += ["property list uchar int vertex_indices", "property uchar flags", "element camera 1"]
+    header += ["property double fx", "element vertex 6", *(f"property double {n}" for n in names[:4])]
+    header += ["property list ushort float extra", *(f"property double {n}" for n in names[4:])]
+    header += ["element trailer 1", "property list uchar uchar data", "end_header"]
+    faces = [[3, 0, 1, 2, 7], [1, 4, 9]]
+    for n, lengths in enumerate([0, 2, 5, 0, 1, 3]):
+        numbers = [float(given[name][n]) for name in names]
+        extra = [0.5] * lengths
+        rows.append([*numbers[:4], lengths, *extra, *numbers[4:]])
+        if form != "ascii":
+            body += struct.pack(f"{order}4d", *numbers[:4]) + struct.pack(f"{order}H{lengths}f", lengths, *extra)
+            body += struct.pack(f"{order}{len(numbers) - 4}d", *numbers[4:])
+    if form == "ascii":
+        lines = [" ".join(map(repr, row)) for row in (*faces, [525.5], *rows, [2, 1, 2])]
+        body = (ends.join([*lines[:3], "", *lines[3:]]) + ends).encode()
+    else:
+        before = struct.pack(f"{order}B3iB", *faces[0]) + struct.pack(f"{order}BiB", *faces[1])
+        body = before + struct.pack(f"{order}d", 525.5) + body + b"\2\1\2"
+    (tmp_path / "a.ply").write_bytes((ends.join(header) + ends).encode("latin-1") + body)
+    found = jsecon.load_gaussians(tmp_path / "a.ply")
+    np.testing.assert_array_equal(found.means, np.stack([given[axis] for axis in "xyz"], -1))
+    np.testing.assert_array_equal(found.quaternions, np.stack([given[f"rot_{n}"] for n in range(4)], -1))
+    np.testing.assert_array_equal(found.sh[:, 2, 1], given["f_rest_4"])
+    whole = (tmp_path / "a.ply").read_bytes()
+    for cut in (30, 200, 500):
+        (tmp_path / "a.ply").write_bytes(whole[: len(whole) - cut])
+        with refused("a.ply"):
+            jsecon.load_gaussians(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("rest", [1, 3, 6, 12, 44, 48, 72])
+def test_numbers_of_harmonics_of_no_whole_degree_are_named(tmp_path, rest):
+    write(tmp_path / "a.ply", columns(rest=rest))
+    with refused("a.ply", f"{rest} properties f_rest", "degree"):
+        jsecon.load_gaussians(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
+def test_a_ply_that_was_trained_with_antialiasing_says_so(tmp_path, comment):
+    write(tmp_path / "a.ply", plys(PLAIN))
+    plain = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(plain.replace(b"comment of mine", b"comment " + comment.encode()))
+    with pytest.warns(UserWarning, match="antialiasing"):
+        jsecon.load_gaussians(tmp_path / "a.ply")
+
+
+# --- SuperSplat's compressed .ply
+
+
+@pytest.mark.parametrize("basis", [1, 4])
+@pytest.mark.parametrize("colours", [True, False])
+def test_a_compressed_ply_with_and_without_bounds_of_colours(tmp_path, basis, colours):
+    given = scene(600, basis)
+    (tmp_path / "a.ply").write_bytes(splat_files.compressed_ply(given, colours=colours))
+    steps = STEPS["a.compressed.ply"]
+    compare(jsecon.load_gaussians(tmp_path / "a.ply"), given, steps)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (b"float min_scale_x", b"float odd_scale_x", "no properties min_scale_x"),
+        (b"float max_b", b"float odd_b", "no properties max_b"),
+        (b"uint packed_color", b"uint odd", "no properties packed_color"),
+        (b"uint packed_color", b"ushort packed_color", "of type uint16"),
+        (b"element sh 600", b"element sh 599", "599 rows of sh for 600 Gaussians"),
+        (b"uchar f_rest_8\n", b"uchar odd\n", "9 properties"),
+        (b"binary_little_endian", b"ascii", "ascii"),
+    ],
+)
+def test_a_compressed_ply_of_another_kind_is_refused_by_name(tmp_path, old, new, says):
+    whole = splat_files.compressed_ply(scene(600, 4))
+    assert old in whole
+    (tmp_path / "a.ply").write_bytes(whole.replace(old, new) + bytes(4000))
+    with refused("a.ply", says):
+        jsecon.load_gaussians(tmp_path / "a.ply")
+
+
+# --- .glb
+
+
+def quantised(path, name, kind, numbers, normalised):
+    """The .glb with an attribute's numbers in place of what it had, behind all others."""
+    data = bytearray(path.read_bytes())
+    size = struct.unpack_from("<I", data, 12)[0]
+    start = 28 + size
+    body = np.ascontiguousarray(numbers, kind).tobytes()
+    body += bytes(-len(body) % 4)
+    place = len(data) - start
+    data += body
+    struct.pack_into("<I", data, 20 + size, place + len(body))
+    path.write_bytes(bytes(data))
+    code = {"i1": 5120, "u1": 5121, "<i2": 5122, "<u2": 5123}[kind]
+
+    def change(told):
+        told.setdefault("extensionsRequired", []).append("KHR_mesh_quantization")
+        told["buffers"][0]["byteLength"] = place + len(body)
+        told["bufferViews"].append({"buffer": 0, "byteOffset": place, "byteLength": len(body)})
+        accessor = told["accessors"][told["meshes"][0]["primitives"][0]["attributes"][name]]
+        accessor |= {"bufferView": len(told["bufferViews"]) - 1, "componentType": code, "normalized": normalised}
+
+    rewritten(path, change)
+
+
+@pytest.mark.parametrize(("kind", "normalised"), [("<i2", False), ("<u2", False), ("i1", True), ("<i2", True)])
+def test_quantised_places_under_a_node_that_scales_and_shifts(tmp_path, kind, normalised):
+    given, rng = gaussians(scene(30, 4)), np.random.default_rng(0)
+    jsecon.save_gaussians(tmp_path / "a.glb", given)
+    numbers = rng.integers(0, 127, (30, 3))
+    quantised(tmp_path / "a.glb", "POSITION", kind, numbers, normalised)
+    node = {"scale": [0.25] * 3, "translation": [1, 2, 3], "rotation": [0, 0, np.sqrt(0.5), np.sqrt(0.5)]}
+    rewritten(tmp_path / "a.glb", lambda told: told["nodes"][0].update(node))
+    found = jsecon.load_gaussians(tmp_path / "a.glb")
+    local = numbers / (np.iinfo(kind).max if normalised else 1)
+    placed = np.column_stack([-local[:, 1], local[:, 0], local[:, 2]]) * 0.25 + [1, 2, 3]
+    np.testing.assert_allclose(found.means, placed * [-1, -1, 1], atol=1e-5)
+    np.testing.assert_allclose(found.log_scales, given.log_scales + np.log(0.25), atol=1e-5)
+
+
+def test_quantised_sizes_turns_and_opacities(tmp_path):
+    given = scene(30, 1)
+    given["log_scales"] = np.log(np.random.default_rng(1).integers(1, 9, (30, 3)).astype(float))
+    jsecon.save_gaussians(tmp_path / "a.glb", gaussians(given))
+    quantised(tmp_path / "a.glb", f"{NAME}:SCALE", "u1", np.exp(given["log_scales"]).round(), False)
+    quantised(tmp_path / "a.glb", f"{NAME}:OPACITY", "<u2", (65535 * opacity(given)[:, None]).round(), True)
+    found = jsecon.load_gaussians(tmp_path / "a.glb")
+    np.testing.assert_allclose(found.log_scales, given["log_scales"], atol=1e-6)
+    alpha = opacity({"opacity_logits": np.asarray(found.opacity_logits, np.float64)})
+    np.testing.assert_allclose(alpha, opacity(given), atol=1 / 65535)
+
+
+# --- through the command line: --gaussians FILE
+
+
+def test_any_file_of_gaussians_has_a_dry_run(room, tmp_path, capsys):
+    plain = scene(50, 1)
+    jsecon.save_gaussians(tmp_path / "a.glb", gaussians(plain))
+    made = {"a.splat": splat_files.splat(plain), "a.sog": splat_files.sog(plain), "a.spz": splat_files.spz(plain, 4)}
+    made |= {"c.ply": splat_files.compressed_ply(plain), "old.SPZ": splat_files.spz(plain, 2)}
+    for name, data in made.items():
+        (tmp_path / name).write_bytes(data)
+    for name in [*made, "a.glb"]:
+        line = ["run", room, "--out", tmp_path / "out", "--gaussians", tmp_path / name, "--dry-run"]
+        assert command_line.main(list(map(str, line))) == 0, name
+        assert "gaussians" in capsys.readouterr().out
+
+
+def nothing():
+    """Files of every format that hold no Gaussian."""
+    arrays = {name: array[:0] for name, array in scene(3, 1).items()}
+    bare = splat_files.compressed_ply(scene(3, 1))
+    header, _ = bare.split(b"end_header\n")
+    header = header.replace(b"element chunk 1", b"element chunk 0").replace(b"element vertex 3", b"element vertex 0")
+    return {
+        "c.ply": header + b"end_header\n",
+        "a.splat": b"",
+        "two.spz": splat_files.spz(arrays, 2),
+        "four.spz": splat_files.spz(arrays, 4),
+    }
+
+
+@pytest.mark.parametrize("how", [[], ["--dry-run"]])
+def test_a_file_of_no_gaussians_is_told_as_such(room, tmp_path, capsys, how):
+    files = nothing() if how else {"two.spz": nothing()["two.spz"]}
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    jsecon.save_gaussians(tmp_path / "a.ply", gaussians(scene(0, 4)))
+    for name in [*files, "a.ply"]:
+        line = ["run", room, "--out", tmp_path / "out", "--gaussians", tmp_path / name, *how]
+        assert command_line.main(list(map(str, line))) == 2, name
+        said = capsys.readouterr().err
+        assert name in said
+        assert "holds no Gaussians" in said
