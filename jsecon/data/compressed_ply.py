@@ -39,10 +39,10 @@ def load_compressed_ply(path: Path) -> Gaussians:
         raise bad_ply(path, "its format is ascii", "a binary compressed .ply", _REMEDY)
     empty = np.zeros(0, [])
     chunks, vertices, rest = (tables.get(name, empty) for name in ("chunk", "vertex", "sh"))
-    there = [*(chunks.dtype.names or ()), *(vertices.dtype.names or ())]
-    with_colours = any(name in there for name in _COLOURS)
-    needed = [*_BOUNDS, *(_COLOURS if with_colours else ()), *_PACKED]
-    if missing := [name for name in needed if name not in there]:
+    bounds, packed = chunks.dtype.names or (), vertices.dtype.names or ()
+    with_colours = any(name in bounds for name in _COLOURS)
+    missing = [name for name in (*_BOUNDS, *(_COLOURS if with_colours else ())) if name not in bounds]
+    if missing := [*missing, *(name for name in _PACKED if name not in packed)]:
         raise bad_ply(path, f"it has no properties {', '.join(missing)}", _WANTED, _REMEDY)
     if wrong := [
         name for name in _PACKED if vertices.dtype[name].kind not in "iu" or vertices.dtype[name].itemsize != 4

@@ -104,6 +104,9 @@ def _header(path: Path, data: bytes) -> Header:
             raise bad_ply(path, f"the header line {line.strip()!r} is not valid", "a valid .ply header") from error
     if form not in ORDERS:
         raise bad_ply(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
+    for element in elements:
+        if len({name for name, _ in element.fields}) < len(element.fields):
+            raise bad_ply(path, f"a property of its element {element.name} is there twice", "distinct names")
     return Header(form, elements, tuple(comments), end.end())
 
 
@@ -162,8 +165,6 @@ def vertex_blocks(path: Path, rows: int) -> tuple[int, tuple[str, ...], Iterator
         raise bad_ply(path, "it is compressed (SuperSplat's packed chunks)", "an uncompressed .ply", remedy)
     if not vertex.names:
         raise bad_ply(path, "its element vertex has no properties", "x y z and more")
-    if len({name for name, _ in vertex.fields}) < len(vertex.fields):
-        raise bad_ply(path, "a property of its vertices is there twice", "distinct names")
     before = header.elements[: names.index("vertex")]
     plain = header.form != "ascii" and all(element.fixed for element in [*before, vertex])
     if not plain:
