@@ -140,7 +140,7 @@ class Capture(_Shown):
     depths: Array | None
     """(T, H, W) float32 z-depth in world units, 0 = unknown; or None."""
     to_source: Array
-    """(4, 4) similarity from this world to the files' own world (identity where nothing was normalised)."""
+    """(4, 4) float64 similarity from this world to the files' own world (identity where nothing was normalised)."""
     names: tuple[str, ...] = static()
     """T file names without folder or ending, in frame order."""
     notes: tuple[str, ...] = static(default=())
@@ -149,6 +149,9 @@ class Capture(_Shown):
     """(T, H, W) bool: what a fit shall not look at, as what moved; or None."""
     files: tuple[ImageFile, ...] = static(default=())
     """T images, or () where the frames were made of none. Masks, proposals and depth follow their folders."""
+    to_poses: Array | None = None
+    """(4, 4) similarity from this world to the one that the poses are given in by the files, before any that they name
+    (applied_transform) is undone; None: it is the same."""
 
 
 @record

@@ -18,7 +18,7 @@ from jsecon.files import write_text, written_whole
 from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
-from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.transform import carried
 from jsecon.types import Gaussians, LanguageField
 
 
@@ -89,7 +89,7 @@ def write_answer(
     """
     slug, count = slug_of(answer.question), field.gaussians.count
     field = part_of(field, answer)
-    chosen = transform_gaussians(selected(field.gaussians, answer.mask), field.to_source)
+    chosen = carried(selected(field.gaussians, answer.mask), field.to_source)
     told = _figures(field, answer, chosen) | {"of": count, ending: None, "masks": {}}
     if answer.mask.any():
         told[ending] = f"{slug}.{ending}"

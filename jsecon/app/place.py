@@ -11,7 +11,7 @@ from jsecon.app.answers import selected
 from jsecon.app.question import Answer, ask_text
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
-from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.transform import carried
 from jsecon.types import LanguageField
 
 STRAY = 0.02
@@ -70,7 +70,7 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
         found = f"nothing selected (score {float(answer.selection.score):.3f})"
         raise InputError(answer.question, found, "a thing in the scene", "Ask with other words, or by a pixel.")
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # colours have no place
-    chosen = transform_gaussians(selected(plain, answer.mask), field.to_source)
+    chosen = carried(selected(plain, answer.mask), field.to_source)
     points = np.asarray(chosen.means, np.float64)
     spread = points - points.mean(0)
     axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]

@@ -37,7 +37,6 @@ from jsecon.language.field import load_field
 from jsecon.pipeline.networks import embedder_of_field
 from jsecon.process import cores
 from jsecon.query.masks import selection_mask
-from jsecon.splat.transform import transform_gaussians
 from jsecon.types import LanguageField
 
 REMEDY = 'pip install "jsecon[serve]"'
@@ -95,7 +94,7 @@ class Scene:
         """The selected Gaussians as a .ply in the capture's own world."""
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "selection.ply"
-            save_ply(file, transform_gaussians(selected(self.field.gaussians, answer.mask), self.field.to_source))
+            save_ply(file, selected(self.field.gaussians, answer.mask), similarity=self.field.to_source)
             return file.read_bytes()
 
     def told(self) -> dict[str, Any]:

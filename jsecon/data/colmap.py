@@ -15,6 +15,7 @@ import numpy as np
 from jsecon.data.colmap_model import MODELS, REMEDY, model_file, read_cameras, read_images, read_points
 from jsecon.data.frames import Posed, Shot
 from jsecon.data.images import write_image
+from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
 from jsecon.files import written_whole
 from jsecon.splat.transform import quaternion_of
@@ -53,7 +54,8 @@ def read_colmap(path: Path, model: Path) -> Posed:
 
 
 def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png") -> None:
-    """Writes `capture` as a COLMAP capture: `path`/sparse/0/{cameras,images,points3D}.bin (PINHOLE) and `path`/images.
+    """Writes `capture` as a COLMAP capture: `path`/sparse/0/{cameras,images,points3D}.bin (PINHOLE) and `path`/images,
+    in the world of the poses that it was loaded from.
 
     The points keep their colours; observations and tracks are empty and errors -1 (not computed), since a Capture holds
     none. Depths and the held-out frames have no place in the format: choose the latter again on loading. Raises
@@ -71,14 +73,16 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
         for n, row in enumerate(distinct, start=1)
     ]
     image_bytes = [struct.pack("<Q", len(files))]
-    poses = np.asarray(cameras.world_to_camera, np.float64)
+    from_world = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
+    poses = moved_poses(np.asarray(cameras.world_to_camera, np.float64), from_world)
     for n, (file, pose, camera) in enumerate(zip(files, poses, which.ravel()), start=1):
         quaternion = quaternion_of(pose[:3, :3])
         numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])
         image_bytes.append(struct.pack("<i7di", n, *numbers, camera + 1) + file.encode() + b"\0" + struct.pack("<Q", 0))
     points = np.zeros(len(capture.points), "<u8, 3<f8, 3u1, <f8, <u8")
     points["f0"] = np.arange(1, len(points) + 1)
-    points["f1"], points["f2"], points["f3"] = capture.points, capture.point_colors, -1.0
+    points["f1"] = np.asarray(capture.points, np.float64) @ from_world[:3, :3] + from_world[:3, 3]
+    points["f2"], points["f3"] = capture.point_colors, -1.0
     contents = {
         "cameras": b"".join(camera_bytes),
         "images": b"".join(image_bytes),

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.data.images import TRANSPOSED, image_header, read_depth, read_image, turned
 from jsecon.data.lens import Lens, distort, seen_through, undistorted, undistortion_maps
 from jsecon.data.poses import camera_jumps, rigid
+from jsecon.data.worlds import moved_poses, ordinary_world
 from jsecon.errors import InputError
 from jsecon.numerics import sane
 from jsecon.types import Camera, Capture, ImageFile
@@ -33,6 +34,8 @@ EXIF_LOOKS = 4
 """images, at most, that the colours of sparse points are compared with to tell which way up their cameras are"""
 WIDE = 2.0
 """x/z and y/z up to which points are looked at there"""
+DEPTHS_SEEN = 8
+"""depth maps that the scene's size is read off"""
 IN_MEMORY = 1 << 30
 """bytes of frames that are kept in memory; more are kept in a temporary file"""
 
@@ -63,9 +66,10 @@ class Posed:
     where: object
     """names the capture in errors."""
     points: Float[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """sparse points, world."""
+    """sparse points, world, float64."""
     colours: UInt8[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     to_source: Float[np.ndarray, "4 4"] = dataclasses.field(default_factory=lambda: np.eye(4))
+    """from the world of the poses to that of the files that they were made from."""
     notes: tuple[str, ...] = ()
 
 
@@ -188,6 +192,13 @@ def _true_lens(shot: Shot, width: int, height: int) -> Lens:
     return lens.resized(width, height)
 
 
+def _some_depths(posed: Posed, shots: Sequence[Shot]) -> list[np.ndarray]:
+    """A few depth maps, where there are no points to tell how far things are."""
+    deep = [shot for shot in shots if shot.depth is not None and not len(posed.points)]
+    chosen = [deep[index] for index in spread(len(deep), DEPTHS_SEEN)] if deep else []
+    return [read_depth(shot.depth, shot.depth_unit) for shot in chosen if shot.depth is not None]
+
+
 def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     if image.shape[:2] == (height, width):
         return image
@@ -256,7 +267,8 @@ def assemble(
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by
     `downscale` (area average), or where that is None so that the longer side is at most `long_side`. Where the sizes
     differ, the commonest is taken and the others are resized to it, focal lengths with them. `only`: frames of these
-    names alone. Raises InputError on
+    names alone. Large coordinates and units far from metres are changed in float64 (`ordinary_world`), by the same for
+    any choice of frames; `Capture.to_source` leads back. Raises InputError on
     images that are missing, damaged or of another aspect, and on poses that are not finite and rigid.
     """
     check_options(downscale, frames, holdout, long_side)
@@ -266,6 +278,8 @@ def assemble(
     shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
     names = _short_names(shots, where)
+    world, changed = ordinary_world(poses, posed.points, _some_depths(posed, shots))  # of all, whatever is taken
+    poses, from_world = moved_poses(poses, world), np.linalg.inv(world)
     if only is not None:
         missing = sorted(set(only) - set(names))
         if missing or not only:
@@ -273,7 +287,7 @@ def assemble(
             raise InputError(where, told, wanted, "Give the capture that these names are of.")
         kept = [i for i, name in enumerate(names) if name in only]
         shots, poses, names = [shots[i] for i in kept], poses[kept], tuple(names[i] for i in kept)
-    notes = [*posed.notes, *camera_jumps(poses, names)]
+    notes = [*posed.notes, *changed, *camera_jumps(poses, names)]
     chosen = spread(len(shots), frames)
     if len(chosen) < len(shots):
         notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
@@ -309,7 +323,7 @@ def assemble(
             image = cv2.remap(image, *maps(lens, pinholes[lens]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         result[index] = _resize(image, width, height)
         if shot.depth is not None and depths is not None:
-            depth = read_depth(shot.depth, shot.depth_unit)
+            depth = read_depth(shot.depth, shot.depth_unit * world[0, 0])
             if shot.depth_lens is not None:
                 depth = seen_through(depth, shot.depth_lens, lens)
             elif not _fits(lens, *depth.shape[1::-1]) and orientations[index] in TRANSPOSED:
@@ -345,15 +359,16 @@ def assemble(
     return Capture(
         frames=result,
         cameras=Camera(poses.astype(np.float32), fx, fy, cx, cy, width, height),
-        points=np.asarray(posed.points, np.float32),
+        points=(np.asarray(posed.points, np.float64) @ world[:3, :3] + world[:3, 3]).astype(np.float32),
         point_colors=np.asarray(posed.colours, np.uint8),
         held_out=out,
         depths=depths,
-        to_source=np.asarray(posed.to_source, np.float64),
+        to_source=np.asarray(posed.to_source, np.float64) @ from_world,
         names=names,
         notes=tuple(notes),
         files=tuple(
             ImageFile(shot.name, lens.width, lens.height, orientation)
             for shot, lens, orientation in zip(shots, lenses, orientations)
         ),
+        to_poses=from_world,
     )

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.data.compressed_ply import load_compressed_ply
-from jsecon.data.gltf import load_glb, save_glb
-from jsecon.data.ply import SH_DC, load_ply, save_ply, sound
+from jsecon.data.gltf import read_glb, save_glb
+from jsecon.data.ply import SH_DC, in_float32, read_ply, save_ply, sound
 from jsecon.data.ply_file import header_of, is_compressed
 from jsecon.data.spz import load_spz, save_spz
 from jsecon.errors import InputError, why
@@ -28,7 +28,7 @@ _CONVERTED = (".ksplat", ".lcc", ".mjs")
 _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
 
-def load_gaussians(path: str | Path) -> Gaussians:
+def load_gaussians(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
     """Reads Gaussians from a .ply (INRIA's layout, see `load_ply`, or SuperSplat's compressed one), .glb (see
     `load_glb`), .spz, .sog or .splat.
 
@@ -38,22 +38,26 @@ def load_gaussians(path: str | Path) -> Gaussians:
 
     Args:
       path: The file; its ending, in small or capital letters, says the format.
+      similarity: (4, 4) float64. Carries the Gaussians into another world before they become float32. The inverse of
+        `Capture.to_source` carries them from the world of a capture's files into that of its cameras. Positions in
+        double precision, as in a map projection's coordinates, keep their digits so.
 
     Returns:
       Its Gaussians, float32; N may be 0.
 
     Raises:
-      InputError: The file is of another format, damaged, or holds numbers that cannot be drawn; or it needs a package
-        that is not installed (gsply for .sog, zstandard for .spz of version 4).
+      InputError: The file is of another format, damaged, or holds numbers that cannot be drawn; float32 does not hold
+        its positions; or it needs a package that is not installed (gsply for .sog, zstandard for .spz of version 4).
     """
     gaussians, notes = read_gaussians(path)
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return gaussians
+    return in_float32(Path(path), gaussians, similarity)
 
 
 def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
-    """As `load_gaussians`, with what it would warn of, a sentence each."""
+    """What `load_gaussians` reads, as NumPy arrays, with what it would warn of, a sentence each. The means are float64
+    where the file has them finer than float32."""
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in (".ply", ".glb", ".spz", ".sog", ".splat"):
@@ -66,9 +70,9 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
     if kind == ".ply":
         header = header_of(path)
         notes = _trained_antialiased(path) if any(map(_antialiased, header.comments)) else ()
-        return (load_compressed_ply if is_compressed(header) else load_ply)(path), notes
+        return (load_compressed_ply if is_compressed(header) else read_ply)(path), notes
     if kind == ".glb":
-        return load_glb(path), ()
+        return read_glb(path), ()
     if kind == ".spz":
         return load_spz(path)
     if not path.is_file():

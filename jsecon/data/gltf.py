@@ -14,17 +14,16 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.ply import sound, usable_blocks
+from jsecon.data.ply import in_float32, needs_float64, sound, usable_blocks
 from jsecon.errors import InputError, why
 from jsecon.files import UNREADABLE, parsed_json, written_whole
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import BANDS, C0
-from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.transform import carried, transformed_blocks
 from jsecon.types import Array, Gaussians
 
 _NAME = "KHR_gaussian_splatting"
@@ -59,7 +58,9 @@ def save_glb(
     similarity: Float[Array, "4 4"] | None = None,
 ) -> None:
     """Writes Gaussians in float32, carried by `similarity` (4, 4) into another world and turned to glTF's axes:
-    (x, y, z) becomes (-x, -y, z), y up. In blocks: mapped columns need not fit into memory.
+    (x, y, z) becomes (-x, -y, z), y up. In blocks: mapped columns need not fit into memory. Where float32 would not
+    hold the positions (in a map projection's coordinates, say), they are relative to a point that the node has as its
+    translation.
 
     `codes` become the application's attributes _CODE_0, _CODE_1 ..., four numbers in each; `regions` (-1 = none)
     _REGION. Raises ValueError where shapes disagree; InputError where there is no Gaussian, which glTF has no form for,
@@ -67,18 +68,22 @@ def save_glb(
     be written.
     """
     check_gaussians(gaussians)
-    count, carried = gaussians.count, _AXES if similarity is None else _AXES @ np.asarray(similarity, np.float64)
+    count, into = gaussians.count, _AXES if similarity is None else _AXES @ np.asarray(similarity, np.float64)
     if not count:
         raise InputError(
             path, "there are no Gaussians to write", "at least one in a .glb", "Write a .ply, which may be empty."
         )
 
+    middle = np.zeros(3)
+    if needs_float64(gaussians, into):
+        middle = np.median(next(transformed_blocks(gaussians, into))[1].means, axis=0)
+
     def blocks(of: Gaussians) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        for own, part in usable_blocks(path, of, carried):
+        for own, part in usable_blocks(path, of, into):
             if part.log_scales.max() > _LARGEST_LOG_SCALE:
                 found = f"a Gaussian is exp({part.log_scales.max():.4g}) units large"
                 raise InputError(path, found, "at most exp(88) in a .glb", "Write a .ply, or scale the scene down.")
-            attributes = _attributes(part)
+            attributes = _attributes(dataclasses.replace(part, means=part.means - middle))
             if codes is not None:
                 table = np.asarray(codes[own])
                 attributes |= {f"_CODE_{n // 4}": table[:, n : n + 4] for n in range(0, table.shape[1], 4)}
@@ -103,7 +108,8 @@ def save_glb(
     splats = {_NAME: {"kernel": "ellipse", "colorSpace": _SRGB}}
     primitive = {"mode": _POINTS, "attributes": dict(zip(first, range(len(views)))), "extensions": splats}
     told = {"asset": {"version": "2.0", "generator": "jsecon"}, "extensionsUsed": [_NAME]}
-    told |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]}
+    node = {"mesh": 0} | ({"translation": middle.tolist()} if middle.any() else {})
+    told |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node], "meshes": [{"primitives": [primitive]}]}
     told |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": offset}]}
     text = json.dumps(told, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -160,6 +166,11 @@ def load_glb(path: str | Path) -> Gaussians:
         its axes unequally; or it holds numbers that cannot be drawn.
     """
     path = Path(path)
+    return in_float32(path, read_glb(path))
+
+
+def read_glb(path: Path) -> Gaussians:
+    """What `load_glb` reads, as NumPy arrays, the means in float64."""
     try:
         with path.open("rb") as file:
             told, start, length = _container(path, file, path.stat().st_size)
@@ -171,8 +182,7 @@ def load_glb(path: str | Path) -> Gaussians:
                 count += len(arrays["means"])
                 if 12 * count > length:
                     raise InputError(path, f"{count} Gaussians do not fit into {length} bytes", _WANTED, _REMEDY)
-                part = jax.tree.map(np.asarray, sound(path, arrays))
-                found.append(transform_gaussians(part, _AXES @ matrix))
+                found.append(carried(sound(path, arrays), _AXES @ matrix))
     except InputError:
         raise
     except OSError as error:
@@ -185,7 +195,7 @@ def load_glb(path: str | Path) -> Gaussians:
     if len(degrees) > 1:
         what = f"its primitives have {' and '.join(map(str, sorted(degrees)))} coefficients of harmonics"
         raise InputError(path, what, "one degree for all", "Export each part as a .ply of its own.")
-    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), *found)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 
 def _container(path: Path, file: BinaryIO, size: int) -> tuple[Any, int, int]:

@@ -2,7 +2,7 @@
 
 Format: nerfstudio docs/quickstart/data_conventions.md, instant-ngp scripts/colmap2nerf.py. transform_matrix is
 camera-to-world in OpenGL camera axes (x right, y up, looking along -z): columns 1 and 2 are negated for OpenCV axes.
-The world stays the file's own; Capture.to_source undoes what made it of the source's (applied_transform, _scale).
+The world is the file's own; Capture.to_source undoes what made it of the source's (applied_transform, _scale).
 """
 
 import math
@@ -132,7 +132,8 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
     if "applied_transform" in scene:
         transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
     scaled = np.diag([scale, scale, scale, 1.0]) @ (transform if sane(transform) else np.zeros((4, 4)))
-    if abs(np.linalg.det(scaled)) < 1e-12:
+    size = np.abs(scaled[:3, :3]).max()
+    if not size > 0 or abs(np.linalg.det(scaled[:3, :3] / size)) < 1e-9:
         raise _bad(file, "an applied_transform or applied_scale that cannot be inverted", "a similarity")
     return np.linalg.inv(scaled)
 

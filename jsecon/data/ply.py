@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jsecon.data.ply_file import bad_ply, read_vertices, vertex_blocks
+from jsecon.data.ply_file import bad_ply, property_types, read_vertices, vertex_blocks
 from jsecon.errors import InputError, require_shape
 from jsecon.files import written_whole
 from jsecon.numerics import sane
 from jsecon.splat.project import check_gaussians, unusable_rows
-from jsecon.splat.transform import transformed_blocks
+from jsecon.splat.transform import carried, float32_rounds, transformed_blocks
 from jsecon.types import Array, Gaussians
 
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -28,25 +30,30 @@ _FILTERS = ("filter_3D", "filter_3d")
 """standard deviation of Mip-Splatting's 3D filter, world units: of its own training, and of other programs"""
 _ROWS = 1 << 18
 """Gaussians read at a time"""
+ROUNDED_WRITTEN, ROUNDED_READ = 0.02, 0.25
+"""of a Gaussian's largest standard deviation, by which float32 may round its place: on writing, else it is written in
+float64, and on reading"""
+_COARSE = ("i1", "u1", "i2", "u2", "f2", "f4")
+"""types of which float32 holds every number"""
 _SIZES = {"means": 3, "log_scales": 3, "quaternions": 4}
 _REST_COUNTS = (0, 9, 24, 45)
 _WANTED = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what float32 does not hold is infinite, which no reader takes
-def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:
+def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str], dtype: type = np.float32) -> np.ndarray:
     fields = vertices.dtype.names or ()
     if len({vertices.dtype[name] for name in fields}) == 1:
         # One type throughout, as in nearly every file: a plain table, read along its rows (twice as fast).
         table = vertices.view(vertices.dtype[0]).reshape(len(vertices), len(fields))
-        return table[:, [fields.index(name) for name in names]].astype(np.float32)
-    result = np.empty((len(vertices), len(names)), np.float32)
+        return table[:, [fields.index(name) for name in names]].astype(dtype)
+    result = np.empty((len(vertices), len(names)), dtype)
     for column, name in enumerate(names):
         result[:, column] = vertices[name]
     return result
 
 
-def load_ply(path: str | Path) -> Gaussians:
+def load_ply(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
     """Reads Gaussians from a .ply in INRIA's layout (graphdeco-inria/gaussian-splatting, gaussian_model.py).
 
     The degree of the spherical harmonics follows from the number of f_rest properties (0, 9, 24, 45; channel-major).
@@ -63,15 +70,22 @@ def load_ply(path: str | Path) -> Gaussians:
 
     Args:
       path: The .ply file.
+      similarity: (4, 4) float64, see `load_gaussians`.
 
     Returns:
       Its Gaussians, float32; N may be 0.
 
     Raises:
       InputError: The file is compressed or cut short, a property is missing, a number is NaN or infinite (other than
-        log scales of -inf and opacity logits of -inf and inf, which can be drawn), or a quaternion is zero.
+        log scales of -inf and opacity logits of -inf and inf, which can be drawn), or a quaternion is zero; or float32
+        does not hold the positions.
     """
     path = Path(path)
+    return in_float32(path, read_ply(path), similarity)
+
+
+def read_ply(path: Path) -> Gaussians:
+    """What `load_ply` reads, as NumPy arrays. The means are float64 where the file has them finer than float32."""
     count, names, blocks = vertex_blocks(path, _ROWS)
     scales = _SCALE[:2] if "scale_2" not in names else _SCALE
     colours = _RGB if not any(name in names for name in _DC) and all(name in names for name in _RGB) else _DC
@@ -85,12 +99,15 @@ def load_ply(path: str | Path) -> Gaussians:
         remedy = "Export the file again, with harmonics of degree 3 or less."
         raise bad_ply(path, f"its vertices have {rest} properties f_rest", wanted, remedy)
     filters = [name for name in _FILTERS if name in names][:1]
+    types = property_types(path)
+    fine = any(types[name] not in _COARSE for name in _POSITION)
     arrays = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
+    arrays["means"] = np.empty((count, 3), np.float64 if fine else np.float32)
     arrays |= {"opacity_logits": np.empty(count, np.float32), "sh": np.empty((count, 1 + rest // 3, 3), np.float32)}
     first, unit = 0, 1.0
     for vertices in blocks:
         own, first = slice(first, first + len(vertices)), first + len(vertices)
-        arrays["means"][own] = _columns(vertices, _POSITION)
+        arrays["means"][own] = _columns(vertices, _POSITION, arrays["means"].dtype.type)
         arrays["log_scales"][own, 2] = -np.inf
         arrays["log_scales"][own, : len(scales)] = _columns(vertices, scales)
         arrays["quaternions"][own] = _columns(vertices, _ROTATION)
@@ -130,10 +147,24 @@ def _fuse(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> N
 
 
 def sound(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
-    """The Gaussians of a file's float32 arrays, by their fields. Raises InputError where one of them cannot be drawn:
+    """The Gaussians of a file's arrays (NumPy), by their fields. Raises InputError where one of them cannot be drawn:
     see `unusable_rows`."""
     _require_usable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
-    return Gaussians(**{name: jnp.asarray(array) for name, array in arrays.items()})
+    return Gaussians(**arrays)
+
+
+def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
+    """A file's Gaussians (NumPy) on jax's device, carried by `similarity` in float64 first. Raises InputError where
+    float32 then does not hold where they are."""
+    if similarity is not None:
+        gaussians = carried(gaussians, similarity)
+    rounded = float32_rounds(gaussians)
+    if len(rounded) and np.median(rounded) > ROUNDED_READ:
+        place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
+        found = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
+        remedy = "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.to_source)."
+        raise bad_ply(path, found, "coordinates nearer to 0", remedy)
+    return jax.tree.map(jnp.asarray, gaussians)
 
 
 def usable_blocks(
@@ -168,7 +199,8 @@ def save_ply(
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
     Written in blocks, so that mapped columns need not fit into memory; `similarity` (4, 4) carries each block into
-    another world (`transform_gaussians`).
+    another world (`carried`). Positions are written in double precision where float32 would not hold them (in a map
+    projection's coordinates, say), else in float.
 
     Float32 Gaussians come back bit by bit from `load_ply`. `rgb` (0..1) replaces the spherical harmonics by one
     colour a Gaussian, for showing codes or similarities; viewers such as SuperSplat open either. A selection is
@@ -181,26 +213,44 @@ def save_ply(
         require_shape("rgb", rgb, (count, 3), "Give one colour per Gaussian.")
     rest_names = (f"f_rest_{index}" for index in range(0 if rgb is not None else 3 * (gaussians.sh.shape[1] - 1)))
     names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
-    properties = (f"property float {name}" for name in names)
+    double = needs_float64(gaussians, similarity)
+    kinds = ("double" if double and name in _POSITION else "float" for name in names)
+    properties = (f"property {kind} {name}" for kind, name in zip(kinds, names))
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with written_whole(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         for own, part in usable_blocks(path, gaussians, similarity):
             colours = part.sh if rgb is None else ((np.asarray(rgb[own], np.float64) - 0.5) / SH_DC)[:, None]
-            file.write(_table(part, np.asarray(colours, np.float32)).tobytes())  # tofile would not tell a full disk
+            rows = _table(part, np.asarray(colours, np.float32), double)
+            file.write(rows.tobytes())  # tofile would not tell a full disk
 
 
-def _table(part: Gaussians, sh: np.ndarray) -> np.ndarray:
+def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
+    """Whether float32 rounds the means, where `similarity` carries them, by more than a reader should see: for more
+    than 1 in 100 by ROUNDED_WRITTEN of their size."""
+    if similarity is None and gaussians.means.dtype != np.float64:
+        return False
+    bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
+    far = sum(int((float32_rounds(part) > ROUNDED_WRITTEN).sum()) for _, part in transformed_blocks(bare, similarity))
+    return far > 0.01 * gaussians.count
+
+
+def _table(part: Gaussians, sh: np.ndarray, double: bool) -> np.ndarray:
     """A row of the file for each Gaussian."""
     count = len(sh)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
     normals, opacity = np.zeros((count, 3)), np.asarray(part.opacity_logits)[:, None]
     columns = [part.means, normals, sh[:, 0], rest, opacity, part.log_scales, part.quaternions]
-    return np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1).astype("<f4", copy=False)
+    table = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1).astype("<f4", copy=False)
+    if not double:
+        return table
+    rows = np.empty(count, [("means", "<f8", 3), ("others", "<f4", table.shape[1] - 3)])
+    rows["means"], rows["others"] = part.means, table[:, 3:]
+    return rows
 
 
 def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Points and colours of a plain point cloud (nerfstudio's ply_file_path).
+    """Points (float64) and colours of a plain point cloud (nerfstudio's ply_file_path).
 
     Colours are red green blue in 8 or 16 bits, or in float (0..1, or 0..255 where any is above 1); mid grey where there
     are none. Raises InputError on a damaged file, or one without x y z.
@@ -210,7 +260,7 @@ def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[n
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
         raise bad_ply(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
-    points = _columns(vertices, _POSITION)
+    points = _columns(vertices, _POSITION, np.float64)
     if not sane(points):
         raise bad_ply(path, "its points have NaN, infinite or absurd coordinates", "finite points")
     if not all(name in names for name in _RGB):

@@ -135,6 +135,11 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
         raise bad_ply(path, why(error), "a .ply file", "Check the path.") from error
 
 
+def property_types(path: Path) -> dict[str, str]:
+    """NumPy's type of each property of the element vertex, by its name. Only the header is read."""
+    return next((dict(element.fields) for element in header_of(path).elements if element.name == "vertex"), {})
+
+
 def read_vertices(path: Path) -> np.ndarray:
     """The vertex element as a structured array."""
     blocks = list(vertex_blocks(path, sys.maxsize)[2])

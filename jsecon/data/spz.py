@@ -67,15 +67,15 @@ def save_spz(path: str | Path, gaussians: Gaussians, *, similarity: Float[Array,
     drawn, farther than 4,194,303 units from the origin, larger than exp(5.9) units, or of which more than 1 % are
     smaller than exp(-10) units, for more than 2^32, and where the folder cannot be written.
     """
-    carried = AXES if similarity is None else AXES @ np.asarray(similarity, np.float64)
-    bits = _fraction_bits(path, gaussians, carried)
+    into = AXES if similarity is None else AXES @ np.asarray(similarity, np.float64)
+    bits = _fraction_bits(path, gaussians, into)
     if gaussians.count >= 1 << 32:
         raise InputError(path, f"{gaussians.count} Gaussians", "fewer than 2^32 in a .spz", "Write a .ply.")
     degree = math.isqrt(gaussians.sh.shape[1]) - 1
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, gaussians.count, degree, bits, 0, 0)
     with written_whole(path) as temporary, contextlib.ExitStack() as stack:
         columns = [stack.enter_context(tempfile.TemporaryFile(dir=temporary.parent)) for _ in range(6)]
-        for _, part in usable_blocks(path, gaussians, carried):
+        for _, part in usable_blocks(path, gaussians, into):
             for column, data in zip(columns, _packed(part, bits), strict=True):
                 column.write(data)
         raw = stack.enter_context(open(temporary, "wb"))
@@ -87,12 +87,12 @@ def save_spz(path: str | Path, gaussians: Gaussians, *, similarity: Float[Array,
                 shutil.copyfileobj(column, file, 1 << 20)
 
 
-def _fraction_bits(path: str | Path, gaussians: Gaussians, carried: np.ndarray) -> int:
+def _fraction_bits(path: str | Path, gaussians: Gaussians, into: np.ndarray) -> int:
     """The bits behind the point with which the farthest Gaussian fits into 24. Raises InputError where none do, and
     where sizes do not fit."""
     reach, small, large = 0.0, 0, -np.inf
     check_gaussians(gaussians)
-    for _, part in usable_blocks(path, dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), carried):
+    for _, part in usable_blocks(path, dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), into):
         sizes = np.asarray(part.log_scales, np.float64).max(axis=1)
         reach = max(reach, float(np.abs(part.means).max()))
         large = max(large, float(sizes.max()))

@@ -20,8 +20,11 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     """The Gaussians in the world that `similarity` (4, 4) leads to: x' = s R x + t, with R a rotation and s > 0.
 
     Positions, sizes, orientations and the spherical harmonics all follow, so a camera that is carried along sees the
-    same image. NumPy arrays stay such, and the identity returns the Gaussians as they are. Raises ValueError for a
-    matrix that is no similarity.
+    same image. Arrays keep their kind (NumPy, jax) and their type: float64 means (NumPy) are carried in float64. The
+    identity returns the Gaussians as they are.
+
+    Raises:
+      ValueError: The matrix is no similarity.
     """
     matrix = np.asarray(similarity, np.float64)
     if np.array_equal(matrix, np.eye(4)):
@@ -32,16 +35,34 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     similar = bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1]))
     expected, remedy = "a rotation, one positive scale and a shift", "Leave out shear, mirrors and unequal scales."
     require(similar, "similarity", matrix.tolist(), expected, remedy)
-    xp, dtype = gaussians.means.__array_namespace__(), gaussians.means.dtype
-    cast = lambda array: xp.asarray(array, dtype)
+    xp = gaussians.means.__array_namespace__()
+    like = lambda column, array: xp.asarray(array, column.dtype)
+    means, turns, sh = gaussians.means, gaussians.quaternions, gaussians.sh
     with jax.default_matmul_precision("highest"):  # WHOLE, for NumPy arrays too
         return Gaussians(
-            means=gaussians.means @ cast(scale * rotation.T) + cast(matrix[:3, 3]),
-            log_scales=gaussians.log_scales + cast(np.log(scale)),
-            quaternions=gaussians.quaternions @ cast(_product_matrix(quaternion_of(rotation))),
+            means=means @ like(means, scale * rotation.T) + like(means, matrix[:3, 3]),
+            log_scales=gaussians.log_scales + like(gaussians.log_scales, np.log(scale)),
+            quaternions=turns @ like(turns, _product_matrix(quaternion_of(rotation))),
             opacity_logits=gaussians.opacity_logits,
-            sh=cast(_sh_rotation(rotation, gaussians.sh.shape[1])) @ gaussians.sh,
+            sh=like(sh, _sh_rotation(rotation, sh.shape[1])) @ sh,
         )
+
+
+def carried(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
+    """`transform_gaussians` on the host, with the means in float64 before and after: NumPy arrays.
+
+    Use it into a world of large coordinates (a map projection's), where float32 holds no millimetres, and out of it.
+    """
+    host = jax.tree.map(np.asarray, gaussians)
+    return transform_gaussians(dataclasses.replace(host, means=host.means.astype(np.float64)), similarity)
+
+
+def float32_rounds(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
+    """(N,) by how much float32 rounds each of the means, in units of the Gaussian's largest standard deviation."""
+    means = np.asarray(gaussians.means)
+    moved = np.abs(means - means.astype(np.float32).astype(np.float64)).max(axis=1, initial=0.0)
+    sizes = np.exp(np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf))
+    return np.divide(moved, sizes, out=np.where(moved > 0, np.inf, 0.0), where=sizes > 0)
 
 
 def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians:
@@ -69,12 +90,12 @@ def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians
 def transformed_blocks(
     gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
 ) -> Iterator[tuple[slice, Gaussians]]:
-    """`transform_gaussians` of ROWS Gaussians after the other, NumPy, and which they are: mapped columns need not fit
-    into memory."""
+    """`carried` of ROWS Gaussians after the other, and which they are: mapped columns need not fit into memory.
+    Without a similarity they come as they are, NumPy."""
     for first in range(0, gaussians.count, ROWS):
         own = slice(first, min(first + ROWS, gaussians.count))
         part = jax.tree.map(lambda a, own=own: np.asarray(a[own]), gaussians)
-        yield own, part if similarity is None else transform_gaussians(part, similarity)
+        yield own, part if similarity is None else carried(part, similarity)
 
 
 def recentred(
