@@ -268,8 +268,8 @@ def assemble(
     `downscale` (area average), or where that is None so that the longer side is at most `long_side`. Where the sizes
     differ, the commonest is taken and the others are resized to it, focal lengths with them. `only`: frames of these
     names alone. Large coordinates and units far from metres are changed in float64 (`ordinary_world`), by the same for
-    any choice of frames; `Capture.to_source` leads back. Raises InputError on
-    images that are missing, damaged or of another aspect, and on poses that are not finite and rigid.
+    any choice of frames; `Capture.to_source` leads back. Raises InputError on images that are missing, damaged or
+    of another aspect, and on poses that are not finite and rigid.
     """
     check_options(downscale, frames, holdout, long_side)
     where = posed.where

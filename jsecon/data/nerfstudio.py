@@ -133,8 +133,9 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
         transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
     scaled = np.diag([scale, scale, scale, 1.0]) @ (transform if sane(transform) else np.zeros((4, 4)))
     size = np.abs(scaled[:3, :3]).max()
-    if not size > 0 or abs(np.linalg.det(scaled[:3, :3] / size)) < 1e-9:
-        raise _bad(file, "an applied_transform or applied_scale that cannot be inverted", "a similarity")
+    turn = scaled[:3, :3] / size if size > 0 else np.zeros((3, 3))
+    if not (np.linalg.det(turn) > 0 and np.allclose(turn @ turn.T, (turn @ turn.T)[0, 0] * np.eye(3), atol=1e-3)):
+        raise _bad(file, "an applied_transform or applied_scale that is no similarity", "a rotation, scale and shift")
     return np.linalg.inv(scaled)
 
 

@@ -28,8 +28,8 @@ fewer than FEW views, which tell too little. Scenes of one Gaussian a sparse poi
 and 0.50 (bonsai) in their world, others up to 0.40 in a wrong one; fitted ones 0.8 to 0.97 and -0.1 to 0.1"""
 FEW = 6
 TOLD_APART = 4.0
-"""standard deviations by which the sum of the correlations lies above that of shuffled photographs: 4.2 and 4.9 in those
-right worlds, up to 3.6 in wrong ones (a tenth of the scene's size beside: 4.0)"""
+"""standard deviations by which the correlation lies above that with shuffled photographs: 4.2 and 4.9 in those right
+worlds, up to 3.6 in wrong ones (a tenth of the scene's size beside: 4.0)"""
 _SHUFFLES = 500
 
 

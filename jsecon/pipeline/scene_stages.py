@@ -4,11 +4,13 @@ fitted, held-out frames are measured."""
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.pipeline.progress import Progress
@@ -146,17 +148,12 @@ def _read(work: Work) -> Stage:
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.data.nerfstudio import trained_to_source
-        from jsecon.splat.transform import transform_gaussians
 
-        capture, (found, notes) = results["load"], given_gaussians(path)
-        if trained.is_file():
-            found = transform_gaussians(found, np.linalg.inv(capture.to_source) @ trained_to_source(trained))
-            notes = (
-                *notes,
-                f"The Gaussians were carried back from nerfstudio's world by {trained.name}.",
-            )
+        capture, (given, said) = results["load"], given_gaussians(path)
+        told = trained_to_source(trained) if trained.is_file() else None
+        found, notes = _in_the_captures_world(given, capture, path, told, progress)
         check_overlap(found, capture.cameras[training_frames(capture)], str(path))
-        return Outcome(found, notes=notes)
+        return Outcome(found, notes=(*notes, *said))
 
     given = {"trained": trained.read_text(errors="replace")} if trained.is_file() else {}
     left = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
@@ -166,13 +163,88 @@ def _read(work: Work) -> Stage:
 
 
 def given_gaussians(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
-    """The Gaussians of a file, and what its reader has to say of them. Raises InputError where there is none."""
+    """The Gaussians of a file (NumPy), and what its reader has to say of them. Raises InputError where there is none."""
     from jsecon.data.gaussian_files import read_gaussians
 
     found, notes = read_gaussians(path)
     if not found.count:
         raise InputError(path, "the file holds no Gaussians", "at least one", "Export the scene again.")
     return found, notes
+
+
+WARNING = "WARNING: "
+"""begins a note on what makes answers wrong"""
+_LEAD = 0.05
+"""of correlation with the frames, that a less likely world must have before a likelier one"""
+
+
+def _in_the_captures_world(
+    gaussians: Gaussians, capture: Capture, path: Path, trained: np.ndarray | None, progress: Progress
+) -> tuple[Gaussians, tuple[str, ...]]:
+    """A file's Gaussians (NumPy, float64 means) in the world of the capture's cameras, and what was taken for theirs.
+
+    The file does not tell its world, so a few frames are rendered in each that it may be: the one that `trained` leads
+    back from, the capture files', the poses', those of known trainings. The one that looks like the frames is taken.
+    """
+    from jsecon.data.worlds import trained_worlds
+    from jsecon.fit.worlds import likeness
+    from jsecon.splat.transform import carried
+
+    to_source = np.asarray(capture.to_source, np.float64)
+    to_poses = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
+    transformed = not np.allclose(to_poses, to_source, rtol=1e-9, atol=1e-9 * np.abs(to_source).max())
+    worlds: list[tuple[str, np.ndarray]] = []
+    if trained is not None:
+        worlds.append(("dataparser_transforms.json", trained))
+        if transformed:
+            worlds.append(("dataparser_transforms.json, of the poses", to_source @ np.linalg.inv(to_poses) @ trained))
+    worlds.append(("the capture's files" if transformed else "the capture's poses", np.eye(4)))
+    if transformed:
+        worlds.append(("the poses, without the applied_transform undone", to_source @ np.linalg.inv(to_poses)))
+
+    def seen_in(world: np.ndarray) -> tuple[Gaussians, Any]:
+        moved = carried(gaussians, np.linalg.inv(to_source) @ world)
+        scene = jax.tree.map(jnp.asarray, moved)
+        return scene, likeness(scene, capture)
+
+    looked = []
+    for n, (name, world) in enumerate(worlds):
+        looked.append((name, *seen_in(world)))
+        progress(n + 1, len(worlds))
+    best = looked[0]
+    for other in looked[1:]:
+        if other[2].correlation > best[2].correlation + _LEAD:
+            best = other
+    if not best[2].explained:
+        cameras = np.linalg.inv(moved_poses(np.asarray(capture.cameras.world_to_camera, np.float64), to_poses))
+        points = np.asarray(capture.points, np.float64) @ to_poses[:3, :3].T + to_poses[:3, 3]
+        for name, world in trained_worlds(cameras, points):
+            scene, seen = seen_in(to_source @ np.linalg.inv(world @ to_poses))
+            if seen.explained and seen.correlation > best[2].correlation + _LEAD:
+                best = f"the training, normalised as by {name}", scene, seen
+    name, scene, seen = best
+    figures = f"correlation with the frames {seen.correlation:.2f}, {seen.psnr:.1f} dB"
+    notes = [f"The Gaussians were read in the world of {name} ({figures})."]
+    if not seen.explained:
+        notes[0] = (
+            f"{WARNING}The Gaussians of {path.name} do not look like the frames ({figures}). They are probably in "
+            f"another world than the poses, and answers will be wrong. Give Gaussians in the world of the capture, or "
+            f"put the dataparser_transforms.json of their training beside {path.name}."
+        )
+    return scene, (*notes, *_rounded_note(gaussians, path))
+
+
+def _rounded_note(gaussians: Gaussians, path: Path) -> tuple[str, ...]:
+    """Where a file's float32 has rounded the places of its Gaussians: nothing brings them back."""
+    from jsecon.data.ply import ROUNDED_READ
+
+    if gaussians.means.dtype != np.float32:
+        return ()
+    steps = np.spacing(np.abs(gaussians.means).max(axis=1))
+    if np.median(steps / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))) < 2 * ROUNDED_READ:
+        return ()
+    told = f"{path.name} holds positions in float32, which rounds them to {np.median(steps):.2g} units out there."
+    return (f"{WARNING}{told} Export them in double precision, or nearer to the origin.",)
 
 
 def _fitted(work: Work) -> Stage:
