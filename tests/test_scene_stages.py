@@ -1,4 +1,4 @@
-"""Gaussians given to a run: read in every format, and carried back from the world that nerfstudio trained in."""
+"""Gaussians given to a run: read in every format, in whichever world they are that the frames show."""
 
 import dataclasses
 import json
@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 import splat_files
 from capture_files import refused, small_capture
+from scipy.spatial.transform import Rotation
 from splat_files import scene
 from test_gaussian_files import gaussians
 
-from jsecon.data.gaussian_files import save_gaussians
+from jsecon.data.gaussian_files import load_gaussians, save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians as stage_of
 from jsecon.pipeline.stages import Record, Work
-from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.render import render_rgb
+from jsecon.splat.transform import carried, transform_gaussians
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -38,20 +40,119 @@ def near():
     return gaussians(arrays | {"means": arrays["means"] / 10})
 
 
+def photographed(scene, capture=None):
+    """The capture (by default the small one) with frames that show the scene."""
+    capture = capture or small_capture(8)
+    frames = [render_rgb(scene, capture.cameras[t]).features for t in range(len(capture.names))]
+    return dataclasses.replace(capture, frames=(255 * np.clip(np.stack(frames), 0, 1)).astype(np.uint8))
+
+
 @pytest.mark.parametrize("name", ["scene.ply", "scene.spz", "scene.glb"])
 def test_a_scene_that_nerfstudio_trained_is_carried_back(tmp_path, near, name):
     """Into the world of transforms.json, which is not the source's where an applied_transform made it."""
     applied = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
-    capture = dataclasses.replace(small_capture(), to_source=np.linalg.inv(applied))
+    capture = dataclasses.replace(photographed(near), to_source=np.linalg.inv(applied))
     save_gaussians(tmp_path / name, transform_gaussians(near, TRAINED @ np.linalg.inv(applied)))
     plain, before = read(capture, tmp_path / name)
-    assert plain.notes == ()
+    assert plain.notes[0].startswith("WARNING")
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": TURN[:3].tolist(), "scale": 0.4}))
     found, after = read(capture, tmp_path / name)
     np.testing.assert_allclose(found.value.means, near.means, atol=1e-4)
     np.testing.assert_allclose(found.value.log_scales, near.log_scales, atol=0.04)
     assert "dataparser_transforms.json" in found.notes[0]
     assert before.given != after.given
+
+
+@pytest.mark.parametrize("world", ["files", "poses", "gsplat", "nerfstudio"])
+def test_the_world_is_found_that_the_frames_show(tmp_path, near, world):
+    """The one before an applied_transform, which jsecon writes; that of the poses; and those that trainings make of it.
+    The capture's points are not about the origin, so that the trainings' worlds are their own."""
+    applied = np.array([[1, 0, 0, 2], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
+    to_source = np.linalg.inv(applied) if world in ("files", "poses") else np.eye(4)
+    capture = dataclasses.replace(photographed(near), to_source=to_source)
+    others = {
+        "files": to_source,
+        "poses": np.eye(4),
+        "gsplat": gsplat_world(capture),
+        "nerfstudio": nerfstudio_world(capture),
+    }
+    save_gaussians(tmp_path / "scene.ply", near, similarity=others[world])
+    found, _ = read(capture, tmp_path / "scene.ply")
+    np.testing.assert_allclose(found.value.means, near.means, atol=1e-5)
+    assert world in found.notes[0]
+    assert "WARNING" not in found.notes[0]
+
+
+def gsplat_world(capture):
+    """As examples/datasets/normalize.py of gsplat has it, for cameras whose up is not +y."""
+    c2w = np.linalg.inv(capture.cameras.world_to_camera.astype(np.float64))
+    up, to = -c2w[:, :3, 1].mean(0), np.array([0, -1.0, 0])
+    up = up / np.linalg.norm(up)
+    axis = np.cross(up, to)
+    angle = np.arctan2(np.linalg.norm(axis), up @ to)
+    turn = Rotation.from_rotvec(angle * axis / max(np.linalg.norm(axis), 1e-12)).as_matrix()
+    ahead, places = c2w[:, :3, 2] @ turn.T, c2w[:, :3, 3] @ turn.T
+    middle = np.median(places - (ahead * places).sum(1)[:, None] * ahead, axis=0)
+    size = np.median(np.linalg.norm(places - middle, axis=1))
+    points = (capture.points @ turn.T - middle) / size
+    axes = np.linalg.svd(points - np.median(points, axis=0) - (points - np.median(points, axis=0)).mean(0))[2]
+    axes[0] *= np.sign(np.linalg.det(axes))
+    world = np.eye(4)
+    world[:3, :3] = axes @ turn / size
+    world[:3, 3] = axes @ (-middle / size - np.median(points, axis=0))
+    return world
+
+
+def nerfstudio_world(capture):
+    """As auto_orient_and_center_poses of nerfstudio has it: up to z, the mean to the origin, the largest to 1."""
+    c2w = np.linalg.inv(capture.cameras.world_to_camera.astype(np.float64))
+    up = -c2w[:, :3, 1].mean(0)
+    up = up / np.linalg.norm(up)
+    axis = np.cross(up, [0, 0, 1])
+    angle = np.arctan2(np.linalg.norm(axis), up[2])
+    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    places = (c2w[:, :3, 3] - c2w[:, :3, 3].mean(0)) @ turn.T
+    world = np.eye(4)
+    world[:3, :3] = turn / np.abs(places).max()
+    world[:3, 3] = -world[:3, :3] @ c2w[:, :3, 3].mean(0)
+    return world
+
+
+@pytest.mark.parametrize("holdout", [0, 4])
+def test_a_wrong_world_is_told(tmp_path, near, holdout):
+    capture = photographed(near)
+    held_out = np.arange(8) % holdout == 0 if holdout else np.zeros(8, bool)
+    save_gaussians(tmp_path / "scene.ply", transform_gaussians(near, TRAINED))
+    found, _ = read(dataclasses.replace(capture, held_out=held_out), tmp_path / "scene.ply")
+    assert found.notes[0].startswith("WARNING: The Gaussians of scene.ply do not look like the frames")
+
+
+@pytest.mark.parametrize("ending", ["ply", "glb"])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_gaussians_are_read_as_they_were_written_in_a_map_projections_world(tmp_path, near, scale, ending):
+    """Where float32 would round them to half a unit."""
+    to_source = np.diag([scale, scale, scale, 1.0])
+    to_source[:3, 3] = 455123.4, 5411876.6, 1e7
+    capture = dataclasses.replace(photographed(near), to_source=to_source, to_poses=to_source)
+    save_gaussians(tmp_path / f"scene.{ending}", near, similarity=to_source)
+    found, _ = read(capture, tmp_path / f"scene.{ending}")
+    np.testing.assert_allclose(found.value.means, near.means, atol=1e-5)
+    assert len(found.notes) == 1
+    if scale <= 1:  # the larger ones float32 does hold
+        with refused(f"scene.{ending}", "float32"):
+            load_gaussians(tmp_path / f"scene.{ending}")
+    there = load_gaussians(tmp_path / f"scene.{ending}", similarity=np.linalg.inv(to_source))
+    np.testing.assert_allclose(there.means, near.means, atol=1e-5)
+
+
+def test_a_file_whose_float32_has_rounded_the_places_is_told(tmp_path, near):
+    to_source = np.eye(4)
+    to_source[:3, 3] = 455123.4, 5411876.6, 1e7
+    capture = dataclasses.replace(photographed(near), to_source=to_source, to_poses=to_source)
+    far = carried(near, to_source)
+    save_gaussians(tmp_path / "scene.ply", dataclasses.replace(far, means=far.means.astype(np.float32)))
+    found, _ = read(capture, tmp_path / "scene.ply")
+    assert any("scene.ply holds positions in float32" in note for note in found.notes)
 
 
 def test_a_compressed_ply_is_read(tmp_path, near):

@@ -1,0 +1,86 @@
+"""The same scene in other units and places: a capture comes out the same, and what is written leads back."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import small_capture, transforms, write_images, write_text_model
+
+import jsecon
+
+SHIFT = np.array([1e7, -5411876.6, 312.25])
+
+
+def moved(capture, scale, shift):
+    """The capture with poses and points in float64, `scale` times as large and shifted."""
+    poses = capture.cameras.world_to_camera.astype(np.float64)
+    left, _, right = np.linalg.svd(poses[:, :3, :3])
+    poses[:, :3, :3] = left @ right
+    poses[:, :3, 3] = scale * poses[:, :3, 3] - poses[:, :3, :3] @ shift
+    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses)
+    return dataclasses.replace(capture, cameras=cameras, points=scale * capture.points.astype(np.float64) + shift)
+
+
+def written(kind, capture, folder, scale, shift):
+    """A capture folder of the kind: COLMAP, nerfstudio with depth, and nerfstudio with nothing but poses."""
+    there = moved(capture, scale, shift)
+    write_images(capture, folder / "images")
+    if kind == "colmap":
+        write_text_model(there, folder / "sparse" / "0")
+        return folder
+    told = transforms(there, depth_unit_scale_factor=0.001 * scale)
+    if kind == "depth":
+        (folder / "depth").mkdir()
+        for frame, name in zip(told["frames"], capture.names):
+            frame["depth_file_path"] = f"depth/{name}.png"
+            depth = np.full(capture.frames.shape[1:3], 2500, np.uint16)
+            cv2.imwrite(str(folder / frame["depth_file_path"]), depth)
+    (folder / "transforms.json").write_text(json.dumps(told))
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["colmap", "depth", "poses"])
+@pytest.mark.parametrize(("scale", "shift"), [(1, SHIFT), (1e-3, 0 * SHIFT), (1e-3, SHIFT), (1e3, SHIFT), (1e6, SHIFT)])
+def test_a_capture_comes_out_the_same_in_any_place_and_unit(tmp_path, kind, scale, shift):
+    plain = jsecon.load_capture(written(kind, small_capture(), tmp_path / "plain", 1, 0 * SHIFT))
+    there = jsecon.load_capture(written(kind, small_capture(), tmp_path / "there", scale, shift))
+    np.testing.assert_array_equal(plain.to_source, np.eye(4))
+    offset = there.cameras.centres[0] - plain.cameras.centres[0]
+    assert np.abs(offset).max() < 11
+    np.testing.assert_allclose(there.cameras.centres, plain.cameras.centres + offset, atol=2e-5)
+    if kind == "colmap":
+        np.testing.assert_allclose(there.points, plain.points + offset, atol=2e-5)
+    if kind == "depth":
+        np.testing.assert_allclose(there.depths, plain.depths, rtol=1e-6)
+    back = there.cameras.centres.astype(np.float64) @ there.to_source[:3, :3].T + there.to_source[:3, 3]
+    np.testing.assert_allclose(back, scale * plain.cameras.centres.astype(np.float64) + shift, atol=3e-6 * scale)
+
+
+@pytest.mark.parametrize("frames", [None, 3])
+def test_the_world_of_a_capture_is_that_of_all_its_frames(tmp_path, frames):
+    """Whichever are loaded: a field of some of them goes with the capture of others."""
+    folder = written("colmap", small_capture(), tmp_path, 1e-3, SHIFT)
+    whole = jsecon.load_capture(folder)
+    some = jsecon.load_capture(folder, frames=frames, only=whole.names[:3])
+    np.testing.assert_array_equal(some.to_source, whole.to_source)
+    assert set(some.names) <= set(whole.names)
+
+
+@pytest.mark.parametrize("ending", ["ply", "glb"])
+def test_gaussians_of_large_coordinates_keep_a_millimetre(tmp_path, scene, ending):
+    to_source = np.eye(4)
+    to_source[:3, 3] = SHIFT
+    file = tmp_path / f"scene.{ending}"
+    jsecon.save_gaussians(file, scene, similarity=to_source)
+    found = jsecon.load_gaussians(file, similarity=np.linalg.inv(to_source))
+    np.testing.assert_allclose(found.means, scene.means, atol=1e-5)
+    with pytest.raises(jsecon.InputError, match="similarity"):
+        jsecon.load_gaussians(file)
+
+
+def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):
+    """As INRIA's readers expect it, whatever turns and moves it a little."""
+    jsecon.save_ply(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))
+    assert b"property double" not in (tmp_path / "a.ply").read_bytes()
