@@ -53,7 +53,7 @@ def test_a_capture_comes_out_the_same_in_any_place_and_unit(tmp_path, kind, scal
     if kind == "colmap":
         np.testing.assert_allclose(there.points, plain.points + offset, atol=2e-5)
     if kind == "depth":
-        np.testing.assert_allclose(there.depths, plain.depths, rtol=1e-6)
+        np.testing.assert_allclose(np.asarray(there.depths), np.asarray(plain.depths), rtol=1e-6)
     back = there.cameras.centres.astype(np.float64) @ there.to_source[:3, :3].T + there.to_source[:3, 3]
     np.testing.assert_allclose(back, scale * plain.cameras.centres.astype(np.float64) + shift, atol=3e-6 * scale)
 

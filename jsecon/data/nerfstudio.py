@@ -135,7 +135,8 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
     size = np.abs(scaled[:3, :3]).max()
     turn = scaled[:3, :3] / size if size > 0 else np.zeros((3, 3))
     if not (np.linalg.det(turn) > 0 and np.allclose(turn @ turn.T, (turn @ turn.T)[0, 0] * np.eye(3), atol=1e-3)):
-        raise _bad(file, "an applied_transform or applied_scale that is no similarity", "a rotation, scale and shift")
+        found = "an applied_transform or applied_scale that cannot be inverted, or shears or mirrors"
+        raise _bad(file, found, "a rotation, a scale and a shift")
     return np.linalg.inv(scaled)
 
 

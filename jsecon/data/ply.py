@@ -101,7 +101,7 @@ def read_ply(path: Path) -> Gaussians:
     filters = [name for name in _FILTERS if name in names][:1]
     types = property_types(path)
     fine = any(types[name] not in _COARSE for name in _POSITION)
-    arrays = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
+    arrays: dict[str, np.ndarray] = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
     arrays["means"] = np.empty((count, 3), np.float64 if fine else np.float32)
     arrays |= {"opacity_logits": np.empty(count, np.float32), "sh": np.empty((count, 1 + rest // 3, 3), np.float32)}
     first, unit = 0, 1.0

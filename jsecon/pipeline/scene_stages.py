@@ -163,7 +163,7 @@ def _read(work: Work) -> Stage:
 
 
 def given_gaussians(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
-    """The Gaussians of a file (NumPy), and what its reader has to say of them. Raises InputError where there is none."""
+    """A file's Gaussians (NumPy), and what its reader has to say of them. Raises InputError where there is none."""
     from jsecon.data.gaussian_files import read_gaussians
 
     found, notes = read_gaussians(path)
