@@ -1,58 +1,29 @@
-"""Masklets from disk: one label image per frame, matched to the frames by name.
-
-One folder of black and white masks for each object, as SAM 2 writes them with --per_obj_png_file:
-`<id>/<frame>.png`, the id in decimal digits (001, 002, ...).
-"""
+"""Masklets from disk: one label image per frame, or one black and white mask per object and frame, matched by name."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import collections
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-from jaxtyping import Int16, Int64
+from jaxtyping import Int16
 
 from jsecon.data.frames import Progress
-from jsecon.data.images import IMAGE_ENDINGS, read_ids
+from jsecon.data.images import TRANSPOSED, read_ids, turned
+from jsecon.data.mask_names import Masks, find_masks, object_ids
 from jsecon.errors import InputError
 from jsecon.files import UNREADABLE, map_array
-
-
-def object_folders(folder: Path) -> tuple[Path, ...]:
-    """The objects' folders by ascending id; none where `folder` itself holds masks, or no such folders."""
-    own = any(path.suffix in (".png", ".npy") for path in folder.iterdir())
-    numbered = [path for path in folder.iterdir() if path.is_dir() and path.name.isdecimal()]
-    holding = [path for path in numbered if next(path.glob("*.png"), None) is not None]
-    return () if own else tuple(sorted(holding, key=lambda path: int(path.name)))
-
-
-def read_objects(folders: Sequence[Path], name: str) -> Int64[np.ndarray, "h w"]:
-    """The ids (H, W) of one frame, the file `name` in each folder that has it, -1 = none.
-
-    Where objects overlap, the lower id lies on top, as where SAM 2 writes them into one file. Raises InputError where a
-    mask cannot be read or differs in size.
-    """
-    image: np.ndarray | None = None
-    for folder in reversed(folders):
-        if (folder / name).is_file():
-            mask = read_ids(folder / name)[0]
-            image = np.full(mask.shape, -1, np.int64) if image is None else image
-            if mask.shape != image.shape:
-                found, wanted = (f"{width}x{height}" for height, width in (mask.shape, image.shape))
-                remedy = "Write all masks of a frame at one size."
-                raise InputError(folder / name, f"a mask of {found}", f"{wanted}, like those of other objects", remedy)
-            image[mask > 0] = int(folder.name)
-    assert image is not None, f"{name} lies in none of the folders"
-    return image
-
+from jsecon.types import ImageFile
 
 LEVELS = ("default", "s", "m", "l")
 """LangSplat's levels in the order of its `_s.npy`: all of SAM's masks, subpart, part, whole"""
 MOST_REGIONS = int(np.iinfo(np.int16).max)
 MOST_IDS = 1 << 24
-"""what float32 holds without a gap, and colours of 8 bits make"""
+"""what float32, in which LangSplat writes ids, holds without a gap"""
+GREY = 65793
+"""the number of the colour (1, 1, 1), R*65536 + G*256 + B"""
 _SUFFIX = "_s.npy"
 
 
@@ -76,159 +47,303 @@ def load_labels(
     level: str | int = "l",
     shared: bool | None = None,
     order: Sequence[str] | None = None,
+    files: Mapping[str, ImageFile] | None = None,
     progress: Progress = None,
 ) -> MasksFromDisk:
-    """The masks in `folder` of the frames called `names`, `size` = (H, W), as labels (T, H, W).
+    """Reads the masks in `folder` of the frames called `names` as labels (T, H, W).
 
-    `<name>.png` (also `<name>.jpg.png`), one id per pixel: 8 or 16 bit grey, a palette PNG (its indices), or RGB (each
-    colour an id, R*65536 + G*256 + B); `background` is the id of no region (None: every id is one). Such are Gaussian
-    Grouping's object_mask and SAM 2's PNGs. Or `<id>/<name>.png`, black and white masks in a folder for each object, as
-    SAM 2 writes them with --per_obj_png_file; where they overlap the lower id lies on top. Or LangSplat's
-    `<name>_s.npy` (4, H, W), -1 = none, of which `level` is taken ("default", "s", "m", "l", or its index).
+    A mask is called like its frame: `<name>.png`, also `<name>.jpg.png` or `<name>_mask.png`. It has an id per pixel:
+    8 or 16 bit grey, a palette PNG (its indices), RGB (each colour an id, R*65536 + G*256 + B), or whole numbers in a
+    `.npy`. Such are Gaussian Grouping's object_mask and SAM 2's PNGs. Or it is LangSplat's `<name>_s.npy` (4, H, W),
+    -1 = none.
 
-    SAM 2 wants frames called 0, 1, ... `order` says what such numbers stand for: where no PNG is called like a frame,
-    and they are numbered from 0 to len(order) - 1, number n is the mask of the frame `order[n]`.
-
-    `shared`: whether an id means the same object in every frame. By default so for PNGs; not for `_s.npy`, since
-    LangSplat numbers the masks of each frame afresh: each is then a region of its own. Say True for tracked ones.
+    Subfolders named like those of the images are cameras. Other subfolders of black and white masks are objects, as SAM
+    2 writes them with --per_obj_png_file (`<id>/<name>.png`); where they overlap the lower id lies on top.
 
     Masks must be of the frames as the capture was loaded, undistorted. Another size is resized to theirs (nearest)
-    where the aspect agrees to a pixel. A frame without a mask file is wholly -1. Both are said in the notes. Raises
-    InputError where no frame has a mask, a file is damaged, or of another aspect or kind, or there are more than 32767
-    regions.
+    where the aspect agrees to a pixel; masks of stored pixels are turned like their images. A frame without a mask file
+    is wholly -1. The notes tell all of it.
+
+    Args:
+      folder: The masks.
+      names: T frames.
+      size: (H, W) of the labels.
+      background: The id of no region; None: every id is one.
+      level: LangSplat's level: "default", "s", "m", "l", or its index.
+      shared: Whether an id means the same object in every frame. By default so for all but `_s.npy`: LangSplat numbers
+        the masks of each frame afresh, and each is a region of its own. Say True for tracked ones.
+      order: All frames of the capture. Where no file is called like a frame and the files are numbered from 0 to
+        len(order) - 1, as SAM 2 wants them, number n is the mask of order[n].
+      files: The image of each frame, by its name: its folders are the cameras', its orientation that of its masks.
+      progress: Called with (frames done, frames).
+
+    Raises:
+      InputError: No frame has a mask, a file is damaged, or of another aspect or kind, or there are more than 32767
+        regions.
     """
     folder = Path(folder)
     height, width = size
-    objects = object_folders(folder) if folder.is_dir() else ()
-    files, kind = _find(folder, objects, names, order)
-    per_frame = kind == _SUFFIX if shared is None else not shared
+    found = _masks_of(folder, names, order, files)
+    shared = found.ending != _SUFFIX if shared is None else shared
+    reader = _Reader(found, names, level, None if found.objects else background, files or {}, size)
     labels = np.full((len(names), height, width), -1, np.int16)
     own_ids: list[np.ndarray] = []
-    resized = colours = 0
     for index, name in enumerate(names):
-        own_ids.append(np.zeros(0, np.int64))
-        if name in files:
-            if kind == _SUFFIX:
-                image, none = read_level(files[name], level), -1
-            elif objects:
-                image, none = read_objects(objects, files[name].name), -1
-            else:
-                image, coloured = read_ids(files[name])
-                none, colours = background, colours + coloured
-            fitted = fitted_to_frame(files[name], image, width, height)
-            resized += fitted is not image
-            own_ids[-1], labels[index] = _compact(files[name], fitted, none)
+        own, labels[index] = reader.read(name)
+        own_ids.append(own)
         if progress is not None:
             progress(index + 1, len(names))
-    if 0 < colours < len(files):
-        found = f"{colours} colour images among {len(files)} masks"
-        raise InputError(folder, found, "ids in all, or colours in all", "Write all alike, best as 16 bit grey PNGs.")
+    own_ids = reader.without_background(folder, own_ids)
 
-    if per_frame:
-        ids = np.concatenate(own_ids)
-        starts = np.cumsum([0, *map(len, own_ids)])
-        tables = [np.arange(len(own)) + start for own, start in zip(own_ids, starts)]
-    else:
+    if shared:
         ids = np.unique(np.concatenate(own_ids))
-        tables = [np.searchsorted(ids, own) for own in own_ids]
+        ids = ids[ids >= 0]
+        tables = [np.where(own >= 0, np.searchsorted(ids, own), -1) for own in own_ids]
+    else:
+        kept = [own >= 0 for own in own_ids]
+        ids = np.concatenate([own[keep] for own, keep in zip(own_ids, kept)])
+        starts = np.cumsum([0, *(int(keep.sum()) for keep in kept)])
+        tables = [np.where(keep, np.cumsum(keep) - 1 + start, -1) for keep, start in zip(kept, starts)]
     if len(ids) > MOST_REGIONS:
         remedy = "Take a coarser level, fewer frames, or say shared=True if the ids are tracked."
-        raise InputError(folder, f"{len(ids)} regions", f"at most {MOST_REGIONS}", remedy)
+        raise InputError(folder, f"there are {len(ids)} regions", f"at most {MOST_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    notes = _notes(names, files, resized, colours, per_frame, size)
-    return MasksFromDisk(labels, tuple(map(int, ids)), notes)
+    return MasksFromDisk(labels, reader.named(ids), (*reader.notes(not shared), *found.notes))
 
 
-def _notes(names, files, resized, colours, per_frame, size) -> tuple[str, ...]:
-    notes, missing = [], [name for name in names if name not in files]
-    if missing:
-        without = f"{len(missing)} of {len(names)} frames have no mask"
-        notes.append(f"{without} (the first: {missing[0]}); they are unlabelled.")
-    if resized:
-        notes.append(f"{resized} masks were resized to {size[1]}x{size[0]} (nearest).")
-    if colours:
-        notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
-    if numbered := [name for name in files if files[name].stem.isdecimal() and files[name].stem != name]:
-        first = numbered[0]
-        notes.append(f"The masks are numbered, and taken in the order of the frames: {files[first].name} is {first}.")
-    if per_frame:
-        notes.append("Each frame's masks count as regions of their own, since their ids are not shared between frames.")
-    return tuple(notes)
-
-
-def _find(
-    folder: Path, objects: Sequence[Path], names: Sequence[str], order: Sequence[str] | None
-) -> tuple[dict[str, Path], str]:
-    """Mask files by frame name, and their common ending; where objects have folders of their own, one of each frame."""
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder of masks", "Check the path.")
-    found: dict[str, dict[str, Path]] = {".png": {}, _SUFFIX: {}}
-    for file in sorted(file for place in objects or (folder,) for file in place.iterdir()):
-        for ending, files in found.items():
-            if file.name.lower().endswith(ending):
-                key = file.name[: -len(ending)]
-                files[key] = file
-                # COLMAP calls the mask of a.jpg "a.jpg.png"; the plain name has precedence.
-                if Path(key).suffix in IMAGE_ENDINGS:
-                    files.setdefault(Path(key).stem, file)
-    # LangSplat cuts names at the first dot.
-    arrays = {name: found[_SUFFIX].get(name) or found[_SUFFIX].get(name.split(".")[0]) for name in names}
-    matched = {
-        ".png": {name: found[".png"][name] for name in names if name in found[".png"]},
-        _SUFFIX: {name: file for name, file in arrays.items() if file is not None},
-    }
-    numbered = {int(key): file for key, file in found[".png"].items() if key.isdecimal()}
-    if order is not None and not matched[".png"] and sorted(numbered) == list(range(len(order))):
-        matched[".png"] = {name: numbered[order.index(name)] for name in names}
-    if not matched[".png"] and not matched[_SUFFIX]:
-        inside = len(set(found[".png"].values())) + len(found[_SUFFIX])
-        found_there = f"{inside} masks, none of which is called like a frame"
-        numbers = "" if order is None else f"; or a PNG for each number from 0 to {len(order) - 1}"
-        wanted = f"<name>.png or <name>{_SUFFIX}, for instance {names[0]}.png{numbers}"
-        raise InputError(folder, found_there, wanted, "Name each mask like its frame.")
-    if matched[".png"] and matched[_SUFFIX]:
-        both = f"both .png and {_SUFFIX} masks of these frames"
+def _masks_of(
+    folder: Path, names: Sequence[str], order: Sequence[str] | None, files: Mapping[str, ImageFile] | None
+) -> Masks:
+    """The mask files of the frames. Raises InputError where there are none, or of two kinds."""
+    every = order if order is not None else names
+    kinds = find_masks(
+        folder, every, (".png", _SUFFIX, ".npy"), black_and_white, files=files, numbered=order is not None
+    )
+    if len(kinds) > 1:
+        both = f"there are both {kinds[0].ending} and {kinds[1].ending} masks of these frames"
         raise InputError(folder, both, "one kind", "Keep each kind in a folder of its own.")
-    kind = ".png" if matched[".png"] else _SUFFIX
-    return matched[kind], kind
+    if not any(name in kinds[0].files or name in kinds[0].objects for name in names):
+        problem = f"it has masks, but of none of the {len(names)} frames that are worked with"
+        raise InputError(folder, problem, f"a mask of {names[0]} and others", "Name each mask like its frame.")
+    return kinds[0]
+
+
+def black_and_white(path: Path) -> bool:
+    """Whether a mask has no value but 0 and 1, or 0 and the largest of its kind."""
+    image, coloured = read_ids(path)
+    values = np.unique(image)
+    values = values // GREY if coloured and not (values % GREY).any() else values
+    return len(values) <= 2 and set(values.tolist()) <= {0, int(values.max())} and values.max() in (0, 1, 255, 65535)
+
+
+class _Reader:
+    """Reads the labels of one frame after the other, and remembers what a note should tell."""
+
+    def __init__(self, found: Masks, names, level, background, files: Mapping[str, ImageFile], size):
+        self.found, self.names, self.level, self.background = found, names, level, background
+        self.files, self.size = files, size
+        folders = {folder for masks in found.objects.values() for folder in masks}
+        self.ids = object_ids(sorted(folders))
+        self.folders = sorted(folders, key=lambda folder: (self.ids[folder], folder))
+        self.fit = Fit(files, size, self._shape)
+        self.coloured: dict[Path | None, bool] = {}
+        self.negative = False
+
+    def _shape(self, name: str) -> tuple[int, ...] | None:
+        path = self.found.path(name)
+        return None if path is None else self._values(path).shape
+
+    def _values(self, path: Path) -> np.ndarray:
+        """The ids (H, W) of a file."""
+        if self.found.ending == _SUFFIX:
+            return read_level(path, self.level)
+        image, self.coloured[path] = read_ids(path)
+        self.negative |= bool(image.min() < 0)
+        return image
+
+    def read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """The ids of a frame, ascending, and its labels (H, W) as indices into them, -1 = none."""
+        if name in self.found.objects:
+            return self._objects(name, self.found.objects[name])
+        if name not in self.found.files:
+            return np.zeros(0, np.int64), np.full(self.size, -1, np.int16)
+        path = self.found.files[name]
+        image = self._values(path)
+        own, indices = compact(path, image)
+        return own, self.fit(path, indices, name)
+
+    def _objects(self, name: str, masks: Mapping[str, Path]) -> tuple[np.ndarray, np.ndarray]:
+        """The objects of a frame as indices into `folders`; the first lies on top."""
+        labels = np.full(self.size, -1, np.int16)
+        shown = []
+        for index, folder in reversed(list(enumerate(self.folders))):
+            if folder in masks:
+                image, _ = read_ids(masks[folder])
+                self._require_one_object(masks[folder], image)
+                labels[self.fit(masks[folder], (image > 0).astype(np.uint8), name) > 0] = index
+        shown = np.unique(labels[labels >= 0]).astype(np.int64)
+        return shown, np.where(labels >= 0, np.searchsorted(shown, labels), -1).astype(np.int16)
+
+    def _require_one_object(self, path: Path, image: np.ndarray) -> None:
+        inside = image[image > 0]
+        if inside.size and (inside != inside[0]).any():
+            count = len(np.unique(inside))
+            problem = (
+                f"the mask has {count} values besides 0, but the folders {', '.join(self.folders[:4])} hold objects"
+            )
+            remedy = (
+                "Name the folders like those of the images where they are cameras, or make each mask black and white."
+            )
+            raise InputError(path, problem, "one value for the object", remedy)
+
+    def without_background(self, folder: Path, own_ids: list[np.ndarray]) -> list[np.ndarray]:
+        """The frames' ids with -1 in place of the background's. Grey that is stored as colours has its grey values."""
+        if self.found.objects or self.found.ending == _SUFFIX:
+            return own_ids
+        coloured = [self.coloured.get(self.found.path(name), False) for name in self.names]
+        if not any((own % GREY).any() for own, colour in zip(own_ids, coloured) if colour):
+            own_ids = [own // GREY if colour else own for own, colour in zip(own_ids, coloured)]
+            self.coloured = {}
+        count = sum(self.coloured.values())
+        if 0 < count < len(self.coloured):
+            problem = f"there are {count} colour images among {len(self.coloured)} masks"
+            raise InputError(folder, problem, "ids in all, or colours in all", "Write all as 16 bit grey PNGs.")
+        if self.background is None or (self.negative and self.background == 0):
+            return own_ids
+        return [np.where(own == self.background, -1, own) for own in own_ids]
+
+    def named(self, ids: np.ndarray) -> tuple[int, ...]:
+        """The ids as the files, or the folders of objects, have them."""
+        return tuple(self.ids[self.folders[int(index)]] if self.found.objects else int(index) for index in ids)
+
+    def notes(self, per_frame: bool) -> list[str]:
+        notes, paths = [], {name: self.found.path(name) for name in self.names}
+        missing = [name for name, path in paths.items() if path is None]
+        if missing:
+            without = f"{len(missing)} of {len(self.names)} frames have no mask"
+            notes.append(f"{without} (the first: {missing[0]}); they are unlabelled.")
+        notes += self.fit.notes()
+        if any(self.coloured.values()):
+            notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
+        if self.negative and self.background == 0:
+            notes.append("The masks hold negative ids: these are taken for no region, and 0 for one.")
+        numbered = [
+            (name, path) for name, path in paths.items() if path and path.stem.isdecimal() and _other(name, path)
+        ]
+        if numbered:
+            name, path = numbered[0]
+            notes.append(f"The masks are numbered, and taken in the order of the frames: {path.name} is {name}.")
+        if per_frame:
+            notes.append("Each frame's masks count as regions of their own, since their ids are not shared.")
+        if not all(folder.isdecimal() for folder in self.folders):
+            told = ", ".join(f"{folder} is {self.ids[folder]}" for folder in self.folders[:8])
+            notes.append(f"The objects are numbered: {told}{' ...' if len(self.folders) > 8 else ''}.")
+        return notes
+
+
+def _other(name: str, path: Path) -> bool:
+    """Whether a numbered mask is not called like its frame."""
+    return name != path.stem and not name.endswith(f"_{path.stem}")
 
 
 def read_level(path: Path, level: str | int) -> np.ndarray:
     """ids (H, W) of one level of a `_s.npy`, -1 = none. Raises InputError where it is no such file."""
     if level not in (*LEVELS, 0, 1, 2, 3):
-        raise InputError("level", repr(level), f"one of {', '.join(LEVELS)}", "l is the coarsest.")
+        raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     try:
         image = map_array(path)
     except UNREADABLE as error:
         wanted = f"a .npy of shape ({len(LEVELS)}, H, W)"
-        raise InputError(path, f"no whole array ({error})", wanted, "Write the masks again.") from error
+        raise InputError(path, f"there is no whole array ({error})", wanted, "Write the masks again.") from error
     if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
         wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
-        raise InputError(path, f"an array of shape {image.shape}", wanted, remedy)
+        raise InputError(path, f"the array has shape {image.shape}", wanted, remedy)
     with np.errstate(invalid="ignore"):  # of a signalling NaN
         image = np.asarray(image[LEVELS.index(level) if isinstance(level, str) else level], np.float64)
     if not ((image >= -MOST_IDS) & (image < MOST_IDS) & (image == image.round())).all():
-        raise InputError(path, "numbers that are no integers or too large", "ids, -1 = none", "Write the masks again.")
+        problem = "the array holds numbers that are no integers or too large"
+        raise InputError(path, problem, "ids, -1 = none", "Write the masks again.")
     return image.astype(np.int64)
 
 
-def fitted_to_frame(path: Path, image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The mask at the frames' size; itself where it has that."""
-    if image.shape == (height, width):
-        return image
+def nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """An image (H, W) of integers at another size: each pixel has the value at its centre."""
     rows, columns = image.shape
-    # Within a pixel of the coarser of the two, whose size was rounded.
-    if min(abs(columns * height / rows - width), abs(width * rows / height - columns)) > 1:
-        remedy = "Make the masks from the frames as they are loaded (undistorted, unrotated), at any scale."
-        wanted = f"{width}x{height} like its frame, or that aspect"
-        raise InputError(path, f"a mask of {columns}x{rows}", wanted, remedy)
-    # Integers below 2^24 pass through float32 unchanged; OpenCV has no int64.
-    return cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST_EXACT).astype(np.int64)
+    down = (2 * np.arange(height) + 1) * rows // (2 * height)
+    across = (2 * np.arange(width) + 1) * columns // (2 * width)
+    return image[down[:, None], across]
 
 
-def _compact(path: Path, image: np.ndarray, none: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """The ids of an image in ascending order, and the image as indices into them: -1 for `none` and negative ids."""
+def _alike(rows: int, columns: int, width: int, height: int) -> bool:
+    """Whether an image has this size's aspect, within a pixel of the coarser of the two, whose size was rounded."""
+    return min(abs(columns * height / rows - width), abs(width * rows / height - columns)) <= 1
+
+
+class Fit:
+    """Brings masks to their frames' size, and counts what that took.
+
+    Args:
+      files: The frames' images by name. Masks have their size, upright or as stored, at any scale.
+      size: (H, W) of the frames.
+      shape: The shape (H, W) of a frame's mask by name, None where it has none. Where masks of images that lie on their
+        side turn out to be of the stored pixels, so are those of images that stand on their head, whose size cannot
+        tell.
+    """
+
+    def __init__(
+        self,
+        files: Mapping[str, ImageFile],
+        size: tuple[int, int],
+        shape: Callable[[str], tuple[int, ...] | None],
+    ):
+        self.files, (self.height, self.width) = files, size
+        self.count: collections.Counter[str] = collections.Counter()
+        self.stored = False
+        if any(1 < file.orientation < 5 for file in files.values()):
+            lying = [name for name, file in files.items() if file.orientation in TRANSPOSED]
+            self.stored = any(self._of_stored(files[name], shape(name)) for name in lying[:8])
+
+    def _of_stored(self, file: ImageFile, shape: tuple[int, ...] | None) -> bool:
+        """Whether a mask of this shape can only be one of the stored pixels of an image that lies on its side."""
+        if shape is None:
+            return False
+        rows, columns = shape
+        stored = _alike(rows, columns, file.height, file.width)
+        return stored and not _alike(rows, columns, file.width, file.height)
+
+    def __call__(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
+        """The mask (H, W) of the frame `name` at the frames' size; itself where it has that. Raises InputError, at
+        `path`, where its aspect is another."""
+        file = self.files.get(name)
+        upright = (self.width, self.height) if file is None else (file.width, file.height)
+        turn = 1 if file is None else file.orientation
+        stored = upright[::-1] if turn in TRANSPOSED else upright
+        rows, columns = image.shape
+        if turn != 1 and _alike(rows, columns, *stored) and (self.stored or not _alike(rows, columns, *upright)):
+            image = turned(image, turn)
+            self.count["turned"] += 1
+        elif not _alike(rows, columns, *upright) and not _alike(rows, columns, self.width, self.height):
+            remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
+            wanted = f"{upright[0]}x{upright[1]} like its frame, or that aspect"
+            raise InputError(path, f"the mask is {columns}x{rows}", wanted, remedy)
+        if image.shape == (self.height, self.width):
+            return image
+        self.count["resized"] += 1
+        return nearest(image, self.width, self.height)
+
+    def notes(self) -> list[str]:
+        """What was done to the masks, a sentence each."""
+        notes = []
+        if count := self.count["resized"]:
+            notes.append(f"{count} masks were resized to {self.width}x{self.height} (nearest).")
+        if count := self.count["turned"]:
+            notes.append(f"{count} masks were of the stored pixels, and were turned upright like their images.")
+        return notes
+
+
+def compact(path: Path, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The ids of an image in ascending order, and the image as indices into them: -1 for negative ids."""
     if image.max(initial=0) < 1 << 20:
         # A table instead of a sort: some ten times faster, and most masks have small ids.
         seen = np.zeros(int(image.max(initial=0)) + 2, bool)
@@ -237,11 +352,9 @@ def _compact(path: Path, image: np.ndarray, none: int | None) -> tuple[np.ndarra
     else:
         ids = np.unique(image)
         ids = ids[ids >= 0]
-    if none is not None:
-        ids = ids[ids != none]
-    if len(ids) > MOST_REGIONS:
+    if len(ids) > MOST_REGIONS + 1:  # and the background
         remedy = "Give label images, not photographs."
-        raise InputError(path, f"{len(ids)} ids in one mask", f"at most {MOST_REGIONS}", remedy)
+        raise InputError(path, f"the mask has {len(ids)} ids", f"at most {MOST_REGIONS}", remedy)
     if not len(ids):
         return ids, np.full(image.shape, -1, np.int16)
     position = np.minimum(np.searchsorted(ids, image), len(ids) - 1)

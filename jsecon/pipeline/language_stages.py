@@ -40,7 +40,8 @@ def regions(work: Work) -> Stage:
         capture, labels = results["load"], results["masklets"]
         assert options.features is not None
         names = [capture.names[t] for t in training_frames(capture)]
-        given = load_features(options.features, names, labels.shape[1:], level=options.level)
+        how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
+        given = load_features(options.features, names, labels.shape[1:], **how)
         if not len(given.embeddings):
             there = f"no mask of level {options.level} in any frame"
             remedy = "Take another --level, or write the files again."
@@ -107,7 +108,8 @@ def _masks_of(work: Work, results: Results) -> tuple[Callable[[int], np.ndarray]
         from jsecon.data.langsplat_files import load_features
 
         names = [capture.names[t] for t in training_frames(capture)]
-        given = load_features(options.features, names, frames.shape[1:3], level=options.level)
+        how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
+        given = load_features(options.features, names, frames.shape[1:3], **how)
         rows = lambda t: np.flatnonzero(np.asarray(given.frame) == t)
         return lambda t: given.labels[t][None] == rows(t)[:, None, None], lambda t, masks: given.embeddings[rows(t)]
     if options.masks is not None:

@@ -33,7 +33,8 @@ def _read(work: Work) -> Stage:
 
         capture = results["load"]
         names, size = [capture.names[t] for t in training_frames(capture)], capture.frames.shape[1:3]
-        found = load_labels(folder, names, size, level=options.level, order=capture.names, progress=progress)
+        how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
+        found = load_labels(folder, names, size, **how, progress=progress)
         _require_regions(found.labels, str(folder))
         return Outcome(found.labels, notes=(f"{len(found.ids)} regions in the masks", *found.notes))
 
@@ -93,7 +94,8 @@ def proposals_of(
         from jsecon.data.proposal_files import proposals_from_disk
 
         names = [capture.names[t] for t in train]
-        return proposals_from_disk(options.proposals, names, frames.shape[1:3], level=options.level)
+        how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
+        return proposals_from_disk(options.proposals, names, frames.shape[1:3], **how)
     segmenter = work.networks.segmenter
     if segmenter is not None:  # which keeps what it finds on disk
         alone = threading.Lock()  # a network takes all cores for one frame
