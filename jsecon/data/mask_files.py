@@ -146,9 +146,9 @@ class _Reader:
         folders = {folder for masks in found.objects.values() for folder in masks}
         self.ids = object_ids(sorted(folders))
         self.folders = sorted(folders, key=lambda folder: (self.ids[folder], folder))
-        self.fit = Fit(files, size, self._shape)
         self.coloured: dict[Path | None, bool] = {}
         self.negative = False
+        self.fit = Fit(files, size, self._shape)
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
         path = self.found.path(name)

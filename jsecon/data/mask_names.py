@@ -221,7 +221,8 @@ def _arranged(
     if _holds_objects(plain, others, by_frame, black_and_white):
         folders = sorted({_object(match) for match in matches}, key=_natural)
         notes.append(f"The folders {_listed(folders)} are taken for objects: each holds black and white masks of one.")
-        objects = {frame: {_object(match): match.path for match in reversed(some)} for frame, some in by_frame.items()}
+        ranked = {frame: {_object(match): match.path for match in reversed(some)} for frame, some in by_frame.items()}
+        objects = {frame: {name: some[name] for name in folders if name in some} for frame, some in ranked.items()}
         return Masks({}, objects, ending, (*notes, *_left_over(ending, unknown)))
     best = {frame: some[0] for frame, some in by_frame.items() if not (plain and some[0].extra)}
     if len(folders := sorted({match.folders for match in best.values()})) > 1:

@@ -61,11 +61,12 @@ class Options(SceneOptions):
     compressed .ply, .spz, .sog; or nerfstudio's beside its dataparser_transforms.json; without it, Gaussians are fitted
     to the frames"""
     masks: Folder = None
-    """instance masks, one integer PNG per frame under the frame's name (0 = none), <id>/<frame>.png, or LangSplat's
-    _s.npy; without it, they are found in the frames"""
+    """instance masks: one integer PNG or .npy per frame under the frame's name (0 = none), in folders like the images'
+    where those have some; <object>/<frame>.png in black and white; or LangSplat's _s.npy; without it, masks are found in
+    the frames"""
     proposals: Folder = None
-    """masks of single frames, to be brought together: <frame>.json of SAM's own generator, LangSplat's _s.npy, or
-    PNGs"""
+    """masks of single frames, to be brought together: <frame>.json of SAM's own generator, a COCO file of all frames,
+    LangSplat's _s.npy, PNGs, or .npy; named like the masks of --masks"""
     granularity: Literal["fine", "medium", "coarse"] = "medium"
     """of the proposals, without masks: fine parts things; coarse joins the colours of one thing, and tells things apart
     by the depth that the Gaussians render"""
