@@ -62,8 +62,8 @@ class Options(SceneOptions):
     to the frames"""
     masks: Folder = None
     """instance masks: one integer PNG or .npy per frame under the frame's name (0 = none), in folders like the images'
-    where those have some; <object>/<frame>.png in black and white; or LangSplat's _s.npy; without it, masks are found in
-    the frames"""
+    where those have some; <object>/<frame>.png in black and white; or LangSplat's _s.npy; without it, masks are found
+    in the frames"""
     proposals: Folder = None
     """masks of single frames, to be brought together: <frame>.json of SAM's own generator, a COCO file of all frames,
     LangSplat's _s.npy, PNGs, or .npy; named like the masks of --masks"""
