@@ -2,6 +2,7 @@
 arrays, and JSON that says what they are. Reading both without trust: no more memory is taken than the file's bytes can
 fill, and no Python object is built."""
 
+import codecs
 import contextlib
 import dataclasses
 import fcntl
@@ -86,10 +87,42 @@ def alone(folder: Path) -> Iterator[None]:
         yield
 
 
+def made_by_jsecon(folder: Path) -> bool:
+    """Whether a folder is the output folder of a run or of a query, and so no input, wherever it lies."""
+    return (folder / "cache" / "CACHEDIR.TAG").is_file() or (folder / "answers.html").is_file()
+
+
+def files_beneath(root: Path, *, leave_out: Path | None = None) -> Iterator[Path]:
+    """Yields the files beneath a folder in name order, through links too.
+
+    Hidden files are left out, the folders in it that are output of jsecon, and `leave_out`.
+    """
+    own = None if leave_out is None else leave_out.resolve()
+    found, visited = [], set()
+    for place, folders, names in os.walk(root, followlinks=True):
+        folder, home = Path(place), os.path.realpath(place)
+        kept = () if home in visited else sorted(name for name in folders if not name.startswith("."))
+        visited.add(home)  # a link to a folder above would lead round and round
+        folders[:] = [name for name in kept if not made_by_jsecon(folder / name) and (folder / name).resolve() != own]
+        found += [folder / name for name in names if not name.startswith(".")]
+    yield from (file for file in sorted(found) if file.is_file())
+
+
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Writes `text` (UTF-8) to `path`, whole or not at all."""
+    """Writes `text` (UTF-8) to `path`, whole or not at all; bytes of file names that are no UTF-8 as \\udcxx."""
     with written_whole(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def read_text(path: Path) -> str:
+    """Reads a text file as UTF-8, or as UTF-16 where it begins with that byte order mark.
+
+    Bytes that are no UTF-8 become surrogates, as in file names: a path made of them finds its file.
+    """
+    data = path.read_bytes()
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
+    return data.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")
 
 
 def parsed_json(text: str | bytes) -> Any:

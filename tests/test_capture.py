@@ -23,7 +23,8 @@ def test_formats_are_detected(tmp_path):
     for path in ("colmap", "nerfstudio/transforms_train.json"):
         loaded = load_capture(tmp_path / path)
         np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
-    with refused("nerfstudio", "none of them", "transforms.json"):
+    (tmp_path / "nerfstudio/images").rename(tmp_path / "elsewhere")
+    with refused("nerfstudio", "without poses", "transforms_train.json"):
         load_capture(tmp_path / "nerfstudio")
     with refused("nowhere", "nothing there"):
         load_capture(tmp_path / "nowhere")

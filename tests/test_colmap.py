@@ -1,5 +1,6 @@
 """COLMAP captures: binary and text say the same, distorted models are undone, damage is told."""
 
+import dataclasses
 import struct
 
 import numpy as np
@@ -8,7 +9,7 @@ from capture_files import refused, ring_poses, small_capture, write_images, writ
 
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.colmap_model import MODELS, read_images
+from jsecon.data.colmap_model import read_images
 from jsecon.data.images import write_image
 from jsecon.errors import InputError
 from jsecon.types import Camera
@@ -190,13 +191,128 @@ def test_distorted_models(tmp_path, model, parameters):
     assert "2 images were undistorted" in loaded.notes[0]
 
 
-@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
-def test_models_that_opencv_lacks(tmp_path, model):
-    parameters = ["100", "100", "12", "8", *["0.1"] * (MODELS[model][1] - 4)]
-    write_text_model(CAPTURE, tmp_path / "sparse", [f"1 {model} 24 16 {' '.join(parameters)}"])
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_PINHOLE", (90.0, 59.0, 46.0)),
+        ("SIMPLE_RADIAL_FISHEYE", (90.0, 59.0, 46.0, 0.05)),
+        ("FOV", (90.0, 88.0, 59.0, 46.0, 0.9)),
+        ("THIN_PRISM_FISHEYE", (90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 0.004, -0.003, 0.002, 0.001, 0.01, -0.02)),
+        (
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            (
+                *(90.0, 88.0, 59.0, 46.0, 0.03, -0.01, 0.002, 0.001, -5e-4, 2e-4),
+                *(4e-3, -3e-3, 0.01, -2e-3, 5e-3, 3e-3),
+            ),
+        ),
+        ("SIMPLE_DIVISION", (90.0, 59.0, 46.0, -0.1)),
+        ("DIVISION", (90.0, 88.0, 59.0, 46.0, 0.05)),
+        ("SIMPLE_FISHEYE", (90.0, 59.0, 46.0)),
+        ("FISHEYE", (90.0, 88.0, 59.0, 46.0)),
+        ("EUCM", (90.0, 88.0, 59.0, 46.0, 0.6, 1.1)),
+    ],
+)
+def test_every_model_is_undistorted_as_colmap_projects_it(tmp_path, model, parameters):
+    """A binary model that pycolmap writes, and images as pycolmap's camera sees the plane z = 1."""
+    colmap = pytest.importorskip("pycolmap")
+    width, height = 120, 90
+    camera = colmap.Camera(model=model, width=width, height=height, params=parameters, camera_id=1)
+    v, u = np.mgrid[:height, :width] + 0.5
+    seen = camera.cam_from_img(np.stack([u, v], -1).reshape(-1, 2)).reshape(height, width, 2)
+    image = np.repeat(picture(seen[..., 0], seen[..., 1]).round().astype(np.uint8)[..., None], 3, -1)
+    capture = small_capture(2, width, height)
+    write_colmap(capture, tmp_path)
+    number = getattr(colmap.CameraModelId, model).value
+    numbers = np.array(parameters, "<f8").tobytes()
+    cameras = struct.pack("<Q", 2) + b"".join(struct.pack("<iiQQ", n, number, width, height) + numbers for n in (1, 2))
+    (tmp_path / "sparse/0/cameras.bin").write_bytes(cameras)
+    for name in capture.names:
+        write_image(tmp_path / "images" / f"{name}.png", image)
+    loaded = load_capture(tmp_path, holdout=0)
+    pinhole = loaded.cameras[0]
+    expected = picture((u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy)
+    error = np.abs(loaded.frames[0, ..., 0] - expected)
+    assert error.max() < 3
+    assert error.mean() < 0.5
+    # Each pixel looks along its own direction: the focal length is one that the image covers.
+    assert 0.8 < pinhole.fx / parameters[0] < 1.2
+
+
+def test_models_that_no_pinhole_stands_in_for(tmp_path):
     write_images(CAPTURE, tmp_path / "images")
-    with refused("cameras.txt", model, "image_undistorter"):
+    write_text_model(CAPTURE, tmp_path / "sparse", ["1 EQUIRECTANGULAR 24 16 24 16"])
+    with refused("cameras.txt", "EQUIRECTANGULAR", "perspective views"):
         load_capture(tmp_path)
+    write_text_model(CAPTURE, tmp_path / "sparse", ["1 NEW_FISHEYE 24 16 24 16"])
+    with refused("cameras.txt", "NEW_FISHEYE", "image_undistorter"):
+        load_capture(tmp_path)
+    write_colmap(CAPTURE, tmp_path / "binary")
+    path = tmp_path / "binary/sparse/0/cameras.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<i", data, 12, 99)
+    path.write_bytes(data)
+    with refused("cameras.bin", "99", "image_undistorter"):
+        load_capture(tmp_path / "binary")
+
+
+def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_path):
+    write_colmap(CAPTURE, tmp_path)
+    (tmp_path / "sparse/0").rename(tmp_path / "sparse/10")
+    small = dataclasses.replace(
+        CAPTURE, frames=CAPTURE.frames[:2], names=CAPTURE.names[:2], cameras=CAPTURE.cameras[np.arange(2)]
+    )
+    write_colmap(small, tmp_path / "other")
+    (tmp_path / "other/sparse/0").rename(tmp_path / "sparse/0")
+    write_text_model(small, tmp_path / "sparse/2")
+    loaded = load_capture(tmp_path, holdout=0)
+    assert_same(loaded, CAPTURE)
+    assert len(loaded.notes) == 1
+    for words in ("3 models", "sparse/10", "5", "sparse/0 with 2", "sparse/2 with 2"):
+        assert words in loaded.notes[0]
+
+
+@pytest.mark.parametrize("place", ["sparse/1", "sparse", "colmap/sparse/0", "colmap_text", ""])
+def test_places_where_programs_put_a_model(tmp_path, place):
+    write_text_model(CAPTURE, tmp_path / place)
+    write_images(CAPTURE, tmp_path if place == "" else tmp_path / "images")
+    loaded = load_capture(tmp_path, holdout=0)
+    assert_same(loaded, CAPTURE)
+    assert loaded.notes == ()
+
+
+NAMES = ["p 1.png", "1 2 3.png", "0001.png", "cam a/p.JPG", "cam b/p.JPG"]
+
+
+@pytest.mark.parametrize("second", ["none", "empty", "observations", "mixed"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_images_txt_with_and_without_its_second_lines(tmp_path, second, encoding):
+    """What follows a first line is a second one only where it is a list of triples."""
+    write_text_model(CAPTURE, tmp_path / "sparse")
+    lines = [line for line in (tmp_path / "sparse/images.txt").read_text().split("\n") if ".png" in line]
+    lines = [line.rpartition(" ")[0] + " " + name for line, name in zip(lines, NAMES)]
+    seconds = {
+        "none": 5 * [[]],
+        "empty": 5 * [[""]],
+        "observations": 5 * [["1.5 2.5 -1 3 4 17 1e2 2 3 4 5 6"]],
+        "mixed": [[], [""], ["12 13 14"], [], ["1.5 2.5 -1"]],
+    }[second]
+    text = "# a comment\r\n" + "\r\n".join(line for own, more in zip(lines, seconds) for line in (own, *more))
+    (tmp_path / "sparse/images.txt").write_bytes(text.encode(encoding))
+    for file in ("cameras.txt", "points3D.txt"):
+        content = (tmp_path / "sparse" / file).read_text()
+        (tmp_path / "sparse" / file).write_bytes(content.replace("\n", "\r\n").encode(encoding))
+    for name, frame in zip(NAMES, CAPTURE.frames):
+        write_image(tmp_path / "images" / name.replace(".JPG", ".png"), frame)
+        if name.endswith(".JPG"):
+            (tmp_path / "images" / name).with_suffix(".png").rename(tmp_path / "images" / name.replace(".JPG", ".jpg"))
+    loaded = load_capture(tmp_path, holdout=0)
+    names = ["0001", "1 2 3", "cam a_p", "cam b_p", "p 1"]
+    assert sorted(loaded.names) == names
+    order = [names.index(name) for name in ("p 1", "1 2 3", "0001", "cam a_p", "cam b_p")]
+    place = [loaded.names.index(names[n]) for n in order]
+    np.testing.assert_array_equal(loaded.frames[place], CAPTURE.frames)
+    np.testing.assert_allclose(loaded.cameras.world_to_camera[place], CAPTURE.cameras.world_to_camera, atol=1e-6)
+    assert len(loaded.points) == len(CAPTURE.points)
 
 
 def test_missing_images_are_counted(folder):
@@ -291,7 +407,7 @@ def test_names_that_clash(tmp_path):
     assert load_capture(tmp_path).names == ("frame_000", "frame_002", "frame_004", "left_a", "right_a")
     path.write_text(path.read_text().replace("right/a.png", "left/a.jpg"))
     (tmp_path / "images/right/a.png").rename(tmp_path / "images/left/a.jpg")
-    with refused("left_a"):
+    with refused("left/a.png", "left/a.jpg"):
         load_capture(tmp_path)
 
 

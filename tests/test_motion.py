@@ -123,8 +123,9 @@ def test_one_lens_for_the_photographs_of_one_camera_and_focal_length(photos, tmp
         if focal is not None:
             exif[motion._MODEL], exif.get_ifd(motion._EXIF)[motion._FOCAL] = "camera", float(focal)
         Image.new("RGB", (32, 24)).save(tmp_path / f"{number}.jpg", exif=exif)
-    assert motion._lenses(photographs(tmp_path)) == [[0, 1], [2], [3]]
-    assert motion._lenses(photographs(photos[0])) == [list(range(COUNT))]
+    assert motion._lenses(photographs(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
+    assert motion._lenses(photographs(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
+    assert motion._lenses(photographs(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
 
 
 def test_pairs_are_the_neighbours_and_the_frames_that_look_alike(monkeypatch, tmp_path):

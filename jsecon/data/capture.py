@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import nnls
 
-from jsecon.data.colmap import find_model, read_colmap
+from jsecon.data.colmap import find_models, read_colmap
 from jsecon.data.frames import Extent, Posed, Progress, assemble, check_options, extent_of
+from jsecon.data.motion import photographs
 from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.data.rgbd import find_rgbd
 from jsecon.errors import InputError
+from jsecon.files import made_by_jsecon
 from jsecon.types import Camera, Capture
 
 POINTS_AT_ONCE = 65536
@@ -50,18 +52,59 @@ def capture_extent(
     return extent_of(_posed(Path(path)), downscale, long_side, frames)
 
 
+def has_poses(path: Path) -> bool:
+    """Whether a path is a capture with poses, of any known format."""
+    if path.is_file():
+        return path.suffix.lower() == ".json"
+    return bool(find_models(path)) or (path / "transforms.json").exists() or find_rgbd(path) is not None
+
+
 def _posed(path: Path) -> Posed:
-    if path.is_dir() and (model := find_model(path)) is not None:
-        return read_colmap(path, model)
+    if path.is_dir() and (models := find_models(path)):
+        return read_colmap(path, models)
     file = path / "transforms.json" if path.is_dir() else path
-    if file.is_file() and file.suffix == ".json":
+    if file.is_file() and file.suffix.lower() == ".json":
         return read_nerfstudio(file)
     if (read := find_rgbd(path)) is not None:
         return read(path)
-    found = "nothing there" if not path.exists() else "a file" if path.is_file() else "none of them"
-    wanted = "a folder with sparse/0 (COLMAP) and images, with transforms.json, or of a known depth camera or phone"
-    remedy = "Give the capture's own folder; a transforms file of another name can be given itself."
-    raise InputError(path, found, wanted, remedy)
+    raise _no_capture(path)
+
+
+def bare_photographs(path: Path) -> list[Path]:
+    """Lists the photographs of a folder that has no poses; those of subfolders only where none is a capture itself."""
+    if not path.is_dir() or has_poses(path):
+        return []
+    photos = photographs(path)
+    nested = bool(photos) and photos[0].parent not in (path, path / "images")
+    return [] if nested and _inner_captures(path) else photos
+
+
+def _inner_captures(path: Path) -> list[Path]:
+    folders = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
+    return [child for child in folders if not made_by_jsecon(child) and has_poses(child)]
+
+
+def _no_capture(path: Path) -> InputError:
+    """What lies at a path that is no capture, and what to give instead."""
+    expected = "a capture: COLMAP's, nerfstudio's, of a depth camera or phone; or photographs, or a video"
+    if not path.exists():
+        return InputError(path, "nothing there", expected, "Check the path.")
+    if not path.is_dir():
+        remedy = "Give the folder of the capture, its transforms file (.json), or the video."
+        return InputError(path, f"a file that ends in {path.suffix or 'nothing'}", expected, remedy)
+    if photos := bare_photographs(path):
+        remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/poses as a capture."
+        return InputError(path, f"{len(photos)} photographs without poses", "a capture with poses", remedy)
+    entries = sorted(child for child in path.iterdir() if not child.name.startswith("."))
+    if not entries:
+        return InputError(path, "an empty folder", expected, "Copy the capture there, or check the path.")
+    remedy = "Give a folder with images/ and sparse/0, with transforms.json, or with photographs in it."
+    if captures := _inner_captures(path):
+        remedy = f"Give the capture's own folder, for example {captures[0]}."
+    elif files := [child for child in entries if child.suffix.lower() == ".json"]:
+        remedy = f"Give the transforms file itself, for example {files[0]}."
+    names = ", ".join(child.name for child in entries[:5]) + (", ..." if len(entries) > 5 else "")
+    return InputError(path, f"a folder without poses and photographs, but with {names}", expected, remedy)
 
 
 def check_views_overlap(capture: Capture) -> None:

@@ -8,13 +8,22 @@ from __future__ import annotations
 import itertools
 import os
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.colmap_model import MODELS, REMEDY, model_file, read_cameras, read_images, read_points
+from jsecon.data.colmap_model import (
+    MODELS,
+    REMEDY,
+    count_images,
+    model_file,
+    read_cameras,
+    read_images,
+    read_points,
+)
 from jsecon.data.frames import Posed, Shot
-from jsecon.data.images import write_image
+from jsecon.data.images import existing_image, write_image
 from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
 from jsecon.files import written_whole
@@ -22,22 +31,45 @@ from jsecon.splat.transform import quaternion_of
 from jsecon.types import Capture
 
 
-def find_model(path: str | Path) -> Path | None:
-    """The folder of the model below a capture: sparse/0, sparse, or None."""
-    for folder in (Path(path) / "sparse" / "0", Path(path) / "sparse"):
-        if model_file(folder, "cameras") is not None:
-            return folder
-    return None
+def find_models(path: str | Path) -> list[Path]:
+    """Finds the folders of COLMAP models below a capture, the one with the most images first.
 
-
-def read_colmap(path: Path, model: Path) -> Posed:
-    """A COLMAP capture: the model in `model` and the images in `path`/images.
-
-    Every camera model that OpenCV can undistort is read. Raises InputError on a model that is cut short or names images
-    that are not there, and on the models that OpenCV lacks (FOV, thin prisms).
+    They lie in sparse/0, sparse/1, ... or in sparse itself. Where neither holds one and there is no transforms.json,
+    colmap/sparse, colmap_text and the capture's own folder are tried, as nerfstudio and instant-ngp lay them out.
     """
+    path = Path(path)
+    models = _models_below(path / "sparse")
+    if not models and not (path / "transforms.json").exists():
+        places = (path / "colmap" / "sparse", path / "colmap_text", path)
+        models = next(filter(None, map(_models_below, places)), [])
+    return models
+
+
+def _models_below(folder: Path) -> list[Path]:
+    """The models in the folders of a folder, or in itself, the one with the most images first."""
+    if not folder.is_dir():
+        return []
+    inner = [child for child in folder.iterdir() if child.is_dir()] if folder.name == "sparse" else []
+    inner.sort(key=lambda child: (not child.name.isdecimal(), len(child.name), child.name))
+    models = [place for place in (*inner, folder) if model_file(place, "cameras") is not None]
+    return sorted(models, key=count_images, reverse=True) if len(models) > 1 else models
+
+
+def find_model(path: str | Path) -> Path | None:
+    """The folder of the largest model below a capture (`find_models`), or None."""
+    return next(iter(find_models(path)), None)
+
+
+def read_colmap(path: Path, models: Sequence[Path]) -> Posed:
+    """Reads a COLMAP capture: the first of `models` and the images in `path`/images, or beside each other in `path`.
+
+    Every camera model is read but EQUIRECTANGULAR. The notes tell which models were left out. Raises InputError on a
+    model that is cut short or names images that are not there.
+    """
+    model = models[0]
     lenses, images = read_cameras(model), read_images(model)
-    missing = [name for name, _, _ in images if not os.path.isfile(path / "images" / name)]
+    files = _image_files(path, [name for name, _, _ in images])
+    missing = [name for name, _, _ in images if name not in files]
     if missing:
         found = f"{len(missing)} of {len(images)} images of the model missing (the first: {missing[0]})"
         remedy = "Copy them there, or take them out of the model (colmap image_deleter)."
@@ -47,10 +79,29 @@ def read_colmap(path: Path, model: Path) -> Posed:
         if camera not in lenses:
             found = f"image {name} of camera {camera}, which is not in the cameras file"
             raise InputError(model, found, "cameras and images of one model", REMEDY)
-        shots.append(Shot(name, path / "images" / name, lenses[camera], pose))
+        shots.append(Shot(name, files[name], lenses[camera], pose))
+    notes = []
+    if len(models) > 1:
+        others = ", ".join(f"{place.relative_to(path)} with {count_images(place)}" for place in models[1:])
+        told = (
+            f"There are {len(models)} models. {model.relative_to(path)} has the most images, {len(images)}, and is used"
+        )
+        remedy = "Join them (colmap model_merger), or take photographs between them, to use all images."
+        notes.append(f"{told}; left out: {others}. {remedy}")
     if model_file(model, "points3D") is None:
-        return Posed(shots, model, notes=("The model has no points3D file: there are no sparse points.",))
-    return Posed(shots, model, *read_points(model))
+        return Posed(shots, model, notes=(*notes, "The model has no points3D file: there are no sparse points."))
+    return Posed(shots, model, *read_points(model), notes=tuple(notes))
+
+
+def _image_files(path: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The image files of a model by name: all from images/, or else all from the capture's own folder or input/."""
+    found: dict[str, Path] = {}
+    for folder in (path / "images", path, path / "input"):
+        files = {name: file for name in names if (file := existing_image(folder, name)) is not None}
+        if len(files) == len(set(names)):
+            return files
+        found = found or files
+    return found
 
 
 def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png") -> None:
@@ -78,7 +129,8 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
     for n, (file, pose, camera) in enumerate(zip(files, poses, which.ravel()), start=1):
         quaternion = quaternion_of(pose[:3, :3])
         numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])
-        image_bytes.append(struct.pack("<i7di", n, *numbers, camera + 1) + file.encode() + b"\0" + struct.pack("<Q", 0))
+        head = struct.pack("<i7di", n, *numbers, camera + 1)
+        image_bytes.append(head + os.fsencode(file) + b"\0" + struct.pack("<Q", 0))
     points = np.zeros(len(capture.points), "<u8, 3<f8, 3u1, <f8, <u8")
     points["f0"] = np.arange(1, len(points) + 1)
     points["f1"] = np.asarray(capture.points, np.float64) @ from_world[:3, :3] + from_world[:3, 3]

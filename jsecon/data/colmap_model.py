@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jsecon.data.lens import Lens
+from jsecon.data.lens import PROJECTIONS, Lens
 from jsecon.errors import InputError
+from jsecon.files import read_text
 from jsecon.numerics import sane
 
 # name -> (number in the binary format, count of parameters)
@@ -32,10 +33,17 @@ MODELS = {
     "RADIAL_FISHEYE": (9, 5),
     "THIN_PRISM_FISHEYE": (10, 12),
     "RAD_TAN_THIN_PRISM_FISHEYE": (11, 16),
+    "SIMPLE_DIVISION": (12, 4),
+    "DIVISION": (13, 5),
+    "SIMPLE_FISHEYE": (14, 3),
+    "FISHEYE": (15, 4),
+    "EUCM": (16, 6),
+    "EQUIRECTANGULAR": (17, 2),
 }
 _BY_NUMBER = {number: (name, count) for name, (number, count) in MODELS.items()}
-_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_ONE_FOCAL = {name for name in MODELS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
 _UNDISTORT = "Run colmap image_undistorter and load its output."
+_PERSPECTIVE_VIEWS = "Cut perspective views out of the panoramas (colmap panorama_sfm.py does) and load those."
 REMEDY = "Copy the model again, or export it anew with colmap model_converter."
 
 
@@ -89,28 +97,45 @@ class _Bytes:
         return name.decode("utf-8", "surrogateescape")
 
 
-def _records(file: Path, expected: str, read: Callable[[str], Any], *, lines_each: int = 1) -> list[Any]:
-    """What `read` makes of the text file's records, all but comments and empty lines. Of `lines_each` lines only the
-    first is read; the others may be empty. Raises InputError, naming the line, where `read` raises ValueError."""
-    found, text = [], file.read_text(encoding="utf-8", errors="surrogateescape")
-    lines = ((n, line) for n, line in enumerate(text.split("\n"), start=1) if not line.lstrip().startswith("#"))
-    for number, line in lines:
-        if line.strip():
-            try:
-                found.append(read(line.strip()))
-            except InputError:
-                raise
-            except ValueError as error:
-                raise bad_model(file, f"line {number}: {line.strip()[:80]!r}", expected) from error
-            for _ in range(lines_each - 1):
-                next(lines, None)
+def _records(file: Path, expected: str, read: Callable[[str], Any], skip: Callable[[str], bool] | None = None) -> list:
+    """What `read` makes of the text file's records, a line each; comments and empty lines are left out.
+
+    `skip` tells whether the line behind a record belongs to it and is not read. Raises InputError, naming the line,
+    where `read` raises ValueError.
+    """
+    found, behind = [], False
+    for number, line in enumerate(read_text(file).split("\n"), start=1):
+        line = line.strip()
+        if line.startswith("#"):
+            continue
+        if (behind and skip is not None and skip(line)) or not line:
+            behind = False
+            continue
+        try:
+            found.append(read(line))
+        except InputError:
+            raise
+        except ValueError as error:
+            raise bad_model(file, f"line {number}: {line[:80]!r}", expected) from error
+        behind = True
     return found
 
 
+def _observations(line: str) -> bool:
+    """Whether a line of images.txt is the second one of an image: X Y POINT3D_ID, any number of times.
+
+    Some programs leave these lines out. An image's first line has 10 words, or more where its name has spaces.
+    """
+    return not line.strip("0123456789+-.eE \t") and len(line.split()) % 3 == 0
+
+
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
-    known = [name for name in MODELS if name not in ("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE")]
-    if model not in known:
-        raise bad_model(file, f"camera model {model}", f"one that OpenCV undistorts: {', '.join(known)}", _UNDISTORT)
+    if model not in MODELS:
+        known = ", ".join(name for name in MODELS if name != "EQUIRECTANGULAR")
+        raise bad_model(file, f"the unknown camera model {model}", f"one of {known}", _UNDISTORT)
+    if model == "EQUIRECTANGULAR":
+        found = f"the camera model {model}, whose images see all around"
+        raise bad_model(file, found, "cameras with a field of view below 180 degrees", _PERSPECTIVE_VIEWS)
     if len(parameters) != MODELS[model][1]:
         raise bad_model(file, f"{len(parameters)} parameters of a {model} camera", str(MODELS[model][1]))
     focals = 1 if model in _ONE_FOCAL else 2
@@ -119,7 +144,8 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     if not (sane(parameters) and fx > 0 and fy > 0 and 0 < width < 1 << 31 and 0 < height < 1 << 31):
         found = f"a camera of {width}x{height} px with parameters {parameters}"
         raise bad_model(file, found, "positive size and focal length", "Estimate the cameras again.")
-    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="FISHEYE" in model)
+    own = model if model in PROJECTIONS else None
+    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), "FISHEYE" in model and own is None, own)
 
 
 def read_cameras(model: Path) -> dict[int, Lens]:
@@ -135,7 +161,8 @@ def read_cameras(model: Path) -> dict[int, Lens]:
     for _ in data.records(48):
         identity, number, width, height = data.take("iiQQ")
         if number not in _BY_NUMBER:
-            raise bad_model(file, f"camera model number {number}", f"one of 0 to {max(_BY_NUMBER)}", _UNDISTORT)
+            found = f"the unknown camera model number {number}"
+            raise bad_model(file, found, f"one of 0 to {max(_BY_NUMBER)} (COLMAP 4.2)", _UNDISTORT)
         name, count = _BY_NUMBER[number]
         lenses[identity] = _lens(file, name, width, height, data.take(f"{count}d"))
     return lenses
@@ -167,8 +194,8 @@ def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
         _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
         return name, int(camera), _pose(file, name, tuple(map(float, (qw, qx, qy, qz, tx, ty, tz))))
 
-    if file.suffix == ".txt":  # an image's second line holds its observations
-        return _records(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", image, lines_each=2)
+    if file.suffix == ".txt":
+        return _records(file, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", image, _observations)
     data, images = _Bytes(file), []
     for _ in data.records(73):
         _, *numbers, camera = data.take("i7di")
@@ -176,6 +203,17 @@ def read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
         images.append((name, camera, _pose(file, name, tuple(numbers))))
         data.skip(24 * data.take("Q")[0])
     return images
+
+
+def count_images(model: Path) -> int:
+    """How many images a model says that it has; 0 where it has no such file."""
+    file = model_file(model, "images")
+    if file is None:
+        return 0
+    if file.suffix == ".txt":
+        return len(read_images(model))
+    with file.open("rb") as stream:
+        return int.from_bytes(stream.read(8), "little")
 
 
 def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:

@@ -100,15 +100,25 @@ def held_out(count: int, every: int | None) -> Bool[np.ndarray, " t"]:
     return np.arange(count) % every == 0 if every else np.zeros(count, bool)
 
 
-def _short_names(shots: Sequence[Shot], where: object) -> tuple[str, ...]:
-    """File names without folder or ending; with their folders ("a_0001") where two would be the same."""
-    paths = [PurePosixPath(shot.name) for shot in shots]
-    for names in ([path.stem for path in paths], ["_".join(path.with_suffix("").parts) for path in paths]):
+def frame_names(files: Sequence[str], where: object) -> tuple[str, ...]:
+    """File names without folder or ending; with their folders ("a_0001") where two would be the same.
+
+    What follows the last dot is no ending where it is a number: render.0001 keeps it. No name holds a "/". Raises
+    InputError, at `where`, where two files differ in nothing but their endings.
+    """
+    paths = [_without_ending(PurePosixPath(file)) for file in files]
+    folders = [[part for part in path.parts if part not in ("/", "..")] for path in paths]
+    for names in ([path.name for path in paths], *([joint.join(parts) for parts in folders] for joint in ("_", "__"))):
         if len(set(names)) == len(names):
             return tuple(names)
     twice = collections.Counter(names).most_common(1)[0][0]
+    first, second = [file for file, name in zip(files, names) if name == twice][:2]
     expected, remedy = "names that differ in more than their endings", "Rename the images, or take one of the two out."
-    raise InputError(where, f"two frames called {twice!r}", expected, remedy)
+    raise InputError(where, f"two frames called {first} and {second}", expected, remedy)
+
+
+def _without_ending(path: PurePosixPath) -> PurePosixPath:
+    return path if path.suffix[1:].isdecimal() else path.with_suffix("")
 
 
 def _as_read(
@@ -277,7 +287,7 @@ def assemble(
         raise InputError(where, "no frame", "at least one posed image", "Estimate the poses again.")
     shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
     poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
-    names = _short_names(shots, where)
+    names = frame_names([shot.name for shot in shots], where)
     world, changed = ordinary_world(poses, posed.points, _some_depths(posed, shots))  # of all, whatever is taken
     poses, from_world = moved_poses(poses, world), np.linalg.inv(world)
     if only is not None:

@@ -5,6 +5,7 @@ captures decide that (jsecon.data.frames), and ask for those with `upright=False
 """
 
 import io
+import os
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -20,7 +21,8 @@ from PIL.PngImagePlugin import PngImageFile
 from jsecon.errors import InputError, why
 from jsecon.files import MOST_DEFLATED, UNREADABLE, map_array, written_whole
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".HEIC")
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+IMAGE_ENDINGS = (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))
 """endings tried, in this order, where a capture names an image without one"""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
@@ -275,6 +277,21 @@ def _checked_bytes(path: Path, data: bytes) -> bytes:
         _jpeg_size(path, data)
         return data.replace(b"Exif\0\0", b"unread")  # of which Pillow would warn
     return data
+
+
+def existing_image(folder: Path, name: str) -> Path | None:
+    """Returns the image file that a capture names, or None.
+
+    Tried are the name itself, with "\\" as a separator (where a Windows program wrote it), with its ending in upper or
+    lower case, and, where it has none of an image, with an ending added.
+    """
+    for base in dict.fromkeys((name, name.replace("\\", "/"))):
+        stem, ending = os.path.splitext(base)
+        added = () if ending.lower() in IMAGE_ENDINGS else IMAGE_ENDINGS  # a.jpg.png is a mask of a.jpg
+        for candidate in (base, stem + ending.lower(), stem + ending.upper(), *(base + end for end in added)):
+            if os.path.isfile(folder / candidate):  # False also for a name that no file can have
+                return folder / candidate
+    return None
 
 
 class ImageHeader(NamedTuple):

@@ -1,5 +1,8 @@
 """Lenses as captures state them, and the pinhole lens that stands in for a distorted one.
 
+OpenCV projects its own two models, Brown's and Kannala and Brandt's. Those that only COLMAP has are projected here, by
+the formulas of its src/colmap/sensor/models.h.
+
 Pixels are counted as everywhere here (and in COLMAP): the centre of the first pixel is at (0.5, 0.5). OpenCV puts it at
 (0, 0), hence the half pixels below.
 """
@@ -7,6 +10,7 @@ Pixels are counted as everywhere here (and in COLMAP): the centre of the first p
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -38,13 +42,17 @@ class Lens:
     cy: float
     """px, from the upper edge of the first pixel."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 where `fisheye`; empty = pinhole."""
+    """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 where `fisheye`; empty = pinhole. COLMAP's order
+    where `model` names one of its models."""
     fisheye: bool = False
     """equidistant model (Kannala and Brandt) instead of the polynomial one (Brown)."""
+    model: str | None = None
+    """one of PROJECTIONS; None: OpenCV's, see `fisheye`."""
 
     @property
     def distorted(self) -> bool:
-        return self.fisheye or any(k != 0 for k in self.distortion)
+        """Whether its images must be resampled before they are those of a pinhole."""
+        return self.fisheye or self.model is not None or any(k != 0 for k in self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:
         """The lens of the same image at another size."""
@@ -52,6 +60,82 @@ class Lens:
         return dataclasses.replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
         )
+
+
+def _radius(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Distance from the axis, above 0 so that it can be divided by."""
+    return np.maximum(np.hypot(x, y), 1e-12)
+
+
+def _equidistant(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(x/z, y/z) -> the direction's angle to the axis, along x and y."""
+    radius = _radius(x, y)
+    scale = np.arctan(radius) / radius
+    return x * scale, y * scale
+
+
+def _polynomial(squared: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
+    """1 + k1 r^2 + k2 r^4 + ..."""
+    result = np.zeros_like(squared)
+    for coefficient in reversed(coefficients):
+        result = squared * (coefficient + result)
+    return 1 + result
+
+
+def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's FOV (Devernay and Faugeras, "Straight lines have to be straight", 2001); omega 0 is a pinhole."""
+    if abs(omega) < 1e-6:
+        return x, y
+    radius = _radius(x, y)
+    scale = np.arctan(2 * radius * np.tan(omega / 2)) / (radius * omega)
+    return x * scale, y * scale
+
+
+def _thin_prism(x: np.ndarray, y: np.ndarray, *parameters: float) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's THIN_PRISM_FISHEYE: k1 k2 p1 p2 k3 k4 sx1 sy1 act on the angles."""
+    k1, k2, p1, p2, k3, k4, sx1, sy1 = parameters
+    u, v = _equidistant(x, y)
+    squared = u * u + v * v
+    radial = _polynomial(squared, (k1, k2, k3, k4))
+    across = u * radial + 2 * p1 * u * v + p2 * (squared + 2 * u * u) + sx1 * squared
+    down = v * radial + 2 * p2 * u * v + p1 * (squared + 2 * v * v) + sy1 * squared
+    return across, down
+
+
+def _radial_tangential(x: np.ndarray, y: np.ndarray, *parameters: float) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's RAD_TAN_THIN_PRISM_FISHEYE (Project Aria's Fisheye624): k0..k5, then p0 p1 s0..s3 on the result."""
+    p0, p1, s0, s1, s2, s3 = parameters[6:]
+    u, v = _equidistant(x, y)
+    radial = _polynomial(u * u + v * v, parameters[:6])
+    u, v = u * radial, v * radial
+    squared = u * u + v * v
+    along = 2 * (u * p0 + v * p1)
+    across = u + along * u + squared * p0 + s0 * squared + s1 * squared**2
+    down = v + along * v + squared * p1 + s2 * squared + s3 * squared**2
+    return across, down
+
+
+def _division(x: np.ndarray, y: np.ndarray, k: float) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's DIVISION (Fitzgibbon, CVPR 2001): undistorted = distorted / (1 + k r^2). NaN beyond its range."""
+    scale = 2 / (1 + np.sqrt(1 - 4 * k * (x * x + y * y)))
+    return x * scale, y * scale
+
+
+def _unified(x: np.ndarray, y: np.ndarray, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's EUCM (Khomutenko et al., "An enhanced unified camera model", RA-L 2016)."""
+    scale = 1 / (alpha * np.sqrt(beta * (x * x + y * y) + 1) + 1 - alpha)
+    return x * scale, y * scale
+
+
+PROJECTIONS: dict[str, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
+    "FOV": _field_of_view,
+    "THIN_PRISM_FISHEYE": _thin_prism,
+    "RAD_TAN_THIN_PRISM_FISHEYE": _radial_tangential,
+    "SIMPLE_DIVISION": _division,
+    "DIVISION": _division,
+    "EUCM": _unified,
+}
+"""COLMAP's models beside OpenCV's: (x/z, y/z) and coefficients -> (u - cx) / fx, (v - cy) / fy"""
 
 
 def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -62,6 +146,9 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """(x/z, y/z) of directions in the camera's frame -> pixels of the distorted image."""
+    if lens.model is not None:
+        across, down = PROJECTIONS[lens.model](*np.asarray(directions, np.float64).T, *lens.distortion)
+        return np.stack([lens.fx * across + lens.cx, lens.fy * down + lens.cy], axis=-1)
     matrix, coefficients = _opencv(lens)
     points = np.ascontiguousarray(directions, np.float64)
     if lens.fisheye:
@@ -100,7 +187,7 @@ def undistorted(lens: Lens, where: object) -> Lens:
     that is raised where no such lens exists (principal point outside the image, or absurd coefficients).
     """
     if not lens.distorted:
-        return dataclasses.replace(lens, distortion=(), fisheye=False)
+        return dataclasses.replace(lens, distortion=())
     # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
     low, high = WIDEST, NARROWEST
     if not _covered(lens, high):
@@ -112,11 +199,17 @@ def undistorted(lens: Lens, where: object) -> Lens:
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if _covered(lens, middle) else (middle, high)
-    return dataclasses.replace(lens, fx=lens.fx * high, fy=lens.fy * high, distortion=(), fisheye=False)
+    return dataclasses.replace(lens, fx=lens.fx * high, fy=lens.fy * high, distortion=(), fisheye=False, model=None)
 
 
 def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
     """For each pixel of the pinhole image, where it lies in the distorted one: two tables for cv2.remap."""
+    if lens.model is not None:
+        columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
+        rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
+        directions = np.stack(np.meshgrid(columns, rows), axis=-1)
+        pixels = distort(lens, directions.reshape(-1, 2)).reshape(directions.shape) - 0.5
+        return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
     matrix, coefficients = _opencv(lens)
     target, _ = _opencv(pinhole)
     make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap

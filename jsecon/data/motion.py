@@ -11,6 +11,7 @@ import dataclasses
 import importlib.util
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,13 +24,16 @@ from typing import Any
 from PIL import Image
 
 from jsecon.data import motion_steps
+from jsecon.data.frames import frame_names
 from jsecon.data.images import IMAGE_ENDINGS, read_image, write_image
 from jsecon.data.motion_steps import FEWEST
 from jsecon.errors import InputError
-from jsecon.files import write_text
+from jsecon.files import files_beneath, write_text
 
 _FOCAL, _FOCAL_35, _MODEL, _EXIF = 0x920A, 0xA405, 0x0110, 0x8769
 """tags of EXIF, and of the folder within it that holds the first two"""
+_NO_PHOTOGRAPHS = re.compile(r"mask|depth|segmentation|proposal|label|confidence|normal|thumb")
+"""in the name of a folder: it holds images that are no photographs"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +41,7 @@ class Motion:
     """What structure from motion found."""
 
     registered: tuple[str, ...]
-    """file names of the photographs whose poses were found."""
+    """names of the photographs whose poses were found, with their folders where there are several."""
     left_out: tuple[str, ...]
     """those of the others."""
     models: int
@@ -64,11 +68,50 @@ class Motion:
 
 
 def photographs(path: Path) -> list[Path]:
-    """The image files of a folder, of its images/ where it has one, in name order; hidden ones don't count."""
+    """Lists the photographs of a folder, of its images/ where that has some, in name order.
+
+    Where none lies in the folder itself, those of its subfolders are taken (cam0/, cam1/), but not what lies in folders
+    of masks or depth, masks that are called like the photograph beside them (a.jpg.png), and output of jsecon.
+    """
     folder = path / "images" if (path / "images").is_dir() else path
-    endings = {ending.lower() for ending in IMAGE_ENDINGS}
-    files = [f for f in folder.iterdir() if f.suffix.lower() in endings and f.is_file()] if folder.is_dir() else []
-    return sorted(file for file in files if not file.name.startswith("."))
+    if not folder.is_dir():
+        return []
+    own = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
+    if own:
+        return own
+    found = [file for file in files_beneath(folder) if _is_image(file)]
+    names = set(found)
+    aside = [file.relative_to(folder).parts[:-1] for file in found]
+    return [
+        file
+        for file, folders in zip(found, aside)
+        if file.with_suffix("") not in names and not any(_NO_PHOTOGRAPHS.search(name.lower()) for name in folders)
+    ]
+
+
+def _is_image(file: Path) -> bool:
+    return file.suffix.lower() in IMAGE_ENDINGS and not file.name.startswith(".")
+
+
+def require_motion(where: object) -> None:
+    """Raises InputError, at `where`, where pycolmap is not installed."""
+    if importlib.util.find_spec("pycolmap") is None:
+        remedy = "Run: pip install 'jsecon[sfm]' (or give poses: sparse/0 of COLMAP, or transforms.json)."
+        raise InputError(where, "photographs without poses, and no pycolmap to find them", "pycolmap", remedy)
+
+
+def check_photographs(photos: Sequence[Path], where: object) -> list[str]:
+    """Returns the photographs' names below the folder that holds them all, with "/".
+
+    Raises InputError, at `where`, on too few photographs, and where two differ in nothing but their endings.
+    """
+    if len(photos) < FEWEST:
+        found = f"{len(photos)} photographs"
+        raise InputError(where, found, f"at least {FEWEST}", "Take more, that overlap by two thirds.")
+    root = os.path.commonpath([photo.parent for photo in photos])
+    names = [photo.relative_to(root).as_posix() for photo in photos]
+    frame_names(names, where)
+    return names
 
 
 def find_poses(
@@ -81,65 +124,59 @@ def find_poses(
     """Finds the poses of photographs; what was found, and the capture's folder, of COLMAP's layout, below `work`.
 
     The lens is COLMAP's OPENCV (two focal lengths, four coefficients), shared by all photographs whose EXIF names the
-    same camera and focal length, or names none. images/ holds links to the photographs (copies where the system has no
-    links). `work`: a folder where the steps keep what they have found, to be removed by the caller. `progress(done,
-    total)` counts photographs, then pairs, then steps of placing them all or photographs registered; `where` names the
-    capture in errors. Seeds are set, but COLMAP's threads add up in any order: another run may differ in the last
-    digits. Raises InputError where pycolmap is not installed, on too few, damaged or unequally large photographs, and
-    where no model can be made.
+    same camera and focal length; of those whose EXIF names none, by all of one size in one folder. images/ holds links
+    to the photographs (copies where the system has no links). `work`: a folder where the steps keep what they have
+    found, to be removed by the caller. `progress(done, total)` counts photographs, then pairs, then steps of placing
+    them all or photographs registered; `where` names the capture in errors. Seeds are set, but COLMAP's threads add up
+    in any order: another run may differ in the last digits. Raises InputError where pycolmap is not installed, on too few or damaged photographs, and where no model can
+    be made.
     """
-    if importlib.util.find_spec("pycolmap") is None:
-        remedy = "Run: pip install 'jsecon[sfm]' (or give poses: sparse/0 of COLMAP, or transforms.json)."
-        raise InputError(where, "photographs without poses, and no pycolmap to find them", "pycolmap", remedy)
-    remedy = "Take more, that overlap by two thirds."
-    if len(photos) < FEWEST:
-        raise InputError(where, f"{len(photos)} photographs", f"at least {FEWEST}", remedy)
-    size, groups = _one_size(photos, where), _lenses(photos)
-    endings = [photo.suffix.lower().replace(".heic", ".png") for photo in photos]  # COLMAP reads no HEIC
+    require_motion(where)
+    own_names = check_photographs(photos, where)
+    sizes = _sizes(photos)
+    groups = _lenses(photos, sizes)
+    endings = [".png" if photo.suffix.lower() in (".heic", ".heif") else photo.suffix.lower() for photo in photos]
     names = [f"{number:06d}{ending}" for number, ending in enumerate(endings)]  # COLMAP's lists have spaces
     (work / "links").mkdir(parents=True, exist_ok=True)
     for name, photo in zip(names, photos):
         _link(photo, work / "links" / name)
-    job = {"size": size, "groups": [[names[n] for n in group] for group in groups]}
-    write_text(work / "job.json", json.dumps(job | {"names": {n: photo.name for n, photo in zip(names, photos)}}))
+    job = {"size": max(set(sizes), key=sizes.count), "groups": [[names[n] for n in group] for group in groups]}
+    write_text(work / "job.json", json.dumps(job | {"names": dict(zip(names, own_names))}))
     _run_steps(work, progress)
     told = json.loads((work / "found.json").read_text())
     if len(told["registered"]) < FEWEST:
         found = f"{len(photos)} photographs, of which no {FEWEST} could be brought together"
+        remedy = "Take more, that overlap by two thirds."
         raise InputError(where, found, "sharp photographs of a still scene, from places apart", remedy)
     capture = work / "capture"
-    for name, photo in zip(names, photos):
+    for name, photo, own in zip(names, photos, own_names):
         if name in told["registered"]:
-            _link(photo, capture / "images" / photo.name)
-    registered = tuple(photo.name for name, photo in zip(names, photos) if name in told["registered"])
-    others = tuple(photo.name for name, photo in zip(names, photos) if name not in told["registered"])
+            _link(photo, capture / "images" / own)
+    registered = tuple(own for name, own in zip(names, own_names) if name in told["registered"])
+    others = tuple(own for name, own in zip(names, own_names) if name not in told["registered"])
     return Motion(registered, others, told["models"], told["points"], told["error_px"], told["seconds"]), capture
 
 
-def _one_size(photos: Sequence[Path], where: object) -> tuple[int, int]:
-    """(width, height) of all the photographs, each read whole. Raises InputError where they differ."""
+def _sizes(photos: Sequence[Path]) -> list[tuple[int, int]]:
+    """(width, height) of each photograph, all of it read. Raises InputError where one is damaged."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        sizes = [image.shape[1::-1] for image, _ in pool.map(read_image, photos)]
-    commonest = max(set(sizes), key=sizes.count)
-    odd = [f"{p.name} of {w}x{h}" for p, (w, h) in zip(photos, sizes) if (w, h) != commonest]
-    if odd:
-        told, remedy = ", ".join(odd[:3]) + (" ..." if len(odd) > 3 else ""), "Take these out, or run each size alone."
-        found, expected = f"photographs of several sizes ({told})", f"all of {commonest[0]}x{commonest[1]}, as most are"
-        raise InputError(where, found, expected, remedy)
-    return commonest
+        return [image.shape[1::-1] for image, _ in pool.map(read_image, photos)]
 
 
-def _lenses(photos: Sequence[Path]) -> list[list[int]]:
-    """The photographs' numbers, those together whose EXIF names one camera and focal length."""
+def _lenses(photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """The photographs' numbers, those together that have one size and whose EXIF names one camera and focal length; or
+    names none, and they lie in one folder."""
     groups: dict[Any, list[int]] = {}
-    for number, photo in enumerate(photos):
-        lens = None
+    for number, (photo, size) in enumerate(zip(photos, sizes)):
+        lens: tuple = (photo.parent,)
         ignored = contextlib.suppress(OSError, SyntaxError, ValueError), warnings.catch_warnings(action="ignore")
         with ignored[0], ignored[1], Image.open(photo) as image:
             exif = image.getexif()
             inner = exif.get_ifd(_EXIF)
-            lens = exif.get(_MODEL), str(inner.get(_FOCAL)), str(inner.get(_FOCAL_35))
-        groups.setdefault(lens, []).append(number)
+            told = exif.get(_MODEL), inner.get(_FOCAL), inner.get(_FOCAL_35)
+            if any(value is not None for value in told):
+                lens = tuple(map(str, told))
+        groups.setdefault((size, lens), []).append(number)
     return list(groups.values())
 
 

@@ -80,7 +80,7 @@ def main(work: Path) -> None:
         result["registered"] = [image.name for image in best.images.values() if image.has_pose]
         result |= {"points": best.num_points3D(), "error_px": best.compute_mean_reprojection_error()}
         for image in best.images.values():
-            image.name = job["names"][image.name]
+            image.name = os.fsencode(job["names"][image.name])  # also one that is no UTF-8
         shutil.rmtree(work / "capture", ignore_errors=True)
         (work / "capture" / "sparse" / "0").mkdir(parents=True)
         best.write_binary(work / "capture" / "sparse" / "0")

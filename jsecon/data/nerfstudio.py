@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.data.frames import Posed, Shot
-from jsecon.data.images import IMAGE_ENDINGS, image_header
+from jsecon.data.images import existing_image, image_header
 from jsecon.data.lens import Lens
 from jsecon.data.ply import load_points_ply
 from jsecon.data.poses import inverse_pose, rigid
@@ -47,7 +47,7 @@ def read_nerfstudio(file: Path) -> Posed:
         name = _key(file, entry, "file_path", where, str)
         rows = _key(file, entry, "transform_matrix", f"{where} ({name})", list)
         pose = _matrix(file, rows, f"transform_matrix of {name}")
-        if (image := _find_image(file.parent, name)) is None:
+        if (image := existing_image(file.parent, name)) is None:
             missing.append(name)
             continue
         deep = entry.get("depth_file_path") is not None
@@ -56,7 +56,7 @@ def read_nerfstudio(file: Path) -> Posed:
             raise _bad(depth, "no such depth map", f"the depth_file_path of {name}")
         unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
         lens, world_to_camera = _lens(file, scene, entry, name, image), inverse_pose(pose * [1, -1, -1, 1], file, name)
-        shots.append(Shot(_order_name(name), image, lens, world_to_camera, depth, unit))
+        shots.append(Shot(_order_name(name, image), image, lens, world_to_camera, depth, unit))
     first = f" (the first: {missing[0]})" if missing else ""
     if missing:
         left_out = f"{len(missing)} of {len(entries)} frames of {file.name} were left out"
@@ -140,17 +140,10 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
     return np.linalg.inv(scaled)
 
 
-def _order_name(name: str) -> str:
-    return name.replace("\\", "/").removeprefix("./")
-
-
-def _find_image(folder: Path, name: str) -> Path | None:
-    """The image as named, with "\\" as a separator where a Windows program wrote the file, or with an ending added."""
-    for base in dict.fromkeys((name, name.replace("\\", "/"))):
-        for ending in ("", *IMAGE_ENDINGS):
-            if os.path.isfile(candidate := folder / (base + ending)):
-                return candidate
-    return None
+def _order_name(name: str, image: Path) -> str:
+    """The name that orders a frame and is its own: without "./", with the file's ending where it was left out."""
+    name = name.replace("\\", "/").removeprefix("./")
+    return name if name.lower().endswith(image.suffix.lower()) else name + image.suffix
 
 
 def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, image: Path) -> Lens:

@@ -21,7 +21,7 @@ from jsecon.data.images import MOST_PIXELS, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.poses import inverse_pose
 from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, parsed_json
+from jsecon.files import UNREADABLE, parsed_json, read_text
 from jsecon.numerics import sane
 
 _TUM = {
@@ -63,7 +63,7 @@ def _reading(file: Path) -> Iterator[None]:
 
 
 def _words(file: Path) -> list[list[str]]:
-    lines = [line.split() for line in file.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line.split() for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")]
     return lines or [[]]
 
 
@@ -74,9 +74,16 @@ def _rows(file: Path, columns: int, count: int = -1) -> Float[np.ndarray, "n m"]
 
 def _images(folder: Path) -> list[Path]:
     found = [file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png")]
+    found = sorted(file for file in found if not file.name.startswith("."))
     if not found:
         raise InputError(folder, "no image", "the capture's images", "Export the capture again.")
-    return sorted(found)
+    return found
+
+
+def _beside(folder: Path, stem: str, ending: str) -> Path:
+    """The file of a frame, also where its ending is in upper case."""
+    upper = folder / f"{stem}{ending.upper()}"
+    return upper if upper.is_file() else folder / f"{stem}{ending}"
 
 
 def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4 4"]:
@@ -86,10 +93,13 @@ def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4
 
 
 def _lens(width: Any, height: Any, *numbers: Any) -> Lens:
-    """Of numbers as a file has them. Raises ValueError for a frame without pixels, or without a focal length."""
+    """Of numbers as a file has them. Raises ValueError for a frame without pixels, without a focal length, or whose
+    centre lies outside of it: the numbers are then those of another size."""
     fx, fy, cx, cy = map(float, numbers)
     if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS and sane(numbers) and min(fx, fy) >= LEAST_FOCAL):
         raise ValueError(f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g}")
+    if not (0 < cx < width and 0 < cy < height):
+        raise ValueError(f"a frame of {width}x{height} with its centre at {cx:g}, {cy:g}")
     return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
@@ -108,7 +118,7 @@ def _scannet(path: Path) -> Posed:
     images, lenses = _images(path / "color"), {}
     for kind in ("color", "depth"):
         file = path / "intrinsic" / f"intrinsic_{kind}.txt"
-        first = images[0] if kind == "color" else path / "depth" / f"{images[0].stem}.png"
+        first = images[0] if kind == "color" else _beside(path / "depth", images[0].stem, ".png")
         if file.is_file() and first.is_file():
             k = _rows(file, 4, 4)
             with _reading(file):
@@ -117,7 +127,7 @@ def _scannet(path: Path) -> Posed:
     for image in images:
         pose = _rows(path / "pose" / f"{image.stem}.txt", 4, 4)
         if np.isfinite(pose).all():  # infinite where tracking was lost
-            shot = _shot(image, lenses["color"], pose, path / "depth" / f"{image.stem}.png")
+            shot = _shot(image, lenses["color"], pose, _beside(path / "depth", image.stem, ".png"))
             shots.append(dataclasses.replace(shot, depth_lens=lenses.get("depth")))
     return _posed(path, shots, len(images))
 
@@ -125,7 +135,8 @@ def _scannet(path: Path) -> Posed:
 def _listed(file: Path) -> tuple[np.ndarray, list[Path]]:
     """Times and files of TUM's lists."""
     with _reading(file):
-        rows = _words(file)
+        lines = [line for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")] or [""]
+        rows = [line.strip().split(maxsplit=1) for line in lines]  # a name may have spaces
         return np.array([float(row[0]) for row in rows]), [file.parent / row[1] for row in rows]
 
 
@@ -163,36 +174,56 @@ def _tum(path: Path) -> Posed:
 
 def _arkitscenes(path: Path) -> Posed:
     images, rows = _images(path / "lowres_wide"), _rows(path / "lowres_wide.traj", 7)
+    files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
     with _reading(path / "lowres_wide"):
-        times = np.array([float(image.stem.rpartition("_")[2]) for image in images])
-    lenses = {file.stem: file for file in (path / "lowres_wide_intrinsics").glob("*.pincam")}
+        times, of_lens = (np.array([float(f.stem.rpartition("_")[2]) for f in each]) for each in (images, files))
     shots = []
-    for image, own in zip(images, _together(rows[:, 0], times)):
-        if own >= 0 and image.stem in lenses:
-            width, height, *numbers = _rows(lenses[image.stem], 6)[0]
+    # The intrinsics of a frame can be called a millisecond earlier or later than its image.
+    for image, own, lens in zip(images, _together(rows[:, 0], times), _together(of_lens, times)):
+        if own >= 0 and lens >= 0:
+            width, height, *numbers = _rows(files[lens], 6)[0]
             pose = _matrix(Rotation.from_rotvec(rows[own, 1:4]), rows[own, 4:])  # from the world
             depth = path / "lowres_depth" / image.name
-            shots.append(_shot(image, _lens(width, height, *numbers), np.linalg.inv(pose), depth))
+            with _reading(files[lens]):
+                shots.append(_shot(image, _lens(width, height, *numbers), np.linalg.inv(pose), depth))
     return _posed(path, shots, len(images))
 
 
 def _polycam(path: Path) -> Posed:
     frames = path / "keyframes"
-    kind = "corrected_" if (frames / "corrected_images").is_dir() else ""
+    corrected = all((frames / f"corrected_{kind}").is_dir() for kind in ("images", "cameras"))
+    kind = "corrected_" if corrected else ""
+    if not (frames / f"{kind}images").is_dir() or not (frames / f"{kind}cameras").is_dir():
+        remedy = "Export the raw data from Polycam again, with its developer mode on."
+        raise InputError(frames, "no images/ or no cameras/", "both, of a Polycam capture", remedy)
     images, shots = _images(frames / f"{kind}images"), []
     for image in images:
-        file = frames / f"{kind}cameras" / f"{image.stem}.json"
+        file = _beside(frames / f"{kind}cameras", image.stem, ".json")
         if file.is_file():
             with _reading(file):
                 told = parsed_json(file.read_bytes())
-                lens = _lens(*(told[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
+                size = _polycam_size(told, _beside(frames / "cameras", image.stem, ".json"), image)
+                lens = _lens(*size, *(told[name] for name in ("fx", "fy", "cx", "cy")))
                 pose = np.array([[told[f"t_{i}{j}"] for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]], np.float64)
-            shots.append(_shot(image, lens, pose @ _PHONE, frames / "depth" / f"{image.stem}.png"))
+            shots.append(_shot(image, lens, pose @ _PHONE, _beside(frames / "depth", image.stem, ".png")))
     return _posed(path, shots, len(images))
 
 
+def _polycam_size(told: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
+    """(width, height) that a camera's numbers are for: as its file says, or that of the image before its correction, or
+    else the image's own. Recent corrected_cameras/ have no sizes; the images can be smaller than their numbers say."""
+    if "width" in told and "height" in told:
+        return told["width"], told["height"]
+    own = image_size(image)
+    before = parsed_json(uncorrected.read_bytes()) if uncorrected.is_file() else {}
+    width, height = before.get("width", own[0]), before.get("height", own[1])
+    return (width, height) if abs(width * own[1] - height * own[0]) <= max(width, height) else own
+
+
 def _record3d(path: Path) -> Posed:
-    images, file, shots = _images(path / "rgb"), path / "metadata.json", []
+    unpacked = (path / "rgbd").is_dir()  # a .r3d is an archive
+    images, shots = _images(path / ("rgbd" if unpacked else "rgb")), []
+    file = path / ("metadata" if unpacked else "metadata.json")
     with _reading(file):
         told = parsed_json(file.read_bytes())
         k = told["K"]  # by columns
@@ -202,7 +233,8 @@ def _record3d(path: Path) -> Posed:
             n = int(image.stem)
             if n < len(poses):
                 pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE
-                shots.append(_shot(image, _lens(told["w"], told["h"], *numbers[n]), pose))
+                size = (told["w"], told["h"]) if "w" in told and "h" in told else image_size(image)
+                shots.append(_shot(image, _lens(*size, *numbers[n]), pose))
     return _posed(path, shots, len(images), "Record3D's depth was not read: it has a compression of its own.")
 
 
@@ -212,5 +244,6 @@ _FOLDERS: dict[tuple[str, ...], Callable[[Path], Posed]] = {
     ("lowres_wide", "lowres_wide.traj"): _arkitscenes,
     ("keyframes",): _polycam,
     ("rgb", "metadata.json"): _record3d,
+    ("rgbd", "metadata"): _record3d,
 }
 """what a folder holds -> what reads it"""

@@ -25,7 +25,16 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, write_text, written_whole
+from jsecon.files import (
+    UNREADABLE,
+    files_beneath,
+    packed,
+    parsed_json,
+    read_arrays,
+    unpacked,
+    write_text,
+    written_whole,
+)
 
 _TREE = "__tree__"
 MAPPED = 1 << 30
@@ -56,26 +65,28 @@ def key_of(stage: str, parts: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
-    """Digest of files, and of all files beneath folders, by name, size and time of change.
+_WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")
+"""endings of files that programs write beside a capture and that no capture is read from"""
 
-    Hidden files don't count, nor does `leave_out`, the run's own output, where it lies inside of such a folder.
+
+def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
+    """Digest of files, and of all files beneath folders (`files_beneath`), by name, size and time of change.
+
+    `leave_out`, the run's own output, does not count where it lies inside of such a folder: the folder, and the scene
+    of the same name beside it, which `jsecon fit` writes.
     """
     entries = []
     for root in paths:
-        own = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out.resolve()
-        if own is not None and not own.is_relative_to(root.resolve()):
-            own = None
-        for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
+        own = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out
+        written = None if own is None else own.resolve().with_name(f"{own.name}.ply")
+        for path in files_beneath(root, leave_out=own) if root.is_dir() else [root]:
             inside = path.relative_to(root) if path != root else Path(path.name)
-            if any(part.startswith(".") for part in inside.parts) or not path.is_file():
-                continue
-            if own is not None and path.resolve().is_relative_to(own):
+            if path != root and (path.suffix.lower() in _WRITTEN or path.absolute() == written):
                 continue
             with contextlib.suppress(FileNotFoundError):  # gone since it was listed
                 stat = path.stat()
-                entries.append(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}")
-    return hashlib.blake2b("\n".join(entries).encode(), digest_size=8).hexdigest()
+                entries.append(os.fsencode(f"{inside.as_posix()} {stat.st_size} {stat.st_mtime_ns}"))
+    return hashlib.blake2b(b"\n".join(entries), digest_size=8).hexdigest()
 
 
 def source_digest(*entries: Callable) -> str:

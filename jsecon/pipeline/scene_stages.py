@@ -29,16 +29,10 @@ def loaded(work: Work) -> list[Stage]:
 
 def _bare(capture: Path) -> bool:
     """Whether it is a video, or a folder of photographs without a file of poses."""
-    from jsecon.data.colmap import find_model
-    from jsecon.data.rgbd import find_rgbd
-
-    posed = find_model(capture) is not None or find_rgbd(capture) is not None
-    if posed or (capture / "transforms.json").exists() or capture.suffix == ".json":
-        return False
-    from jsecon.data.motion import photographs
+    from jsecon.data.capture import bare_photographs
     from jsecon.data.video import is_video
 
-    return is_video(capture) or len(photographs(capture)) > 0
+    return is_video(capture) or len(bare_photographs(capture)) > 0
 
 
 def poses(work: Work) -> Stage:
@@ -68,9 +62,10 @@ def poses(work: Work) -> Stage:
     else:
         what = f"{len(photographs(capture))} photographs, which have none"
     how = f"found by structure from motion (pycolmap) for {what}"
-    given = work.given("frames") if video else {}
-    files = capture / "images" if (capture / "images").is_dir() else capture
-    return Stage("poses", how, compute, given=given, files=files, leaves=out)
+    if video:
+        return Stage("poses", how, compute, given=work.given("frames"), files=capture, leaves=out)
+    given = {"names": [photo.relative_to(capture).as_posix() for photo in photographs(capture)]}
+    return Stage("poses", how, compute, given=given, files=lambda: photographs(capture), leaves=out)
 
 
 def load(work: Work) -> Stage:

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -103,8 +103,8 @@ class Stage:
     """the stages whose results it reads."""
     given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """options and models that its result depends on; models by their content, not by the place of their files."""
-    files: Path | None = None
-    """input file or folder."""
+    files: Path | Callable[[], Sequence[Path]] | None = None
+    """input file or folder, or what lists the input files."""
     uses: tuple[Any, ...] = ()
     """what it calls beside what it imports: a segmenter, a tracker, an embedder; None where there is none."""
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -129,7 +129,10 @@ class Stage:
 
     def files_digest(self, work: Work) -> str | None:
         """Digest of the names, sizes and times of its files."""
-        return None if self.files is None else cache.files_digest([self.files], leave_out=work.out)
+        if self.files is None:
+            return None
+        paths = [self.files] if isinstance(self.files, Path) else self.files()
+        return cache.files_digest(paths, leave_out=work.out)
 
     def computed(self, work: Work, files: str | None, *given: Any) -> Outcome:
         """What it makes of its files. Raises InputError where they are no longer those of the digest `files`: its key
@@ -138,7 +141,8 @@ class Stage:
         if files != self.files_digest(work):
             remedy = "Give the same command again when nothing writes there; what is done is kept."
             told = f"files that changed while stage {self.name} read them"
-            raise InputError(str(self.files), told, "files that stay as they are during a run", remedy)
+            where = self.files if isinstance(self.files, Path) else work.options.capture
+            raise InputError(where, told, "files that stay as they are during a run", remedy)
         return found
 
 
