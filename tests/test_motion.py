@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import importlib.util
+import os
 import shutil
 import sqlite3
 import sys
@@ -178,16 +179,76 @@ def _damaged(path):
     path.write_bytes(path.read_bytes()[:2000])
 
 
-def _smaller(path):
-    cv2.imwrite(str(path), np.zeros((60, 80, 3), np.uint8))
+def _of_two_endings(path):
+    shutil.copy(path, path.with_suffix(".jpg"))
 
 
-@pytest.mark.parametrize(("spoil", "says"), [(_damaged, "breaks off"), (_smaller, "photo 03.png of 80x60")])
-def test_photographs_that_are_damaged_or_of_several_sizes_are_refused(photos, tmp_path, spoil, says):
+@pytest.mark.parametrize(("spoil", "says"), [(_damaged, "breaks off"), (_of_two_endings, "photo 03.jpg")])
+def test_photographs_that_are_damaged_or_called_the_same_are_refused(photos, tmp_path, spoil, says):
     folder = shutil.copytree(photos[0], tmp_path / "walk")
     spoil(folder / "photo 03.png")
     with refused("photo 03.png", says):
         find_poses(photographs(folder), tmp_path / "work")
+
+
+def test_photographs_in_subfolders_with_names_that_are_no_utf8(photos, found, tmp_path):
+    """Two folders, photographs of the same names in each, one folder's name in Latin-1."""
+    folders = [tmp_path / "walk" / name for name in ("cam 0", os.fsdecode(b"c\xe9 #1"))]
+    for number, photo in enumerate(photographs(photos[0])):
+        folder = folders[number // 4]
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photo, folder / f"{number % 4}.png")
+    shutil.copytree(found[2], tmp_path / "work", symlinks=True)  # features and matches are there
+    told, capture = find_poses(photographs(tmp_path / "walk"), tmp_path / "work")
+    assert told.registered == tuple(f"{folder.name}/{n}.png" for folder in folders for n in range(4))
+    loaded_capture = load_capture(capture, holdout=0)
+    assert loaded_capture.names == tuple(f"{folder.name}_{n}" for folder in folders for n in range(4))
+    plain = load_capture(found[1], holdout=0)
+    np.testing.assert_array_equal(loaded_capture.frames, plain.frames)
+
+
+def test_photographs_in_subfolders_are_told_from_masks_and_from_output(photos, tmp_path):
+    for name in (
+        *("cam0/i0.jpg", "cam0/i1.JPG", "cam1/deep/i0.png", ".thumbs/i0.jpg", "cam0/notes.txt"),
+        *("cam0/i0.jpg.png", "masks/i0.png", "cam1_depth/i0.png", "f/cache/CACHEDIR.TAG", "f/poses/images/i0.jpg"),
+        *("answers/answers.html", "answers/mask.png"),
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [str(p.relative_to(tmp_path)) for p in photographs(tmp_path)] == [
+        *("cam0/i0.jpg", "cam0/i1.JPG", "cam1/deep/i0.png")
+    ]
+    with refused("3 photographs without poses", "jsecon run"):
+        load_capture(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with refused("empty folder"):
+        load_capture(tmp_path / "empty")
+    (tmp_path / "cam1" / "transforms.json").write_text("{}")  # captures beside each other are not one
+    with refused("own folder", str(tmp_path / "cam1")):
+        load_capture(tmp_path)
+
+
+def test_an_output_folder_among_the_photographs_is_no_input(photos, tmp_path):
+    """Its own, that of another run beside it, links in them to the photographs, and the scene of a fit."""
+    folder = shutil.copytree(photos[0], tmp_path / "walk")
+
+    def stage(out):
+        work = Work(Options(folder), Networks(ColourEmbedder()), out)
+        return loaded(work)[0], work
+
+    (one, work), (other, other_work) = stage(folder / "f"), stage(folder / "g")
+    before = one.files_digest(work)
+    assert other.files_digest(other_work) == before
+    for name in ("f", "g"):
+        (folder / name / "cache").mkdir(parents=True)
+        (folder / name / "cache" / "CACHEDIR.TAG").touch()
+        (folder / name / "poses" / "images").mkdir(parents=True)
+        (folder / name / "poses" / "images" / "photo 00.png").symlink_to(folder / "photo 00.png")
+        (folder / f"{name}.ply").touch()
+    assert one.files_digest(work) == other.files_digest(other_work) == before
+    assert one.key(work, {}, before) == stage(folder / "f")[0].key(work, {}, before)
+    (folder / "photo 08.png").touch()
+    assert one.files_digest(work) != before
 
 
 def test_photographs_that_show_nothing_in_common_are_refused(photos, tmp_path):

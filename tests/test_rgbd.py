@@ -194,6 +194,72 @@ def test_the_benchmarks_own_cameras_are_known_by_name(tmp_path, camera, fx, bent
         load_capture(tmp_path / "mine")
 
 
+@pytest.mark.parametrize("before", [None, SIZE])
+@pytest.mark.parametrize("smaller", [False, True])
+def test_polycam_without_sizes(tmp_path, before, smaller):
+    """Recent corrected_cameras/ name none: cameras/ has them, or the images themselves."""
+    write_polycam(tmp_path)
+    frames = tmp_path / "keyframes"
+    (frames / "cameras").mkdir()
+    for file in (frames / "corrected_cameras").iterdir():
+        told = json.loads(file.read_text())
+        told = {name: value for name, value in told.items() if name not in ("width", "height")}
+        file.rename(file.with_suffix(".JSON"))
+        file.with_suffix(".JSON").write_text(json.dumps(told))
+        if before is not None:
+            (frames / "cameras" / file.name).write_text(json.dumps({"width": SIZE[0], "height": SIZE[1]}))
+    if smaller:
+        for file in (frames / "corrected_images").iterdir():
+            cv2.imwrite(str(file), cv2.imread(str(file))[::2, ::2])
+    if smaller and before is None:  # nothing says what size the numbers are for: they don't fit the images
+        with refused("cameras", "12x8", "centre"):
+            load_capture(tmp_path)
+        return
+    found = load_capture(tmp_path, holdout=0)
+    assert (found.cameras.width, found.cameras.height) == ((12, 8) if smaller else SIZE)
+    np.testing.assert_allclose(found.cameras.fx, K[0] / (2 if smaller else 1), rtol=1e-6)
+    np.testing.assert_allclose(found.cameras.cy, K[3] / (2 if smaller else 1), rtol=1e-6)
+    assert len(found.names) == 11
+
+
+def test_polycam_without_corrected_cameras(tmp_path):
+    write_polycam(tmp_path)
+    frames = tmp_path / "keyframes"
+    (frames / "corrected_cameras").rename(frames / "cameras")
+    with refused("keyframes", "images/"):
+        load_capture(tmp_path)
+    shutil.copytree(frames / "corrected_images", frames / "images")  # the corrected ones alone are no capture
+    found = load_capture(tmp_path, holdout=0)
+    np.testing.assert_array_equal(found.frames, CAPTURE.frames[expected("polycam")])
+
+
+def test_record3d_as_its_archive_unpacks(tmp_path):
+    write_record3d(tmp_path)
+    (tmp_path / "rgb").rename(tmp_path / "rgbd")
+    told = json.loads((tmp_path / "metadata.json").read_text())
+    (tmp_path / "metadata.json").unlink()
+    (tmp_path / "metadata").write_text(json.dumps({name: told[name] for name in ("K", "poses")}))
+    found = load_capture(tmp_path, holdout=0)
+    np.testing.assert_array_equal(found.frames, CAPTURE.frames)
+    np.testing.assert_allclose(found.cameras.cx, K[2], rtol=1e-6)
+
+
+def test_arkitscenes_intrinsics_a_millisecond_off(tmp_path):
+    write_arkitscenes(tmp_path)
+    for n, file in enumerate(sorted((tmp_path / "lowres_wide_intrinsics").iterdir())):
+        file.rename(file.with_name(f"41069021_{100 + n / 10 + 0.001 * (n % 3 - 1):.3f}.pincam"))
+    found = load_capture(tmp_path, holdout=0)
+    np.testing.assert_array_equal(found.frames, CAPTURE.frames[expected("arkitscenes")])
+
+
+def test_tum_names_with_spaces(tmp_path):
+    write_tum(tmp_path)
+    (tmp_path / "rgb").rename(tmp_path / "rgb images")
+    text = (tmp_path / "rgb.txt").read_text().replace(" rgb/", " rgb images/")
+    (tmp_path / "rgb.txt").write_bytes(text.encode("utf-8-sig"))
+    assert len(load_capture(tmp_path, holdout=0).names) == 11
+
+
 @pytest.mark.parametrize(
     ("name", "file", "text", "says"),
     [
@@ -209,7 +275,9 @@ def test_the_benchmarks_own_cameras_are_known_by_name(tmp_path, camera, fx, bent
         ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
         ("arkitscenes", "lowres_wide_intrinsics/41069021_100.000.pincam", "24 16 x\n", "pincam"),
         ("polycam", "keyframes/corrected_cameras/101.json", "{", "101.json"),
-        ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "width"),
+        ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'fy'"),
+        ("polycam", "keyframes/corrected_cameras/101.json", "[]", "101.json"),
+        ("record3d", "rgb/left.png", "", "metadata.json"),
         ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
         ("record3d", "metadata.json", "[]", "metadata.json"),
     ],
