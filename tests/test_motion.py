@@ -348,7 +348,7 @@ def test_colmap_is_given_a_png_for_a_heic(photos, tmp_path):
     shape = image.shape[1::-1]
     pillow_heif.from_bytes("RGB", shape, image.tobytes()).save(tmp_path / "IMG_1.HEIC", quality=95)
     assert photographs(tmp_path) == [tmp_path / "IMG_1.HEIC"]
-    motion._link(tmp_path / "IMG_1.HEIC", tmp_path / "links" / "000000.png")
+    motion._link(tmp_path / "IMG_1.HEIC", tmp_path / "links" / "000000.png", upright_copy=True)
     np.testing.assert_array_equal(
         cv2.imread(tmp_path / "links" / "000000.png")[..., ::-1], read_image(tmp_path / "IMG_1.HEIC")[0]
     )

@@ -25,7 +25,7 @@ from PIL import Image
 
 from jsecon.data import motion_steps
 from jsecon.data.frames import frame_names
-from jsecon.data.images import IMAGE_ENDINGS, read_image, write_image
+from jsecon.data.images import IMAGE_ENDINGS, image_header, read_image, write_image
 from jsecon.data.motion_steps import FEWEST
 from jsecon.errors import InputError
 from jsecon.files import files_beneath, write_text
@@ -128,18 +128,20 @@ def find_poses(
     to the photographs (copies where the system has no links). `work`: a folder where the steps keep what they have
     found, to be removed by the caller. `progress(done, total)` counts photographs, then pairs, then steps of placing
     them all or photographs registered; `where` names the capture in errors. Seeds are set, but COLMAP's threads add up
-    in any order: another run may differ in the last digits. Raises InputError where pycolmap is not installed, on too few or damaged photographs, and where no model can
-    be made.
+    in any order: another run may differ in the last digits. Raises InputError where pycolmap is not installed, on too
+    few or damaged photographs, where two differ in nothing but their endings, and where no model can be made.
     """
     require_motion(where)
     own_names = check_photographs(photos, where)
     sizes = _sizes(photos)
     groups = _lenses(photos, sizes)
-    endings = [".png" if photo.suffix.lower() in (".heic", ".heif") else photo.suffix.lower() for photo in photos]
+    turned = [image_header(photo).orientation != 1 for photo in photos]
+    copied = [turn or photo.suffix.lower() in (".heic", ".heif") for turn, photo in zip(turned, photos)]
+    endings = [".png" if copy else photo.suffix.lower() for copy, photo in zip(copied, photos)]
     names = [f"{number:06d}{ending}" for number, ending in enumerate(endings)]  # COLMAP's lists have spaces
     (work / "links").mkdir(parents=True, exist_ok=True)
-    for name, photo in zip(names, photos):
-        _link(photo, work / "links" / name)
+    for name, photo, copy in zip(names, photos, copied):
+        _link(photo, work / "links" / name, upright_copy=copy)
     job = {"size": max(set(sizes), key=sizes.count), "groups": [[names[n] for n in group] for group in groups]}
     write_text(work / "job.json", json.dumps(job | {"names": dict(zip(names, own_names))}))
     _run_steps(work, progress)
@@ -180,10 +182,12 @@ def _lenses(photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> list[li
     return list(groups.values())
 
 
-def _link(photo: Path, link: Path) -> None:
+def _link(photo: Path, link: Path, *, upright_copy: bool = False) -> None:
+    """Makes `link` stand for a photograph; a copy of its upright pixels where COLMAP does not read those from the file:
+    it has no HEIC, and ignores EXIF's orientation."""
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)
-    if link.suffix.lower() != photo.suffix.lower():
+    if upright_copy:
         write_image(link, read_image(photo)[0])
         return
     try:

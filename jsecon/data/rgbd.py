@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from jsecon.data.frames import LEAST_FOCAL, Posed, Shot
-from jsecon.data.images import MOST_PIXELS, image_size
+from jsecon.data.images import MOST_PIXELS, image_header, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.poses import inverse_pose
 from jsecon.errors import InputError, why
@@ -214,7 +214,7 @@ def _polycam_size(told: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
     else the image's own. Recent corrected_cameras/ have no sizes; the images can be smaller than their numbers say."""
     if "width" in told and "height" in told:
         return told["width"], told["height"]
-    own = image_size(image)
+    own = image_header(image).about(told.get("cx"), told.get("cy"))
     before = parsed_json(uncorrected.read_bytes()) if uncorrected.is_file() else {}
     width, height = before.get("width", own[0]), before.get("height", own[1])
     return (width, height) if abs(width * own[1] - height * own[0]) <= max(width, height) else own
