@@ -34,7 +34,7 @@ PACKAGES = (
 )
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
-    "formats": (("gsply", "pillow_heif"), ".spz, .sog, HEIC photographs"),
+    "formats": (("gsply", "pillow_heif"), ".sog, .spz of version 4, HEIC photographs"),
     "serve": (("starlette", "uvicorn"), "jsecon serve"),
     "viewer": (("viser",), "jsecon view"),
     "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),

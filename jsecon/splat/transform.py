@@ -16,6 +16,7 @@ ROWS = 1 << 18
 """Gaussians carried at a time"""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite stays so, for the caller to tell
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
     """The Gaussians in the world that `similarity` (4, 4) leads to: x' = s R x + t, with R a rotation and s > 0.
 
