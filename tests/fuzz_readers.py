@@ -269,7 +269,9 @@ def image(folder: Path) -> Iterator[Case]:
     cv2.imwrite(str(folder / "progressive.jpg"), colour, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
     exif = Image.Exif()
     exif[0x0110], exif.get_ifd(0x8769)[0x920A] = "camera", 35.0
-    Image.fromarray(colour).save(folder / "exif.jpg", exif=exif)
+    exif[0x0112] = 6
+    for ending in (".jpg", ".png", ".webp", ".tif"):
+        Image.fromarray(colour).save(folder / f"exif{ending}", exif=exif)
 
     def read(file: Path):
         found = images.read_image(file)
@@ -381,10 +383,14 @@ def proposals(folder: Path) -> Iterator[Case]:
     ids[2:9, 3:8] = 7
     cv2.imwrite(str(folder / "c.png"), ids)
     np.save(folder / "d_s.npy", np.broadcast_to(ids.astype(np.float32) - 1, (4, 20, 30)))
+    square = [3, 2, 25, 2, 25, 15, 3, 15]
+    polygons = [{"segmentation": [square, [5, 4, 9, 4, 9, 9]]}, {"segmentation": [square]}]
+    (folder / "e.json").write_text(json.dumps({"images": [{"width": 30, "height": 20}], "annotations": polygons}))
+    np.save(folder / "f.npy", boxes)
 
     def read():
-        of_frame, _ = proposal_files.proposals_from_disk(folder, ("a", "b", "c", "d"), (20, 30))
-        return [of_frame(n) for n in range(4)]
+        of_frame, _ = proposal_files.proposals_from_disk(folder, tuple("abcdef"), (20, 30))
+        return [of_frame(n) for n in range(6)]
 
     def whole(found) -> None:
         for masks in found:

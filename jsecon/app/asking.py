@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool
@@ -25,6 +24,7 @@ from jsecon.app.question import (
     unheld,
 )
 from jsecon.data.images import read_stored
+from jsecon.data.mask_files import resize_nearest
 from jsecon.errors import InputError
 from jsecon.language.field import field_of_rows
 from jsecon.process import MEMORY, memory_budget
@@ -92,9 +92,12 @@ def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
     image, size = read_stored(Path(file)), (field.cameras.width, field.cameras.height)
     mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
     if abs(mask.shape[1] * size[1] - mask.shape[0] * size[0]) > max(size) + max(mask.shape):
-        found, wanted = f"{mask.shape[1]}x{mask.shape[0]}", f"{size[0]}x{size[1]}, or the same shape at another size"
+        found, wanted = (
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}",
+            f"{size[0]}x{size[1]}, or the same shape at another size",
+        )
         raise InputError(file, found, wanted, "Outline the frame as the run used it.")
-    return np.asarray(cv2.resize(np.asarray(mask), size, interpolation=cv2.INTER_NEAREST)) > 0
+    return resize_nearest(mask, *size) > 0
 
 
 def larger_than_memory(file: Path) -> bool:

@@ -437,7 +437,7 @@ def _read_id_array(path: Path) -> np.ndarray:
     try:
         image = map_array(path)
     except UNREADABLE as error:
-        raise InputError(path, f"there is no whole array ({error})", expected, "Write the mask again.") from error
+        raise InputError(path, f"there is no whole array ({why(error)})", expected, "Write the mask again.") from error
     image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
     if image.ndim == 3:
         remedy = "Give such stacks with --proposals, or write one image of ids for each frame."
@@ -464,7 +464,7 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         try:
             depth = map_array(path)
         except UNREADABLE as error:
-            raise InputError(path, f"the depth map cannot be read: {error}", expected, remedy) from error
+            raise InputError(path, f"the depth map cannot be read: {why(error)}", expected, remedy) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         if depth.ndim != 2 or not depth.size:
             raise InputError(path, f"the depth map has shape {depth.shape}", expected, remedy)

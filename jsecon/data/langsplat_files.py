@@ -15,7 +15,7 @@ import numpy as np
 
 from jsecon.data.mask_files import Fit, compact, read_level
 from jsecon.data.mask_names import find_masks
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import UNREADABLE, map_array
 from jsecon.numerics import sane
 from jsecon.types import ImageFile
@@ -103,5 +103,5 @@ def _read_table(file: Path) -> np.ndarray:
             raise ValueError("a single number")
     except UNREADABLE as error:
         wanted, remedy = "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."
-        raise InputError(file, f"there is nothing readable ({error})", wanted, remedy) from error
+        raise InputError(file, f"there is nothing readable ({why(error)})", wanted, remedy) from error
     return table

@@ -48,7 +48,7 @@ def load_lerf_labels(folder: str | Path) -> list[LabelledFrame]:
     folder = Path(folder)
     files = sorted(folder.glob("*.json"))
     if not files:
-        raise InputError(folder, "no .json file", "frame_XXXXX.json labels", "Check the path.")
+        raise InputError(folder, "it holds no .json file", "frame_XXXXX.json labels", "Check the path.")
     return [_read(file) for file in files]
 
 
@@ -59,7 +59,7 @@ def _bad(file: Path, found: str, expected: str) -> InputError:
 def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
     if not isinstance(record, dict) or not isinstance(record.get(key), kind):
         expected = "info (name, width, height) and objects (category, segmentation, bbox)"
-        raise _bad(file, f"no usable {key!r} in {where}", expected)
+        raise _bad(file, f"there is no usable {key!r} in {where}", expected)
     return record[key]
 
 
@@ -69,7 +69,7 @@ def _read(file: Path) -> LabelledFrame:
     name = Path(_get(file, info, "name", str, "info")).stem
     width, height = (int(_get(file, info, key, int, "info")) for key in ("width", "height"))
     if min(width, height) < 1 or width * height > MOST_PIXELS:
-        raise _bad(file, f"an image of {width}x{height}", f"a positive size, at most {MOST_PIXELS} pixels")
+        raise _bad(file, f"the image is {width}x{height}", f"a positive size, at most {MOST_PIXELS} pixels")
     objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for index, entry in enumerate(_get(file, content, "objects", list, "the file")):
         where = f"object {index}"
@@ -89,10 +89,10 @@ def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.
     try:
         array = np.array(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
-        found = f"{what} that is no list of {shape[1]} numbers each"
+        found = f"the {what} is no list of {shape[1]} numbers each"
         raise _bad(file, found, "[x, y] corners, and x1 y1 x2 y2") from error
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
-        raise _bad(file, f"{what} that is empty or out of all range", "pixels")
+        raise _bad(file, f"the {what} is empty or out of all range", "pixels")
     return array
 
 

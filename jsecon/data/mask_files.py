@@ -13,7 +13,7 @@ from jaxtyping import Int16
 from jsecon.data.frames import Progress
 from jsecon.data.images import TRANSPOSED, read_ids, turned
 from jsecon.data.mask_names import Masks, find_masks, object_ids
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.files import UNREADABLE, map_array
 from jsecon.types import ImageFile
 
@@ -255,7 +255,7 @@ def read_level(path: Path, level: str | int) -> np.ndarray:
         image = map_array(path)
     except UNREADABLE as error:
         wanted = f"a .npy of shape ({len(LEVELS)}, H, W)"
-        raise InputError(path, f"there is no whole array ({error})", wanted, "Write the masks again.") from error
+        raise InputError(path, f"there is no whole array ({why(error)})", wanted, "Write the masks again.") from error
     if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
         wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
         raise InputError(path, f"the array has shape {image.shape}", wanted, remedy)
@@ -267,7 +267,7 @@ def read_level(path: Path, level: str | int) -> np.ndarray:
     return image.astype(np.int64)
 
 
-def nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
+def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """An image (H, W) of integers at another size: each pixel has the value at its centre."""
     rows, columns = image.shape
     down = (2 * np.arange(height) + 1) * rows // (2 * height)
@@ -330,7 +330,7 @@ class Fit:
         if image.shape == (self.height, self.width):
             return image
         self.count["resized"] += 1
-        return nearest(image, self.width, self.height)
+        return resize_nearest(image, self.width, self.height)
 
     def notes(self) -> list[str]:
         """What was done to the masks, a sentence each."""

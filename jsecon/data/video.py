@@ -60,7 +60,7 @@ def write_frames(
             progress(min(len(sharpness), total), 2 * total)
     if not sharpness:
         remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
-        raise InputError(video, "no frame that OpenCV can read", "a video", remedy)
+        raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
     chosen, written = set(sharpest(sharpness, frames or VIDEO_FRAMES)), []
     for number, (image, _) in enumerate(_decoded(video)):
         if number in chosen:
