@@ -62,7 +62,8 @@ def main() -> None:
     zeros = jax.tree.map(np.zeros_like, gaussians)
     current = on_devices(Current(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
     views = Views(dataclasses.replace(capture, held_out=np.arange(9) != 4))
-    steps, ways = Steps(views, mesh), [Way(3, growth, LearningRates(), None) for growth in ("votes", "none")]
+    steps = Steps(views, mesh)
+    ways = [Way(3, growth, LearningRates(), None, gaussians.count) for growth in ("votes", "none")]
     voting, plain_step = (functools.partial(steps.take, current, 0, 0, 0.0, way) for way in ways)
     reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current[0], camera, frame)
     runs = {"l1": reference, "step": plain_step, "step_with_votes": voting}

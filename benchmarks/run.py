@@ -35,7 +35,7 @@ def measure(capture: Path, out: Path, steps: int) -> None:
     figures = {
         "seconds": run.seconds,
         "programs": run.programs,
-        "peak_mib": pipeline.peak_memory_mib(),
+        "peak_mib": peak_memory_mib(),
         "psnr": float(np.mean(run.psnr)),
         "gaussians": run.field.gaussians.count,
         "regions": run.field.regions.count,

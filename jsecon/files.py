@@ -5,7 +5,7 @@ fill, and no Python object is built."""
 import codecs
 import contextlib
 import dataclasses
-import fcntl
+import errno
 import json
 import math
 import os
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from jsecon.errors import InputError, require, why
 
@@ -32,6 +33,8 @@ ALIGNED = 64
 """bytes: the columns of a .npz that is to be mapped begin at a multiple of them, as jax wants its arrays"""
 _PADDING = 0xD935
 """the zip extra field that Android's zipalign fills up with"""
+_WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
+"""what the system says of a file system that has no locks"""
 MOST_DEFLATED = 1032
 """bytes that one byte of a deflated stream can stand for"""
 _HEADER = (
@@ -72,19 +75,21 @@ def _unwritten(path: Path, error: OSError) -> InputError:
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """While it is open, `folder` is this caller's to write to. Raises InputError where it is another's, or is full."""
+    lock = FileLock(folder / ".lock", timeout=0)
     try:
-        lock = open(folder / ".lock", "w")  # noqa: SIM115 - closed below; its own errors are told apart from the body's
+        lock.acquire()
+    except Timeout as error:
+        remedy = "Wait for its end, or choose another output folder."
+        raise InputError(folder, "another run that writes there", "one at a time", remedy) from error
+    except NotImplementedError:  # a file system without locks
+        pass
     except OSError as error:
-        raise _unwritten(folder / ".lock", error) from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            remedy = "Wait for its end, or choose another output folder."
-            raise InputError(folder, "another run that writes there", "one at a time", remedy) from error
-        except OSError:  # a file system without locks
-            pass
+        if error.errno not in _WITHOUT_LOCKS:
+            raise _unwritten(folder / ".lock", error) from error
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def made_by_jsecon(folder: Path) -> bool:

@@ -1,5 +1,6 @@
 """Safe maths and the named constants, each with its reason. Every guard is finite in value and gradient everywhere."""
 
+import math
 from typing import Any
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jsecon.errors import require
 from jsecon.types import Array
 
 # Splatting semantics (Kerbl et al. 2023, diff-gaussian-rasterization; gsplat agrees). They define the image.
@@ -101,6 +103,19 @@ def finite(*arrays: Array) -> Array:
     return result
 
 
-def is_traced(tree) -> bool:
-    """Whether any leaf of `tree` is being traced (jit, grad, vmap)."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+def is_traced(tree: Any = ()) -> bool:
+    """Whether any leaf of `tree` is being traced (jit, grad, vmap), or whatever is computed now is: inside a jit also
+    arrays that its function closes over."""
+    return any(isinstance(leaf, Tracer) for leaf in [*jax.tree.leaves(tree), jnp.zeros(())])
+
+
+def require_labels(labels: Any, num_regions: int) -> None:
+    """Raises ValueError unless an array of labels holds integers, all below `num_regions`. Inside a trace the numbers
+    are not known: there a label of `num_regions` and more counts as none, as -1 does."""
+    remedy = "Convert them, for example by labels.astype(np.int32)."
+    integers = "integers, -1 where a pixel belongs to no region"
+    require(np.dtype(labels.dtype).kind in "iu", "labels", f"{labels.dtype}", integers, remedy)
+    if not is_traced(labels):
+        highest = int(np.asarray(labels).max()) if math.prod(labels.shape) else -1
+        remedy = "Raise num_regions, or set what belongs to no region to -1."
+        require(highest < max(num_regions, 0), "labels", f"a label of {highest}", f"labels below {num_regions}", remedy)

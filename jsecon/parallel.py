@@ -8,9 +8,9 @@ device, which shares nothing and so scales better, and over several processes to
 frame: `dealt_out`.
 """
 
-import functools
 import io
 import json
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.multihost_utils import process_allgather
-from jax.sharding import AxisType, Mesh, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jsecon.files import packed, unpacked
+from jsecon.types import Array
 
 AXIS = "devices"
 """the mesh's one axis"""
@@ -29,8 +30,12 @@ MESH_OPTIONS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 of each device into parts for the threads of all, and such kernels take up to three times as long: projecting 111,785
 Gaussians 7.4 instead of 2.6 ms. Programs of one device are better off with the parts."""
 
-_LEAST_LANES = 2
-"""of `spread_over_devices`"""
+LANES = 8
+"""of `spread_over_devices`: the sums that views are added up in side by side"""
+_LANES_BYTES = 1 << 30
+"""that the sums of all lanes at once may take, where there are more than two"""
+_AHEAD = 2
+"""steps that are dispatched before one is done"""
 _TREE = "__tree__"
 _PIECE = 1 << 26
 """bytes that `exchanged` sends at once"""
@@ -68,9 +73,18 @@ def over_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any
     return jax.tree.map(lambda a: a[:count], out)
 
 
-def _unbound(arrays: Any) -> Any:
-    """The same numbers on the first device, by jax's leave to move them; on a CPU the same memory."""
-    return jax.tree.map(lambda a: jax.device_put(np.asarray(a), may_alias=True), arrays)
+def lanes_at_once(views: int, state_bytes: int) -> int:
+    """How many lanes of `spread_over_devices` this process works on at a time: no more than there are devices, the same
+    number in every turn, and above two no more than _LANES_BYTES hold, each with a state of `state_bytes`."""
+    world = jax.process_count()
+    own = -(-_lane_count(views) // world)
+    devices = min(sum(device.process_index == p for device in jax.devices()) for p in range(world))
+    turns = -(-own // max(1, min(devices, own, max(2, _LANES_BYTES // max(state_bytes, 1)))))
+    return -(-own // turns)
+
+
+def _lane_count(views: int) -> int:
+    return max(1, min(views, max(LANES, jax.process_count())))
 
 
 def spread_over_devices(
@@ -81,54 +95,112 @@ def spread_over_devices(
     views: Any,
     *,
     static: tuple = (),
-    most: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Any, list[Any]]:
-    """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`, view t in lane
-    t mod L; returns the state and each view's `out`, in the views' order.
+) -> tuple[Any, Any]:
+    """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`. Returns the
+    state, and each view's `out`, stacked, in NumPy.
 
-    There are as many lanes as devices, of all processes, and two at least: one device and two, one process and two, add
-    up in the same order, to the same bits. `start` is the neutral state of `merge`, which joins the lanes' states in
-    their order. At most `most` devices are used: jax compiles anew for each. Host code; dispatch is asynchronous, so
-    the devices work side by side. `progress(done, total)` is called as views finish.
+    View t is added up in lane t mod LANES, and `merge`, whose neutral state is `start`, joins the lanes in their order.
+    So the number of devices and of processes (up to LANES) changes no bit of the sum. A device works on one lane at a
+    time (`lanes_at_once`); all run one program, which jax compiles once. `step` is a pure function, traced under
+    shard_map. Host code; dispatch is asynchronous. `progress(done, total)` is called as views finish.
 
-    Over several processes (`jax.distributed.initialize`), each given the same arguments, process p of P takes views p,
+    Over several processes (`jax.distributed.initialize`), each given the same arguments, process p of P takes lanes p,
     p + P, ...; all end with the same result.
     """
     rank, world = jax.process_index(), jax.process_count()
-    count = jax.tree.leaves(views)[0].shape[0]
-    own = range(rank, count, world)
-    local = min(sum(device.process_index == p for device in jax.devices()) for p in range(world))
-    local = max(1, min(local, -(-count // world), local if most is None else most))
-    lanes = max(_LEAST_LANES, world * local)
-    # The first device is not named, nor is any in what is returned: arrays bound to one have programs of their own.
-    devices = [None, *jax.local_devices()[1:local]]
     common, start, views = jax.tree.map(np.asarray, (common, start, views))
-    shared = [jax.device_put(common, device) for device in devices]
-    place = {lane: (lane // world) % local for lane in range(rank, lanes, world)}
-    states = {
-        lane: jax.device_put(start, devices[at], may_alias=False) for lane, at in place.items()
-    }  # a step takes it
-    outs = []
-    for first in range(0, len(own), local):
-        wave = own[first : first + local]
-        for t in wave:
-            lane = t % lanes
-            view = jax.device_put(jax.tree.map(lambda a, t=t: a[t], views), devices[place[lane]])
-            states[lane], out = step(states[lane], shared[place[lane]], view, *static)
-            outs.append(out)
-        if progress is not None:
-            jax.block_until_ready(states)
-            progress(min((first + len(wave)) * world, count), count)
-    found, outs = _unbound((list(states.values()), outs))
+    count = jax.tree.leaves(views)[0].shape[0]
+    lanes = _lane_count(count)
+    width = lanes_at_once(count, sum(leaf.nbytes for leaf in jax.tree.leaves(start)))
+    mesh = Mesh(np.array(jax.local_devices()[:width]), (AXIS,), axis_types=(AxisType.Auto,))
+    whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
+    # Where half of the cores and more have no lane, XLA cuts the kernels of the others for them.
+    run = _advance[width > 1 and jax.local_device_count() < 2 * width]
+    common = jax.device_put(common, whole)
+    merged = jax.device_put(start, may_alias=False)  # joining takes it
+    outs: list[Any] = []  # of all views, once a step has told their shape
+    dispatched: deque[tuple[list[int], Any]] = deque()
+    done = 0
+
+    def keep(most: int) -> None:
+        """Takes over what the steps gave, but for the last `most`, which may still run."""
+        while len(dispatched) > most:
+            chosen, out = dispatched.popleft()
+            out = jax.tree.map(np.asarray, out)
+            if not outs:
+                outs.append(jax.tree.map(lambda a: np.zeros((count, *a.shape[1:]), a.dtype), out))
+            there = np.array(chosen) < count
+            for of_all, part in zip(jax.tree.leaves(outs), jax.tree.leaves(out), strict=True):
+                of_all[np.array(chosen)[there]] = part[there]
+
+    for turn in range(0, -(-lanes // world), width):
+        own = [rank + world * (turn + place) for place in range(width)]
+        states = jax.tree.map(lambda a: np.broadcast_to(a, (width, *a.shape)), start)
+        states = jax.device_put(states, rows, may_alias=False)  # a step takes it
+        for first in range(0, count, lanes):
+            chosen = [min(first + lane, count) if lane < lanes else count for lane in own]
+            if min(chosen) == count:
+                continue
+            wave = jax.tree.map(lambda a, chosen=chosen: a[np.minimum(chosen, count - 1)], views)
+            wave = jax.device_put((np.array(chosen) < count, wave), rows)
+            states, out = run(states, wave, common, step, static, mesh)
+            dispatched.append((chosen, out))
+            keep(_AHEAD)
+            done += sum(t < count for t in chosen)
+            if progress is not None:
+                jax.block_until_ready(states)
+                progress(min(done * world, count), count)
+        keep(0)
+        for place in range(width):
+            state = jax.tree.map(lambda a, place=place: np.asarray(a.addressable_data(place))[0], states)
+            for part in [state] if world == 1 else _of_all(state):
+                merged = merge(merged, jax.device_put(part, may_alias=True))
+        del states
+    if not outs:  # a process without views
+        view = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), views)
+        blank = jax.eval_shape(lambda *given: step(*given, *static)[1], start, common, view)
+        outs.append(jax.tree.map(lambda a: np.zeros((count, *a.shape), a.dtype), blank))
     if world > 1:
-        parts = [process_allgather(state) for state in found]
-        found = [jax.tree.map(lambda a, p=p: jnp.asarray(a[p]), part) for part in parts for p in range(world)]
-        blank = jax.eval_shape(lambda *a: step(*a, *static)[1], start, common, jax.tree.map(lambda a: a[0], views))
-        outs += [jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), blank)] * (-(-count // world) - len(own))
-        rows = process_allgather(jax.tree.map(lambda *rows: jnp.stack(rows), *outs))
-        outs = [jax.tree.map(lambda a, t=t: jnp.asarray(a[t % world, t // world]), rows) for t in range(count)]
-    return functools.reduce(merge, found), outs
+        rank_of = np.arange(count) % lanes % world
+        most = int(np.bincount(rank_of, minlength=world).max())
+        mine = np.flatnonzero(rank_of == rank)
+        for of_all in jax.tree.leaves(outs):
+            own_rows = np.zeros((most, *of_all.shape[1:]), of_all.dtype)
+            own_rows[: len(mine)] = of_all[mine]
+            for p, part in enumerate(process_allgather(own_rows)):
+                theirs = np.flatnonzero(rank_of == p)
+                of_all[theirs] = part[: len(theirs)]
+    return merged, outs[0]
+
+
+def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Callable, static: tuple, mesh: Mesh):
+    """Each lane's state after its view of the wave, and what its step gave; the same where it has none."""
+
+    def local(_, dealt, common):
+        state, (there, view) = jax.tree.map(lambda a: a[0], dealt)
+        taken = lambda: step(state, common, view, *static)
+        if mesh.size == 1:  # with no view there is no wave
+            found = taken()
+        else:
+            blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(taken)[1])
+            found = jax.lax.cond(there, taken, lambda: (state, blank))
+        return jax.tree.map(lambda a: a[None], found)
+
+    return over_devices(local, (states, wave), common, mesh)
+
+
+# where lanes leave cores idle, and where they do not
+_advance = [
+    jax.jit(_advance_lanes, static_argnums=(3, 4, 5), donate_argnums=0, compiler_options=options)
+    for options in (None, MESH_OPTIONS)
+]
+
+
+def _of_all(state: Any) -> list[Any]:
+    """Every process's, in their order."""
+    parts = process_allgather(state)
+    return [jax.tree.map(lambda a, p=p: np.asarray(a[p]), parts) for p in range(jax.process_count())]
 
 
 def dealt_out(

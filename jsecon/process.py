@@ -125,16 +125,29 @@ def cores() -> int:
 def memory() -> tuple[int | None, int | None]:
     """Bytes that are free, and the limit of this process's cgroup, which what is free counts in; None where the system
     does not tell, or sets none."""
+    import psutil
+
     try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free = 1024 * int(lines["MemAvailable"].split()[0])
-    except (OSError, KeyError, ValueError):
+        free = psutil.virtual_memory().available
+    except (OSError, psutil.Error):
         return None, None
     limit = cgroup_words("memory.max", "memory/memory.limit_in_bytes")
     if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
         return free, None
     used = cgroup_words("memory.current", "memory/memory.usage_in_bytes") or ["0"]
     return min(free, int(limit[0]) - int(used[0])), int(limit[0])
+
+
+def peak_memory_mib() -> float:
+    """Largest resident memory of this process so far, MiB."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        import psutil
+
+        now = psutil.Process().memory_info()
+        return getattr(now, "peak_wset", now.rss) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def memory_budget() -> float:
@@ -241,7 +254,8 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
 
 def _cache_home(environ: Mapping[str, str]) -> Path | None:
     """The user's cache folder where it can be written, else None: a program must run without one."""
-    base = environ.get("XDG_CACHE_HOME") or (Path(environ["HOME"]) / ".cache" if "HOME" in environ else None)
+    home = Path(environ["HOME"]) / ".cache" if "HOME" in environ else None
+    base = environ.get("XDG_CACHE_HOME") or home or environ.get("LOCALAPPDATA")  # the last on Windows
     if base is None:
         return None
     try:

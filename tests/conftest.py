@@ -6,7 +6,6 @@ before jsecon is imported.
 
 import atexit
 import contextlib
-import fcntl
 import gc
 import os
 import shutil
@@ -28,6 +27,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
@@ -189,8 +189,7 @@ def made_once(tmp_path_factory):
     def alone(name):
         base = tmp_path_factory.getbasetemp()
         base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-        with open(base / f"{name}.lock", "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with FileLock(base / f"{name}.lock"):
             yield base / name
 
     return alone

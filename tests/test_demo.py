@@ -53,7 +53,7 @@ def test_metrics_have_every_figure_that_is_promised(finished):
     assert 0.1 * seconds < sum(metrics["seconds"].values()) <= seconds
     assert metrics["seconds_in_all"] == pytest.approx(sum(metrics["seconds"].values()), abs=0.2)
     assert {"segmenter (true masks)", "DBSCAN"} <= set(metrics["left_out"])
-    assert metrics["peak_memory_mib"] == pytest.approx(pipeline.peak_memory_mib(), rel=0.05)
+    assert metrics["peak_memory_mib"] == pytest.approx(peak_memory_mib(), rel=0.05)
 
 
 def test_the_fields_and_the_answers_are_on_disk(finished):

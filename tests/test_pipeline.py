@@ -265,7 +265,7 @@ def test_too_few_frames_to_work_with_are_refused(room_run, tmp_path):
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells it there")
 def test_peak_memory_is_in_mebibytes():
     (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    assert pipeline.peak_memory_mib() == pytest.approx(int(peak) / 2**10, rel=0.01)
+    assert peak_memory_mib() == pytest.approx(int(peak) / 2**10, rel=0.01)
 
 
 def test_embedders_of_other_versions_are_refused():

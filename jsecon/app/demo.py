@@ -61,7 +61,7 @@ def demo(
         write_text(out / "report.html", _page(found, results, queries, labels, metrics, pictured, seed))
     single = sum(told["left_out"].get("DBSCAN") == "the selection is one component" for told in queries.values())
     metrics["left_out"]["DBSCAN"] = f"{single} of {len(queries)} selections are one component"
-    metrics["peak_memory_mib"] = round(pipeline.peak_memory_mib(), 1)
+    metrics["peak_memory_mib"] = round(peak_memory_mib(), 1)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     summary.say_table(results, listener)
     listener.say(

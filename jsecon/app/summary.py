@@ -14,7 +14,7 @@ from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
-from jsecon.pipeline.pipeline import Run, peak_memory_mib
+from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 

@@ -147,9 +147,10 @@ def grown(
     return gaussians, moments
 
 
-def pressure(gaussians: Gaussians) -> Array:
-    """What MCMC adds to the loss: 0.01 times the mean opacity and 0.01 times the mean scale."""
-    return 0.01 * sigmoid(gaussians.opacity_logits).mean() + 0.01 * jnp.exp(gaussians.log_scales).mean()
+def pressure(gaussians: Gaussians, rows: Array) -> Array:
+    """What MCMC adds to the loss: 0.01 times the mean opacity and 0.01 times the mean scale, both of `rows` rows."""
+    opacity, scale = sigmoid(gaussians.opacity_logits).sum() / rows, jnp.exp(gaussians.log_scales).sum() / (3 * rows)
+    return 0.01 * opacity + 0.01 * scale
 
 
 def noise(gaussians: Gaussians, rate: Array, step: Array) -> Float[Array, "n 3"]:

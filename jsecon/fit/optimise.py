@@ -18,9 +18,8 @@ from jsecon.errors import InputError, require
 from jsecon.fit.corrections import Refine, Refined, start_refined
 from jsecon.fit.growth import compact, copies, grown, halves, opacities, rows_for, with_free_rows
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import Current, Steps, Way, on_devices
+from jsecon.fit.step import Current, Steps, Way, on_devices, on_host
 from jsecon.fit.view import Views
-from jsecon.numerics import finite
 from jsecon.parallel import host_mesh
 from jsecon.types import Array, Capture, Gaussians, record
 
@@ -153,32 +152,35 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         views.at(schedule.size(done))
         order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
-        way = Way(schedule.degree(done), schedule.growth_at(done), rates, refine)
+        way = Way(schedule.degree(done), schedule.growth_at(done), rates, refine, state.gaussians.count)
         taking.compile(current, int(order[0]), first, done, way)  # which is not the fit's time
         began = time.monotonic()
         current, taken = _chunk(current, taking, order, first, dones, way)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
+        host = on_host(current, way.rows)
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        if not (np.isfinite(losses[-1]) and bool(_all_finite((current.gaussians, current.refined)))):
+        moved = jax.tree.leaves((losses[-1], host.gaussians, host.refined))
+        if not all(np.isfinite(array).all() for array in moved):
             found = f"numbers that are not finite after step {len(losses)}"
             remedy = "Check the start, the poses and the intrinsics, or lower the learning rates."
             raise InputError("fit", found, "a fit that converges", remedy)
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
-            current = on_devices(_grown(current, schedule, target, [seed, len(losses)]), mesh)
+            host = _grown(host, schedule, target, [seed, len(losses)])
+            current = on_devices(host, mesh)
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
         state = FitState(
-            gaussians=current.gaussians,
-            first_moment=current.first_moment,
-            second_moment=current.second_moment,
-            votes=current.votes,
+            gaussians=host.gaussians,
+            first_moment=host.first_moment,
+            second_moment=host.second_moment,
+            votes=host.votes,
             done=np.asarray(now),
             pace=np.asarray((now - done) / count),
             seconds=np.asarray(spent),
             started=state.started,
             losses=losses,
-            refined=current.refined,
+            refined=host.refined,
         )
         if on_checkpoint:
             on_checkpoint(state)
@@ -188,12 +190,8 @@ def fit_gaussians(
 
 
 def _grown(current: Current, schedule: Schedule, target: int, seed: list[int]) -> Current:
-    """With up to `target` Gaussians; the votes are counted anew."""
-    host = jax.tree.map(np.asarray, current)
-    by, divide = (opacities(host.gaussians), copies) if schedule.growth == "mcmc" else (host.votes, halves)
-    moments = host.first_moment, host.second_moment
-    gaussians, moments = grown(host.gaussians, moments, by, target, schedule.at_most, seed, divide)
-    return Current(gaussians, *moments, np.zeros_like(host.votes, shape=gaussians.count), host.refined)
-
-
-_all_finite = jax.jit(lambda tree: finite(*jax.tree.leaves(tree)))
+    """With up to `target` Gaussians, on the host; the votes are counted anew."""
+    by, divide = (opacities(current.gaussians), copies) if schedule.growth == "mcmc" else (current.votes, halves)
+    moments = current.first_moment, current.second_moment
+    gaussians, moments = grown(current.gaussians, moments, by, target, schedule.at_most, seed, divide)
+    return Current(gaussians, *moments, np.zeros_like(current.votes, shape=gaussians.count), current.refined)

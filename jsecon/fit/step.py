@@ -10,7 +10,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jsecon.fit.corrections import Refine, Refined, refined_further
-from jsecon.fit.growth import noise, pressure
+from jsecon.fit.growth import lengthened, noise, pressure, with_free_rows
 from jsecon.fit.schedule import LearningRates, rates_at
 from jsecon.fit.view import View, Views, view_loss
 from jsecon.parallel import AXIS, MESH_OPTIONS, over_rows
@@ -42,6 +42,8 @@ class Way(NamedTuple):
     """what it does for growth"""
     rates: LearningRates
     refine: Refine | None
+    rows: int
+    """of the scene, before `on_devices` filled it up"""
 
 
 def step(
@@ -51,7 +53,7 @@ def step(
     a mesh, projection, compositing, loss and update are each shared out among its devices.
 
     `numbers`: the step, the view's frame, how often that was taken before, the share of the fit that is done, the
-    degree, the extent, the rates, those of the corrections.
+    degree, the extent, the rates, those of the corrections, the scene's rows.
     """
     gaussians, first, second, votes, refined = current
     nothing = jnp.zeros((gaussians.count, 1 if growth == "votes" else 0))
@@ -60,7 +62,7 @@ def step(
 
     def loss(gaussians, nothing, own):
         total, told = view_loss(gaussians, nothing, own, **fixed)
-        return total + pressure(gaussians) if growth == "mcmc" else total, told
+        return total + pressure(gaussians, numbers["rows"]) if growth == "mcmc" else total, told
 
     by = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, nothing, own)
     (_, (value, overflow)), (gradient, by_error, by_own) = by
@@ -93,14 +95,30 @@ step_compiled = [
 
 
 def _places(mesh: Mesh) -> Current:
-    """Where a device finds what is current: all of it whole but the moments, of which it has its own rows."""
+    """How what is current lies on the devices: each has its own rows of the scene, the moments and the votes, and all
+    of the corrections. A scene that every device held whole would take as many times its memory, and every step would
+    send all of it to each."""
     whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    return cast(Current, Current(*cast(Any, (whole, rows, rows, whole, whole))))
+    return cast(Current, Current(*cast(Any, (rows, rows, rows, rows, whole))))
 
 
 def on_devices(current: Current, mesh: Mesh | None) -> Current:
-    """What is current, where the devices of a step want it."""
-    return jax.device_put(current) if mesh is None else Current(*map(jax.device_put, current, _places(mesh)))
+    """What is current, where the devices of a step want it; over a mesh filled up with free rows, so that each device
+    has as many."""
+    if mesh is None:
+        return jax.device_put(current)
+    rows = -(-current.gaussians.count // mesh.size) * mesh.size
+    longer = current
+    if rows > current.gaussians.count:
+        others = current.first_moment, current.second_moment, current.votes
+        longer = Current(with_free_rows(current.gaussians, rows), *lengthened(others, rows), current.refined)
+    return Current(*map(jax.device_put, longer, _places(mesh)))
+
+
+def on_host(current: Current, rows: int) -> Current:
+    """What is current as NumPy's arrays, without the rows that `on_devices` added to `rows`."""
+    host = jax.tree.map(np.asarray, current)
+    return Current(*jax.tree.map(lambda a: a[:rows], host[:-1]), host.refined)
 
 
 class Steps:
@@ -127,6 +145,7 @@ class Steps:
             "degree": np.int32(way.degree),
             "extent": views.extent,
             "rates": way.rates,
+            "rows": np.int32(way.rows),
             "refine_rates": None if way.refine is None else way.refine.rates(done, float(views.extent)),
         }
         place = None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec())

@@ -28,7 +28,7 @@ from jsecon.language.distill import LEAST_LABELLED, distill_votes
 from jsecon.language.records import append, summed_columns
 from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import NEAR, WHOLE
+from jsecon.numerics import NEAR, WHOLE, require_labels
 from jsecon.splat.banded import listed, still_open
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
 from jsecon.splat.fusion import stored
@@ -99,9 +99,10 @@ def region_votes_in_blocks(
     with _spool(Path(folder)) as spool:
         overflow = 0
         for t in range(views):
-            image = np.asarray(labels[t], np.int32)
+            image = np.asarray(labels[t])
             require_shape(f"labels[{t}]", image, (cameras.height, cameras.width), "Give images of the camera's size.")
-            image = np.where(image < num_regions, image, -1)
+            require_labels(image, num_regions)
+            image = np.asarray(image, np.int32)
             for band, missing, seen, votes in _cast_view(
                 gaussians, bounds, cameras[t], image, centre, near, size, most_held
             ):

@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from jsecon.errors import require, require_one_of, require_shape
-from jsecon.numerics import is_traced, normalize, safe_norm
+from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import ViewPlan, plan_view, plan_views, render_plan
 from jsecon.types import Array, Camera, Gaussians, Key, Votes
@@ -122,7 +122,7 @@ class Descent:
 def distill_l1(
     gaussians: Gaussians,
     cameras: Camera,
-    labels: Int[Array, "t h w"],
+    labels: Shaped[Array, "t h w"],
     region_codes: Float[Array, "r d"],
     *,
     steps: int,
@@ -147,10 +147,12 @@ def distill_l1(
     the one given.
 
     Returns the unit codes (N, d) (zero where still zero) and the loss before each step, NaN where the view overflowed
-    its capacity (as for `render`: outside a trace only a given one can). Raises ValueError on shapes that disagree and,
-    outside a trace, on such a NaN.
+    its capacity (as for `render`: outside a trace only a given one can). Raises ValueError on shapes that disagree, on
+    labels that are no integers and, outside a trace, on such a NaN and on labels of R and more; inside one these count
+    as -1.
     """
     given = gaussians, cameras, labels, region_codes
+    require_labels(labels, len(region_codes))
     start = descent(*given, steps=steps, key=key, init=init)
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
@@ -242,7 +244,7 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, lear
         else:
             plan = jax.tree.map(lambda a: a[view], plans)
         ids = jnp.clip(labels[view], 0, codes.shape[0] - 1)
-        mask = ((labels[view] >= 0) & known[ids])[..., None]
+        mask = ((labels[view] >= 0) & (labels[view] < codes.shape[0]) & known[ids])[..., None]
         # safe_norm has a zero gradient at zero, which leaves 1e9 times the rendering's there, as in LangSplat.
         units = features / (safe_norm(features, keepdims=True) + NORMALISE_EPS)
         rendering = render_plan(plan, units)

@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from scipy import sparse
 
 from jsecon.errors import require, require_one_of, require_shape
+from jsecon.numerics import require_labels
 from jsecon.parallel import dealt_out
 from jsecon.types import Parts, Regions
 
@@ -22,7 +23,7 @@ Embed = Callable[[int, np.ndarray], np.ndarray]
 
 def region_embeddings(
     frames: UInt8[np.ndarray, "t h w 3"],
-    labels: Int[np.ndarray, "t _ _"],
+    labels: Shaped[np.ndarray, "t _ _"],
     embed: Callable[[np.ndarray, np.ndarray], np.ndarray],
     *,
     weighting: Literal["pixels", "uniform"] = "pixels",
@@ -67,7 +68,7 @@ def given_embeddings(
 
 
 def pooled(
-    labels: Int[np.ndarray, "t h w"],
+    labels: Shaped[np.ndarray, "t h w"],
     embed: Embed,
     *,
     weighting: Literal["pixels", "uniform"] = "pixels",
@@ -77,10 +78,8 @@ def pooled(
     """`region_embeddings` with what embeds the masks of the t-th frame given as a function of t. Over several processes
     (`jax.distributed`) the frames are dealt out."""
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
-    highest = int(labels.max(initial=-1))
-    count = highest + 1 if num_regions is None else num_regions
-    found, remedy = f"label {highest} with num_regions={count}", "Raise num_regions, or leave it out."
-    require(highest < count, "num_regions", found, "labels below num_regions", remedy)
+    count = int(labels.max(initial=-1)) + 1 if num_regions is None else num_regions
+    require_labels(labels, count)
     areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
     pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
 

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import NEAR, WHOLE, is_traced
-from jsecon.parallel import spread_over_devices
+from jsecon.numerics import NEAR, WHOLE, is_traced, require_labels
+from jsecon.parallel import lanes_at_once, spread_over_devices
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.fusion import stored
-from jsecon.splat.plan import ViewPlan, plan_view
+from jsecon.splat.plan import plan_view
 from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
 from jsecon.types import Array, Camera, Gaussians, Votes
 
@@ -29,14 +29,12 @@ _SLOTS = 4
 _NOBODY = -2  # a slot that no label equals
 _DENSE_BYTES = 1 << 30
 """the dense N x R block that is accumulated at once; more regions take more passes over the views"""
-_MANY_PIXELS = 1 << 20
-"""of all views together, from which a second device's work is worth the seconds that compiling for it takes"""
 
 
 def region_votes(
     gaussians: Gaussians,
     cameras: Camera,
-    labels: Int[Array, "t h w"],
+    labels: Shaped[Array, "t h w"],
     num_regions: int,
     *,
     top: int = 8,
@@ -46,18 +44,35 @@ def region_votes(
     near: float = NEAR,
     progress: Callable[[int, int], None] | None = None,
 ) -> Votes:
-    """Votes of `labels` (T, H, W; -1 = none) over the views `cameras` (batch of T) on N Gaussians.
+    """Adds up the weight that each region casts on each Gaussian over all views.
 
-    Each Gaussian keeps its `top` strongest regions; the rest is counted (`Votes.cut`). With `by_view` each view's total
-    is kept too (`Votes.by_view`, 4 T N bytes, twice that while it is joined), as `language.shares.with_shown` wants it.
-    A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`: at 1 a Gaussian is what its
-    centre is, at 0 what its whole footprint is.
+    With the geometry frozen, a rendering is linear in the features of the Gaussians. So one pass over the views holds
+    what any later choice of embedding or code needs.
 
-    Outside a trace the views are spread over jax's local devices (a million pixels or more in all), and over processes
-    that all make the same call (`jax.distributed`), and `progress(done, total)` is called after each; inside one the
-    views are scanned. `capacity` as for `render`, but overflow is looked at once, when all views are done: where there
-    is any, outside a trace and without a capacity given, all votes are cast again with enough. Raises ValueError on
-    shapes that disagree.
+    Outside a trace the views are spread over jax's local devices, and over processes that all make the same call
+    (`jax.distributed`). The result has the same bits on any number of devices. Inside a trace the views are scanned
+    on one device.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integers below `num_regions`; -1 where a pixel belongs to no region. Inside a trace, where
+        values cannot be checked, a label of `num_regions` and more counts as -1.
+      num_regions: R.
+      top: Number of strongest regions that each Gaussian keeps; `Votes.cut` counts the rest.
+      by_view: Whether to keep each view's total too (`Votes.by_view`, 4 T N bytes), as `with_shown` needs it.
+      centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`: at 1 a
+        Gaussian is what its centre is, at 0 what its whole footprint is.
+      capacity: As for `render`, but overflow is looked at once, when all views are done. Where there is any, outside
+        a trace and without a capacity given, all votes are cast again with enough.
+      near: Near plane, world units.
+      progress: Called as progress(done, total) while views finish, outside a trace.
+
+    Returns:
+      Votes of the N Gaussians. `overflow` is 0 if they are exact.
+
+    Raises:
+      ValueError: Shapes disagree, or labels are no integers or too large.
     """
     poses = cameras.world_to_camera
     require_shape("cameras.world_to_camera", poses, ("T", 4, 4), "Add a leading axis to all arrays of a single camera.")
@@ -65,43 +80,49 @@ def region_votes(
     require_shape("labels", labels, expected, "Give one label image per view, of the camera's size.")
     require(num_regions >= 0, "num_regions", num_regions, ">= 0", "Count the regions.")
     traced = is_traced((gaussians, cameras, labels))
+    require_labels(labels, num_regions)
     count = gaussians.means.shape[0]
     size = default_capacity(count, cameras.width, cameras.height) if capacity is None else capacity
-    block = max(1, min(max(num_regions, 1), _DENSE_BYTES // max(4 * count, 1)))
+    block = _regions_at_once(count, num_regions)
     blocks = math.ceil(max(num_regions, 1) / block)
     static = size, near, by_view, centre
     xp = jnp if traced else np  # NumPy compiles nothing
     totals: Any = None
     kept = (np.full((count, 0), -1, np.int32), np.zeros((count, 0), gaussians.means.dtype))
     for b in range(blocks):
-        local = xp.asarray(labels, np.int32) - b * block
-        inside = xp.where((local >= 0) & (local < block), local, -1)  # counted from the block of regions
         start = _empty(xp, count, block, gaussians.means.dtype)
+        common = gaussians, np.array([b * block, min((b + 1) * block, num_regions)], np.int32)
         if traced:
-            state, totals = lax.scan(lambda s, view: _add_view(s, gaussians, view, *static), start, (cameras, inside))
+            state, totals = lax.scan(lambda s, view: _add_view(s, common, view, *static), start, (cameras, labels))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
-            views, most = (cameras, inside), None if labels.size >= _MANY_PIXELS else 1
             state, totals = spread_over_devices(
-                _add_view, start, _merge, gaussians, views, static=static, most=most, progress=report
+                _add_view, start, _merge, common, (cameras, labels), static=static, progress=report
             )
             if capacity is None and (missing := np.asarray(state["missing"])):
                 again = functools.partial(region_votes, top=top, by_view=by_view, centre=centre, near=near)
                 again = functools.partial(again, progress=progress)
                 return again(gaussians, cameras, labels, num_regions, capacity=enough_capacity(size, missing[None]))
-        kept, own = _keep_strongest(kept, state["votes"], b * block, min(top, max(num_regions, 1)))
+        votes = state.pop("votes")
+        kept, own = _keep_strongest(kept, votes, b * block, min(top, max(num_regions, 1)))
+        del votes
         labelled = own if b == 0 else labelled + own
-    if by_view and not traced:
-        totals = jnp.stack(totals)
     seen = totals if by_view else None
     return Votes(
         kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions, seen
     )
 
 
+def _regions_at_once(count: int, regions: int) -> int:
+    """Of the dense N x R block that is accumulated at once."""
+    return max(1, min(max(regions, 1), _DENSE_BYTES // max(4 * count, 1)))
+
+
 def bytes_of_votes(count: int, views: int, regions: int) -> int:
-    """What `region_votes` with `by_view` takes in memory beside what it is given, about."""
-    return 8 * views * count + 2 * min(4 * regions * count, _DENSE_BYTES)
+    """What `region_votes` with `by_view` takes in memory beside what it is given, about: the views' totals, and the
+    dense block of each lane that is worked on and of their sum."""
+    dense = 4 * count * _regions_at_once(count, regions)
+    return 4 * views * count + (lanes_at_once(views, dense) + 1) * dense
 
 
 def _empty(xp: Any, count: int, regions: int, dtype) -> dict[str, Array]:
@@ -115,7 +136,7 @@ def _empty(xp: Any, count: int, regions: int, dtype) -> dict[str, Array]:
     }
 
 
-@jax.jit
+@functools.partial(jax.jit, donate_argnums=0)
 def _merge(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
     return {key: jnp.maximum(a[key], b[key]) if key in ("peak", "missing") else a[key] + b[key] for key in a}
 
@@ -125,30 +146,27 @@ def _keep_strongest(
     kept: tuple[Array, Array], votes: Array, first: int | Array, top: int
 ) -> tuple[tuple[Array, Array], Array]:
     """Merges a dense block of votes into the strongest ones kept so far; and (N,) the block's weight."""
-    ids = jnp.broadcast_to(first + jnp.arange(votes.shape[1], dtype=jnp.int32), votes.shape)
-    ids, weights = jnp.concatenate([kept[0], ids], 1), jnp.concatenate([kept[1], votes], 1)
+    weights, ids = lax.top_k(votes, min(top, votes.shape[1]))
+    weights, ids = jnp.concatenate([kept[1], weights], 1), jnp.concatenate([kept[0], first + ids], 1)
     weights, place = lax.top_k(weights, min(top, weights.shape[1]))
     return (jnp.where(weights > 0, jnp.take_along_axis(ids, place, axis=1), -1), weights), votes.sum(-1)
 
 
 def _add_view(
     state: dict[str, Array],
-    gaussians: Gaussians,
+    common: tuple[Gaussians, Array],
     view: tuple[Camera, Array],
     capacity: int,
     near: float,
     by_view: bool,
     centre: float,
 ) -> tuple[dict[str, Array], Array | None]:
-    """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted."""
-    camera, labels = view
+    """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted.
+    `common`: the scene, and the first region of the block and the one after its last. Pure."""
+    (gaussians, (first, after)), (camera, labels) = common, view
+    labels = jnp.asarray(labels, jnp.int32)
+    labels = jnp.where((labels >= first) & (labels < after), labels - first, -1)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-    return (_add_plan if is_traced((state, plan, labels)) else _add_plan_compiled)(state, plan, labels, by_view, centre)
-
-
-def _add_plan(
-    state: dict[str, Array], plan: ViewPlan, labels: Array, by_view: bool, centre: float
-) -> tuple[dict[str, Array], Array | None]:
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, plan.width)
     tiles = to_tiles(labels + 1, lists.tile) - 1
@@ -198,9 +216,6 @@ def _add_plan(
         "overflow": state["overflow"] + plan.overflow,
         "missing": jnp.maximum(state["missing"], plan.overflow),
     }, total if by_view else None
-
-
-_add_plan_compiled = jax.jit(_add_plan, static_argnums=(3, 4), donate_argnums=0)
 
 
 def at_centre(splats: Float[Array, "b c 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "b c pixels"]:

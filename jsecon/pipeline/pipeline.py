@@ -25,8 +25,6 @@ its own room, behind splat/render the engine:
 import dataclasses
 import functools
 import json
-import resource
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -92,12 +90,6 @@ def stages_of(work: Work) -> list[Stage]:
     first = (masklets, gaussians) if work.options.masks is not None else (gaussians, masklets)
     then = (regions, *((parts,) if work.options.parts else ()), codes, votes, distil, held_out)
     return [*loaded(work), *(stage(work) for stage in (*first, *then))]
-
-
-def peak_memory_mib() -> float:
-    """Largest resident memory of this process so far, MiB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 @dataclasses.dataclass(frozen=True)

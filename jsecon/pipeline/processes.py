@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jsecon
@@ -88,7 +88,7 @@ def _awaited(children: Sequence[subprocess.Popen]) -> int | None:
             time.sleep(0.1)
         died = next((place for place, child in enumerate(children) if child.poll()), None)
     except KeyboardInterrupt:  # Ctrl-C has reached the children too, who say so; SIGTERM only this process
-        _end(children, signal.SIGTERM)
+        _end(children, subprocess.Popen.terminate)
         raise SystemExit(130) from None
     _end(children)
     return died
@@ -100,17 +100,17 @@ def _cause(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
-def _end(children: Sequence[subprocess.Popen], by: signal.Signals = signal.SIGKILL) -> None:
-    """Waits for the children, for LAST_WORDS_SECONDS at most; then ends them by a signal, after as long again by
-    SIGKILL."""
-    for sign in (by, signal.SIGKILL):
+def _end(children: Sequence[subprocess.Popen], by: Callable[[subprocess.Popen], None] = subprocess.Popen.kill) -> None:
+    """Waits for the children, for LAST_WORDS_SECONDS at most; then stops them `by` a signal, and after as long again
+    kills them."""
+    for stop in (by, subprocess.Popen.kill):
         until = time.monotonic() + LAST_WORDS_SECONDS
         for child in children:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.wait(max(0.0, until - time.monotonic()))
         for child in children:
             if child.poll() is None:
-                child.send_signal(sign)
+                stop(child)
     for child in children:
         child.wait()
 

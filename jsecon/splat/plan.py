@@ -11,7 +11,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from jsecon.errors import require_shape
+from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, over_rows
 from jsecon.splat.autodiff import splat_contained, view_lists
@@ -71,7 +71,7 @@ def plan_view(
         size = default_capacity(gaussians.means.shape[0], camera.width, camera.height, strips=strips)
     # Colour has no part in it: Gaussians with and without share one program.
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
-    if is_traced((bare, camera, near, jnp.zeros(()))):  # the last inside a jit whose arguments are others
+    if is_traced((bare, camera, near)):
         return _plan(bare, camera, size, near, mesh)
     plan = _plan_compiled[mesh is not None](bare, camera, size, near, mesh)
     if capacity is None and (overflow := np.asarray(plan.lists.overflow)).any():
@@ -139,9 +139,16 @@ def render_plan(
     `render`. Raises ValueError on shapes that disagree.
     """
     require_shape("features", features, (plan.splats.shape[0], "D"), "Give one row of features per Gaussian.")
-    traced = is_traced((plan, features, background, jnp.zeros(())))
+    require_background(background, features.shape[1])
+    traced = is_traced((plan, features, background))
     run = _render_plan if traced else _render_plan_compiled[plan.mesh is not None]
     return run(plan, features, background, depth)
+
+
+def require_background(background: Array | None, channels: int) -> None:
+    """Raises ValueError unless a background has one number for each channel of the features, or one for all."""
+    got, remedy = np.shape(background), "Give one number for each channel of the features."
+    require(background is None or got in ((), (channels,)), "background", got, f"({channels},)", remedy)
 
 
 def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool):

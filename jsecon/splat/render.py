@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require_shape
 from jsecon.numerics import NEAR, is_traced
-from jsecon.splat.plan import plan_view, render_plan
+from jsecon.splat.plan import plan_view, render_plan, require_background
 from jsecon.splat.project import check_shapes
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
@@ -51,6 +51,7 @@ def render(
     """
     check_shapes(gaussians, camera)
     require_shape("features", features, (gaussians.count, "D"), "Give one row of features per Gaussian.")
+    require_background(background, features.shape[1])
     if gaussians.means.shape[0] == 0:
         image = jnp.zeros((camera.height, camera.width, features.shape[1]), gaussians.means.dtype)
         alpha = jnp.zeros(image.shape[:2], image.dtype)
