@@ -125,11 +125,11 @@ def cores() -> int:
 def memory() -> tuple[int | None, int | None]:
     """Bytes that are free, and the limit of this process's cgroup, which what is free counts in; None where the system
     does not tell, or sets none."""
-    import psutil
-
     try:
+        import psutil
+
         free = psutil.virtual_memory().available
-    except (OSError, psutil.Error):
+    except (ImportError, OSError):
         return None, None
     limit = cgroup_words("memory.max", "memory/memory.limit_in_bytes")
     if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
@@ -139,15 +139,17 @@ def memory() -> tuple[int | None, int | None]:
 
 
 def peak_memory_mib() -> float:
-    """Largest resident memory of this process so far, MiB."""
-    try:
+    """Largest resident memory of this process so far, MiB; 0 where the system does not tell."""
+    with contextlib.suppress(ImportError):
         import resource
-    except ImportError:  # Windows
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    with contextlib.suppress(ImportError):  # Windows
         import psutil
 
         now = psutil.Process().memory_info()
         return getattr(now, "peak_wset", now.rss) / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    return 0.0
 
 
 def memory_budget() -> float:

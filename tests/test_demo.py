@@ -12,7 +12,6 @@ from PIL import Image
 from jsecon.app import demo, film as film_of, pictures
 from jsecon.data.ply import load_ply
 from jsecon.language.field import load_field
-from jsecon.pipeline import pipeline
 from jsecon.pipeline.progress import Listener
 
 ROOM = {"views": 8, "width": 160, "height": 120, "points": 1200, "holdout": 4}

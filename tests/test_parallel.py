@@ -1,5 +1,6 @@
 """Views spread over processes: the same sums as in one."""
 
+import functools
 import os
 import socket
 import subprocess
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.parallel import dealt_out, exchanged, parcel, parcel_read, spread_over_devices
+from jsecon.parallel import LANES, dealt_out, exchanged, lanes_at_once, parcel, parcel_read, spread_over_devices
 
 PROGRAM = """
 import sys
@@ -21,6 +22,7 @@ jax.distributed.initialize(f"127.0.0.1:{port}", world, rank)
 from jsecon.parallel import keep_own_programs
 from test_parallel import rows, summed
 keep_own_programs()
+jax.jit(lambda x: jax.numpy.stack([x, x]))(rank)
 state, outs = summed(count)
 print(*map(int, state), "|", *map(int, outs), "|", *rows(count))
 """
@@ -28,7 +30,7 @@ print(*map(int, state), "|", *map(int, outs), "|", *rows(count))
 
 def summed(count: int, progress=None):
     """(sum, number) of 0, 10, 20, ... and the views doubled."""
-    step = jax.jit(lambda state, factor, view: (state + jnp.stack([view, 1]), factor * view))
+    step = lambda state, factor, view: (state + jnp.stack([view, 1]), factor * view)
     merge = lambda a, b: a + b
     views = 10 * jnp.arange(count)
     return spread_over_devices(step, jnp.zeros(2, int), merge, jnp.int32(2), views, progress=progress)
@@ -49,15 +51,25 @@ def test_a_parcel_holds_trees_of_arrays_and_plain_values():
     assert exchanged(b"alone") == [b"alone"]
 
 
-@pytest.mark.parametrize("devices", [1, 2])
-def test_one_device_and_two_add_up_in_the_same_order(devices):
+def test_views_are_added_up_in_lanes_that_are_joined_in_their_order():
     values = np.asarray(np.random.default_rng(0).normal(size=101) * 10.0 ** np.arange(-50, 51).clip(-6, 6), np.float32)
-    step = jax.jit(lambda state, _, view: (state + view, None))
-    got, _ = spread_over_devices(step, np.float32(0), lambda a, b: a + b, np.float32(0), values, most=devices)
-    even, odd = np.float32(0), np.float32(0)
+    step = lambda state, _, view: (state + view, None)
+    got, _ = spread_over_devices(step, np.float32(0), lambda a, b: a + b, np.float32(0), values)
+    lanes = np.zeros(LANES, np.float32)
     for t, value in enumerate(values):
-        even, odd = (even + value, odd) if t % 2 == 0 else (even, odd + value)
-    assert np.float32(got) == even + odd
+        lanes[t % LANES] += value
+    assert np.float32(got) == functools.reduce(lambda a, b: np.float32(a + b), lanes)
+
+
+@pytest.mark.parametrize(
+    ("devices", "at_once"), [(1, 1), (2, 2), (3, 3), (5, 4), (6, 4), (7, 4), (8, 8), (12, 8), (16, 8)]
+)
+def test_no_turn_has_more_lanes_than_devices_and_none_many_fewer(monkeypatch, devices, at_once):
+    local = [jax.local_devices()[0]] * devices
+    monkeypatch.setattr(jax, "devices", lambda: local)
+    assert lanes_at_once(100, 1 << 20) == at_once
+    assert lanes_at_once(3, 1 << 20) == min(devices, 3)  # a lane a view
+    assert lanes_at_once(100, 1 << 30) == min(devices, 2)  # memory
 
 
 def test_one_process_counts_every_view_once():
@@ -82,4 +94,4 @@ def test_two_processes_end_with_what_one_does_and_both_keep_their_programs(count
     expected = " | ".join(" ".join(map(str, words)) for words in (map(int, state), map(int, outs), rows(count)))
     for out, error in said:
         assert out.strip().splitlines()[-1:] == [expected], error
-    assert len(list(tmp_path.glob("jit_stack-*-cache"))) == 2  # one for each process
+    assert len(list(tmp_path.glob("jit__lambda-*-cache"))) == 2  # one for each process

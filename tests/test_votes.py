@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jsecon.association.atoms import cast_on_atoms
-from jsecon.language.votes import region_votes
+from jsecon.language.votes import bytes_of_votes, region_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import plan_view
 from jsecon.splat.reference import weights_reference
@@ -109,23 +109,14 @@ def test_traced_is_eager(cast, scene, cameras, labels):
     np.testing.assert_allclose(traced.by_view, cast.by_view, rtol=1e-4, atol=1e-4)
 
 
-def test_two_devices_cast_the_votes_of_one(monkeypatch, cast, scene, cameras, labels):
-    from jsecon.language import votes as module
-
-    assert jax.local_device_count() == 2
-    placed, compiled = [], module._add_plan_compiled
-
-    def placing(state, *rest):
-        placed.append(state["total"].device)
-        return compiled(state, *rest)
-
-    monkeypatch.setattr(module, "_MANY_PIXELS", labels.size)
-    monkeypatch.setattr(module, "_add_plan_compiled", placing)
-    both = region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
-    assert placed == jax.local_devices() * 2  # view by view
-    np.testing.assert_allclose(both.dense(), cast.dense(), rtol=1e-4, atol=1e-4)
-    np.testing.assert_array_equal(both.by_view, cast.by_view)
-    np.testing.assert_array_equal(both.views, cast.views)
+def test_what_they_take_is_told_beforehand(monkeypatch):
+    count, regions, dense = 1000, 50, 4 * 1000 * 50
+    for devices, lanes in ((1, 1), (2, 2), (6, 4), (16, 8)):
+        local = jax.local_devices()[:1] * devices
+        monkeypatch.setattr(jax, "devices", lambda local=local: local)
+        assert bytes_of_votes(count, 100, regions) == 4 * 100 * count + (lanes + 1) * dense
+    # a block of 1 GiB in each of two lanes, and one of their sum
+    assert bytes_of_votes(1 << 22, 100, 100) == 4 * 100 * (1 << 22) + 3 * (1 << 30)
 
 
 def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):

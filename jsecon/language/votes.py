@@ -93,7 +93,8 @@ def region_votes(
         start = _empty(xp, count, block, gaussians.means.dtype)
         common = gaussians, np.array([b * block, min((b + 1) * block, num_regions)], np.int32)
         if traced:
-            state, totals = lax.scan(lambda s, view: _add_view(s, common, view, *static), start, (cameras, labels))
+            one_view = lambda state, view, common=common: _add_view(state, common, view, *static)
+            state, totals = lax.scan(one_view, start, (cameras, labels))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
             state, totals = spread_over_devices(
