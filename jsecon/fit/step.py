@@ -108,17 +108,17 @@ def on_devices(current: Current, mesh: Mesh | None) -> Current:
     if mesh is None:
         return jax.device_put(current)
     rows = -(-current.gaussians.count // mesh.size) * mesh.size
-    longer = current
     if rows > current.gaussians.count:
         others = current.first_moment, current.second_moment, current.votes
-        longer = Current(with_free_rows(current.gaussians, rows), *lengthened(others, rows), current.refined)
-    return Current(*map(jax.device_put, longer, _places(mesh)))
+        first, second, votes = lengthened(others, rows)
+        current = Current(with_free_rows(current.gaussians, rows), first, second, votes, current.refined)
+    return Current(*map(jax.device_put, current, _places(mesh)))
 
 
 def on_host(current: Current, rows: int) -> Current:
     """What is current as NumPy's arrays, without the rows that `on_devices` added to `rows`."""
     host = jax.tree.map(np.asarray, current)
-    return Current(*jax.tree.map(lambda a: a[:rows], host[:-1]), host.refined)
+    return jax.tree.map(lambda a: a[:rows], host._replace(refined=None))._replace(refined=host.refined)
 
 
 class Steps:

@@ -147,8 +147,9 @@ def render_plan(
 
 def require_background(background: Array | None, channels: int) -> None:
     """Raises ValueError unless a background has one number for each channel of the features, or one for all."""
-    got, remedy = np.shape(background), "Give one number for each channel of the features."
-    require(background is None or got in ((), (channels,)), "background", got, f"({channels},)", remedy)
+    if background is not None:
+        got, remedy = np.shape(background), "Give one number for each channel of the features."
+        require(got in ((), (channels,)), "background", got, f"({channels},)", remedy)
 
 
 def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool):
