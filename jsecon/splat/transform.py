@@ -62,7 +62,8 @@ def float32_rounds(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     """(N,) by how much float32 rounds each of the means, in units of the Gaussian's largest standard deviation."""
     means = np.asarray(gaussians.means)
     moved = np.abs(means - means.astype(np.float32).astype(np.float64)).max(axis=1, initial=0.0)
-    sizes = np.exp(np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf))
+    sizes = np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf)
+    sizes = np.exp(np.minimum(sizes, 700.0))  # the exponential of more is infinite
     return np.divide(moved, sizes, out=np.where(moved > 0, np.inf, 0.0), where=sizes > 0)
 
 
