@@ -14,9 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from capture_files import transforms
 
+import jsecon
 from jsecon import process
-from jsecon.app import question
+from jsecon.app import command_line, question
 from jsecon.association.algorithm1 import iou_matrix
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
@@ -151,6 +153,41 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tm
     assert listener.planned["gaussians"].status == "run"
     np.testing.assert_array_equal(given.field.gaussians.means, run.field.gaussians.means)
     np.testing.assert_array_equal(given.field.codes, run.field.codes)
+
+
+def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answers(room, on_given_gaussians, tmp_path):
+    """In kilometres of a map projection, as nerfstudio's poses with an applied_transform, on Gaussians as `jsecon fit`
+    writes them: in the world before that transform."""
+    given, scale = on_given_gaussians[0], 1e-3
+    shift, turn = np.array([1e7, 5411876.6, 312.25]), np.eye(4)
+    turn[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    to_source = np.diag([scale, scale, scale, 1.0])
+    to_source[:3, 3] = scale * shift
+    told = transforms(given.capture, applied_transform=turn[:3].tolist())
+    for frame in told["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] = scale * (pose[:3, 3] + shift)
+        frame["transform_matrix"] = (turn @ pose).tolist()
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "images").symlink_to(room / "images")
+    (tmp_path / "capture" / "transforms.json").write_text(json.dumps(told))
+    scene, out = tmp_path / "scene.ply", tmp_path / "out"
+    jsecon.save_gaussians(scene, given.field.gaussians, similarity=to_source)
+    options = dataclasses.replace(given.options, capture=tmp_path / "capture", gaussians=scene)
+    there = pipeline.run(options, out)
+    assert not [note for note in there.notes if "WARNING" in note]
+    np.testing.assert_allclose(there.psnr, given.psnr, atol=0.1)
+    text = next(iter(json.loads((room / "scene.json").read_text())["objects"].values()))
+    place = jsecon.locate(given.field, text)
+    assert command_line.main(["query", str(out / "field.npz"), text, "--out", str(out), "--views", "1"]) == 0
+    answer = json.loads(next(out.glob("*.json")).read_text())
+    chosen = jsecon.load_gaussians(out / answer["ply"], similarity=np.linalg.inv(to_source))
+    assert chosen.count == answer["count"] == len(place.points)
+    np.testing.assert_allclose(chosen.means, place.points, atol=1e-4)
+    found = jsecon.locate(jsecon.load_field(out / "field.npz"), text)
+    np.testing.assert_allclose(found.centroid / scale - shift, place.centroid, atol=1e-3)
+    box = answer["place"]["bounding_box"]
+    np.testing.assert_allclose(np.array(box["min"]) / scale - shift, place.points.min(0), atol=1e-3)
 
 
 def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):

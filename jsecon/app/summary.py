@@ -16,6 +16,7 @@ from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
 from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.stages import WARNING
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -36,10 +37,14 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
     metrics = run_metrics(run)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     with listener.progress("report"):
-        parts = [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
+        told = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
+        warnings = [report.section("Warning", note) for note in told]
+        parts = [*warnings, report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
         title = f"Language field of {run.options.capture.resolve().name}"
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
     say_quality(run.held_out, listener)
+    for note in told:
+        listener.say(f"{WARNING}{note}")
     listener.say(
         f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
@@ -90,6 +95,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
         **quality_told(run.held_out),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
         "left_out": run.left_out,
+        "notes": list(run.notes),
         "programs_compiled": run.programs,
         "peak_memory_mib": round(peak_memory_mib(), 1),
     }

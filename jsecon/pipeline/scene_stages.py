@@ -14,7 +14,7 @@ from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.pipeline.progress import Progress
-from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.pipeline.stages import KEY_FILE, WARNING, Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.types import Camera, Capture, Gaussians
 
 
@@ -167,8 +167,6 @@ def given_gaussians(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     return found, notes
 
 
-WARNING = "WARNING: "
-"""begins a note on what makes answers wrong"""
 _LEAD = 0.05
 """of correlation with the frames, that a less likely world must have before a likelier one"""
 

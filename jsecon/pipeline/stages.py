@@ -24,6 +24,9 @@ from jsecon.vision.protocols import Networks
 CHECKPOINT_SECONDS = 20.0
 """between two records of a stage in progress: a stop loses at most this and one chunk of steps, or one tracked frame"""
 
+WARNING = "WARNING: "
+"""begins a note on what makes answers wrong"""
+
 KEY_FILE = "made_by.txt"
 """in a folder that a stage leaves beside its result: the name and key of that stage"""
 
