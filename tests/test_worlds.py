@@ -80,6 +80,21 @@ def test_gaussians_of_large_coordinates_keep_a_millimetre(tmp_path, scene, endin
         jsecon.load_gaussians(file)
 
 
+@pytest.mark.parametrize("far", [1e4, 455123.4, 1e7])
+def test_a_spz_refuses_coordinates_that_it_cannot_hold(tmp_path, scene, far):
+    """Fixed-point numbers of 24 bits: 2^-9 units at 1e4, 2^-4 at 455123, which is larger than Gaussians of 0.02."""
+    small = dataclasses.replace(scene, log_scales=np.full_like(scene.log_scales, np.log(0.02)))
+    to_source = np.eye(4)
+    to_source[0, 3] = far
+    if far == 1e4:
+        jsecon.save_gaussians(tmp_path / "a.spz", small, similarity=to_source)
+        there = jsecon.load_gaussians(tmp_path / "a.spz", similarity=np.linalg.inv(to_source))
+        np.testing.assert_allclose(there.means, small.means, atol=2**-9)
+    else:
+        with pytest.raises(jsecon.InputError, match=r"a\.spz.*(places|lies)"):
+            jsecon.save_gaussians(tmp_path / "a.spz", small, similarity=to_source)
+
+
 def test_an_ordinary_scene_is_written_in_single_precision(tmp_path, scene):
     """As INRIA's readers expect it, whatever turns and moves it a little."""
     jsecon.save_ply(tmp_path / "a.ply", scene, similarity=np.diag([2.0, 2.0, 2.0, 1.0]) + np.eye(4, k=3))

@@ -64,8 +64,9 @@ def save_spz(path: str | Path, gaussians: Gaussians, *, similarity: Float[Array,
     memory. What it packs lies beside the file until that is whole, 20 to 65 bytes a Gaussian.
 
     Precision as in `save_gaussians`. Raises ValueError where shapes disagree; InputError for Gaussians that cannot be
-    drawn, farther than 4,194,303 units from the origin, larger than exp(5.9) units, or of which more than 1 % are
-    smaller than exp(-10) units, for more than 2^32, and where the folder cannot be written.
+    drawn, farther than 4,194,303 units from the origin, or so far that places are rounded by more than most Gaussians'
+    size, larger than exp(5.9) units, or of which more than 1 % are smaller than exp(-10) units, for more than 2^32, and
+    where the folder cannot be written.
     """
     into = AXES if similarity is None else AXES @ np.asarray(similarity, np.float64)
     bits = _fraction_bits(path, gaussians, into)
@@ -103,6 +104,14 @@ def _fraction_bits(path: str | Path, gaussians: Gaussians, into: np.ndarray) -> 
     if bits < 1:  # 0 would do for the format, but not for all of its readers
         remedy = "Write a .ply, or bring the scene nearer to its origin."
         raise InputError(path, f"a Gaussian lies {reach:,.0f} units from the origin", "at most 4,194,303", remedy)
+    step, coarse = 2.0**-bits, 0
+    if bits < _BITS:
+        for _, part in usable_blocks(path, dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), into):
+            coarse += int((np.exp(np.asarray(part.log_scales, np.float64).max(axis=1)) < 2 * step).sum())
+    if coarse > 0.5 * gaussians.count:
+        found = f"its places would be rounded to {step:.3g} units, which is coarser than most of the Gaussians"
+        remedy = "Write a .ply or a .glb, or bring the scene nearer to its origin."
+        raise InputError(path, found, "a scene nearer to its origin in a .spz", remedy)
     if large > _LEAST_SIZE + 255.5 / _SIZE_STEPS:
         found = f"a Gaussian is {math.exp(min(large, 700)):.3g} units large"
         raise InputError(path, found, "at most 379 in a .spz", "Write a .ply, or scale the scene down.")
