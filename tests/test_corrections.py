@@ -29,7 +29,7 @@ from jsecon.fit.view import Views, cameras_extent, view_loss
 from jsecon.splat.render import render
 from jsecon.types import Camera, Capture, Gaussians
 
-KEY, VIEWS = jax.random.key(0), 6
+KEY, VIEWS = jax.random.key(0), 7
 FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 WHOLE = Schedule(sizes=((1.0, 1.0),), growth="none")
 GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
@@ -38,7 +38,7 @@ GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
 @pytest.fixture(autouse=True)
 def _one_size(monkeypatch):
     """A program less to compile."""
-    monkeypatch.setattr(settle, "SCHEDULE", WHOLE)
+    monkeypatch.setattr(settle, "FINE", 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     gains = rng.uniform(0.8, 1.0, VIEWS)
     told, states = rough(capture, twists=twists, gains=gains), []
     given = GIVEN | {"rates": FROZEN, "refine": Refine(pose_rate=2e-3), "on_checkpoint": states.append}
-    fit_gaussians(told, start=truth, steps=40 * 5, **given)
+    fit_gaussians(told, start=truth, steps=80 * (VIEWS - 1), **given)
     found, pixels = jax.tree.map(np.asarray, states[-1].refined.now), []
     for poses in (capture.cameras.world_to_camera, hat_exp_of(found.twists) @ told.cameras.world_to_camera):
         x, y, z = np.moveaxis(truth.means @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], -1, 0)
@@ -217,6 +217,56 @@ def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_n
     assert settled(told, start, key=KEY, refine=None) is told
 
 
+def errors(seed=4):
+    """Twists and gains of a rough capture."""
+    rng = np.random.default_rng(seed)
+    twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
+    return {"twists": twists, "gains": rng.uniform(0.8, 1.0, VIEWS)}
+
+
+def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_the_decision(capture, truth):
+    told = rough(capture, **errors())
+    given = {"key": KEY, "visits": 15, "probes": 2, "decide": True}
+    better = settled(told, truth, **given)
+    assert "are corrected" in " ".join(better.notes)
+    assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
+    frames = told.frames.copy()
+    frames[2] = 255 - frames[2]
+    other = settled(dataclasses.replace(told, frames=frames), truth, **given)
+    train = ~told.held_out
+    assert same(other.cameras[train], better.cameras[train])
+    assert same(other.frames[train], better.frames[train])
+    assert other.notes[0] == better.notes[0]
+
+
+def test_an_exact_capture_stays_as_it_is_bit_by_bit(capture, truth):
+    kept = settled(capture, truth, key=KEY, visits=15, probes=2, decide=True)
+    assert "stay as they are" in kept.notes[-1]
+    assert same(dataclasses.replace(kept, notes=()), capture)
+
+
+def test_probes_that_take_too_long_or_have_nothing_to_be_tested_on_change_nothing(capture, truth):
+    told = rough(capture, **errors())
+    short = settled(told, truth, key=KEY, decide=True, at_most=10.0)
+    assert "--steps" in short.notes[-1]
+    assert same(dataclasses.replace(short, notes=()), told)
+    few = dataclasses.replace(told, held_out=np.arange(VIEWS) > 4)
+    kept = settled(few, truth, key=KEY, decide=True)
+    assert "too few" in kept.notes[-1]
+    assert same(dataclasses.replace(kept, notes=()), few)
+
+
+def test_probes_end_when_the_poses_have_settled(capture, truth):
+    """The last one still comes."""
+    steps = []
+    settled(capture, truth, key=KEY, visits=8, probes=9, progress=lambda done, total: steps.append((done, total)))
+    total = 8 * 9 * (VIEWS - 1) + settle.ALIGNING_VISITS
+    assert {whole for _, whole in steps} == {total}
+    assert sorted(steps) == steps
+    assert steps[-1] == (total, total)
+    assert steps[-2][0] < total
+
+
 def test_the_world_stays_where_it_was(capture):
     given = np.asarray(capture.cameras.world_to_camera, np.float64)
     motion = hat_exp([0.1, -0.2, 0.3, 1.0, 2.0, -1.0])
@@ -257,9 +307,9 @@ def test_a_frame_that_nothing_explains_is_left_out(capture, truth):
     frames = capture.frames.copy()
     frames[4] = np.random.default_rng(5).integers(0, 256, frames[4].shape, np.uint8)
     kept = settled(dataclasses.replace(capture, frames=frames), truth, key=KEY, refine=None, drop_weak=True, visits=8)
-    assert kept.names == ("f0", "f1", "f2", "f3", "f5")
+    assert kept.names == ("f0", "f1", "f2", "f3", "f5", "f6")
     assert "f4" in kept.notes[-1]
-    assert len(kept.frames) == len(kept.depths) == len(kept.cameras.fx) == len(kept.held_out) == 5
+    assert len(kept.frames) == len(kept.depths) == len(kept.cameras.fx) == len(kept.held_out) == 6
 
 
 def test_depths_and_masks_are_made_smaller_without_mixing(capture):

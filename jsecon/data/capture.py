@@ -59,6 +59,16 @@ def has_poses(path: Path) -> bool:
     return bool(find_models(path)) or (path / "transforms.json").exists() or find_rgbd(path) is not None
 
 
+def may_have_depth(path: Path) -> bool:
+    """Whether a capture's files can hold depth, as its format and its transforms.json tell; loads no frame."""
+    if path.is_dir() and find_models(path):
+        return False
+    file = path / "transforms.json" if path.is_dir() else path
+    if file.is_file() and file.suffix == ".json":
+        return b"depth_file_path" in file.read_bytes()
+    return find_rgbd(path) is not None
+
+
 def _posed(path: Path) -> Posed:
     if path.is_dir() and (models := find_models(path)):
         return read_colmap(path, models)

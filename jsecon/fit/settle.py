@@ -3,38 +3,99 @@
 A probe, a short fit with corrections (corrections.py), says how far each frame is off. What comes of it is a capture
 again, its cameras where they stood and its frames as one exposure shows them, for all that follows. Points from depth
 stand where their own frame's wrong pose puts them, and hold it there: so a probe has few of them, which several frames
-must share, and after each of the first probes the next starts from points made anew with the poses found. Frames held
-out have no part in the probes; they are aligned to the last once it is frozen, each by its own pose and exposure alone,
-as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
+must share, and after each of the first probes the next starts from points made anew with the poses found. The first
+probes see small frames and end as soon as the poses settle; the last sees larger ones.
+
+Whether corrections help is decided by `decide` on training frames kept aside: a first probe with corrections and one
+without, both fitted to the other training frames, are compared on them. A kept-aside frame is aligned to either probe,
+frozen, on half of its pixels, and compared on the other half: so alignment alone wins nothing. Frames held out have no
+part in the probes or in that decision; they are aligned to the last probe once it is frozen, each by its own pose and
+exposure alone, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jsecon.errors import require
-from jsecon.fit.corrections import Corrections, Refine, at_rest, exponential
+from jsecon.fit.corrections import Corrections, Refine, at_rest, corrected_camera, exponential, exposed
 from jsecon.fit.optimise import FitState, fit_gaussians
 from jsecon.fit.quality import GLANCE, quality, weak
-from jsecon.fit.schedule import LearningRates, Schedule
+from jsecon.fit.schedule import LearningRates, Schedule, resized, resized_frame
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.view import cameras_extent
-from jsecon.types import Array, Capture, Gaussians
+from jsecon.splat.render import render_rgb
+from jsecon.types import Array, Camera, Capture, Gaussians
 
-VISITS, PROBES = 30, 4
-"""of each frame by a probe, and probes one after the other"""
-POINTS = 12_000
+VISITS, PROBES = 20, 4
+"""of each frame by a probe, and probes one after the other at most"""
+POINTS = 8_000
 """that a probe starts from at most, where it has more than the capture's sparse ones"""
-ALIGNING_VISITS = 120
-"""of each held-out frame by its alignment"""
-SCHEDULE = Schedule(sizes=((0.5, 1.0),), growth="none")
-"""of a probe: half the frames' size, which measures as well as all of it here, in half the time"""
+ALIGNING_VISITS = 40
+"""of each frame that has no part in a probe, by its alignment"""
+FINE = 0.5
+"""size of the frames in the last probe, which measures as well as all of it here, in half the time"""
+COARSE_PX, COARSE_LEAST = 100, 0.25
+"""longer side of the frames in the probes before it, px, and their least size as a share of the frames' own"""
+SETTLED_PX = 0.25
+"""median movement of the picture by a probe, px of the frames' own size, from which on the poses have settled"""
+GAIN_DB = 0.5
+"""that corrections must win on the frames kept aside. In the demo's room they win 0.1 dB where nothing is wrong, 0.9
+where poses are off by 3 mm and 0.15 degrees, 2 to 3 by three times as much (experiments/rough_capture.py)"""
+ASIDE = 2, 8
+"""training frames kept aside for the decision at least (of three times as many), and at most"""
+FEWEST_VISITS = 6
+"""of each frame by a probe: with fewer the poses do not come to rest"""
+SQUARES = 8
+"""of the chequerboard on which frames kept aside are compared, along each side of a frame"""
+TOO_MANY = (
+    "{} frames are too many to correct them within half of the fit's time (use more --steps, fewer --frames, or "
+    "--refine both, which takes longer)"
+)
+_STEP_PIXELS, _STEP_ONCE = 0.6, 0.1
+"""time of a probe's step, in steps of the fit: for frames of the fit's size, and for its Gaussians"""
 _REFINE = Refine()
+_STILL = Refine(poses=False, exposure=False)
+"""of a probe without corrections that shares the program of one with them"""
 _FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
+
+
+class _Plan(NamedTuple):
+    """How the probes go."""
+
+    coarse: float
+    """size of the frames in all probes but the last"""
+    probes: int
+    visits: int
+    """of each frame by each probe"""
+    aligning: int
+    """visits of each frame held out, and of each kept aside"""
+
+
+def _planned(
+    capture: Capture, refine: Refine | None, *, visits: int, probes: int, decide: bool, at_most: float | None
+) -> _Plan | None:
+    """The probes, with as many visits as fit into the time of `at_most` steps of the fit; None where those are fewer
+    than FEWEST_VISITS."""
+    held = np.asarray(capture.held_out)
+    train, out = int((~held).sum()), int(held.sum()) if refine is not None else 0
+    coarse = min(FINE, max(COARSE_LEAST, COARSE_PX / max(capture.cameras.width, capture.cameras.height)))
+    probes = probes if refine is not None and refine.poses else 1
+    small, large = (_STEP_PIXELS * size**2 + _STEP_ONCE for size in (coarse, FINE))
+    # The decision takes a probe more, which sees no corrections; where there is one alone, two.
+    each = train * (large + small * (probes - 1 + decide + (decide and probes == 1)))
+    aligned = ALIGNING_VISITS * (out * large + min(ASIDE[1], train // 3) * small * 2 * decide)
+    share = 1.0 if at_most is None else min(1.0, at_most / (visits * each + aligned))
+    if share * visits < min(FEWEST_VISITS, visits):
+        return None
+    return _Plan(coarse, probes, max(1, int(share * visits)), max(1, int(share * ALIGNING_VISITS)))
 
 
 def settled(
@@ -44,60 +105,206 @@ def settled(
     key: PRNGKeyArray,
     refine: Refine | None = _REFINE,
     drop_weak: bool = False,
+    decide: bool = False,
+    at_most: float | None = None,
     visits: int = VISITS,
     probes: int = PROBES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Capture:
-    """The capture with its poses and exposures corrected by `probes` probes (one where no pose is refined), without the
-    training frames that the last does not explain where `drop_weak` (`quality.weak`); its notes say what was done, and
-    how far. Each starts from `start`; without, from what the capture and the poses of the probe before give.
+    """Corrects a capture's poses and exposures by short fits, and leaves out frames that these do not explain.
 
     The world stays where it was: of all corrections the rigid motion that brings the training cameras nearest to where
     they were told to stand is taken back, and colours are such that the mean correction is none. A corrected frame is
-    clipped to 8 bits; pixels that were white and come out darker are `ignored`. With neither a refinement nor
-    `drop_weak` the capture is returned as it is. Raises InputError where the probe does not converge.
+    clipped to 8 bits; pixels that were white and come out darker are `ignored`.
+
+    Args:
+      capture: Frames with the poses to correct. Frames held out have no part in the probes.
+      start: Gaussians that each probe starts from. Without, points made with the poses of the probe before.
+      key: Draws the order of the frames.
+      refine: What to correct, or None.
+      drop_weak: Leave out training frames that the last probe does not explain (`quality.weak`).
+      decide: Correct only where that lowers the error of training frames kept aside. Otherwise the frames and the
+        poses stay as they are.
+      at_most: The probes take at most about the time of so many steps of the fit: fewer visits. Where that leaves too
+        few of them, nothing is refined.
+      visits: Visits of each frame by each probe.
+      probes: Maximum number of probes; one where no pose is refined.
+      progress: Called with the number of steps done and of all.
+
+    Returns:
+      The corrected capture, whose notes say what was done and why. Without `refine` and `drop_weak` the capture itself.
+
+    Raises:
+      ValueError: `visits` or `probes` is below 1.
+      InputError: A probe does not converge.
     """
     if refine is None and not drop_weak:
         return capture
-    train, out = ~np.asarray(capture.held_out), np.asarray(capture.held_out)
     require(visits > 0, "visits", visits, "at least 1", f"{VISITS} are usual.")
     require(probes > 0, "probes", probes, "at least 1", f"{PROBES} are usual.")
-    told, probes = capture, probes if refine is not None and refine.poses else 1
-    steps, more = visits * int(train.sum()), ALIGNING_VISITS * int(out.sum()) if refine is not None else 0
+    told, train, notes = capture, ~np.asarray(capture.held_out), []
+    plan = _planned(capture, refine, visits=visits, probes=probes, decide=decide, at_most=at_most)
+    if plan is None:
+        refine, plan = None, _Plan(FINE, 1, visits, 0)
+        notes.append(f"poses and exposures stay as they are: {TOO_MANY.format(len(capture.names))}")
+    steps, out = plan.visits * int(train.sum()), int((~train).sum()) if refine is not None else 0
+    total, done = steps * (plan.probes + 2 * decide) + plan.aligning * out, 0
 
-    def tell(before: int):
-        return lambda done, _: None if progress is None else progress(before + done, probes * steps + more)
+    def probed(capture: Capture, start: Gaussians, refine: Refine | None, size: float, steps: int, **given: Any):
+        nonlocal done
+        before, done = done, done + steps
 
-    def probed(number: int):
-        begun = starting_gaussians(capture, at_most=POINTS)[0] if start is None else start
-        return _probed(capture, begun, refine, key=key, steps=steps, progress=tell(number * steps))
+        def tell(taken: int, _: int) -> None:
+            if progress is not None:
+                progress(min(before + taken, total), total)
 
-    for number in range(probes - 1):
-        assert refine is not None
-        found = probed(number)[1]
-        capture = _corrected(capture, found, dataclasses.replace(refine, exposure=False))
-    probe, found = probed(probes - 1)
-    if more:
-        others = dataclasses.replace(capture, held_out=train)
-        _, aligned = _probed(others, probe, refine, key=key, steps=more, rates=_FROZEN, progress=tell(probes * steps))
-        pick = lambda a, b: np.where(out.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-        found = jax.tree.map(pick, found, aligned)
+        return _probed(capture, start, refine, key=key, steps=steps, size=size, progress=tell, **given)
+
+    def begun() -> Gaussians:
+        return starting_gaussians(capture, at_most=POINTS)[0] if start is None else start
+
+    left = plan.probes
+    if decide and refine is not None:
+        found, better, plain = _compared(capture, begun(), refine, plan, probed)
+        notes.append(_decision(found, better, plain))
+        if found is None:
+            refine, left = None, 1
+        elif left > 1:
+            moved = dataclasses.replace(refine, exposure=False)
+            capture, left = _corrected(capture, found, moved), left - 1
+    if refine is None and not drop_weak:
+        return dataclasses.replace(told, notes=(*told.notes, *notes))
+    while refine is not None and left > 1:
+        scene, found = probed(capture, begun(), refine, plan.coarse, steps)
+        before, capture = capture, _corrected(capture, found, dataclasses.replace(refine, exposure=False))
+        still = _moved_px(scene, before.cameras[train], capture.cameras[train]) < SETTLED_PX
+        left = 1 if still else left - 1
+    probe, found = probed(capture, begun(), refine, FINE, steps)
+    if out:
+        found = _with_aligned(capture, probe, found, ~train, refine, FINE, plan.aligning, probed)
     # In the probe's own world and colours.
-    left = weak_frames(probe, _corrected(capture, found, refine, at_home=False)) if drop_weak else np.zeros(0, int)
+    left_out = weak_frames(probe, _corrected(capture, found, refine, at_home=False)) if drop_weak else np.zeros(0, int)
     better = _corrected(capture, found, refine)
-    better = dataclasses.replace(better, notes=(*capture.notes, *_told(told, better, found, refine)))
-    return _without(better, left)
+    if progress is not None:
+        progress(total, total)
+    notes = (*told.notes, *notes, *_told(told, better, found, refine))
+    return _without(dataclasses.replace(better, notes=notes), left_out)
 
 
-def _probed(capture: Capture, start: Gaussians, refine: Refine | None, **given: Any) -> tuple[Gaussians, Corrections]:
-    """A short fit, and its frames' corrections: none where nothing is refined."""
+def _probed(
+    capture: Capture, start: Gaussians, refine: Refine | None, *, size: float, **given: Any
+) -> tuple[Gaussians, Corrections]:
+    """A short fit to frames of this size, and its frames' corrections: none where nothing is refined."""
     last: list[FitState] = []
     # What is rendered of soft Gaussians lies before a surface, and depth as a teacher would push every camera back.
     capture = capture if refine is None else dataclasses.replace(capture, depths=None)
+    if capture.ignored is None:  # one program serves probes and alignments on parts of a frame
+        capture = dataclasses.replace(capture, ignored=np.broadcast_to(False, np.shape(capture.frames)[:3]))
     keep = lambda state: last.__setitem__(slice(None), [state])
-    found, _ = fit_gaussians(capture, start=start, refine=refine, schedule=SCHEDULE, on_checkpoint=keep, **given)
+    schedule = Schedule(sizes=((size, 1.0),), growth="none")
+    found, _ = fit_gaussians(capture, start=start, refine=refine, schedule=schedule, on_checkpoint=keep, **given)
     refined = last[0].refined
     return found, at_rest(len(capture.names)) if refined is None else jax.tree.map(np.asarray, refined.now)
+
+
+def _with_aligned(
+    capture: Capture,
+    probe: Gaussians,
+    found: Corrections,
+    which: Bool[np.ndarray, " t"],
+    refine: Refine | None,
+    size: float,
+    visits: int,
+    probed: Callable[..., tuple[Gaussians, Corrections]],
+) -> Corrections:
+    """`found`, with the corrections of the frames `which` by alignment to the frozen probe."""
+    others = dataclasses.replace(capture, held_out=~which)
+    _, aligned = probed(others, probe, refine, size, visits * int(which.sum()), rates=_FROZEN)
+    pick = lambda a, b: np.where(which.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+    return jax.tree.map(pick, found, aligned)
+
+
+def _compared(
+    capture: Capture,
+    start: Gaussians,
+    refine: Refine,
+    plan: _Plan,
+    probed: Callable[..., tuple[Gaussians, Corrections]],
+) -> tuple[Corrections | None, float, float]:
+    """Corrections of the training frames, or None where they do not help; and the mean PSNR (dB) of frames kept aside,
+    aligned to a probe with corrections and to one without (NaN where there are too few frames to keep any aside)."""
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    count = min(ASIDE[1], len(train) // 3)
+    if count < ASIDE[0]:
+        return None, math.nan, math.nan
+    aside = np.zeros(len(capture.names), bool)
+    aside[train[((np.arange(count) + 0.5) * len(train) / count).astype(int)]] = True
+    fitted = dataclasses.replace(capture, held_out=np.asarray(capture.held_out) | aside)
+    steps = plan.visits * int((~fitted.held_out).sum())
+    scene, found = probed(fitted, start, refine, plan.coarse, steps)
+    plain, _ = probed(fitted, start, _STILL, plan.coarse, steps)
+    # Aligned on the squares of one colour of a chequerboard, compared on the others.
+    rows, columns = (np.arange(length) * SQUARES // length for length in np.shape(capture.frames)[1:3])
+    even = np.add.outer(rows, columns) % 2 == 0
+    ignored = np.zeros(np.shape(capture.frames)[:3], bool) if capture.ignored is None else np.asarray(capture.ignored)
+    half = dataclasses.replace(capture, ignored=ignored | even)
+    found = _with_aligned(half, scene, found, aside, refine, plan.coarse, plan.aligning, probed)
+    alike = _with_aligned(half, plain, at_rest(len(aside)), aside, refine, plan.coarse, plan.aligning, probed)
+    seen = even & ~ignored
+    better = _mean_psnr(scene, capture, found, aside, seen, plan.coarse)
+    without = _mean_psnr(plain, capture, alike, aside, seen, plan.coarse)
+    return found if better >= without + GAIN_DB else None, better, without
+
+
+def _mean_psnr(
+    scene: Gaussians,
+    capture: Capture,
+    found: Corrections,
+    which: Bool[np.ndarray, " t"],
+    seen: Bool[np.ndarray, "t h w"],
+    size: float,
+) -> float:
+    """Mean PSNR (dB) of the frames `which` on the pixels `seen`, rendered with their corrections at this size."""
+    cameras, values = resized(capture.cameras, size), []
+    scene = jax.device_put(scene)
+    for t in np.flatnonzero(which):
+        own = jax.tree.map(lambda a, t=t: jnp.asarray(a[t]), found)
+        camera = corrected_camera(jax.tree.map(jnp.asarray, cameras[int(t)]), own.twists)
+        image = np.clip(exposed(render_rgb(scene, camera).features, own.colours), 0, 1)
+        frame = resized_frame(np.asarray(capture.frames[t]), cameras) / 255.0
+        share = cv2.resize(seen[t].astype(np.float32), frame.shape[1::-1], interpolation=cv2.INTER_AREA)
+        squares = ((image - frame) ** 2)[share > 0.999]
+        if len(squares):
+            values.append(-10 * math.log10(max(float(squares.mean()), 1e-10)))
+    return float(np.mean(values)) if values else math.nan
+
+
+def _decision(found: Corrections | None, better: float, without: float) -> str:
+    """Whether poses and exposures are corrected, and why."""
+    what = "are corrected" if found is not None else "stay as they are"
+    if math.isnan(better):
+        return f"poses and exposures {what}: there are too few training frames to test on some of them"
+    told = f"training frames kept aside have {better:.1f} dB in a short fit with corrections"
+    return f"poses and exposures {what}: {told}, {without:.1f} dB in one without"
+
+
+def _moved_px(scene: Gaussians, before: Camera, after: Camera) -> float:
+    """Median over the cameras of the median distance, px, by which their move shifts the scene's Gaussians in view."""
+    points, moved = np.asarray(scene.means, np.float64), []
+    for t in range(len(before.fx)):
+        (u, v), (other_u, other_v) = (_projected(points, cameras, t) for cameras in (before, after))
+        inside = (u >= 0) & (u <= before.width) & (v >= 0) & (v <= before.height)
+        shifts = np.hypot(other_u - u, other_v - v)[inside]
+        moved.append(np.nanmedian(shifts) if np.isfinite(shifts).any() else 0.0)
+    return float(np.median(moved))
+
+
+def _projected(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where points appear in camera t, px; NaN behind it."""
+    pose = np.asarray(cameras.world_to_camera[t], np.float64)
+    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+    z = np.where(z > 0, z, np.nan)
+    return cameras.fx[t] * x / z + cameras.cx[t], cameras.fy[t] * y / z + cameras.cy[t]
 
 
 def _corrected(capture: Capture, found: Corrections, refine: Refine | None, *, at_home: bool = True) -> Capture:

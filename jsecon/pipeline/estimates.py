@@ -24,6 +24,7 @@ from jsecon.fit.schedule import gaussians_for
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener, Step
+from jsecon.pipeline.scene_stages import refinement
 from jsecon.pipeline.stages import Work
 
 REFERENCE = 0.06
@@ -122,13 +123,31 @@ def estimates(work: Work, steps: Sequence[Step], place: Mapping[str, Path], slow
     units = units_of(extent, gaussians, options.steps)
     if any(step.name == "distil" for step in steps):
         steps = [*steps, Step("field", "run", "all of it in one file")]
-    return [_estimate(step, _cost(step.name, options), units, options, slower) for step in steps]
+    found = [_estimate(step, _cost(step.name, options), units, options, slower) for step in steps]
+    if "load" in running and refinement(work) == "auto":
+        fit = next(one for one in found if one.name == "gaussians")
+        found = [_refined(one, fit) if one.name == "load" else one for one in found]
+    return found
+
+
+def _refined(load: Estimate, fit: Estimate) -> Estimate:
+    """Of loading with poses and exposures refined: half of the fit's time more at most; not known where that is not."""
+    if load.seconds is None or fit.seconds is None:
+        return dataclasses.replace(load, seconds=None, compilation=None, memory_mib=None, disk_mib=None)
+    assert load.compilation is not None
+    assert load.memory_mib is not None
+    return dataclasses.replace(
+        load,
+        seconds=load.seconds + fit.seconds / 2,
+        compilation=load.compilation + (fit.compilation or 0.0),
+        memory_mib=max(load.memory_mib, fit.memory_mib or 0.0),
+    )
 
 
 def _cost(name: str, options: Options) -> Cost | None:
     """None where nothing like it was measured."""
     others = {
-        "load": options.refine != "none" or options.drop_frames != "none",
+        "load": options.refine not in ("none", "auto") or options.drop_frames != "none",
         "gaussians": options.gaussians is not None or options.start in ("dense", "random"),
         "masklets": any((options.masks, options.proposals, options.segmenter, options.tracker))
         or options.association != "consensus"

@@ -4,7 +4,7 @@ fitted, held-out frames are measured."""
 import dataclasses
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import numpy as np
 from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
 from jsecon.files import write_text
+from jsecon.pipeline.options import SceneOptions
 from jsecon.pipeline.progress import Progress
 from jsecon.pipeline.stages import KEY_FILE, WARNING, Outcome, Record, Results, Stage, Work, training_frames
 from jsecon.types import Camera, Capture, Gaussians
@@ -68,34 +69,73 @@ def poses(work: Work) -> Stage:
     return Stage("poses", how, compute, given=given, files=lambda: photographs(capture), leaves=out)
 
 
+STEP_SECONDS = 0.024, 0.2
+"""of a step of the fit: in all, and for a million pixels of the frames, as benchmarks/estimates.py measured; says how
+many steps --minutes allows about"""
+
+
 def load(work: Work) -> Stage:
-    """The capture, at the size that the options ask for, put right where they ask for that."""
+    """Loads the capture at the size that the options ask for, and corrects it where they ask for that."""
+    as_it_is = refinement(work) == "none" and work.options.drop_frames == "none"
+    return _as_it_is(work) if as_it_is else _put_right(work)
+
+
+def refinement(work: Work) -> Literal["none", "poses", "exposure", "both", "auto"]:
+    """What a run corrects of poses and exposures; "auto" only where depth and the data can still decide it."""
     options = work.options
-    return _as_it_is(work) if options.refine == "none" and options.drop_frames == "none" else _put_right(work)
+    if options.refine != "auto":
+        return options.refine
+    from jsecon.data.capture import may_have_depth
+
+    if options.gaussians is not None:  # they belong to the poses as they are
+        return "none"
+    return "auto" if work.load is not None or may_have_depth(options.capture) else "none"
 
 
 def _put_right(work: Work) -> Stage:
-    """Poses and exposures as a probe fit finds them, without the frames that it does not explain."""
-    options, plain = work.options, _as_it_is(work)
+    """Corrects poses and exposures by probe fits, and leaves out the frames that these do not explain."""
+    options, plain, asked = work.options, _as_it_is(work), refinement(work)
 
     def compute(results: Results, progress: Progress, record: Record) -> Outcome:
         from jsecon.fit.corrections import Refine
         from jsecon.fit.settle import settled
 
         loaded = plain.compute(results, progress, record)
-        capture, asked = loaded.value, options.refine
-        if asked == "auto":
-            asked = "none" if capture.depths is None else "both"
-        refine = None if asked == "none" else Refine(asked in ("poses", "both"), asked in ("exposure", "both"))
-        told = len(capture.notes)
-        given = {"refine": refine, "drop_weak": options.drop_frames == "auto", "progress": progress}
-        better = settled(capture, key=jax.random.key(options.seed), **given)
+        capture, refine, at_most = loaded.value, None, None
+        if asked == "auto" and capture.depths is not None:
+            refine, at_most = Refine(), _fit_steps(options, capture) / 2
+        elif asked not in ("auto", "none"):
+            refine = Refine(asked in ("poses", "both"), asked in ("exposure", "both"))
+        better = settled(
+            capture,
+            key=jax.random.key(options.seed),
+            refine=refine,
+            drop_weak=options.drop_frames == "auto",
+            decide=asked == "auto",
+            at_most=at_most,
+            progress=progress,
+        )
         training_frames(better)
-        return Outcome(better, notes=(*loaded.notes, *better.notes[told:]))
+        return Outcome(better, notes=(*loaded.notes, *better.notes[len(capture.notes) :]))
 
-    asked = work.given("refine", "drop_frames", "seed")
-    how = f"{plain.how}, put right by a probe fit (refine {options.refine}, drop frames {options.drop_frames})"
-    return Stage("load", how, compute, given={**plain.given, **asked}, files=plain.files)
+    given = work.given("drop_frames", "seed") | {"refine": asked}
+    if asked == "auto":
+        given |= work.given("steps", "minutes")
+        how = "poses and exposures corrected where that helps, in about half of the fit's time at most (--refine auto)"
+    else:
+        how = f"corrected by short fits (--refine {asked})" if asked != "none" else ""
+    left = "frames that a short fit does not explain left out" if options.drop_frames == "auto" else ""
+    how = ", ".join(part for part in (plain.how, how, left) if part)
+    return Stage("load", how, compute, given={**plain.given, **given}, files=plain.files)
+
+
+def _fit_steps(options: SceneOptions, capture: Capture) -> float:
+    """Steps of the photometric fit; those that `minutes` allow are estimated."""
+    if options.minutes is None:
+        return float(options.steps)
+    once, by_pixels = STEP_SECONDS
+    pixels = capture.cameras.width * capture.cameras.height / 1e6
+    return 60 * options.minutes / (once + by_pixels * pixels)
 
 
 def _as_it_is(work: Work) -> Stage:

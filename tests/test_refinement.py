@@ -1,0 +1,112 @@
+"""`--refine` of a run: which captures it looks at by default, what it decides, and what a dry run tells of it."""
+
+import dataclasses
+import json
+
+import cv2
+import jax
+import numpy as np
+import pytest
+from capture_files import transforms, write_images
+from test_corrections import (
+    capture as capture,  # fixtures
+    errors,
+    rough,
+    truth as truth,
+)
+
+from jsecon.app import command_line
+from jsecon.fit import settle
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.pipeline import _computed
+from jsecon.pipeline.processes import First
+from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.scene_stages import loaded
+from jsecon.pipeline.stages import Work
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
+
+
+def write(capture, folder, *, depth=True):
+    """As nerfstudio lays out an RGB-D capture."""
+    write_images(capture, folder / "images")
+    scene = transforms(capture)
+    if depth:
+        (folder / "depth").mkdir()
+        for frame, name, image in zip(scene["frames"], capture.names, capture.depths):
+            assert cv2.imwrite(str(folder / "depth" / f"{name}.png"), np.rint(image * 1000).astype(np.uint16))
+            frame["depth_file_path"] = f"depth/{name}.png"
+    (folder / "transforms.json").write_text(json.dumps(scene))
+    return folder
+
+
+def load(folder, out, **options):
+    """What the first stage of a run makes of a capture, and what it told."""
+    given = Options(capture=folder, holdout=7, steps=2000, **options)
+    work = Work(given, Networks(ColourEmbedder()), out)
+    done = _computed(work, loaded(work), out / "cache", Listener(), First(several=False))
+    return done.results["load"], " ".join(done.notes), done.steps[0].status
+
+
+def alike(a, b):
+    a, b = (dataclasses.replace(c, notes=()) for c in (a, b))
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+@pytest.fixture
+def _small(monkeypatch, truth):
+    """Frames of one size, and a start of the probes that few views can correct."""
+    monkeypatch.setattr(settle, "FINE", 1.0)
+    monkeypatch.setattr(settle, "starting_gaussians", lambda capture, **_: (truth, ""))
+
+
+@pytest.mark.usefixtures("_small")
+def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, tmp_path):
+    told = write(rough(capture, **errors()), tmp_path / "rough")
+    as_it_is, _, _ = load(told, tmp_path / "none", refine="none")
+    better, notes, status = load(told, tmp_path / "out")
+    assert status == "run"
+    assert "are corrected" in notes
+    assert not alike(better, as_it_is)
+    again, notes, status = load(told, tmp_path / "out")
+    assert status == "cached"
+    assert "are corrected" in notes
+    assert alike(again, better)
+
+
+@pytest.mark.usefixtures("_small")
+def test_by_default_an_exact_capture_stays_as_its_files_say(capture, tmp_path):
+    exact = write(capture, tmp_path / "exact")
+    kept, notes, _ = load(exact, tmp_path / "out")
+    assert "stay as they are" in notes
+    assert alike(kept, load(exact, tmp_path / "none", refine="none")[0])
+
+
+def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
+    def how(folder, **options):
+        return loaded(Work(Options(folder, **options), Networks(ColourEmbedder()), tmp_path / "out"))[-1]
+
+    plain = write(capture, tmp_path / "plain", depth=False)
+    deep = write(capture, tmp_path / "deep")
+    for one, other in ((how(plain), how(plain, refine="none")), (how(deep, gaussians=plain), how(deep, refine="none"))):
+        assert one.how == other.how
+        assert one.given == other.given
+    assert how(deep).given != how(deep, steps=300).given
+    _, notes, _ = load(plain, tmp_path / "none")
+    assert "stay as they are" not in notes
+
+
+def test_a_dry_run_counts_the_refinement_as_half_of_the_fit(capture, tmp_path, capsys):
+    folder = write(capture, tmp_path / "deep")
+
+    def told(*options):
+        line = ["fit", str(folder), "--out", str(tmp_path / "out.ply"), *options, "--dry-run", "--json"]
+        assert command_line.main(line) == 0
+        answer = json.loads(capsys.readouterr().out)
+        return {stage["name"]: stage for stage in answer["stages"]}, answer["slower"]
+
+    (stages, slower), (without, as_slow) = told(), told("--refine", "none")
+    assert "--refine auto" in stages["load"]["how"]
+    assert "--refine" not in without["load"]["how"]
+    extra = stages["load"]["seconds"] / slower - without["load"]["seconds"] / as_slow
+    assert extra == pytest.approx(stages["gaussians"]["seconds"] / slower / 2)
