@@ -42,7 +42,7 @@ def write(capture, folder, *, depth=True):
 
 def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
-    given = Options(capture=folder, holdout=7, steps=2000, **options)
+    given = Options(capture=folder, holdout=6, steps=2000, **options)
     work = Work(given, Networks(ColourEmbedder()), out)
     done = _computed(work, loaded(work), out / "cache", Listener(), First(several=False))
     return done.results["load"], " ".join(done.notes), done.steps[0].status
@@ -57,6 +57,7 @@ def alike(a, b):
 def _small(monkeypatch, truth):
     """Frames of one size, and a start of the probes that few views can correct."""
     monkeypatch.setattr(settle, "FINE", 1.0)
+    monkeypatch.setattr(settle, "ASIDE", (1, 8))
     monkeypatch.setattr(settle, "starting_gaussians", lambda capture, **_: (truth, ""))
 
 
