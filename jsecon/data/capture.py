@@ -64,7 +64,7 @@ def may_have_depth(path: Path) -> bool:
     if path.is_dir() and find_models(path):
         return False
     file = path / "transforms.json" if path.is_dir() else path
-    if file.is_file() and file.suffix == ".json":
+    if file.is_file() and file.suffix.lower() == ".json":
         return b"depth_file_path" in file.read_bytes()
     return find_rgbd(path) is not None
 
