@@ -275,7 +275,7 @@ def image(folder: Path) -> Iterator[Case]:
 
     def read(file: Path):
         found = images.read_image(file)
-        return found, images.image_size(file), motion._lenses([file])
+        return found, images.image_size(file), motion._lenses([file], [images.image_size(file)])
 
     def whole(found) -> None:
         (picture, _), (width, height), groups = found
