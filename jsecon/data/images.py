@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Int, UInt8
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
@@ -390,7 +390,7 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
         temporary.write_bytes(data.tobytes())
 
 
-def read_ids(path: str | Path) -> tuple[Int64[np.ndarray, "h w"], bool]:
+def read_ids(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
     """A label image as integers (H, W), and whether they are colours.
 
     PNG: grey of 1 to 16 bits has its values; a palette the indices into it, never its colours; RGB of 8 bits
@@ -414,20 +414,20 @@ def read_ids(path: str | Path) -> tuple[Int64[np.ndarray, "h w"], bool]:
     image = _decode(path, _png([(kind, header), *(own for own in others if own[0] == b"IDAT")]))
     image = turned(image, exif_orientation(data))
     if colour_type == 0 and image.ndim == 2:
-        step = 255 // (2**bits - 1) if bits < 8 else 1  # fewer than 8 bits come stretched to 0..255
-        return image.astype(np.int64) // step, False
+        ids = image.astype(np.int32)
+        return ids if bits >= 8 else ids // (255 // (2**bits - 1)), False  # fewer than 8 come stretched to 0..255
     if bits > 8 or image.ndim != 3:
         raise InputError(
             path, f"the mask has {bits} bits in each of {_CHANNELS[colour_type]} channels", expected, ID_REMEDY
         )
-    red, green, blue = (image[..., channel].astype(np.int64) for channel in range(3))
+    red, green, blue = (image[..., channel].astype(np.int32) for channel in range(3))
     grey = colour_type == 4
     ids = red if grey else red * 65536 + green * 256 + blue
     if image.shape[2] == 4:
         opaque = image[..., 3] == 255
         if not (opaque | (image[..., 3] == 0)).all():
             raise InputError(path, "the mask has pixels that are half transparent (4 channels)", expected, ID_REMEDY)
-        ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int64)
+        ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
     return ids, not grey
 
 

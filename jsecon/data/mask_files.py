@@ -169,9 +169,7 @@ class _Reader:
         if name not in self.found.files:
             return np.zeros(0, np.int64), np.full(self.size, -1, np.int16)
         path = self.found.files[name]
-        image = self._values(path)
-        own, indices = compact(path, image)
-        return own, self.fit(path, indices, name)
+        return compact(path, self.fit(path, self._values(path), name))
 
     def _objects(self, name: str, masks: Mapping[str, Path]) -> tuple[np.ndarray, np.ndarray]:
         """The objects of a frame as indices into `folders`; the first lies on top."""
@@ -179,9 +177,9 @@ class _Reader:
         shown = []
         for index, folder in reversed(list(enumerate(self.folders))):
             if folder in masks:
-                image, _ = read_ids(masks[folder])
+                image = self.fit(masks[folder], read_ids(masks[folder])[0], name)
                 self._require_one_object(masks[folder], image)
-                labels[self.fit(masks[folder], (image > 0).astype(np.uint8), name) > 0] = index
+                labels[image > 0] = index
         shown = np.unique(labels[labels >= 0]).astype(np.int64)
         return shown, np.where(labels >= 0, np.searchsorted(shown, labels), -1).astype(np.int16)
 
