@@ -100,7 +100,7 @@ def main(options: Options) -> str:
             except InputError:
                 rows.append((seed, name, np.inf, 0.0))
                 continue
-            away = float(np.linalg.norm(place.centroid - box.mean(0)))
+            away = float(np.linalg.norm(place.center - box.mean(0)))
             rows.append((seed, name, away, box_iou(np.stack([place.low, place.high]), box)))
     away, overlap = (np.array([row[k] for row in rows]) for k in (2, 3))
     told = [(seed, name, f"{1000 * a:.1f}", f"{o:.3f}") for seed, name, a, o in rows]

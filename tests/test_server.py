@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import json
 import random
+import socket
 import threading
 import time
 
@@ -15,7 +16,7 @@ pytest.importorskip("starlette", reason="the extra serve is not installed")
 from small_field import make_field
 from starlette.testclient import TestClient
 
-from jsecon.app.guard import Guard, Limits
+from jsecon.app.guard import Busy, Guard, Limits, Workers
 from jsecon.app.server import Scene, application, open_scenes, ready
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
@@ -24,6 +25,7 @@ from jsecon.vision.colours import ColourEmbedder
 
 LIMITS = Limits(body=2000, seconds_to_send=0.3, waiting=4, text=80)
 KINDS = {200, 400, 401, 404, 405, 408, 413, 422, 503}
+HERE, JSON = "http://127.0.0.1:8765", {"content-type": "application/json"}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ def scenes(scene, cameras):
 
 @pytest.fixture(scope="module")
 def client(scenes):
-    return TestClient(application(scenes, limits=LIMITS), raise_server_exceptions=False)
+    return TestClient(application(scenes, limits=LIMITS), HERE, raise_server_exceptions=False)
 
 
 def test_a_text_and_a_pixel_are_answered(client, scenes):
@@ -49,24 +51,100 @@ def test_a_text_and_a_pixel_are_answered(client, scenes):
     assert client.post("/query", json={"at": [1, 24, 20]}).json()["count"] == pixel["count"]
 
 
-def test_what_is_known_is_told_while_all_cores_are_taken(scenes):
-    desk, told = scenes["desk"], []
-    first = desk.tell("red")
-    for _ in range(cores()):
-        desk._free.acquire()
-    try:
-        known, new = (
-            threading.Thread(target=lambda t=t: told.append(desk.tell(t)), daemon=True) for t in ("red", "blue")
-        )
-        new.start()
-        known.start()
-        known.join(20)
-        assert told == [first]  # the new one waits
-    finally:
-        for _ in range(cores()):
-            desk._free.release()
-    new.join(20)
-    assert len(told) == 2
+def test_what_is_known_is_told_while_all_threads_are_taken_and_no_thread_is_added(scenes, monkeypatch):
+    """A soak: questions that take longer than clients wait keep their places; those beyond are told to come back."""
+    held, limits = threading.Event(), Limits(waiting=cores() + 3, seconds=0.05)
+    desk, asked = scenes["desk"], []
+
+    def slow(*question):
+        asked.append(question)
+        assert held.wait(60)
+        return {"question": question[0]}
+
+    with TestClient(application({"desk": desk}, limits=limits), HERE) as client:
+        ask = lambda text: client.post("/query", json={"text": text})
+        first = ask("red")
+        while first.status_code == 503:  # it was computed for longer than 0.05 s
+            first = ask("red")
+        monkeypatch.setattr(desk, "_tell", slow)
+        before = threading.active_count()
+        answers = [ask(f"thing {k}") for k in range(20)]
+        assert {answer.status_code for answer in answers} == {503}
+        assert len(asked) == cores()
+        assert "wait for an answer" not in answers[0].json()["error"]
+        assert threading.active_count() <= before + cores()
+        assert ask("red").json() == first.json()
+        texts = [client.post("/query", json={"text": f"more {k}"}).json()["error"] for k in range(3)]
+        assert all("0.05 s" in text for text in texts), "those that never began have left their places"
+        held.set()
+        answer = ask("green")
+        while answer.status_code == 503:
+            answer = ask("green")
+        assert answer.json() == {"question": "green"}
+        assert not any(question[0].startswith("more") for question in asked)
+    desk._known.clear()
+
+
+def test_places_are_bounded_and_given_back():
+    """One thread: a running question keeps its place when its client gives up, and one that waits leaves."""
+
+    async def soak():
+        workers, held = Workers(1, 2), threading.Event()
+        for _ in range(30):
+            with pytest.raises(TimeoutError):
+                await workers.compute(held.wait, 0.002)
+        assert workers.taken == 1
+        waits = asyncio.ensure_future(workers.compute(lambda: "late", 20))
+        await asyncio.sleep(0.01)
+        with pytest.raises(Busy):
+            await workers.compute(lambda: 1, 1)
+        held.set()
+        assert await waits == "late"
+        assert await workers.compute(lambda: 3, 20) == 3
+        workers.close()
+        assert workers.taken == 0
+
+    asyncio.run(soak())
+
+
+def test_a_field_of_a_request_that_is_wrong_is_named(client):
+    for body, field in (({"at": [True, 1, 2]}, "at"), ({"text": "caf\udce9 red"}, "text"), ({"at": [0, 99, 2]}, "at")):
+        error = client.post("/query", content=json.dumps(body), headers=JSON).json()["error"]
+        assert error.startswith(f'Field "{field}": ')
+    error = client.get("/mask.png", params={"text": "red", "frame": "#99"}).json()["error"]
+    assert error.startswith('Field "frame": ')
+
+
+@pytest.mark.parametrize(
+    ("status", "headers"),
+    [
+        (200, {"host": "localhost", **JSON}),
+        (200, {"host": "[::1]:8765", "content-type": "Application/JSON; charset=utf-8"}),
+        (200, {"host": "box.lan", **JSON}),
+        (403, {"host": "evil.example:8765", **JSON}),
+        (403, {"host": "", **JSON}),
+        (415, {"content-type": "text/plain"}),
+        (415, {"content-type": ""}),
+        (415, {"content-type": "application/x-www-form-urlencoded"}),
+    ],
+)
+def test_a_page_of_another_site_cannot_ask(scenes, status, headers):
+    client = TestClient(application(scenes, limits=LIMITS, hosts=("box.lan",)), HERE)
+    assert client.post("/query", content=b'{"text": "red"}', headers=headers).status_code == status
+
+
+def test_get_takes_what_it_lists_and_nothing_else(client):
+    paths = client.get("/openapi.json").json()["paths"]
+    for path in ("/regions", "/selection.ply", "/mask.png", "/healthz"):
+        listed = [parameter["name"] for parameter in paths[path]["get"]["parameters"]]
+        usual = {"text": "red", "field": "desk", "by": "votes", "frame": "#0"}
+        found = client.get(path, params={name: usual[name] for name in listed})
+        assert found.status_code == 200 or "selects nothing" in found.text, found.text
+        if listed:
+            for other in {"at", "threshold", "all", "frame"} - set(listed):
+                found = client.get(path, params={"text": "red", other: "1"})
+                assert found.status_code == 422
+                assert f"takes {', '.join(listed)}." in found.json()["error"]
 
 
 def test_what_it_knows_and_files_of_the_answer(client, scenes):
@@ -98,6 +176,22 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
         (422, b'{"text": "red", "at": [0, 1, 2]}'),
         (422, b'{"at": [0, 1]}'),
         (422, b'{"at": [0, true, 2]}'),
+        (422, b'{"at": [true, 1, 2]}'),
+        (422, b'{"at": ["frame_1", 1e400, 2]}'),
+        (422, b'{"at": ["frame_1", NaN, 2]}'),
+        (422, b'{"at": ["\\udce9", 1, 2]}'),
+        (422, b'{"at": ["#99999999999999999999", 1, 2]}'),
+        (422, b'{"at": ["#\xc2\xb2", 1, 2]}'),
+        (422, b'{"at": [0, 1' + b"0" * 200 + b", 2]}"),
+        (422, b'{"at": [0, 1, 2], "by": "canonical"}'),
+        (422, b'{"at": [0, 1, 2], "all": true}'),
+        (422, b'{"text": "caf\\udce9 red"}'),
+        (422, b'{"text": null}'),
+        (422, b'{"text": "red", "by": ["votes"]}'),
+        (422, b'{"text": "red", "by": {}}'),
+        (422, b'{"text": "red", "frame": "#0"}'),
+        (422, b'{"text": "red", "\\udce9": 1}'),
+        (404, b'{"text": "red", "field": "\\udce9"}'),
         (422, b'{"at": [99, 1, 2]}'),
         (422, b'{"text": "red", "by": "magic"}'),
         (422, b'{"text": "red", "threshold": "a"}'),
@@ -112,9 +206,10 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
     ],
 )
 def test_odd_questions_have_an_error_of_their_own_kind(client, status, body):
-    answer = client.post("/query", content=body)
+    answer = client.post("/query", content=body, headers=JSON)
     assert answer.status_code == status, answer.text
     assert answer.json()["error"]
+    assert "--" not in answer.json()["error"]
 
 
 def test_paths_lead_nowhere(client):
@@ -134,12 +229,12 @@ def test_mutated_requests_never_crash_it(client):
         for _ in range(draw.randint(1, 6)):
             place = draw.randrange(len(body))
             body[place : place + draw.randint(0, 3)] = bytes(draw.randrange(256) for _ in range(draw.randint(0, 3)))
-        answer = client.post("/query", content=bytes(body))
+        answer = client.post("/query", content=bytes(body), headers=JSON)
         assert answer.status_code in KINDS, (bytes(body), answer.text)
 
 
 def test_a_token_is_asked_for_where_one_is_set(scenes, tmp_path):
-    guarded = TestClient(application(scenes, token="secret", limits=LIMITS))
+    guarded = TestClient(application(scenes, token="secret", limits=LIMITS), "http://any.name")
     assert guarded.get("/healthz").status_code == 401
     assert guarded.get("/healthz", headers={"Authorization": "Bearer wrong"}).status_code == 401
     assert guarded.get("/healthz", headers={"Authorization": "Bearer secret"}).status_code == 200
@@ -155,8 +250,19 @@ def test_its_address_is_told_and_a_port_in_use_is_refused(scenes, tmp_path):
     port = int(told["address"].removeprefix("http://127.0.0.1:"))
     assert port > 0
     assert [scene["name"] for scene in told["fields"]] == [tmp_path.name]
+    if has_ipv6():
+        told, _ = ready([tmp_path / "field.npz"], port=0, **given | {"host": "::1"})
+        assert told["address"].startswith("http://[::1]:")
     with pytest.raises(InputError, match="in use"):
         ready([tmp_path / "field.npz"], port=port, **given)
+
+
+def has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
 
 
 def sent(receive, limits=LIMITS, app=None):
@@ -172,7 +278,7 @@ def sent(receive, limits=LIMITS, app=None):
         told.append(message)
 
     async def run():
-        await Guard(app or reached, "", limits)({"type": "http", "headers": []}, receive, send)
+        await Guard(app or reached, "", limits)({"type": "http", "headers": [(b"host", b"localhost")]}, receive, send)
 
     asyncio.run(run())
     return told[0]["status"], told[1]["body"]
@@ -199,7 +305,7 @@ def test_a_slow_sender_and_one_that_goes_away(scenes):
         return {"type": "http.request", "body": b"abc"}
 
     assert sent(whole) == (200, b"abc")
-    assert sent(whole, Limits(waiting=0))[0] == 503
+    assert sent(whole, Limits(requests=0))[0] == 503
 
 
 def test_clients_at_once_get_the_same_answers(client):

@@ -5,7 +5,6 @@ it does when that is told.
 """
 
 import dataclasses
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -195,8 +194,8 @@ def _serve(asked: Serve, console: Console) -> Told:
     with console.progress("start"):
         from jsecon.app import server
 
-    token = asked.token or os.environ.get("JSECON_TOKEN", "")
-    given = {"host": asked.host, "port": asked.port, "token": token, "embedder": asked.embedder}
+    given = {"host": asked.host, "port": asked.port, "token": asked.token, "embedder": asked.embedder}
+    given["hosts"] = asked.allow_host or ()
     with console.progress("fields"):
         told, answer = server.ready([Path(file) for file in asked.fields], **given)
     for scene in told["fields"]:

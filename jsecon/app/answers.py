@@ -1,7 +1,13 @@
-"""An answer as files: one of the Gaussians, a JSON of figures, a few masks."""
+"""An answer as files: one of the Gaussians, a JSON of figures, a few masks.
 
+Every question has file names of its own, the same in every run: an ordinary text is its own name ("red mug" is
+red-mug), any other name ends in a hash of what it stands for (`stem_of`).
+"""
+
+import hashlib
 import json
 import re
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
+from jsecon.app.place import digits, points_of, rounded
 from jsecon.app.question import Answer
 from jsecon.app.splat_page import NOWHERE, regions_of
 from jsecon.data.gaussian_files import save_gaussians
@@ -20,6 +27,11 @@ from jsecon.language.shares import probability_inside
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import carried
 from jsecon.types import Gaussians, LanguageField
+
+_MOST_BYTES = 80
+"""of a slug: a file's name may have 255 bytes, two slugs and their hashes among them"""
+_DEVICES = frozenset(("con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))))
+"""names that Windows keeps for devices, whatever their ending"""
 
 
 def selected(gaussians: Gaussians, mask: np.ndarray) -> Gaussians:
@@ -49,13 +61,19 @@ def part_of(field: LanguageField, answer: Answer) -> LanguageField:
     return field if answer.rows is None else field_of_rows(field, answer.rows)
 
 
-def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[str, Any]:
-    """What there is to say about an answer: count, score, region, and the place of the Gaussians `chosen`."""
-    means = np.asarray(chosen.means, np.float64)
+def _figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
+    """The figures of an answer: count, score, region, and where it is.
+
+    Under "place", in the capture's own world: "centroid", the mean of the centres of the selected Gaussians, as
+    `Place.centroid`, and "bounding_box", the least and the greatest of their coordinates.
+    """
+    means = points_of(field, answer.mask)
     place = sure = None
     if len(means):
-        box = {"min": means.min(0).round(6).tolist(), "max": means.max(0).round(6).tolist()}
-        place = {"centroid": means.mean(0).round(6).tolist(), "bounding_box": box}
+        low, high = means.min(0), means.max(0)
+        size = float(np.linalg.norm(high - low))
+        box = {"min": rounded(low, size), "max": rounded(high, size)}
+        place = {"centroid": rounded(means.mean(0), size), "bounding_box": box}
     region = int(answer.selection.region)
     if answer.by == "votes" and len(means):
         probability = probability_inside(answer.selection.similarity, field.votes, answer.mask)
@@ -76,6 +94,13 @@ def _figures(field: LanguageField, answer: Answer, chosen: Gaussians) -> dict[st
     } | ({} if answer.frames is None else {"frames": dict(answer.frames)})
 
 
+def place_told(place: dict[str, Any]) -> str:
+    """The centroid of a "place" of `_figures` in words, to a hundredth of the size of the thing."""
+    box = place["bounding_box"]
+    decimals = digits(float(np.linalg.norm(np.subtract(box["max"], box["min"]))), 0.01)
+    return f"({', '.join(f'{c:.{decimals}f}' for c in place['centroid'])})"
+
+
 def write_answer(
     field: LanguageField,
     answer: Answer,
@@ -84,22 +109,23 @@ def write_answer(
     *,
     ending: str = "ply",
 ) -> dict[str, Any]:
-    """Writes OUT/<slug>.ply (or .spz, .glb: `ending`), .json, and <slug>-<frame>.png of `masks` (by frame, see
-    `masks_of`); returns the figures. An empty selection leaves out the Gaussians and the masks.
+    """Writes OUT/<stem>.ply (or .spz, .glb: `ending`), .json, and <stem>-<frame>.png of `masks` (by frame, see
+    `masks_of`); returns the figures. The stem is `stem_of` the answer. An empty selection leaves out the Gaussians and
+    the masks.
     """
-    slug, count = slug_of(answer.question), field.gaussians.count
+    stem, count = stem_of(answer), field.gaussians.count
     field = part_of(field, answer)
     chosen = carried(selected(field.gaussians, answer.mask), field.to_source)
-    told = _figures(field, answer, chosen) | {"of": count, ending: None, "masks": {}}
+    told = _figures(field, answer) | {"of": count, ending: None, "masks": {}}
     if answer.mask.any():
-        told[ending] = f"{slug}.{ending}"
+        told[ending] = f"{stem}.{ending}"
         own = {"codes": np.asarray(field.codes), "regions": _regions(field)} if ending == "glb" else {}
         save_gaussians(out / told[ending], chosen, **{name: table[answer.mask] for name, table in own.items()})
         for t, mask in masks.items():
-            told["masks"][field.names[t]] = f"{slug}-{field.names[t]}.png"
-            with written_whole(out / told["masks"][field.names[t]]) as temporary:
+            told["masks"][field.names[t]] = file = f"{stem}-{_frame_stem(field, t)}.png"
+            with written_whole(out / file) as temporary:
                 temporary.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
-    write_text(out / f"{slug}.json", json.dumps(told, indent=2) + "\n")
+    write_text(out / f"{stem}.json", json.dumps(told, indent=2) + "\n")
     return told
 
 
@@ -125,6 +151,32 @@ def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool
     return {t: np.asarray(selection_mask(gaussians, cameras[t], mask)) for t in frames}
 
 
-def slug_of(question: str) -> str:
-    """A file name without spaces or signs."""
-    return re.sub(r"[^\w]+", "-", question.lower()).strip("-")[:80] or "query"
+def stem_of(answer: Answer) -> str:
+    """The name of an answer's files without their endings: the same in every run, and no other question's."""
+    question = answer.question
+    if answer.key is not None:
+        return _hashed(_slug(question), answer.key)
+    plain = _slug(question)
+    ordinary = plain.replace("-", " ") == question and len(plain.encode()) <= _MOST_BYTES
+    return plain if ordinary and plain not in _DEVICES else _hashed(plain, question)
+
+
+def _frame_stem(field: LanguageField, frame: int) -> str:
+    """A frame's name as a part of file names: a name of letters and digits as it is, any other as a slug and a hash."""
+    name = field.names[frame]
+    alike = sum(other.casefold() == name.casefold() for other in field.names)  # on a file system without case
+    ordinary = re.fullmatch(r"[A-Za-z0-9_]+", name) and len(name) <= _MOST_BYTES and alike == 1
+    return name if ordinary else _hashed(_slug(name), name)
+
+
+def _slug(text: str) -> str:
+    """The letters and digits of a text, in lower case, with hyphens between; "query" for a text without any."""
+    folded = unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
+    return re.sub(r"[^\w]+", "-", folded).strip("-") or "query"
+
+
+def _hashed(slug: str, key: str) -> str:
+    """The beginning of a slug, and a hash of the key behind two hyphens, which no slug has."""
+    digest = hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:10]
+    start = slug.encode("utf-8", "replace")[:_MOST_BYTES].decode("utf-8", "ignore")
+    return f"{start}--{digest}"

@@ -19,6 +19,7 @@ from jsecon.app.question import (
     ask_outline,
     ask_pixel,
     ask_text,
+    frame_index,
     region_under,
     sought,
     unheld,
@@ -62,13 +63,24 @@ def questions_of(
     found += [functools.partial(ask_text, field, embedder, text, several=several, **how) for text in texts]
     found += [functools.partial(ask_pixel, field, *pixel, **how) for pixel in pixels]
 
+    def require_outline(name: str) -> None:
+        if by != "votes" or even:
+            found = "the outline alone decides, so --by and --even have no meaning"
+            raise InputError(f"query {name!r}", found, remedy="Leave them out, or ask by a text.")
+
     def outlined(pairs: Sequence[str]) -> Answer:
         files = dict(zip(pairs[::2], map(Path, pairs[1::2])))
         outlines = {frame: read_mask(file, field) for frame, file in files.items()}
-        return ask_outline(field, Path(pairs[1]).stem, outlines, **shape)
+        names = [field.names[frame_index(field, frame)] for frame in pairs[::2]]
+        if len(set(names)) < len(names):
+            raise InputError("--mask", "a frame is given twice", remedy="Give one mask of a thing in each frame.")
+        require_outline(Path(pairs[1]).stem)
+        key = "\0".join(("mask", *(part for pair in zip(names, pairs[1::2]) for part in pair)))
+        return ask_outline(field, Path(pairs[1]).stem, outlines, key=key, **shape)
 
     def boxed(frame: str, *ends: int) -> Answer:
-        name = f"box {frame} {' '.join(map(str, ends))}"
+        name = f"box {field.names[frame_index(field, frame)]} {' '.join(map(str, ends))}"
+        require_outline(name)
         return ask_outline(field, name, {frame: box_mask(field, *ends)}, **shape)
 
     found += [functools.partial(outlined, pairs) for pairs in masks]
@@ -169,7 +181,7 @@ def _answered(
     own, mask = field_of_rows(field, rows), np.arange(size) < count
     selection = Selection(mask, similarity, np.asarray(chosen.region, np.int32), np.asarray(chosen.score, np.float32))
     if asked.text is None:
-        answer = answer_of(own, asked.name, asked.by, selection, outliers, POINTED)
+        answer = answer_of(own, asked.name, asked.by, selection, outliers, POINTED, key=asked.name)
         return dataclasses.replace(answer, rows=rows)
     if several and own.parts is not None:
         selection = query_parts(

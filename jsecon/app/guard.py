@@ -1,13 +1,16 @@
-"""What stands before the server's application: who may ask, how much, how slowly; and what can be asked."""
+"""What stands before the server's application: who may ask, how much, how slowly; how many questions are computed; and
+what can be asked."""
 
 import asyncio
 import dataclasses
-import hmac
 import json
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jsecon
+from jsecon.app.access import named, right_token
 from jsecon.app.question import METHODS
 
 
@@ -21,7 +24,9 @@ class Limits:
     seconds: float = 30.0
     """of an answer."""
     waiting: int = 64
-    """requests at once."""
+    """questions that are computed or wait for it."""
+    requests: int = 256
+    """at once, the cheap ones too."""
     text: int = 500
     """characters."""
 
@@ -29,19 +34,57 @@ class Limits:
 LIMITS = Limits()
 
 
-class Guard:
-    """Before the application: who may ask, how much, how slowly, and how many at once."""
+class Busy(Exception):
+    """As many questions wait as may."""
 
-    def __init__(self, app: Any, token: str, limits: Limits):
-        self.app, self.token, self.limits, self.now = app, token, limits, 0
+
+class Workers:
+    """Threads that compute answers: never more than `threads`, and never more than `most` questions in them or waiting.
+
+    A question keeps its place until its thread is done with it, also where its client was told that it took too long.
+    """
+
+    def __init__(self, threads: int, most: int):
+        self.most, self.taken = most, 0
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="jsecon-answer")
+        self._lock = threading.Lock()
+
+    async def compute(self, work: Callable[[], Any], seconds: float) -> Any:
+        """What `work` returns or raises. Raises Busy, and TimeoutError after `seconds`: work that has not begun by then
+        never does."""
+        with self._lock:
+            if self.taken >= self.most:
+                raise Busy
+            self.taken += 1
+        future = self._pool.submit(work)
+        future.add_done_callback(self._leave)
+        return await asyncio.wait_for(asyncio.wrap_future(future), seconds)
+
+    def _leave(self, future: Future) -> None:
+        with self._lock:
+            self.taken -= 1
+
+    def close(self) -> None:
+        """Ends the threads: what has begun is computed to its end, what waits is not begun."""
+        self._pool.shutdown(cancel_futures=True)
+
+
+class Guard:
+    """Before the application: who may ask, how much, how slowly, and how many at once.
+
+    With a token it must be sent; without one a request must name this machine, by a loopback name or one of `hosts`.
+    """
+
+    def __init__(self, app: Any, token: str, limits: Limits, hosts: Collection[str] = ()):
+        self.app, self.token, self.limits, self.hosts, self.now = app, token, limits, hosts, 0
 
     async def __call__(self, scope: dict, receive: Callable, send: Callable) -> None:
         if scope["type"] == "lifespan":
             return await self.app(scope, receive, send)
         if scope["type"] != "http":
             return await send({"type": "websocket.close", "code": 1008})
-        status, told, content = 503, "too many at once: come back", b""
-        if self.now < self.limits.waiting:
+        status, told, content = 503, "Too many requests at once. Try again.", b""
+        if self.now < self.limits.requests:
             self.now += 1
             try:
                 status, told, content = await self._body(scope, receive)
@@ -56,24 +99,29 @@ class Guard:
     async def _body(self, scope: dict, receive: Callable) -> tuple[int, str, bytes]:
         """(200, "", body), or a status and why."""
         headers = dict(scope["headers"])
-        given = headers.get(b"authorization", b"")
-        if self.token and not hmac.compare_digest(given, b"Bearer " + self.token.encode()):
-            return 401, "a token is wanted: Authorization: Bearer TOKEN", b""
+        if self.token:
+            if not right_token(headers.get(b"authorization", b""), f"Bearer {self.token}"):
+                return 401, "A token is required. Send the header Authorization: Bearer TOKEN.", b""
+        elif not named(headers.get(b"host", b"").decode("latin-1"), self.hosts):
+            return 403, "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME.", b""
+        kind = headers.get(b"content-type", b"").partition(b";")[0].strip().lower()
+        if scope.get("method") == "POST" and kind != b"application/json":
+            return 415, "The body must be JSON. Send the header Content-Type: application/json.", b""
         parts, size = [], 0
         try:
             async with asyncio.timeout(self.limits.seconds_to_send):
                 while True:
                     message = await receive()
                     if message["type"] != "http.request":
-                        return 400, "the sender went away", b""
+                        return 400, "The sender closed the connection.", b""
                     parts.append(message.get("body", b""))
                     size += len(parts[-1])
                     if size > self.limits.body:
-                        return 413, f"at most {self.limits.body} bytes", b""
+                        return 413, f"The body has more than {self.limits.body} bytes.", b""
                     if not message.get("more_body"):
                         return 200, "", b"".join(parts)
         except TimeoutError:
-            return 408, f"not sent within {self.limits.seconds_to_send:g} s", b""
+            return 408, f"The body did not arrive within {self.limits.seconds_to_send:g} s.", b""
 
 
 def _once(content: bytes, receive: Callable) -> Callable:
@@ -84,6 +132,16 @@ def _once(content: bytes, receive: Callable) -> Callable:
         return waiting.pop() if waiting else await receive()
 
     return replay
+
+
+TAKES: dict[str, tuple[str, ...]] = {
+    "/query": ("text", "at", "field", "by", "threshold", "all"),
+    "/regions": ("field",),
+    "/selection.ply": ("text", "field", "by"),
+    "/mask.png": ("text", "frame", "field", "by"),
+    "/healthz": (),
+}
+"""path -> the fields of a question there"""
 
 
 def paths_told() -> dict[str, str]:
@@ -110,9 +168,8 @@ def openapi(limits: Limits) -> dict[str, Any]:
     paths: dict[str, Any] = {}
     for line, told in paths_told().items():
         verb, path = line.split()
-        names = {"/regions": ("field",), "/healthz": ()}.get(path, ("text", "field", "by"))
-        names += ("frame",) if path == "/mask.png" else ()
-        inputs = [{"name": n, "in": "query", "schema": options.get(n, {"type": "string"})} for n in names]
+        kinds = [(name, options.get(name, {"type": "string"})) for name in TAKES[path]]
+        inputs = [{"name": name, "in": "query", "required": name == "text", "schema": kind} for name, kind in kinds]
         operation: dict[str, Any] = {"summary": told, "responses": {"200": {"description": "the answer"}}}
         if verb == "POST":
             schema = {"type": "object", "properties": asked, "additionalProperties": False}

@@ -1,13 +1,14 @@
 """Where an answer is, for a robot: centre, boxes and points, in metres of the capture's own world."""
 
 import dataclasses
+import math
 from typing import Any
 
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jsecon.app.answers import selected
 from jsecon.app.question import Answer, ask_text
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
@@ -25,7 +26,10 @@ class Place:
 
     name: str
     centroid: np.ndarray
-    """(3,) the middle of the oriented box: views from above see more of a thing's top, which pulls a mean upwards."""
+    """(3,) the mean of the centres of the selected Gaussians, as in an answer's .json."""
+    center: np.ndarray
+    """(3,) the middle of the oriented box, nearer to the middle of a thing that is seen from one side: views from above
+    see more of its top, which pulls the centroid upwards."""
     axes: np.ndarray
     """(3, 3) unit columns, right-handed, the longest first: the principal axes of the points."""
     extent: np.ndarray
@@ -43,17 +47,18 @@ class Place:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON; of the points their count."""
-        told = {name: getattr(self, name) for name in ("centroid", "axes", "extent", "low", "high")}
-        rounded = {name: np.round(np.asarray(value, np.float64), 6).tolist() for name, value in told.items()}
+        size = float(np.linalg.norm(self.high - self.low))
+        lengths = {name: rounded(getattr(self, name), size) for name in ("centroid", "center", "extent", "low", "high")}
         sure = {"score": round(self.score, 6), "probability": round(self.probability, 4)}
-        return {"name": self.name, **rounded, "points": len(self.points), **sure, "frame": self.frame}
+        shape = {**lengths, "axes": np.round(self.axes, 6).tolist(), "points": len(self.points)}
+        return {"name": self.name, **shape, **sure, "frame": self.frame}
 
 
 def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) -> Place:
     """Where the thing is that a text names; `how` as for `jsecon.app.question.ask_text`.
 
     `embedder`: that of the field, opened where it is not given. In five rooms of the demo, of whose things that no
-    other shares a name with it finds 59 of 60, the middle of the box is off by 6 mm in the median and the box along the
+    other shares a name with it finds 59 of 60, `center` is off by 6 mm in the median and the box along the
     world's axes has an IoU of 0.69 with the true one (experiments/places.py). Raises InputError where nothing answers
     the text.
     """
@@ -70,8 +75,9 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
         found = f"nothing selected (score {float(answer.selection.score):.3f})"
         raise InputError(answer.question, found, "a thing in the scene", "Ask with other words, or by a pixel.")
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # colours have no place
-    chosen = carried(selected(plain, answer.mask), field.to_source)
-    points = np.asarray(chosen.means, np.float64)
+    rows = np.asarray(answer.mask)
+    chosen = carried(jax.tree.map(lambda a: np.asarray(a)[rows], plain), field.to_source)
+    points = points_of(field, rows)
     spread = points - points.mean(0)
     axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -81,6 +87,7 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     own_low, own_high = _ends(points, shapes, axes)
     return Place(
         answer.question,
+        points.mean(0),
         axes @ (0.5 * (own_low + own_high)),
         axes,
         own_high - own_low,
@@ -90,6 +97,22 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
         float(answer.selection.score),
         float(probability_inside(answer.selection.similarity, field.votes, answer.mask).mean()),
     )
+
+
+def points_of(field: LanguageField, mask: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
+    """(M, 3) float64 centres of the Gaussians in `mask`, in the capture's own world."""
+    to_source = np.asarray(field.to_source, np.float64)
+    return np.asarray(field.gaussians.means)[mask].astype(np.float64) @ to_source[:3, :3].T + to_source[:3, 3]
+
+
+def digits(size: float, part: float) -> int:
+    """Decimals that tell coordinates apart which differ by `part` of a thing's size; 6 for a size of 0."""
+    return max(0, math.ceil(-math.log10(size * part))) if size > 0 and math.isfinite(size) else 6
+
+
+def rounded(values: np.ndarray, size: float) -> list[float]:
+    """Coordinates of a thing of this size as plain numbers, to a millionth of it, at least to six decimals."""
+    return np.round(np.asarray(values, np.float64), max(6, digits(size, 1e-6))).tolist()
 
 
 def _ends(

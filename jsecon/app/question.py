@@ -36,8 +36,10 @@ from jsecon.types import Array, LanguageField, Selection
 
 BY_VOTES = ("votes", *OUTLINES)
 """anchored, membership by a Gaussian's votes; of OUTLINES then one by one by the outline that they make"""
-METHODS = (*BY_VOTES, "code", "one_step", "canonical")
-"""code: anchored, membership by a Gaussian's code; one_step, canonical: codes against the text"""
+BY_CODES = ("one_step", "canonical")
+"""every Gaussian's code against the text, without regions"""
+METHODS = (*BY_VOTES, "code", *BY_CODES)
+"""code: anchored, membership by a Gaussian's code"""
 ONE_STEP_THRESHOLD = 0.8
 """on the cosine of a Gaussian's code and the text's"""
 CANONICAL_THRESHOLD = 0.5
@@ -64,6 +66,8 @@ class Answer:
     """of a phrase: frame -> the score of each mask found there, best first; None of other questions."""
     rows: np.ndarray | None = None
     """(M,) int64 the Gaussians that selection and mask have a row for, where those are not all N of the field."""
+    key: str | None = None
+    """what tells the question from every other in the names of its files; None: `question` alone does, a text."""
 
     @property
     def dropped(self) -> int:
@@ -92,8 +96,9 @@ def ask_text(
     regions or a composite text by anything but votes.
     """
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
-    if by in ("one_step", "canonical") and not several and sum(map(len, parts_of_question(text))) == 1:
-        return answer_of(field, text, by, _compared(field, embedder, text, by, threshold), outliers, {})
+    wanted, unwanted = parts_of_question(text)
+    if by in BY_CODES and not several and len(wanted + unwanted) == 1:
+        return answer_of(field, text, by, _compared(field, embedder, wanted[0], by, threshold), outliers, {})
     asked = sought(field, embedder, text, by=by, several=several, piece_nearness=piece_nearness)
     if (found := unheld(asked, by, threshold)) is not None:
         selection, asked, left = found.selection, asked._replace(there=found.there), UNHELD
@@ -149,13 +154,13 @@ def sought(
     keep = "largest"
     if several or unwanted or len(wanted) > 1:
         if by not in BY_VOTES:
-            remedy = "Leave out --by, or ask for one thing."
-            raise InputError(text, f"several regions by {by}", "by votes or a silhouette", remedy)
+            found = f"by {by} it has no answer of several regions"
+            raise InputError(f"query {text!r}", found, remedy="Ask by votes or a silhouette, or for one thing.")
         embedded, keep = jax.device_put(embedder.embed_text(wanted + unwanted)), "all"
         texts = embedded[: len(wanted)]
         found = found_of_several(field, texts, embedded[len(wanted) :], several=several, **how)
     else:
-        texts = jax.device_put(embedder.embed_text([text]))
+        texts = jax.device_put(embedder.embed_text(wanted))
         found = found_of(field, texts[0], **how)
     there = best_presence(field.regions, texts, found.region, how["logits"])
     return Sought(field, texts, found, keep, there, how["logits"])
@@ -193,13 +198,16 @@ def ask_pixel(
     """The Gaussians of what lies under pixel (column x, row y) of a frame (its index or name); no text is embedded.
     `near` as for `ask_text`.
 
-    Raises InputError for a frame or pixel that the field does not have, and where no region lies there.
+    Raises InputError for a frame or pixel that the field does not have, where no region lies there, and for a method
+    that compares a text.
     """
     name, region = region_under(field, frame, x, y)
-    by = by if by in (*OUTLINES, "code") else "votes"
+    if by in BY_CODES:
+        remedy = "Ask for it by votes, code or a silhouette."
+        raise InputError(f"query {name!r}", f"by {by} a text is compared, and a pixel has none", remedy=remedy)
     selection = query_region(field, region, by="code" if by == "code" else "votes", similarity_threshold=threshold)
     selection = _shaped(field, selection, by, threshold, near)
-    return answer_of(field, name, by, selection, outliers, POINTED)
+    return answer_of(field, name, by, selection, outliers, POINTED, key=name)
 
 
 POINTED = {"text encoder": "the region under the pixel is the anchor"}
@@ -211,15 +219,15 @@ def region_under(field: LanguageField, frame: int | str, x: int, y: int) -> tupl
     region, name = region_at(field, index, x, y), field.names[index]
     if region < 0:
         remedy = "Choose another pixel or frame: report.html of the run shows the regions."
-        raise InputError(f"--at {name} {x} {y}", "no region under that pixel", "a pixel of an object", remedy)
+        raise InputError(f"frame {name}", f"no region lies under column {x}, row {y}", remedy=remedy)
     return f"at {name} {x} {y}", region
 
 
 def ask_region(field: LanguageField, region: int, *, several: bool = False, **shape: Any) -> Answer:
     """The Gaussians of a region, with `several` of all that are alike; `shape` as for `query_region`."""
     selection = query_region(field, region, alike_threshold=ALIKE_THRESHOLD if several else None, **shape)
-    left = {"text encoder": "the region is the anchor"}
-    return answer_of(field, f"region {region}", "votes", selection, True, left, keep="all" if several else "largest")
+    left, name = {"text encoder": "the region is the anchor"}, f"region {region}"
+    return answer_of(field, name, "votes", selection, True, left, keep="all" if several else "largest", key=name)
 
 
 def ask_outline(
@@ -229,6 +237,7 @@ def ask_outline(
     *,
     threshold: float | None = None,
     outliers: bool = True,
+    key: str | None = None,
 ) -> Answer:
     """The Gaussians of one thing, outlined in one frame or several: frame -> mask (H, W), or what `box_mask` made.
 
@@ -238,7 +247,7 @@ def ask_outline(
     least = SHARE_THRESHOLD if threshold is None else threshold
     selection = lift(field, np.stack([np.asarray(m).astype(int) for m in outlines.values()]), frames, threshold=least)
     left = {"text encoder": "the outline says what is meant"}
-    return answer_of(field, name, "outline", selection, outliers, left)
+    return answer_of(field, name, "outline", selection, outliers, left, key=name if key is None else key)
 
 
 def _shaped(
@@ -268,9 +277,10 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
         if len(ends) == 1:
             return ends[0]
         if len(ends) > 1:
-            found, wanted = f"{len(ends)} frames that end so", f"one, such as {field.names[ends[0]]}"
-            raise InputError(f"frame {frame}", found, wanted, "Give more of the name.")
-    place = int(str(frame).lstrip("#")) if re.fullmatch(r"#\d+", str(frame)) or isinstance(frame, int) else -1
+            found = f"the names of {len(ends)} frames end so, such as that of {field.names[ends[0]]}"
+            raise InputError(f"frame {frame}", found, remedy="Give more of the name.")
+    digits = re.fullmatch(r"#([0-9]{1,9})", frame) if isinstance(frame, str) else None
+    place = int(digits[1]) if digits else frame if isinstance(frame, int) and not isinstance(frame, bool) else -1
     if 0 <= place < len(field.names):
         return place
     last = len(field.names) - 1
@@ -286,12 +296,14 @@ def answer_of(
     outliers: bool,
     left: dict[str, str],
     keep: str = "largest",
+    key: str | None = None,
 ) -> Answer:
-    """A selection as the answer to a question, without outliers; `left`: what was not needed, and why."""
+    """A selection as the answer to a question, without outliers; `left`: what was not needed, and why; `key` as in
+    `Answer`."""
     mask = np.asarray(selection.mask)
     if outliers:
         mask, why = outliers_removed(field.gaussians.means, mask, keep=keep)
         left = left | ({"DBSCAN": why} if why else {})
     else:
         left = left | {"DBSCAN": "not asked for"}
-    return Answer(question, by, selection, mask, left)
+    return Answer(question, by, selection, mask, left, key=key)

@@ -120,7 +120,7 @@ def write_answers(
             told = answers_of.write_answer(field, item, out, masks, ending=ending)
             figures_of.append(told)
             if told["place"]:
-                place = f"around ({', '.join(f'{c:.3g}' for c in told['place']['centroid'])})"
+                place = f"around {answers_of.place_told(told['place'])}"
             elif told["region"] is None and item.by in ("votes", "code"):
                 place = "nothing selected: no region answers it"
             else:

@@ -176,9 +176,13 @@ class View(Asking):
     link: Annotated[str, {"metavar": "LINE"}] = ""
     """what the viewer gave as its link, to have it back"""
     host: str = "127.0.0.1"
-    """address to listen on"""
+    """address to listen on; beyond loopback a token is required"""
     port: Annotated[int, {"least": 0}] = 8766
     """port to listen on"""
+    token: str = ""
+    """what the page's address must carry, as the printed one does (default: JSECON_TOKEN of the environment)"""
+    allow_host: Annotated[list[str] | None, {"action": "append", "metavar": "NAME"}] = None
+    """a name by which browsers reach this server beside localhost and --host, such as that of a proxy"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -200,8 +204,8 @@ class Eval(Asking):
 class Serve:
     """answer over HTTP, loaded once
 
-    POST /query {"text": "red mug"} and more, see GET / and /openapi.json. On loopback unless told otherwise, and beyond
-    it only with a token (extra serve).
+    POST /query {"text": "red mug"} as application/json and more, see GET / and /openapi.json. On loopback unless --host
+    names another address, which needs a token (extra serve).
     """
 
     fields: Annotated[list[Path], {"positional": True, "nargs": "+", "metavar": "FIELD"}]
@@ -212,6 +216,9 @@ class Serve:
     """port to listen on"""
     token: str = ""
     """what clients must send as "Authorization: Bearer TOKEN" (default: the environment's JSECON_TOKEN, else none)"""
+    allow_host: Annotated[list[str] | None, {"action": "append", "metavar": "NAME"}] = None
+    """a name by which clients reach this server beside localhost and --host, such as that of a proxy; without a token a
+    request by any other name is refused"""
     embedder: Folder = None
     """the CLIP model folder that the fields were made with (default: where the runs had it)"""
 

@@ -8,25 +8,27 @@ import contextlib
 import functools
 import io
 import queue
-import socket
 import tempfile
 import threading
 import traceback
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 
 from jsecon.app import viewing
-from jsecon.app.answers import masks_of, slug_of, write_answer
+from jsecon.app.access import bracketed, listen, token_for
+from jsecon.app.answers import masks_of, stem_of, write_answer
 from jsecon.app.candidates import Candidate, Pictures, candidates, region_along
 from jsecon.app.layers import Layers
 from jsecon.app.panel import Panel, sheet, told
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
 from jsecon.app.question import Answer, ask_region, ask_text
 from jsecon.app.splat_page import NOWHERE
+from jsecon.app.viewer_access import guarded_pages
 from jsecon.app.viewing import Ask, History, ViewState
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -149,9 +151,7 @@ class Viewer:
             if not found:
                 self.panel.notice("Nothing is lit up, so there is nothing to export.")
             else:
-                client.send_file_download(
-                    f"{slug_of(found[0].question)}.zip", self.packed(found), save_immediately=True
-                )
+                client.send_file_download(f"{stem_of(found[0])}.zip", self.packed(found), save_immediately=True)
 
         self.do(act)
 
@@ -257,18 +257,33 @@ class Viewer:
         return [(k, found) for k, thing in asked for found in candidates(self.field, self.embedder, thing, each)]
 
 
-def open_viewer(field: LanguageField, embedder: Any, *, host: str, port: int, name: str, state: ViewState) -> Viewer:
-    """A viewer that listens. Raises InputError where the extra is missing or the address can't be had."""
+def open_viewer(
+    field: LanguageField,
+    embedder: Any,
+    *,
+    host: str,
+    port: int,
+    name: str,
+    state: ViewState,
+    token: str = "",
+    hosts: Collection[str] = (),
+) -> Viewer:
+    """A viewer that listens, and shows its page to who has the token, or on loopback without one asks for it by a name
+    of this machine (one of `hosts` too).
+
+    Raises InputError where the extra is missing, the address can't be had, or others can reach it without a token.
+    """
     try:
         import viser
     except ImportError as error:
-        raise InputError("jsecon view", "viser is not installed", "the extra viewer, or --export", REMEDY) from error
-    try:
-        socket.create_server((host, port)).close()  # viser would go on to the next port
-    except (OSError, OverflowError) as error:
-        raise InputError("--port", f"{host}:{port} ({error})", "a free port of this machine", "Set --port.") from error
-    with contextlib.redirect_stdout(io.StringIO()):  # its banner comes before anything can be asked
-        server = viser.ViserServer(host, port, label=f"jsecon · {name}", verbose=False)
+        raise InputError(
+            "jsecon view", "the package viser is missing", remedy=f"Run: {REMEDY}. Or write a page with --export."
+        ) from error
+    listen(host, port).close()  # viser would go on to the next port
+    token = token_for(host, token)
+    quiet = contextlib.redirect_stdout(io.StringIO())  # its banner comes before anything can be asked
+    with quiet, guarded_pages(token, (host, *hosts)):
+        server = viser.ViserServer(host.strip("[]"), port, label=f"jsecon · {name}", verbose=False)
     viewer = Viewer(field, embedder, server, name=name)
     viewer.start(state)
     return viewer
@@ -276,17 +291,18 @@ def open_viewer(field: LanguageField, embedder: Any, *, host: str, port: int, na
 
 def view(asked: Any, embedder_of: Callable[..., Any], say: Callable[[str], object]) -> dict[str, Any]:
     """Shows a field as `jsecon view` asks until it is stopped; raises as `open_viewer` does."""
+    token = token_for(asked.host, asked.token)
     state = viewing.state_of(asked.link) if asked.link else ViewState()
     state = viewing.asked(state, "; ".join(asked.texts)) if asked.texts else state
     field, name, dim = load_field(asked.field), asked.field.resolve().parent.name, None
     if not asked.texts and asked.embedder is None:
         dim = given_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
     embedder = embedder_of(field, asked) if dim is None else GivenSpace(dim)
-    viewer = open_viewer(field, embedder, host=asked.host, port=asked.port, name=name, state=state)
+    place = {"host": asked.host, "port": asked.port, "token": token, "hosts": asked.allow_host or ()}
+    viewer = open_viewer(field, embedder, name=name, state=state, **place)
     say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
-    if asked.host not in ("127.0.0.1", "::1", "localhost"):
-        say(f"note: who can reach {asked.host} can see and ask this field")
-    say(f"http://{asked.host}:{viewer.server.get_port()}")
+    carried = f"/?{urlencode({'token': token})}" if token else ""
+    say(f"http://{bracketed(asked.host)}:{viewer.server.get_port()}{carried}")
     try:
         viewer.server.sleep_forever()
     finally:

@@ -81,7 +81,7 @@ def box_mask(field: LanguageField, x0: int, y0: int, x1: int, y1: int) -> Int[np
     if not mask.any():
         size = f"{field.cameras.width}x{field.cameras.height}"
         remedy = "Give its left, upper, right and lower end, in the frames as the run used them."
-        raise InputError("box", f"{x0} {y0} {x1} {y1}", f"pixels of a frame of {size}", remedy)
+        raise InputError("box", f"{x0} {y0} {x1} {y1} has no pixels of a frame of {size}", remedy=remedy)
     return mask
 
 

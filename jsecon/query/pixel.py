@@ -62,7 +62,8 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
         raise InputError("frame", str(frame), f"0 to {frames - 1}", "Frames are numbered in the order of their names.")
     if not (0 <= x < width and 0 <= y < height):
         remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
-        raise InputError("pixel", f"({x}, {y})", f"column 0 to {width - 1}, row 0 to {height - 1}", remedy)
+        known = f"column 0 to {width - 1}, row 0 to {height - 1}"
+        raise InputError("pixel", f"column {x}, row {y} is outside the frame", known, remedy)
     return region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
 
 

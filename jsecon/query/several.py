@@ -16,6 +16,11 @@ from jsecon.vision.protocols import Logits
 
 ROUNDING = 1e-5
 """similarities that differ by no more are equal: one text, wanted and unwanted, answers to neither"""
+_QUOTES = "\"'“”"
+_QUOTED = re.compile(r"""(?<!\S)(?:"[^"]+"|'.+?'|“[^”]+”)(?!\S)""", re.DOTALL)
+"""a text in quotes: an apostrophe within a word is none"""
+_JOINED = re.compile(r"\s+(?:(but\s+not)|or)(?=\s)", re.IGNORECASE)
+"""what stands between the texts of a question"""
 
 
 def query_several(
@@ -99,14 +104,24 @@ _retrieve = jax.jit(_retrieve_body, static_argnames=("several", "retrieval"))
 
 
 def parts_of_question(question: str) -> tuple[list[str], list[str]]:
-    """(wanted, unwanted) texts of a question such as `"red mug" or "bowl" but not "handle"`; quotes may be left out.
+    """(wanted, unwanted) texts of a question such as `"red mug" or "bowl" but not "handle"`.
 
-    Raises InputError where a part is empty.
+    Quotes may be left out. They are removed, and "or" and "but not" between a pair of them belong to the text: "tea or
+    coffee" in quotes is one text. Raises InputError where a part is empty, or is not UTF-8.
     """
-    first, *rest = re.split(r"\s+but not\s+", question.strip(), flags=re.IGNORECASE)
-    sides = [re.split(r"\s+or\s+", side, flags=re.IGNORECASE) for side in (first, *rest)]
-    sides = [[part.strip().strip("\"'").strip() for part in side] for side in sides]
-    if not all(part for side in sides for part in side) or re.fullmatch(r"but not\b.*", question.strip().lower()):
+    if re.search("[\ud800-\udfff]", question):
+        remedy = "Type it in a terminal, or send it from a program, that uses UTF-8."
+        raise InputError("", f"the text {question!r} is not UTF-8", remedy=remedy)
+    question = question.strip()
+    quoted = [found.span() for found in _QUOTED.finditer(question)]
+    parts, unwanted, start = ([], []), 0, 0
+    for word in _JOINED.finditer(question):
+        if not any(first < word.start() < last for first, last in quoted):
+            parts[unwanted].append(question[start : word.start()])
+            unwanted, start = max(unwanted, int(word[1] is not None)), word.end()
+    parts[unwanted].append(question[start:])
+    wanted, refused = ([part.strip().strip(_QUOTES).strip() for part in side] for side in parts)
+    if not all(wanted + refused) or re.match(r"but not\b", question, re.IGNORECASE):
         remedy = 'For example: "red mug" or "bowl" but not "handle"'
-        raise InputError(question, "a part without words", 'texts joined by "or" and "but not"', remedy)
-    return sides[0], [part for side in sides[1:] for part in side]
+        raise InputError(f"query {question!r}", 'a part beside "or" or "but not" has no words', remedy=remedy)
+    return wanted, refused
