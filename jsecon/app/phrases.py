@@ -4,7 +4,6 @@ A frame in which nothing is found speaks too: what it sees is outside. So a thin
 not selected.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from jsecon.data.frames import Progress, spread
 from jsecon.errors import InputError
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
+from jsecon.pipeline.sources import sources_of
 from jsecon.query.anchored import query_region
 from jsecon.query.lift import lift
 from jsecon.query.outliers import outliers_removed
@@ -45,13 +45,11 @@ def frames_of(field: LanguageField, capture: Path, count: int) -> dict[int, np.n
 def capture_of(field: LanguageField, beside: Path) -> Path:
     """The capture that a field in the folder `beside` was made from: the poses that its run found, else the folder that
     the run was given. Raises InputError where neither is there."""
-    used = json.loads(field.provenance or "{}").get("options", {}).get("capture")
-    places = [beside / "poses", *([] if used is None else [Path(used)])]
-    for place in places:
-        if place.exists():
-            return place
-    told = f"none of {', '.join(map(str, places))}"
-    raise InputError("--phrases", told, "the capture, whose frames are asked", "Give its folder: --images DIR.")
+    if (poses := beside / "poses").exists():
+        return poses
+    if (capture := sources_of(field, beside).capture) is not None:
+        return capture
+    raise InputError("--phrases", "the capture that the field was made from is not found", remedy="Give --images DIR.")
 
 
 def ask_phrases(

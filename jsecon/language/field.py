@@ -107,6 +107,12 @@ def field_of_rows(field: LanguageField, rows: Int[np.ndarray, " m"]) -> Language
     return dataclasses.replace(field, votes=votes, **own)
 
 
+class Provenance(str):
+    """A field's provenance that knows the folder of the file that it was read from."""
+
+    folder: Path
+
+
 def check_field(path: str | os.PathLike) -> None:
     """Raises InputError where `load_field` would: reads the whole file, checksums and numbers, a piece at a time."""
     _read(Path(path), MAPPED, checked=True)
@@ -140,7 +146,9 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         raise InputError(path, found, "a whole one", changed) from error
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
-    return field
+    provenance = Provenance(field.provenance)
+    provenance.folder = path.resolve().parent
+    return dataclasses.replace(field, provenance=provenance)
 
 
 def _known(node: Any) -> Any:

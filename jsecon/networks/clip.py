@@ -52,6 +52,11 @@ _POOLED = "pooler_output"
 """of a SigLIP by transformers: its poolers are the last step, with the projection in them"""
 
 
+def clip_name(files: ClipFiles) -> str:
+    """What the space of a CLIP model is called: it follows from the content of its files."""
+    return f"clip-{files.digest()}"
+
+
 class ClipEmbedder:
     """Embedder (jsecon.vision.protocols) by a CLIP model's two graphs.
 
@@ -79,7 +84,7 @@ class ClipEmbedder:
             raise InputError("--template", given, "a phrase that holds {}", remedy)
         self.files = model if isinstance(model, ClipFiles) else find_clip(model)
         self.templates, self._batch, self._threads = tuple(templates), batch, threads
-        self.name = f"clip-{self.files.digest()}"
+        self.name = clip_name(self.files)
         self._store = None if store is None else EmbeddingStore(Path(store), self.name)
 
     @functools.cached_property

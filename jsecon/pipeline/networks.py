@@ -3,7 +3,6 @@
 Networks are opened when first needed and closed when their stage is done: their memory would stay otherwise.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -12,6 +11,7 @@ import numpy as np
 
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
+from jsecon.pipeline.sources import sources_of
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Networks
 from jsecon.vision.stores import StoredSegmenter
@@ -118,9 +118,20 @@ def embedder_named(
 def embedder_of_field(
     field: LanguageField, folder: Path | None = None, *, templates: Sequence[str] = ("{}",)
 ) -> Embedder:
-    """The embedder that a field's regions live with: from `folder`, else from the folder that its run used, if that is
-    still there. Raises InputError where it cannot be had."""
+    """The embedder that a field's regions live with: from `folder`, else from where the run had it, if the same model
+    is still there (`sources_of`). Raises InputError where it cannot be had."""
     if folder is None:
-        used = json.loads(field.provenance or "{}").get("options", {}).get("embedder")
-        folder = Path(used) if used is not None and Path(used).is_dir() else None
+        sources = sources_of(field)
+        folder = sources.model if sources.model is not None and _holds(sources.model, sources.embedder) else None
     return embedder_named(field.embedder, folder=folder, templates=templates)
+
+
+def _holds(folder: Path, name: str | None) -> bool:
+    """Whether a folder holds the CLIP model of this name, which follows from the content of its files."""
+    from jsecon.networks.clip import clip_name
+    from jsecon.networks.clip_folder import find_clip
+
+    try:
+        return clip_name(find_clip(folder)) == name
+    except InputError:  # another thing lies there now: the model is as good as gone
+        return False

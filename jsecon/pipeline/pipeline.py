@@ -43,6 +43,7 @@ from jsecon.pipeline.options import Options, require_inputs, require_writable
 from jsecon.pipeline.processes import First
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
+from jsecon.pipeline.sources import folders_told
 from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Stage, Work
 from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
@@ -205,7 +206,9 @@ def run(
     with listener.progress("field"):
         from jsecon.language.field import save_field
 
-        field = field_of(done.results, work.networks.embedder, _provenance(options, done.keys))
+        field = field_of(
+            done.results, work.networks.embedder, _provenance(options, done.keys, work.networks.embedder.name, out)
+        )
         save_field(out / FIELD_FILE, field)
     done.seconds["field"] = time.monotonic() - started
     listener.done("field", done.seconds["field"], True)
@@ -252,7 +255,9 @@ def _left(stage: Stage, stages: list[Stage], place: dict[str, Path]) -> bool:
     return all(place[other.name].exists() for other in stages if stage.name in other.after)
 
 
-def _provenance(options: Options, keys: dict[str, str]) -> str:
+def _provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
+    """JSON of where a field comes from: `jsecon.pipeline.sources` reads "embedder" and "folders"."""
     chosen = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     chosen = {name: str(value) if isinstance(value, Path) else value for name, value in chosen.items()}
-    return json.dumps({"jsecon": jsecon.__version__, "options": chosen, "keys": keys}, sort_keys=True)
+    told = {"jsecon": jsecon.__version__, "options": chosen, "keys": keys, "embedder": embedder}
+    return json.dumps(told | {"folders": folders_told(options, out)}, sort_keys=True)

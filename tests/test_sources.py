@@ -1,0 +1,72 @@
+"""Where a field says that its model and its capture are: hints of a stranger, which open nothing of themselves."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from small_field import make_field
+
+from jsecon.app.command_line import main
+from jsecon.errors import InputError
+from jsecon.language.field import load_field, save_field
+from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.sources import folders_told, sources_of
+from jsecon.vision.colours import ColourEmbedder
+
+CLIP = "clip-0123456789abcdef"
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    return make_field(scene, cameras)[0]
+
+
+def told(field, **given):
+    return dataclasses.replace(field, provenance=json.dumps(given))
+
+
+def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, tmp_path):
+    out, model = tmp_path / "runs" / "a", tmp_path / "models" / "clip"
+    for folder in (out, model, tmp_path / "capture"):
+        folder.mkdir(parents=True)
+    hints = folders_told(Options(tmp_path / "capture", embedder=model), out)
+    assert hints == {"capture": "../../capture", "embedder": "../../models/clip"}
+    own = told(field, folders=hints, embedder=CLIP)
+    save_field(out / "field.npz", own)
+    for found in (sources_of(load_field(out / "field.npz")), sources_of(own, out)):
+        assert found == (CLIP, model, tmp_path / "capture")
+    assert sources_of(own) == (CLIP, None, None)  # of a field that no file was read of
+
+
+@pytest.mark.parametrize(
+    "hint", ["/etc", "//host/share", "C:\\models", "C:models", "\\\\host\\share", "a\0b", "x" * 9000]
+)
+def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path, hint):
+    own = told(field, folders={"capture": hint, "embedder": hint}, embedder=CLIP, options={"embedder": hint})
+    assert sources_of(own, tmp_path) == (CLIP, None, None)
+
+
+def test_a_model_of_another_name_is_not_opened(field, tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "visual.onnx").write_bytes(b"no graph")
+    own = dataclasses.replace(told(field, folders={"embedder": "model"}, embedder=CLIP), embedder=CLIP)
+    save_field(tmp_path / "field.npz", own)
+    with pytest.raises(InputError, match="--embedder DIR"):
+        embedder_of_field(load_field(tmp_path / "field.npz"))
+
+
+@pytest.mark.parametrize(
+    "provenance",
+    ["[]", '{"options": []}', '{"folders": 3}', '{"folders": {"embedder": 7}}', '{"embedder": {}}', "{", "[" * 5000],
+)
+def test_a_malformed_provenance_is_refused_in_words(field, tmp_path, provenance, capsys):
+    own = dataclasses.replace(field, provenance=provenance, embedder=ColourEmbedder().name)
+    with pytest.raises(InputError, match="provenance is not what jsecon run writes"):
+        embedder_of_field(own)
+    if provenance.startswith('{"'):  # others load_field refuses
+        save_field(tmp_path / "field.npz", own)
+        assert main(["query", str(tmp_path / "field.npz"), "red", "--out", str(tmp_path / "a")]) == 2
+        assert "provenance" in capsys.readouterr().err
+        assert not np.any([file.name.startswith("red") for file in (tmp_path / "a").iterdir()])
