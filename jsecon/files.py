@@ -31,6 +31,8 @@ UNREADABLE = (
 """what reading a damaged .npz, and `unpacked` of a damaged description, raise"""
 ALIGNED = 64
 """bytes: the columns of a .npz that is to be mapped begin at a multiple of them, as jax wants its arrays"""
+LONGEST_NAME = 80
+"""characters of a name that a message quotes"""
 _PADDING = 0xD935
 """the zip extra field that Android's zipalign fills up with"""
 _WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
@@ -90,6 +92,15 @@ def alone(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def path_within(folder: Path, name: str) -> Path:
+    """The path of what a file names beneath a folder. Raises InputError for a name that leads out of the folder."""
+    first = Path(os.path.normpath(name)).parts[:1]
+    if "\0" in name or os.path.splitdrive(name)[0] or os.path.isabs(name) or first == ("..",):
+        found = f"the name {name[:LONGEST_NAME]!r} leads out of the folder"
+        raise InputError(folder, found, remedy="Rename it: names must lie beneath the folder.")
+    return folder / name
 
 
 def made_by_jsecon(folder: Path) -> bool:

@@ -26,7 +26,7 @@ from jsecon.data.frames import Posed, Shot
 from jsecon.data.images import existing_image, write_image
 from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
-from jsecon.files import written_whole
+from jsecon.files import path_within, written_whole
 from jsecon.splat.transform import quaternion_of
 from jsecon.types import Capture
 
@@ -95,6 +95,8 @@ def read_colmap(path: Path, models: Sequence[Path]) -> Posed:
 
 def _image_files(path: Path, names: Sequence[str]) -> dict[str, Path]:
     """The image files of a model by name: all from images/, or else all from the capture's own folder or input/."""
+    for name in names:
+        path_within(path / "images", name)  # a name from a file is no path to elsewhere
     found: dict[str, Path] = {}
     for folder in (path / "images", path, path / "input"):
         files = {name: file for name in names if (file := existing_image(folder, name)) is not None}
@@ -116,8 +118,9 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
     intrinsics = np.stack([cameras.fx, cameras.fy, cameras.cx, cameras.cy], axis=-1).astype(np.float64)
     distinct, which = np.unique(intrinsics, axis=0, return_inverse=True)
     files = [f"{name}.{image_format.lstrip('.')}" for name in capture.names]
-    for file, frame in zip(files, np.asarray(capture.frames)):
-        write_image(path / "images" / file, frame)
+    places = [path_within(path / "images", file) for file in files]
+    for place, frame in zip(places, np.asarray(capture.frames)):
+        write_image(place, frame)
     camera_bytes = [struct.pack("<Q", len(distinct))]
     camera_bytes += [
         struct.pack("<iiQQ4d", n, MODELS["PINHOLE"][0], cameras.width, cameras.height, *row)

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Real
 
 from jsecon.data.images import MOST_PIXELS
 from jsecon.errors import InputError, require
-from jsecon.files import read_json, write_text
+from jsecon.files import path_within, read_json, write_text
 
 _REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels have it)."
 
@@ -123,7 +123,7 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
                 rest = {"bbox": box.tolist(), "iscrowd": 0, "note": ""}
                 objects.append({"category": category, "group": group} | shape | rest)
         info = {"name": frame.name + image_ending, "width": frame.width, "height": frame.height, "depth": 3, "note": ""}
-        write_text(Path(folder) / f"{frame.name}.json", json.dumps({"info": info, "objects": objects}))
+        write_text(path_within(Path(folder), f"{frame.name}.json"), json.dumps({"info": info, "objects": objects}))
 
 
 def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:

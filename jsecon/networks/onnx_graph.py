@@ -175,7 +175,7 @@ def graph_files(path: str | os.PathLike) -> tuple[Path, ...]:
     _check_bytes(path)
     content = path.read_bytes()
     beside = (file for file in sorted(path.parent.rglob("*")) if file.is_file() and file.suffix != ".onnx")
-    return path, *(file for file in beside if file.relative_to(path.parent).as_posix().encode() in content)
+    return path, *(file for file in beside if os.fsencode(file.relative_to(path.parent).as_posix()) in content)
 
 
 def content_digest(files: Iterable[str | os.PathLike], *, extra: str = "") -> str:
