@@ -71,8 +71,8 @@ def _part(told: Any, name: str, kind: type) -> Any:
 
 
 def _folder(beside: Path | None, hint: str | None) -> Path | None:
-    """A folder from its hint; None where the hint is missing or absolute, or leads to no folder."""
+    """A folder, or a video, from its hint; None where the hint is missing or absolute, or leads nowhere."""
     if beside is None or not hint or PurePosixPath(hint).is_absolute() or PureWindowsPath(hint).anchor:
         return None
     folder = os.path.normpath(os.path.join(beside, hint))
-    return Path(folder) if os.path.isdir(folder) else None
+    return Path(folder) if os.path.exists(folder) else None
