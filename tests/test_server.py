@@ -251,8 +251,8 @@ def test_its_address_is_told_and_a_port_in_use_is_refused(scenes, tmp_path):
     assert port > 0
     assert [scene["name"] for scene in told["fields"]] == [tmp_path.name]
     if has_ipv6():
-        told, _ = ready([tmp_path / "field.npz"], port=0, **given | {"host": "::1"})
-        assert told["address"].startswith("http://[::1]:")
+        six, _run = ready([tmp_path / "field.npz"], port=0, **given | {"host": "::1"})
+        assert six["address"].startswith("http://[::1]:")
     with pytest.raises(InputError, match="in use"):
         ready([tmp_path / "field.npz"], port=port, **given)
 

@@ -66,7 +66,7 @@ def listen(host: str, port: int) -> socket.socket:
     except (OSError, OverflowError, ValueError) as error:
         reason = why(error) if isinstance(error, OSError) else "it is not an address"
         remedy = "Take another --port, or 0 to have one chosen. --host must be an address of this machine."
-        raise InputError("", f"cannot listen on --host {host} --port {port}: {reason}", remedy=remedy) from error
+        raise InputError("--port", f"cannot listen on {bracketed(host)}:{port} ({reason})", remedy=remedy) from error
 
 
 def bracketed(host: str) -> str:

@@ -32,6 +32,8 @@ _MOST_BYTES = 80
 """of a slug: a file's name may have 255 bytes, two slugs and their hashes among them"""
 _DEVICES = frozenset(("con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))))
 """names that Windows keeps for devices, whatever their ending"""
+_POINTED = re.compile(r"(at|box|region) .*\d", re.DOTALL)
+"""questions without a text: a pixel, a box, a region"""
 
 
 def selected(gaussians: Gaussians, mask: np.ndarray) -> Gaussians:
@@ -153,12 +155,11 @@ def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool
 
 def stem_of(answer: Answer) -> str:
     """The name of an answer's files without their endings: the same in every run, and no other question's."""
-    question = answer.question
-    if answer.key is not None:
-        return _hashed(_slug(question), answer.key)
-    plain = _slug(question)
-    ordinary = plain.replace("-", " ") == question and len(plain.encode()) <= _MOST_BYTES
-    return plain if ordinary and plain not in _DEVICES else _hashed(plain, question)
+    question, plain = answer.question, _slug(answer.question)
+    pointed = _POINTED.fullmatch(question) is not None
+    own = answer.key == question if pointed else answer.key is None  # a text may be called like a pixel
+    ordinary = plain.replace("-", " ") == question and len(plain.encode()) <= _MOST_BYTES and plain not in _DEVICES
+    return plain if own and ordinary else _hashed(plain, question if answer.key is None else answer.key + "\0")
 
 
 def _frame_stem(field: LanguageField, frame: int) -> str:

@@ -123,5 +123,5 @@ def parts_of_question(question: str) -> tuple[list[str], list[str]]:
     wanted, refused = ([part.strip().strip(_QUOTES).strip() for part in side] for side in parts)
     if not all(wanted + refused) or re.match(r"but not\b", question, re.IGNORECASE):
         remedy = 'For example: "red mug" or "bowl" but not "handle"'
-        raise InputError(f"query {question!r}", 'a part beside "or" or "but not" has no words', remedy=remedy)
+        raise InputError(f"query {question!r}", "a part without words", 'texts joined by "or" and "but not"', remedy)
     return wanted, refused
