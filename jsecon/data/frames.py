@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.data.images import TRANSPOSED, image_header, read_depth, read_image, turned
+from jsecon.data.images import TRANSPOSED, ImageHeader, image_header, read_depth, read_image, turned
 from jsecon.data.lens import Lens, distort, seen_through, undistorted, undistortion_maps
 from jsecon.data.poses import camera_jumps, rigid
 from jsecon.data.worlds import moved_poses, ordinary_world
@@ -121,29 +121,25 @@ def _without_ending(path: PurePosixPath) -> PurePosixPath:
     return path if path.suffix[1:].isdecimal() else path.with_suffix("")
 
 
-def _as_read(
-    shots: Sequence[Shot], points: np.ndarray | None = None, colours: np.ndarray | None = None
-) -> tuple[list[Lens], list[int], list[str]]:
+def _as_read(shots: Sequence[Shot], posed: Posed | None = None) -> tuple[list[Lens], list[int], list[str]]:
     """How each shot's image is read: the lens at the size that it really has (a folder of smaller images is common),
     the EXIF orientation that is applied to its pixels, 1 where they are taken as stored; and notes.
 
     A camera model belongs to the stored pixels or to the upright image: COLMAP ignores EXIF, other programs apply it.
     Where only one of the two has the model's aspect, it is that one. Where both have it (a square, or a turn by 180
-    degrees), the other images decide, else the colours of the sparse points, else EXIF is applied.
+    degrees), the other images of the capture `posed` decide, else the colours of its sparse points, else EXIF is
+    applied.
     """
     headers = [image_header(shot.image) for shot in shots]
-    tagged = [n for n, header in enumerate(headers) if header.orientation != 1]
-    as_stored = {n for n in tagged if _fits(shots[n].lens, *headers[n].stored)}
-    as_upright = {n for n in tagged if _fits(shots[n].lens, *headers[n].upright)}
-    kept, unsure = as_stored - as_upright, sorted(as_stored & as_upright)
-    undecided = [shots[n] for n in unsure] if not as_upright - as_stored else []
-    if undecided and (kept or (points is not None and _stored_explains(undecided, points, colours))):
-        kept |= set(unsure)
+    kept = {n for n, header in enumerate(headers) if _belongs(shots[n].lens, header) == "stored"}
+    unsure = {n for n, header in enumerate(headers) if _belongs(shots[n].lens, header) == "either"}
+    if unsure and posed is not None and _exif_ignored(posed):
+        kept |= unsure
     notes = []
     if kept:
         told = f"{len(kept)} images have an EXIF orientation that their camera models leave out"
         notes.append(f"{told} (the first: {shots[min(kept)].name}); they are taken as they are stored.")
-    if applied := [n for n in tagged if n not in kept]:
+    if applied := [n for n, header in enumerate(headers) if header.orientation != 1 and n not in kept]:
         first = f"the first: {shots[applied[0]].name}"
         notes.append(f"{len(applied)} images were turned upright, as their EXIF orientation says ({first}).")
     lenses = [
@@ -153,15 +149,34 @@ def _as_read(
     return lenses, [1 if n in kept else header.orientation for n, header in enumerate(headers)], notes
 
 
+def _belongs(lens: Lens, header: ImageHeader) -> str:
+    """Which pixels of an image that EXIF turns have the aspect of a camera model: "stored", "upright", "either"; empty
+    where it turns none, or neither fits."""
+    if header.orientation == 1:
+        return ""
+    stored, upright = _fits(lens, *header.stored), _fits(lens, *header.upright)
+    return {(True, True): "either", (True, False): "stored", (False, True): "upright"}.get((stored, upright), "")
+
+
+def _exif_ignored(posed: Posed) -> bool:
+    """Whether the poses of a capture belong to stored pixels, by its images whose aspect tells, else by the colours of
+    its points."""
+    belongs = [_belongs(shot.lens, image_header(shot.image)) for shot in posed.shots]
+    if "upright" in belongs or "stored" in belongs:
+        return "upright" not in belongs
+    either = [shot for shot, pixels in zip(posed.shots, belongs) if pixels == "either"]
+    return _stored_explains(either, posed.points, posed.colours)
+
+
 def _fits(lens: Lens, width: int, height: int) -> bool:
     """Whether an image of this size has the lens's aspect, to a pixel of the coarser of the two."""
     return min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) <= 1
 
 
-def _stored_explains(shots: Sequence[Shot], points: np.ndarray, colours: np.ndarray | None) -> bool:
+def _stored_explains(shots: Sequence[Shot], points: np.ndarray, colours: np.ndarray) -> bool:
     """Whether the colours of the sparse points agree better with the stored pixels than with the upright images, in
     most of EXIF_LOOKS shots; False where there are no colours to compare."""
-    if colours is None or not len(colours) or (colours == colours[0]).all():
+    if not len(colours) or (colours == colours[0]).all():
         return False
     better = 0
     for shot in shots[:: -(-len(shots) // EXIF_LOOKS)]:
@@ -303,7 +318,7 @@ def assemble(
         notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
     shots, poses, names = [shots[i] for i in chosen], poses[chosen], tuple(names[i] for i in chosen)
 
-    lenses, orientations, told = _as_read(shots, posed.points, posed.colours)
+    lenses, orientations, told = _as_read(shots, posed)
     notes += told
     rescaled = sum(
         (lens.width, lens.height) != (shot.lens.width, shot.lens.height) for lens, shot in zip(lenses, shots)
