@@ -55,9 +55,9 @@ def load_compressed_ply(path: Path) -> Gaussians:
 
     def between(kinds: str | tuple[str, ...], share: np.ndarray) -> np.ndarray:
         """(N, 3) numbers that lie at a share of the way between the bounds of their chunks."""
-        low, high = (np.stack([chunks[f"{end}_{kind}"] for kind in kinds], axis=1) for end in ("min", "max"))
-        low, high = (np.repeat(a.astype(np.float64), _CHUNK, axis=0)[:count] for a in (low, high))
-        with np.errstate(invalid="ignore", over="ignore"):  # refused below
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused below
+            low, high = (np.stack([chunks[f"{end}_{kind}"] for kind in kinds], axis=1) for end in ("min", "max"))
+            low, high = (np.repeat(a.astype(np.float64), _CHUNK, axis=0)[:count] for a in (low, high))
             return low * (1 - share) + high * share
 
     rgba = _shares(colour, (24, 8), (16, 8), (8, 8), (0, 8))
