@@ -17,6 +17,7 @@ from jsecon.files import write_text
 from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.stages import WARNING
+from jsecon.process import peak_memory_mib
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
 
 KINDS: dict[str, dict[str, Any]] = {
