@@ -437,7 +437,7 @@ def _read_id_array(path: Path) -> np.ndarray:
     try:
         image = map_array(path)
     except UNREADABLE as error:
-        raise InputError(path, f"there is no whole array ({why(error)})", expected, "Write the mask again.") from error
+        raise InputError(path, f"the array cannot be read: {why(error)}", expected, "Write the mask again.") from error
     image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
     if image.ndim == 3:
         remedy = "Give such stacks with --proposals, or write one image of ids for each frame."

@@ -201,7 +201,7 @@ def _unmatched(folder, names, endings, count, others, known, numbered) -> InputE
             return InputError(path, f"masks are not read from {ending} files", "a PNG or .npy", "Save it as one.")
     numbers = f"; or a PNG for each number from 0 to {len(names) - 1}" if numbered else ""
     wanted = f"{' or '.join(names[0] + ending for ending in endings)} and so on{numbers}"
-    problem = f"it holds {count} masks, none of which is called like a frame"
+    problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"
     return InputError(folder, problem, wanted, "Name each mask like its frame.")
 
 
