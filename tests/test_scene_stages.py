@@ -118,12 +118,10 @@ def nerfstudio_world(capture):
     return world
 
 
-@pytest.mark.parametrize("holdout", [0, 4])
-def test_a_wrong_world_is_told(tmp_path, near, holdout):
-    capture = photographed(near)
-    held_out = np.arange(8) % holdout == 0 if holdout else np.zeros(8, bool)
+def test_a_wrong_world_is_told(tmp_path, near):
+    """Also where no frame is held out."""
     save_gaussians(tmp_path / "scene.ply", transform_gaussians(near, TRAINED))
-    found, _ = read(dataclasses.replace(capture, held_out=held_out), tmp_path / "scene.ply")
+    found, _ = read(photographed(near), tmp_path / "scene.ply")
     assert found.notes[0].startswith("WARNING: The Gaussians of scene.ply do not look like the frames")
 
 

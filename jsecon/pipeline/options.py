@@ -58,9 +58,10 @@ class Options(SceneOptions):
     """All that the result of a run depends on, but for the files themselves."""
 
     gaussians: Annotated[Path | None, {"metavar": "FILE"}] = None
-    """a scene of 3D Gaussians in the capture's world: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's
-    compressed one), .glb, .spz, .splat, with the extra formats .sog; or nerfstudio's beside its
-    dataparser_transforms.json; without it, Gaussians are fitted to the frames"""
+    """a scene of 3D Gaussians: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's compressed one), .glb, .spz,
+    .splat, with the extra formats .sog; in the world of the capture's files, of its poses, of a
+    dataparser_transforms.json beside it, or in that which gsplat or nerfstudio normalise to: a few frames are rendered
+    to tell which, and a warning says where none shows them; without it, Gaussians are fitted to the frames"""
     masks: Folder = None
     """instance masks: one integer PNG or .npy per frame under the frame's name (0 = none), in folders like the images'
     where those have some; <object>/<frame>.png in black and white; or LangSplat's _s.npy; without it, masks are found
