@@ -18,6 +18,7 @@ from jsecon.pipeline import pipeline
 from jsecon.pipeline.arguments import parsed
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console, Listener
+from jsecon.process import peak_memory_mib
 from jsecon.splat.transform import transform_gaussians
 
 

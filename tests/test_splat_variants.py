@@ -42,6 +42,7 @@ def test_a_spz_places_gaussians_within_half_a_step_at_any_magnitude(tmp_path, re
     rng = np.random.default_rng(0)
     given["means"] = rng.uniform(-reach, reach, (60, 3)) * 10 ** rng.uniform(-3, 0, (60, 1))
     given["means"][:3] = np.diag([reach, -reach, reach])
+    given["log_scales"] = np.full((60, 3), np.clip(np.log(reach / 50), -9, 5.5))  # as large as its scene asks
     written = gaussians(given)
     jsecon.save_gaussians(tmp_path / "a.spz", written)
     found = jsecon.load_gaussians(tmp_path / "a.spz")
