@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from jsecon.process import prepare_process
+from jsecon.process import peak_memory_mib, prepare_process
 
 KEPT = "load", "gaussians"
 """stages of the cold run that the warm one finds in the cache"""

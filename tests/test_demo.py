@@ -13,6 +13,7 @@ from jsecon.app import demo, film as film_of, pictures
 from jsecon.data.ply import load_ply
 from jsecon.language.field import load_field
 from jsecon.pipeline.progress import Listener
+from jsecon.process import peak_memory_mib
 
 ROOM = {"views": 8, "width": 160, "height": 120, "points": 1200, "holdout": 4}
 

@@ -451,6 +451,7 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import Stage
 from jsecon.language.field import load_field
 from jsecon.vision.colours import ColourEmbedder
+from jsecon.process import peak_memory_mib
 
 home, ran = Path(jsecon.__file__).parent, {}
 digested, on_the_way, seen = [], [], set()

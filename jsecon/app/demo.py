@@ -23,6 +23,7 @@ from jsecon.pipeline import networks, pipeline
 from jsecon.pipeline.options import Options, require_writable
 from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
+from jsecon.process import peak_memory_mib
 from jsecon.types import LanguageField
 
 HOLDOUT = 5
