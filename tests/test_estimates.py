@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import cv2
 import numpy as np
@@ -68,7 +69,7 @@ def test_bad_options_are_refused_as_in_a_run(room, tmp_path, capsys):
 def test_the_extent_is_that_of_the_loaded_capture(room, given):
     capture, extent = load_capture(room, **given), capture_extent(room, **given)
     size = capture.cameras.width, capture.cameras.height
-    assert extent == Extent(len(capture.names), size, (160, 120), len(capture.points))
+    assert extent == Extent(len(capture.names), size, (160, 120), len(capture.points), capture.names, capture.files)
 
 
 def test_photographs_without_poses_have_an_extent_too(room, tmp_path, capsys):
@@ -112,3 +113,68 @@ def test_a_variant_that_costs_otherwise_has_no_figure(room):
     }.items():
         assert estimates._cost(name, Options(room)) is not None
         assert estimates._cost(name, Options(room, **changed)) is None
+
+
+def _wrong_masks(room, folder):
+    (folder / "wrong").mkdir()
+    cv2.imwrite(str(folder / "wrong" / "of_no_frame.png"), np.ones((120, 160), np.uint8))
+    return ["--masks", folder / "wrong"]
+
+
+def _narrow_masks(room, folder):
+    shutil.copytree(room / "masks", folder / "narrow")
+    for path in (folder / "narrow").iterdir():
+        cv2.imwrite(str(path), np.ones((100, 100), np.uint8))
+    return ["--masks", folder / "narrow"]
+
+
+def _broken_pose(room, folder):
+    images = folder / "capture" / "sparse" / "0" / "images.bin"
+    data = bytearray(images.read_bytes())
+    data[12:20] = np.array(np.nan).tobytes()
+    images.write_bytes(data)
+    return []
+
+
+WRONG = {
+    "the masks are of no frame": (_wrong_masks, "wrong"),
+    "the masks have another aspect": (_narrow_masks, "100x100"),
+    "proposals of no frame": (lambda room, folder: ["--proposals", _wrong_masks(room, folder)[1]], "wrong"),
+    "features of no frame": (lambda room, folder: ["--features", folder / "capture" / "images"], "_f.npy"),
+    "no model in the folder": (lambda room, folder: ["--embedder", folder / "capture" / "images"], "images"),
+    "Gaussians of no known form": (lambda room, folder: ["--gaussians", room / "sparse/0/cameras.bin"], "cameras.bin"),
+    "a pose that is none": (_broken_pose, "images.bin"),
+    "too few frames": (lambda room, folder: ["--frames", 2, "--holdout", 2], "1 of 2 frames"),
+    "a file where the output should be": (lambda room, folder: ["--out", room / "sparse/0/cameras.bin/f"], "is a file"),
+    "the output is an input": (lambda room, folder: ["--out", folder / "capture/images"], "own folder"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_dry_run_refuses_what_a_run_would_refuse_at_once(room, tmp_path, capsys, kind):
+    make, says = WRONG[kind]
+    shutil.copytree(room, tmp_path / "capture")
+    options = make(room, tmp_path)
+    line = ["run", tmp_path / "capture", "--out", tmp_path / "out", *options]
+    assert command_line.main([*map(str, line), "--dry-run"]) == 2
+    told = capsys.readouterr().err
+    assert says in told
+    assert "Traceback" not in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_on_photographs_needs_what_finds_their_poses(room, tmp_path, capsys, monkeypatch):
+    shutil.copytree(room / "images", tmp_path / "photos")
+    line = ["run", tmp_path / "photos", "--out", tmp_path / "out"]
+    _dry(capsys, *line, "--masks", room / "masks")
+    assert (
+        command_line.main([*map(str, line), "--dry-run", *_wrong_masks(room, tmp_path)[:1], str(tmp_path / "wrong")])
+        == 2
+    )
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert command_line.main([*map(str, line), "--dry-run"]) == 2
+    assert "jsecon[sfm]" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "photos")
+    (tmp_path / "photos").mkdir()
+    assert command_line.main([*map(str, line), "--dry-run"]) == 2
+    assert "empty folder" in capsys.readouterr().err

@@ -256,14 +256,39 @@ class Extent(NamedTuple):
     source: tuple[int, int]
     """of most of the images"""
     points: int
+    names: tuple[str, ...] = ()
+    """of the frames, where they are known."""
+    files: tuple[ImageFile, ...] = ()
+    """the frames' images."""
 
 
 def extent_of(posed: Posed, downscale: float | int | None, long_side: int | None, frames: int | None) -> Extent:
-    """What `assemble` would make of it; of the images, only the headers are read."""
-    source = _commonest(_as_read(posed.shots)[0])
-    return Extent(
-        len(spread(len(posed.shots), frames)), shrunk(source, downscale, long_side), source, len(posed.points)
+    """What `assemble` would make of it; of the images, only the headers are read.
+
+    Raises InputError where `assemble` would, but for what only the images' pixels tell.
+    """
+    shots, _, names = _in_order(posed)
+    chosen = spread(len(shots), frames)
+    shots = [shots[i] for i in chosen]
+    lenses, orientations, _ = _as_read(shots)
+    for lens in set(lenses):
+        undistorted(lens, posed.where)
+    source = _commonest(lenses)
+    files = tuple(
+        ImageFile(shot.name, lens.width, lens.height, orientation)
+        for shot, lens, orientation in zip(shots, lenses, orientations)
     )
+    size = shrunk(source, downscale, long_side)
+    return Extent(len(shots), size, source, len(posed.points), tuple(names[i] for i in chosen), files)
+
+
+def _in_order(posed: Posed) -> tuple[list[Shot], np.ndarray, tuple[str, ...]]:
+    """The shots in name order, their poses (t, 4, 4) made exactly rigid, and the frames' names."""
+    if not posed.shots:
+        raise InputError(posed.where, "no frame", "at least one posed image", "Estimate the poses again.")
+    shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
+    poses = np.stack([rigid(shot.world_to_camera, posed.where, shot.name) for shot in shots])
+    return shots, poses, frame_names([shot.name for shot in shots], posed.where)
 
 
 def _commonest(lenses: Sequence[Lens]) -> tuple[int, int]:
@@ -298,11 +323,7 @@ def assemble(
     """
     check_options(downscale, frames, holdout, long_side)
     where = posed.where
-    if not posed.shots:
-        raise InputError(where, "no frame", "at least one posed image", "Estimate the poses again.")
-    shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
-    poses = np.stack([rigid(shot.world_to_camera, where, shot.name) for shot in shots])
-    names = frame_names([shot.name for shot in shots], where)
+    shots, poses, names = _in_order(posed)
     world, changed = ordinary_world(poses, posed.points, _some_depths(posed, shots))  # of all, whatever is taken
     poses, from_world = moved_poses(poses, world), np.linalg.inv(world)
     if only is not None:

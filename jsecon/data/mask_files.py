@@ -112,6 +112,21 @@ def load_labels(
     return MasksFromDisk(labels, reader.named(ids), (*reader.notes(not shared), *found.notes))
 
 
+def check_labels(
+    folder: str | Path,
+    names: Sequence[str],
+    size: tuple[int, int],
+    *,
+    level: str | int = "l",
+    order: Sequence[str] | None = None,
+    files: Mapping[str, ImageFile] | None = None,
+) -> None:
+    """Raises InputError where `load_labels` would, as far as the names of the masks and the first of them tell."""
+    found = _masks_of(Path(folder), names, order, files)
+    first = next(name for name in names if found.path(name) is not None)
+    load_labels(folder, [first], size, level=level, order=order, files=files)
+
+
 def _masks_of(
     folder: Path, names: Sequence[str], order: Sequence[str] | None, files: Mapping[str, ImageFile] | None
 ) -> Masks:

@@ -16,16 +16,18 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from jsecon.data.capture import capture_extent
-from jsecon.data.frames import Extent, shrunk
+from jsecon.data.frames import Extent, frame_names, shrunk, spread
 from jsecon.data.images import image_size
-from jsecon.data.motion import photographs
+from jsecon.data.motion import check_photographs, photographs
 from jsecon.data.video import VIDEO_FRAMES, is_video, size_of
 from jsecon.fit.schedule import gaussians_for
 from jsecon.pipeline import cache
+from jsecon.pipeline.checks import check_inputs
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.scene_stages import refinement
 from jsecon.pipeline.stages import Work
+from jsecon.types import ImageFile
 
 REFERENCE = 0.06
 """seconds of `workload` on the machine that it was MEASURED on (two cores of an AMD EPYC)"""
@@ -107,9 +109,11 @@ def workload() -> float:
 
 
 def estimates(work: Work, steps: Sequence[Step], place: Mapping[str, Path], slower: float) -> list[Estimate]:
-    """Of each stage; `slower`: how many times this machine takes the time of the one that measured."""
+    """Of each stage; `slower`: how many times this machine takes the time of the one that measured. Raises InputError
+    where a run would for its inputs (`check_inputs`)."""
     options, running = work.options, {step.name for step in steps if step.status == "run"}
     extent, gaussians = _extent(work, running, place), None
+    check_inputs(work, running, extent)
     if "gaussians" not in running:
         gaussians = cache.load(place["gaussians"]).value.count
     elif options.gaussians is not None:
@@ -174,7 +178,7 @@ def _extent(work: Work, running: set[str], place: Mapping[str, Path]) -> Extent:
     if "load" not in running:
         capture = cache.load(place["load"]).value
         size = capture.cameras.width, capture.cameras.height
-        return Extent(len(capture.names), size, size, len(capture.points))
+        return Extent(len(capture.names), size, size, len(capture.points), capture.names, capture.files)
     if "poses" not in place:
         return capture_extent(options.capture, **given)
     if "poses" not in running:
@@ -183,7 +187,14 @@ def _extent(work: Work, running: set[str], place: Mapping[str, Path]) -> Extent:
         count, source = options.frames or VIDEO_FRAMES, size_of(options.capture)
     else:
         photos = photographs(options.capture)
-        count, source = min(len(photos), options.frames or len(photos)), image_size(photos[0])
+        paths = check_photographs(photos, options.capture)
+        chosen = spread(len(photos), options.frames)
+        sizes = [image_size(photo) for photo in photos]
+        count, source = len(chosen), max(set(sizes), key=sizes.count)
+        files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
+        names = frame_names(paths, options.capture)
+        size = shrunk(source, options.downscale, options.long_side)
+        return Extent(count, size, source, 0, tuple(names[i] for i in chosen), files)
     return Extent(count, shrunk(source, options.downscale, options.long_side), source, 0)
 
 

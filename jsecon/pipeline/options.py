@@ -134,6 +134,19 @@ def require_inputs(options: Options) -> None:
         raise InputError("--centre", str(options.centre), "0 to 1", "Use 1 for the pixel of the centre alone.")
 
 
+def require_own_folder(options: Options | SceneOptions, out: Path) -> None:
+    """Raises InputError where the output folder is one of the input folders, or a folder of the capture's own files."""
+    capture = options.capture
+    inputs = {"capture": [capture, *(capture / name for name in ("images", "sparse", "sparse/0", "keyframes"))]}
+    inputs |= {argument.name: [getattr(options, argument.name, None)] for argument in arguments_of(Options)[1:]}
+    for name, folders in inputs.items():
+        for folder in folders:
+            if isinstance(folder, Path) and folder.is_dir() and folder.resolve() == out.resolve():
+                problem = f"it is the input folder ({name}) and the output folder at once"
+                remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
+                raise InputError(out, problem, "", remedy)
+
+
 def require_writable(folder: Path) -> None:
     """Raises InputError where no file can be made in `folder`; makes the folder itself."""
     try:

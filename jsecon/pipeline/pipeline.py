@@ -39,7 +39,7 @@ from jsecon.files import alone
 from jsecon.pipeline import cache, networks, processes
 from jsecon.pipeline.language_stages import codes, distil, field_of, parts, regions, votes
 from jsecon.pipeline.masklet_stages import masklets
-from jsecon.pipeline.options import Options, require_inputs, require_writable
+from jsecon.pipeline.options import Options, require_inputs, require_own_folder, require_writable
 from jsecon.pipeline.processes import First
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
@@ -110,10 +110,8 @@ class _Plan:
 def _planned(work: Work, stages: list[Stage], folder: Path) -> _Plan:
     """The stages, and which of them `folder` holds already; writes nothing. Raises InputError for bad options."""
     options, keys, files = work.options, {}, {}
-    if work.out.resolve() == options.capture.resolve():
-        found = "the capture's own folder as the output folder"
-        raise InputError(work.out, found, "a folder of its own", f"For example {work.out / 'field'}, or one elsewhere.")
     require_inputs(options)
+    require_own_folder(options, work.out)
     require_contrib()
     for stage in stages:
         files[stage.name] = stage.files_digest(work)

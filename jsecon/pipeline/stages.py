@@ -152,7 +152,12 @@ class Stage:
 def training_frames(capture: Capture) -> np.ndarray:
     """Indices of the frames that may be fitted to. Raises InputError where there are fewer than two."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    if len(train) < 2:
-        found = f"{len(train)} of {len(capture.names)} frames to work with"
-        raise InputError("frames", found, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
+    require_training(len(train), len(capture.names))
     return train
+
+
+def require_training(count: int, of: int) -> None:
+    """Raises InputError where fewer than two frames may be fitted to."""
+    if count < 2:
+        found = f"{count} of {of} frames to work with"
+        raise InputError("frames", found, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
