@@ -29,6 +29,7 @@ from jsecon.pipeline import cache, networks, pipeline, stages
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.scene_stages import gaussians
 from jsecon.pipeline.stages import Work
+from jsecon.process import peak_memory_mib
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -451,7 +452,6 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import Stage
 from jsecon.language.field import load_field
 from jsecon.vision.colours import ColourEmbedder
-from jsecon.process import peak_memory_mib
 
 home, ran = Path(jsecon.__file__).parent, {}
 digested, on_the_way, seen = [], [], set()
