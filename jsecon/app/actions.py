@@ -5,6 +5,7 @@ it does when that is told.
 """
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -109,18 +110,18 @@ def _check_phrases(asked: Query) -> None:
     if asked.phrases is None:
         for name, given in (("--images", asked.images is not None), ("--looks", asked.looks != Query.looks)):
             if given:
-                raise InputError(name, "no --phrases", "a SAM 3 model folder beside it", "Give --phrases DIR.")
+                found = "no --phrases is given, which it belongs to"
+                raise InputError(name, found, remedy="Give --phrases DIR, a SAM 3 model folder.")
         return
     if not asked.texts:
         remedy = 'For example: jsecon query field.npz "red mug" --phrases sam3 --out answers'
-        raise InputError("--phrases", "no text", "a TEXT, the phrase", remedy)
+        raise InputError("--phrases", "no text is given, which is the phrase", remedy=remedy)
     given = {"by": asked.by != "votes", "all": asked.all, "even": asked.even}
     given |= {"template": asked.template is not None, "embedder": asked.embedder is not None}
     if any(given.values()):
         found = " ".join(f"--{name}" for name, there in given.items() if there)
-        raise InputError(
-            "--phrases", found, "none of them: SAM 3 reads the texts and finds all of a kind", "Leave out."
-        )
+        why_not = f"{found} cannot be combined with it: SAM 3 reads the texts and finds all of a kind"
+        raise InputError("--phrases", why_not, remedy=f"Leave out {found}.")
 
 
 def _phrases(field: Any, asked: Query, console: Console) -> tuple[list[Any], list[InputError]]:
@@ -161,7 +162,7 @@ def _view(asked: View, console: Console) -> Told:
 
         return view(asked, _embedder, console.say)
     if asked.export.suffix != ".html":
-        raise InputError("--export", str(asked.export), "a file that ends in .html", "For example: --export page.html")
+        raise InputError("--export", f"{asked.export} does not end in .html", remedy="For example: --export page.html")
     require_writable(asked.export.parent)
     with console.progress("page"):
         from jsecon.app import asking
@@ -229,10 +230,13 @@ def _embedder(field: Any, asked: Asking) -> Any:
     return networks.embedder_of_field(field, asked.embedder, templates=asked.template or ("{}",))
 
 
+_EXAMPLES = {"--at": "For example: --at frame_00012 310 145", "--box": "For example: --box frame_00012 280 120 340 190"}
+
+
 def _whole(option: str, *texts: str) -> list[int]:
     for text in texts:
-        if not text.isdecimal():
-            raise InputError(option, text, "whole numbers of pixels", "For example: --at frame_00012 310 145")
+        if not re.fullmatch("[0-9]{1,9}", text):
+            raise InputError(option, repr(text), "whole numbers of pixels", _EXAMPLES[option])
     return [int(text) for text in texts]
 
 

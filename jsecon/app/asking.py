@@ -124,9 +124,13 @@ def require_blocks(file: Path, *, by: str, even: bool, outlined: bool) -> None:
     for option, given in needs.items():
         if given:
             size, most = file.stat().st_size / 2**30, memory_budget() / 2**30
-            found = f"{option}, of {size:.3g} GiB of columns where memory has room for {most:.3g}"
-            remedy = f"Leave it out, or have all columns read into memory: {MEMORY}={1.1 * size:.2g}, in GiB."
-            raise InputError(file, found, "a text or --at, by votes or code, which are answered in blocks", remedy)
+            found = (
+                f"the field has {size:.3g} GiB, memory has room for {most:.3g}, and {option} needs all of it at once"
+            )
+            remedy = (
+                f"Ask by a text or --at, by votes or code, or read it into memory: {MEMORY}={1.1 * size:.2g} (GiB)."
+            )
+            raise InputError(file, found, remedy=remedy)
 
 
 class _Asked(NamedTuple):

@@ -33,7 +33,7 @@ def asked_demo(asked: Demo, listener: Listener) -> dict[str, Any]:
     if asked.real is not None:
         return demo_real(asked.real, asked.out, texts=asked.texts or (), **how)
     if asked.texts:
-        raise InputError("--texts", "no --real", "a capture to ask them of", "The room's things are asked by name.")
+        raise InputError("--texts", "no --real is given, the capture to ask them of", remedy="Give --real CAPTURE.")
     return demo(asked.out, **how)
 
 

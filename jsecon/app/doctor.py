@@ -19,6 +19,8 @@ LEAST_FOR_PROGRAMS = 32 << 20
 """bytes of its compiled programs, rounded up"""
 PACKAGES = (
     "numpy",
+    "filelock",
+    "psutil",
     "scipy",
     "sklearn",
     "cv2",
@@ -64,7 +66,7 @@ def checks_of(models: Path | None = None) -> list[Check]:
 def wrong(checks: Iterable[Check]) -> list[InputError]:
     """What every run needs and is not there."""
     broken = [check for check in checks if check.remedy and check.status != "ok"]
-    return [InputError(check.name, check.told, "what every run needs", check.remedy) for check in broken]
+    return [InputError(check.name, check.told, remedy=check.remedy) for check in broken]
 
 
 def _packages() -> Check:

@@ -73,7 +73,7 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     """Where an answer is. Raises InputError where it selected nothing."""
     if not answer.mask.any():
         found = f"nothing selected (score {float(answer.selection.score):.3f})"
-        raise InputError(answer.question, found, "a thing in the scene", "Ask with other words, or by a pixel.")
+        raise InputError(f"query {answer.question!r}", found, remedy="Ask with other words, or by a pixel.")
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # colours have no place
     rows = np.asarray(answer.mask)
     chosen = carried(jax.tree.map(lambda a: np.asarray(a)[rows], plain), field.to_source)

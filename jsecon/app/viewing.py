@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, why
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.retrieval import PIECE_NEARNESS
 
@@ -157,8 +157,8 @@ def state_of(link: str) -> ViewState:
         state = ViewState(**told)
         _require_kinds(state)
     except (ValueError, TypeError, RecursionError) as error:
-        found = f"{link[:60]!r} ({error})"
-        raise InputError("link", found, "a line that a viewer gave", "Copy the whole line.") from error
+        found = f"{link[:60]!r} is not a line that a viewer gave ({why(error)})"
+        raise InputError("link", found, remedy="Copy the whole line.") from error
     return state
 
 

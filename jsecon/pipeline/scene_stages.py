@@ -262,9 +262,7 @@ def _in_the_captures_world(
     figures = f"correlation with the frames {seen.correlation:.2f}, {seen.psnr:.1f} dB"
     notes = [f"The Gaussians were read in the world of {name} ({figures})."]
     if seen.correlation < _ROUGHLY:
-        notes[0] += (
-            " They show the frames only roughly: the scene is crude, or its world or poses are a bit off."
-        )
+        notes[0] += " They show the frames only roughly: the scene is crude, or its world or poses are a bit off."
     if not seen.explained:
         notes[0] = (
             f"{WARNING}The Gaussians of {path.name} do not look like the frames ({figures}). They are probably in "

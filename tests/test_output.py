@@ -1,0 +1,72 @@
+"""Output whose reader goes away, as in `jsecon query ... | head -1`, and texts that are not UTF-8."""
+
+import dataclasses
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from small_field import make_field
+
+from jsecon.__main__ import UNREAD, Output
+from jsecon.app.command_line import main
+from jsecon.app.question import ask_text
+from jsecon.errors import InputError
+from jsecon.language.field import save_field
+from jsecon.vision.colours import ColourEmbedder
+
+
+@pytest.fixture(scope="module")
+def saved(scene, cameras, tmp_path_factory):
+    """A small field whose texts are colours, and its file."""
+    field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
+    field = dataclasses.replace(field, embedder=ColourEmbedder().name)
+    file = tmp_path_factory.mktemp("field") / "field.npz"
+    save_field(file, field)
+    return field, file
+
+
+def closed_pipe() -> io.TextIOWrapper:
+    """A text stream to a pipe that nobody reads."""
+    read, write = os.pipe()
+    os.close(read)
+    return os.fdopen(write, "w", buffering=1)
+
+
+def test_answers_are_written_where_nobody_reads_the_lines(saved, tmp_path, monkeypatch, capsys):
+    with closed_pipe() as stream:
+        output = Output(stream)
+        monkeypatch.setattr(sys, "stdout", output)
+        assert main(["query", str(saved[1]), "red", "green", "--out", str(tmp_path), "--views", "0"]) == 0
+        output.flush()
+    assert output.failure is not None
+    assert output.failure.errno == errno.EPIPE
+    assert {"red.json", "green.json", "answers.html"} <= {file.name for file in tmp_path.iterdir()}
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes of POSIX")
+def test_the_program_ends_quietly_with_the_code_of_a_broken_pipe():
+    with closed_pipe() as stream:
+        command = [sys.executable, "-m", "jsecon", "completion", "bash"]
+        done = subprocess.run(command, stdout=stream, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (UNREAD, "")
+
+
+def test_a_text_that_is_not_utf8_is_refused_in_one_sentence(saved, tmp_path, capsys):
+    field, file = saved
+    text = os.fsdecode(b"caf\xe9 red")
+    asked = ["query", str(file), text, "red", "--out", str(tmp_path), "--views", "0"]
+    assert main([*asked, "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert "is not UTF-8" in told["error"]["message"]
+    assert [answer["query"] for answer in told["answers"]] == ["red"]
+    assert main(asked) == 2
+    line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("jsecon: "))
+    assert line.isascii()
+    for by in ("votes", "one_step"):
+        with pytest.raises(InputError, match="not UTF-8"):
+            ask_text(field, ColourEmbedder(), text, by=by)
