@@ -1,11 +1,11 @@
-"""Both cores: the views, or one view's strips, spread over jax's local devices.
+"""All cores: the views, or one view's strips, spread over jax's local devices.
 
 A CPU is one device to jax unless the program says otherwise before jax starts (`process.prepare_process`); the command
 line does. The library only uses what it finds.
 
-One view over both devices, under jit: `render(..., mesh=host_mesh())`. Many views: `spread_over_devices`, one view a
-device, which shares nothing and so scales better, and over several processes too. What is no program of jax, frame by
-frame: `dealt_out`.
+One view over all devices, under jit: `render(..., mesh=host_mesh())`. Many views: `spread_over_devices`, one view on
+each device, which needs no exchange and so scales better, and over several processes too. Work that is no program of
+jax, frame by frame: `dealt_out`. Each works with any number of devices, and compiles once for all of them.
 """
 
 import io
@@ -117,6 +117,8 @@ def spread_over_devices(
     whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
     # Where half of the cores and more have no lane, XLA cuts the kernels of the others for them.
     run = _advance[width > 1 and jax.local_device_count() < 2 * width]
+    # XLA reads NumPy's memory in place where it is aligned as its own is: all devices share one copy.
+    common = jax.tree.map(lambda a: np.asarray(jax.device_put(a, may_alias=True)), common)
     common = jax.device_put(common, whole)
     merged = jax.device_put(start, may_alias=False)  # joining takes it
     outs: list[Any] = []  # of all views, once a step has told their shape

@@ -4,6 +4,7 @@ With the geometry frozen, rendering is linear in the features (image = W f, W th
 targets take only R values. The N x R votes therefore hold all that distillation needs.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -27,6 +28,8 @@ from jsecon.types import Array, Camera, Gaussians, Votes
 # A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
 _SLOTS = 4
 _NOBODY = -2  # a slot that no label equals
+_BARE_BYTES = 4 * 14
+"""of a Gaussian with one band of colour"""
 _DENSE_BYTES = 1 << 30
 """the dense N x R block that is accumulated at once; more regions take more passes over the views"""
 
@@ -87,11 +90,12 @@ def region_votes(
     blocks = math.ceil(max(num_regions, 1) / block)
     static = size, near, by_view, centre
     xp = jnp if traced else np  # NumPy compiles nothing
+    bare = dataclasses.replace(gaussians, sh=np.zeros((count, 1, 3), gaussians.means.dtype))  # colour has no part in it
     totals: Any = None
     kept = (np.full((count, 0), -1, np.int32), np.zeros((count, 0), gaussians.means.dtype))
     for b in range(blocks):
         start = _empty(xp, count, block, gaussians.means.dtype)
-        common = gaussians, np.array([b * block, min((b + 1) * block, num_regions)], np.int32)
+        common = bare, np.array([b * block, min((b + 1) * block, num_regions)], np.int32)
         if traced:
             one_view = lambda state, view, common=common: _add_view(state, common, view, *static)
             state, totals = lax.scan(one_view, start, (cameras, labels))
@@ -120,10 +124,10 @@ def _regions_at_once(count: int, regions: int) -> int:
 
 
 def bytes_of_votes(count: int, views: int, regions: int) -> int:
-    """What `region_votes` with `by_view` takes in memory beside what it is given, about: the views' totals, and the
-    dense block of each lane that is worked on and of their sum."""
+    """What `region_votes` with `by_view` takes in memory beside what it is given, about: the views' totals, a copy of
+    the Gaussians with one band of colour, and the dense block of each lane that is worked on and of their sum."""
     dense = 4 * count * _regions_at_once(count, regions)
-    return 4 * views * count + (lanes_at_once(views, dense) + 1) * dense
+    return (4 * views + _BARE_BYTES) * count + (lanes_at_once(views, dense) + 1) * dense
 
 
 def _empty(xp: Any, count: int, regions: int, dtype) -> dict[str, Array]:
