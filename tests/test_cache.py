@@ -170,6 +170,20 @@ def test_files_digest_leaves_out_the_output_and_hidden_files(tmp_path):
     assert cache.files_digest([tmp_path], leave_out=tmp_path / "out") == before
 
 
+def test_files_digest_of_names_that_are_no_utf8_and_of_linked_folders(tmp_path):
+    for name in (b"Gr\xf6\xdfe.png", "Größe #1 50% 🐱.png".encode()):
+        (tmp_path / os.fsdecode(name)).write_bytes(b"one")
+    before = cache.files_digest([tmp_path])
+    assert cache.files_digest([tmp_path / os.fsdecode(b"Gr\xf6\xdfe.png")]) != before
+    (tmp_path / "elsewhere" / "deep").mkdir(parents=True)
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "images").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "deep" / "round").symlink_to(tmp_path / "elsewhere")
+    before = cache.files_digest([tmp_path / "capture"])
+    (tmp_path / "elsewhere" / "deep" / "a.png").write_bytes(b"one")
+    assert cache.files_digest([tmp_path / "capture"]) != before
+
+
 def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
     capture = tmp_path / "out" / "capture"
     capture.mkdir(parents=True)

@@ -144,6 +144,21 @@ def test_distortion_keys(tmp_path):
         load_changed(tmp_path, lambda content: content.update(camera_model="OPENCV", k4=0.1))
     with refused("transforms.json", "EQUIRECTANGULAR"):
         load_changed(tmp_path, lambda content: content.update(camera_model="EQUIRECTANGULAR"))
+    with refused("transforms.json", "ftheta_p0"):
+        load_changed(tmp_path, lambda content: content.update(ftheta_p0=0.1))
+
+
+def test_names_with_dots_and_without_ending(tmp_path):
+    """The ending is that of the file; what follows another dot belongs to the name."""
+    write_images(CAPTURE, tmp_path / "images", ".PNG")
+    content = transforms(CAPTURE, "")
+    for n, entry in enumerate(content["frames"]):
+        (tmp_path / f"images/frame_{n:03d}.PNG").rename(tmp_path / f"images/render.{n:04d}.PNG")
+        entry["file_path"] = f"./images/render.{n:04d}" + (".png" if n == 3 else "")
+    (tmp_path / "scene.JSON").write_text(json.dumps(content))
+    loaded = load_capture(tmp_path / "scene.JSON", holdout=0)
+    assert loaded.names == tuple(f"render.{n:04d}" for n in range(5))
+    np.testing.assert_array_equal(loaded.frames, CAPTURE.frames)
 
 
 def test_masks_are_said_to_be_unused(tmp_path):

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from jsecon.data.images import IMAGE_ENDINGS
 from jsecon.errors import InputError
+from jsecon.files import made_by_jsecon
 from jsecon.types import ImageFile
 
 DEEPEST = 4
@@ -129,11 +130,13 @@ def _extra(folders: tuple[str, ...], frame: _Frame, key: str) -> tuple[int, int,
 
 
 def _files_beneath(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
-    """The files of a folder and of its subfolders, in order, each with its subfolders; without hidden ones."""
+    """The files of a folder and of its subfolders, in order, each with its subfolders; without hidden ones, and
+    without the output of jsecon."""
     found = []
     for place, inner, files in os.walk(folder, followlinks=True):
         folders = Path(place).relative_to(folder).parts
-        inner[:] = sorted(name for name in inner if not name.startswith(".")) if len(folders) < DEEPEST else []
+        kept = (name for name in inner if not name.startswith(".") and not made_by_jsecon(Path(place) / name))
+        inner[:] = sorted(kept) if len(folders) < DEEPEST else []
         found += [(Path(place) / name, folders) for name in sorted(files) if not name.startswith(".")]
     return found
 

@@ -26,6 +26,8 @@ MILLIMETRE = 0.001
 """nerfstudio's default depth unit, metres"""
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+"""keys by which instant-ngp names lenses that are neither perspective nor OpenCV's fisheye"""
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
@@ -153,6 +155,10 @@ def _lens(file: Path, scene: dict[str, Any], entry: dict[str, Any], name: str, i
     if model not in _PERSPECTIVE | _FISHEYE:
         known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE))
         raise _bad(file, f"camera_model {model}", f"one of {known}", "Undistort the images first.")
+    if any(keys.get(key) for key in _OTHER_LENSES):
+        key = next(key for key in _OTHER_LENSES if keys.get(key))
+        problem = f"the lens of {name} is one of instant-ngp's own ({key})"
+        raise _bad(file, problem, "a perspective or an OpenCV fisheye lens", "Undistort the images first.")
     fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     width, height = (keys.get("w"), keys.get("h"))
     if width is None or height is None:
