@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -118,6 +119,17 @@ def test_names_lead_out_of_no_folder(tmp_path, room):
     with pytest.raises(InputError, match="leads out"):
         write_colmap(dataclasses.replace(capture, names=("../../evil", *capture.names[1:])), tmp_path / "a" / "b")
     assert not list(tmp_path.rglob("evil*"))
+
+
+def test_a_capture_that_names_images_outside_its_folder_is_refused(tmp_path, room):
+    shutil.copytree(room, tmp_path / "capture")
+    model = next((tmp_path / "capture").rglob("images.bin"))
+    name = sorted(file.name for file in (room / "images").iterdir())[0]
+    evil = "../" + name[3:]
+    shutil.copy(room / "images" / name, tmp_path / "capture" / evil[3:])  # it is there, and an image
+    model.write_bytes(model.read_bytes().replace(name.encode() + b"\0", evil.encode() + b"\0"))
+    with pytest.raises(InputError, match="leads out"):
+        load_capture(tmp_path / "capture")
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
-        remedy = 'Run: pip install "jsecon[figures]"'
+        remedy = "Run: pip install 'jsecon[figures]'"
         raise InputError("jsecon.show", "the package matplotlib is missing", remedy=remedy) from error
     answer = ask_text(field, embedder or networks.embedder_of_field(field), text, **how)
     masks = masks_of(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
