@@ -58,6 +58,19 @@ def test_a_capture_comes_out_the_same_in_any_place_and_unit(tmp_path, kind, scal
     np.testing.assert_allclose(back, scale * plain.cameras.centres.astype(np.float64) + shift, atol=3e-6 * scale)
 
 
+@pytest.mark.parametrize("shift", [0 * SHIFT, SHIFT])
+def test_a_capture_from_one_place_keeps_its_unit(tmp_path, shift):
+    """A tripod's poses, which differ by rounding, tell no size; large coordinates are centred all the same."""
+    capture = small_capture()
+    poses = capture.cameras.world_to_camera.copy()
+    poses[:, :3, 3] = 1e-9 * np.arange(15).reshape(5, 3)
+    capture = dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=poses))
+    found = jsecon.load_capture(written("poses", capture, tmp_path, 1, shift))
+    np.testing.assert_allclose(found.to_source[:3, :3], np.eye(3))
+    assert np.abs(found.cameras.centres).max() < 1
+    np.testing.assert_allclose(found.to_source[:3, 3] + found.cameras.centres[0], shift, atol=1e-3)
+
+
 @pytest.mark.parametrize("frames", [None, 3])
 def test_the_world_of_a_capture_is_that_of_all_its_frames(tmp_path, frames):
     """Whichever are loaded: a field of some of them goes with the capture of others."""

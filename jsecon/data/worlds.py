@@ -16,6 +16,9 @@ NEAREST, FARTHEST = 0.1, 100.0
 """distance of the near things from the cameras, world units, within which the units are kept"""
 WIDEST = 1000.0
 """spread of the cameras, world units, up to which the units are kept where only the cameras are known"""
+LEAST_SIZE, ROUNDING = 1e-6, 1e-12
+"""spread of cameras, also in units of their distance from the origin, that is taken for rounding: they stand in one
+place, which tells no size"""
 STEP = 1000.0
 """the units are changed by a power of this, as from millimetres to metres: a scene comes out the same from each unit"""
 _VIEWS, _POINTS = 64, 20000
@@ -51,8 +54,9 @@ def ordinary_world(
     spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     near = _near_depth(poses, np.asarray(points, np.float64), depths)
     size = max(near or 0.0, spread)
-    if not (np.isfinite(size) and size > 0):
-        return np.eye(4), ()
+    if near is None and size < max(LEAST_SIZE, ROUNDING * np.abs(middle).max()):  # cameras in one place
+        size = 1.0
+        near = size
     origin, notes = np.zeros(3), []
     if np.abs(middle).max() > FAR * size:
         step = 10.0 ** np.ceil(np.log10(size))
