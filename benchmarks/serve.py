@@ -64,7 +64,7 @@ def memory(process: subprocess.Popen) -> float:
 def request(port: int, verb: str, path: str, body: bytes | None = None, token: str = TOKEN, connection=None):
     """(status, body) of one request."""
     own = connection or http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
     own.request(verb, path, body, headers)
     answer = own.getresponse()
     told = answer.status, answer.read()
@@ -120,7 +120,8 @@ def odd(port: int, count: int) -> dict:
     found["paths"] = [request(port, "GET", path)[0] for path in paths]
     for name, stall in (("1 GB body", False), ("slow sender", True)):
         with socket.create_connection(("127.0.0.1", port), timeout=60) as raw:
-            lines = "POST /query HTTP/1.1", "Host: x", f"Authorization: Bearer {TOKEN}", f"Content-Length: {10**9}"
+            lines = "POST /query HTTP/1.1", "Host: x", f"Authorization: Bearer {TOKEN}"
+            lines += "Content-Type: application/json", f"Content-Length: {10**9}"
             head = "\r\n".join((*lines, "", ""))
             raw.sendall(head.encode())
             sent = 0

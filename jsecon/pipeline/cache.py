@@ -25,6 +25,7 @@ import jax
 import numpy as np
 
 import jsecon
+from jsecon.errors import why
 from jsecon.files import (
     UNREADABLE,
     files_beneath,
@@ -237,7 +238,7 @@ def _read(path: Path) -> tuple[Any, float]:
         description = parsed_json(arrays.pop(_TREE).tobytes())
         return unpack(description["tree"], arrays), float(description["seconds"])
     except UNREADABLE as error:
-        raise CorruptCacheError(f"{type(error).__name__}: {error}") from error
+        raise CorruptCacheError(why(error)) from error
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
