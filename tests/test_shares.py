@@ -15,6 +15,8 @@ from scipy.stats import beta
 
 from jsecon.language.shares import (
     CORRELATION,
+    LABELLED_PART,
+    SEEN_PART,
     finish_votes,
     membership_probability,
     probability_inside,
@@ -60,22 +62,31 @@ def exact_shown(votes, regions):
     return np.where(place >= 0, np.take_along_axis(of_region, np.maximum(place, 0), 1), 0.0)
 
 
+def seen_of(votes):
+    """(N, K) float64 what each vote is a share of."""
+    total = np.repeat(np.asarray(votes.total, np.float64)[:, None], votes.regions.shape[1], 1)
+    if votes.shown is None:
+        return total
+    least = np.maximum(LABELLED_PART * np.asarray(votes.labelled, np.float64)[:, None], SEEN_PART * total)
+    return np.maximum(np.asarray(votes.shown, np.float64), least)
+
+
 def exact_share(votes, chosen):
     votes = jax.tree.map(np.asarray, votes)
-    share = np.zeros(len(votes.total))
+    share, all_seen = np.zeros(len(votes.total)), seen_of(votes)
     for n in range(len(share)):
         weight, seen = 0.0, 0.0
         for k, region in enumerate(np.asarray(votes.regions[n])):
             if 0 <= region < len(chosen) and chosen[region]:
                 weight += float(votes.weights[n, k])
-                seen = max(seen, float(votes.total[n] if votes.shown is None else votes.shown[n, k]))
+                seen = max(seen, all_seen[n, k])
         share[n] = min(weight / seen, 1.0) if seen > 0 and votes.views[n] > 0 else 0.0
     return share
 
 
 def exact_overlap(votes):
     votes = jax.tree.map(np.asarray, votes)
-    seen = np.asarray(votes.total[:, None] if votes.shown is None else votes.shown, np.float64)
+    seen = seen_of(votes)
     ratio = np.divide(votes.weights, seen, out=np.zeros(votes.regions.shape), where=seen > 0)
     share = np.zeros((len(votes.total), votes.num_regions))
     n, k = np.nonzero(votes.regions >= 0)
@@ -192,7 +203,7 @@ def test_laws_of_the_share(drawn):
     votes, fewer, more = drawn
     share, known = (np.asarray(a) for a in share_of(votes, fewer))
     assert ((share >= 0) & (share <= 1)).all()
-    voted = (votes.regions >= 0) & fewer[votes.regions] & (votes.shown > 0)
+    voted = (votes.regions >= 0) & fewer[votes.regions] & (seen_of(votes) > 0)
     np.testing.assert_array_equal(known, (votes.views > 0) & voted.any(1))
     assert not share[~known].any()
     # Where one region is shown the others are: then more of them never have less of a Gaussian.
@@ -207,7 +218,7 @@ def test_laws_of_the_share(drawn):
     own = np.where((votes.regions >= 0) & (votes.views > 0)[:, None], vote_shares(votes), 0)
     np.testing.assert_array_equal(alone[votes.regions, np.arange(COUNT)[:, None]] * (votes.regions >= 0), own)
     # Neither the unit of the weights, nor the order of the votes, nor the regions' numbers mean anything.
-    scaled = {name: getattr(votes, name) * np.float32(2**-20) for name in ("weights", "total", "shown")}
+    scaled = {name: getattr(votes, name) * np.float32(2**-20) for name in ("weights", "labelled", "total", "shown")}
     np.testing.assert_allclose(
         share_of(dataclasses.replace(votes, **scaled), fewer).share, share, rtol=1e-6, atol=1e-30
     )
@@ -254,7 +265,8 @@ def test_overlap_without_gaussians_or_regions_and_with_numbers_that_are_not_fini
     without = np.where(np.isfinite(weights) & np.isfinite(shown), votes.regions, -1)
     expected = with_overlap(dataclasses.replace(votes, regions=without)).overlap
     np.testing.assert_allclose(with_overlap(broken).overlap, expected, rtol=1e-6)
-    huge = dataclasses.replace(votes, weights=votes.weights * 1e30, shown=votes.shown * 1e30)
+    huge = {name: getattr(votes, name) * 1e30 for name in ("weights", "labelled", "total", "shown")}
+    huge = dataclasses.replace(votes, **huge)
     np.testing.assert_allclose(with_overlap(huge).overlap, with_overlap(votes).overlap, rtol=1e-5)
 
 

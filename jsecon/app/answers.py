@@ -91,6 +91,13 @@ def _figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "region": region if region >= 0 else None,
         "probability": sure,
         "outliers_dropped": answer.dropped,
+        "outliers": {
+            "dropped": answer.dropped,
+            "of_selected": int(np.asarray(answer.selection.mask).sum()),
+            "clusters_kept": answer.clusters[0],
+            "clusters_dropped": answer.clusters[1],
+            "keep_with": "--keep-outliers" if answer.dropped else None,
+        },
         "place": place,
         "left_out": answer.left_out,
     } | ({} if answer.frames is None else {"frames": dict(answer.frames)})

@@ -4,13 +4,14 @@ A frame in which nothing is found speaks too: what it sees is outside. So a thin
 not selected.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from jsecon.app.question import Answer
+from jsecon.app.question import Answer, answer_of
 from jsecon.data.frames import Progress, spread
 from jsecon.errors import InputError
 from jsecon.language.shares import SHARE_THRESHOLD
@@ -18,7 +19,6 @@ from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
 from jsecon.pipeline.sources import sources_of
 from jsecon.query.anchored import query_region
 from jsecon.query.lift import lift
-from jsecon.query.outliers import outliers_removed
 from jsecon.types import LanguageField
 
 Frames = Mapping[int, np.ndarray]
@@ -95,7 +95,5 @@ def lifted(
         none = np.zeros(field.gaussians.count, bool)
         return Answer(phrase, "phrase", query_region(field, -1), none, left, frames=scores)
     selection = lift(field, stack, list(found), threshold=threshold)
-    mask, why = np.asarray(selection.mask), "not asked for"
-    if outliers:
-        mask, why = outliers_removed(field.gaussians.means, mask, keep="all")
-    return Answer(phrase, "phrase", selection, mask, left | ({"DBSCAN": why} if why else {}), frames=scores)
+    answer = answer_of(field, phrase, "phrase", selection, outliers, left, keep="all")
+    return dataclasses.replace(answer, frames=scores)

@@ -26,7 +26,7 @@ from jsecon.query.anchored import Found, found_of, members, query_region
 from jsecon.query.direct import query_canonical, query_one_step
 from jsecon.query.lift import lift
 from jsecon.query.neighbours import evened
-from jsecon.query.outliers import outliers_removed
+from jsecon.query.outliers import clean
 from jsecon.query.parts import InParts, parts_instead, query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
@@ -68,6 +68,8 @@ class Answer:
     """(M,) int64 the Gaussians that selection and mask have a row for, where those are not all N of the field."""
     key: str | None = None
     """what tells the question from every other in the names of its files; None: `question` alone does, a text."""
+    clusters: tuple[int, int] = (0, 0)
+    """clusters that DBSCAN kept and dropped; (0, 0) where it was not needed or found none."""
 
     @property
     def dropped(self) -> int:
@@ -253,16 +255,19 @@ def ask_outline(
 def _shaped(
     field: LanguageField, selection: Selection, by: str, threshold: float | None, near: np.ndarray | None
 ) -> Selection:
-    """As it is, or of OUTLINES what fits the shares best in the views; with `near` shares are evened out first."""
+    """As it is, or of OUTLINES what fits the shares best in the views; with `near` shares are evened out first, where
+    a view sees the Gaussian."""
     least = SHARE_THRESHOLD if threshold is None else threshold
     if near is not None and by in BY_VOTES:
         share = evened(jnp.asarray(selection.similarity), jnp.asarray(near))
-        inside = (share >= least) & jnp.any(selection.mask)
+        seen = jnp.asarray(field.votes.views) > 0
+        share = jnp.where(seen, share, 0.0)
+        inside = seen & (share >= least) & jnp.any(selection.mask)
         selection = dataclasses.replace(selection, mask=inside, similarity=share)
     if by not in OUTLINES:
         return selection
     given = field.gaussians, field.cameras, selection.similarity
-    mask = silhouette_members(*given, threshold=least, weights=OUTLINES[by])
+    mask = silhouette_members(*given, threshold=least, weights=OUTLINES[by]) & (jnp.asarray(field.votes.views) > 0)
     return dataclasses.replace(selection, mask=mask & jnp.any(selection.mask))
 
 
@@ -299,11 +304,17 @@ def answer_of(
     key: str | None = None,
 ) -> Answer:
     """A selection as the answer to a question, without outliers; `left`: what was not needed, and why; `key` as in
-    `Answer`."""
-    mask = np.asarray(selection.mask)
-    if outliers:
-        mask, why = outliers_removed(field.gaussians.means, mask, keep=keep)
-        left = left | ({"DBSCAN": why} if why else {})
-    else:
+    `Answer`.
+
+    With keep="largest", clusters that the views' masks support as much as FAIR_SHARE of the largest stay too: a mask
+    may show one thing in several pieces.
+    """
+    if not outliers:
         left = left | {"DBSCAN": "not asked for"}
-    return Answer(question, by, selection, mask, left, key=key)
+        return Answer(question, by, selection, np.asarray(selection.mask), left, key=key)
+    seen = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
+    keep = "supported" if keep == "largest" else keep
+    found = clean(field.gaussians.means, np.asarray(selection.mask), keep=keep, weight=seen)
+    left = left | ({"DBSCAN": found.unneeded} if found.unneeded else {})
+    clusters = found.clusters_kept, found.clusters_dropped
+    return Answer(question, by, selection, found.mask, left, clusters=clusters, key=key)

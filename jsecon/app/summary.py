@@ -130,7 +130,10 @@ def write_answers(
             unheld = "regions" in told["left_out"]
             where = "its parts, as no region holds it" if unheld else f"region {told['region']}"
             listener.say(f"{item.question!r}: {count}, {score}, {where}, {place}")
-            dropped = f"{told['outliers_dropped']} outliers dropped"
+            if dropped := outliers_message(told["outliers"]):
+                listener.note(dropped)
+            else:
+                dropped = "no outliers dropped"
             words = f"{count} by {item.by}; {score}; {where}; {dropped}; {place}."
             overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
             figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
@@ -139,6 +142,16 @@ def write_answers(
     write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
     listener.say(f"pictures  {out / 'answers.html'}")
     return {"written": {"folder": out, "pictures": out / "answers.html"}, "answers": figures_of}
+
+
+def outliers_message(outliers: dict[str, Any]) -> str:
+    """What DBSCAN dropped of an answer, and how to keep it; "" where it dropped nothing."""
+    if not outliers["dropped"]:
+        return ""
+    many = outliers["clusters_dropped"]
+    clusters = f", {many} smaller cluster{'s' if many > 1 else ''} among them" if many else ""
+    part = f"{outliers['dropped']} of {outliers['of_selected']} selected Gaussians stand apart and were dropped"
+    return f"{part}{clusters}; --keep-outliers keeps them"
 
 
 def evaluate(

@@ -131,7 +131,8 @@ class Query(Asking):
     even: bool = False
     """even the votes out over each Gaussian's ten neighbours before they are cut: sharper rims where masks are noisy"""
     keep_outliers: bool = False
-    """leave out the last step, DBSCAN"""
+    """keep the Gaussians that stand apart from the rest of an answer. Without it DBSCAN drops them, and clusters with
+    less than a tenth of the largest one's weight in the views; the .json counts them"""
     phrases: Folder = None
     """a SAM 3 model folder (.onnx): each text is put to it as a phrase, in some frames of the capture; selected is what
     lies in its masks in most of the frames that see it, all things of the kind"""

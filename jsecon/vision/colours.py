@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
+from scipy.optimize import nnls
 
 from jsecon.errors import InputError, require_shape
 from jsecon.process import cores
@@ -51,12 +52,21 @@ _SURROUNDINGS = {
 # fmt: on
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
+# A bare basic term names a family: itself and these shades. What is near a shade (burgundy, sky) is near the family too.
+_SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for basic in BASIC} | {
+    "black": ("charcoal",),
+    "white": (),
+    "blue": ("dark blue", "light blue", "navy"),
+}
 _DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
 _PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
 _NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
 # A colour word names a range: its point, and a darker and a lighter neighbour.
 _SPREAD = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
 _SPREAD_WEIGHTS = np.asarray([0.7, 0.15, 0.15], np.float32)
+SHADE = 0.8
+"""likeness of a bare basic term with the shades of its family, where that with its typical colour is 1: a dark red wall
+is red, and a red mug before it is redder"""
 
 KERNEL_WIDTH = 22.0
 """CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or
@@ -79,7 +89,8 @@ class ColourEmbedder:
     """Embedder (jsecon.vision.protocols) over named colours; see the module for the space.
 
     What it understands of a text: colour names, their dark and light variants, `-ish` and compound forms
-    (`bluish-green`), several colours of one thing (`red and white striped box`: each counts alike), and whether
+    (`bluish-green`), bare basic terms with all shades of their family (`red` includes dark red and burgundy, `bright
+    red` and `dark red` do not include each other), several colours of one thing (`red and white striped box`: each counts alike), and whether
     the thing is part of the surroundings (wall, floor, table ...). Nouns otherwise carry no meaning, shapes and
     materials neither.
 
@@ -103,6 +114,7 @@ class ColourEmbedder:
         kept = values > 1e-3 * values[-1]
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
         self.dim = int(kept.sum()) + 2
+        self._families = {basic: self._family(basic) for basic in BASIC}
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
@@ -130,11 +142,10 @@ class ColourEmbedder:
         """Q texts -> (Q, E) float32 unit. Raises InputError for a text without a colour word, or with a negation."""
         out = np.zeros((len(texts), self.dim), np.float32)
         for row, text in zip(out, texts):
-            points = np.stack([self._colour(phrase) for phrase in self._phrases(text)])  # (colours, 3)
-            spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
-            weights = np.tile(_SPREAD_WEIGHTS, len(points))
+            named = [self._distribution(phrase) for phrase in self._phrases(text)]
+            points, weights = (np.concatenate(column) for column in zip(*named))
             surrounds = float(bool(_SURROUNDINGS & set(_words(text))))
-            row[:] = _joined(self._mean(spread.astype(np.float32), weights), surrounds)
+            row[:] = _joined(self._mean(*_spread(points, weights)), surrounds)
         return out
 
     def _mean(self, points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -143,6 +154,23 @@ class ColourEmbedder:
         weights = np.ones(len(points)) if weights is None else weights
         mean = (weights.astype(np.float32) @ likeness / weights.sum()) @ self._projection
         return mean / max(float(np.linalg.norm(mean)), 1e-12)
+
+    def _family(self, basic: str) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
+        """The colours that a bare basic term names, and their weights.
+
+        The weights are the least (non-negative) that bring the likeness with the typical colour to 1 and that with
+        each shade to SHADE, so that shades that lie close together do not count twice.
+        """
+        points = np.stack([self._by_name[name] for name in (basic, *_SHADES[basic])])
+        wanted = np.where(np.arange(len(points)) == 0, 1.0, SHADE)
+        return points, nnls(_kernel(points, points).astype(np.float64), wanted)[0].astype(np.float32)
+
+    def _distribution(self, phrase: list[str]) -> tuple[np.ndarray, np.ndarray]:
+        """A run of modifiers and colour words -> its points (P, 3) CIELAB and their weights (P,)."""
+        base, ish = self._base(phrase[0])
+        if len(phrase) == 1 and base in self._families and not ish:
+            return self._families[base]
+        return self._colour(phrase)[None], np.ones(1, np.float32)
 
     def _phrases(self, text: str) -> list[list[str]]:
         """Splits a text into runs of modifiers and colour words, one run a colour."""
@@ -219,6 +247,12 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     np.maximum(squared, 0.0, out=squared)
     squared *= -0.5
     return np.exp(squared, out=squared)
+
+
+def _spread(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (P, 3) and weights (P,) -> each with its darker and lighter neighbour (3 P, 3), and the weights of all."""
+    spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
+    return spread.astype(np.float32), (weights[:, None] * _SPREAD_WEIGHTS).reshape(-1)
 
 
 def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
