@@ -64,9 +64,10 @@ _NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
 # A colour word names a range: its point, and a darker and a lighter neighbour.
 _SPREAD = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
 _SPREAD_WEIGHTS = np.asarray([0.7, 0.15, 0.15], np.float32)
-SHADE = 0.8
+SHADE, GREY_SHADE = 0.7, 0.85
 """likeness of a bare basic term with the shades of its family, where that with its typical colour is 1: a dark red wall
-is red, and a red mug before it is redder"""
+is red, and a red mug before it is redder. Greys differ in nothing but lightness, and the canonical neutrals take a
+part of it away"""
 
 KERNEL_WIDTH = 22.0
 """CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or
@@ -162,7 +163,8 @@ class ColourEmbedder:
         each shade to SHADE, so that shades that lie close together do not count twice.
         """
         points = np.stack([self._by_name[name] for name in (basic, *_SHADES[basic])])
-        wanted = np.where(np.arange(len(points)) == 0, 1.0, SHADE)
+        shade = GREY_SHADE if basic == "grey" else SHADE
+        wanted = np.where(np.arange(len(points)) == 0, 1.0, shade)
         return points, nnls(_kernel(points, points).astype(np.float64), wanted)[0].astype(np.float32)
 
     def _distribution(self, phrase: list[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,195 @@
+"""Answers that rest on evidence: what a wall hides, what no view saw, pieces that stand apart, shades of a colour."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import look_at
+from small_field import field_of
+
+import jsecon
+from jsecon.app import command_line
+from jsecon.language.field import save_field
+from jsecon.language.shares import finish_votes
+from jsecon.types import Camera, Gaussians, Regions, Votes
+from jsecon.vision.colours import PALETTE, ColourEmbedder
+
+FRIDGE, WALL, SOFA = 0, 1, 2
+COLOURS = ColourEmbedder()
+
+
+def sheet(x, half, step, thing):
+    """Means of a square of Gaussians across the x axis, and what they are of."""
+    y, z = np.meshgrid(*[np.arange(-half, half + step / 2, step)] * 2)
+    return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], 1), np.full(y.size, thing)
+
+
+@pytest.fixture(scope="module")
+def two_rooms():
+    """A fridge before a wall, a sofa behind it in the next room; three cameras in each room see that room alone, but
+    for what the wall lets through."""
+    sheets = [sheet(-0.3, 0.3, 0.1, FRIDGE), sheet(0.0, 0.8, 0.1, WALL), sheet(0.3, 0.3, 0.1, SOFA)]
+    means, thing = (np.concatenate(column) for column in zip(*sheets))
+    count = len(means)
+    scene = Gaussians(
+        means.astype(np.float32),
+        np.full((count, 3), np.log(0.05), np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        np.full(count, 2.5, np.float32),  # the sheets overlap: about a hundredth passes
+        np.zeros((count, 1, 3), np.float32),
+    )
+    sides = [(-2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)] + [(2.0, y, 0.1) for y in (-0.3, 0.0, 0.3)]
+    focal = np.full(6, 40, np.float32)
+    centre = np.full(6, 16, np.float32)
+    cameras = Camera(np.stack([look_at(eye) for eye in sides]), focal, focal, centre, centre, width=32, height=32)
+    one_hot = jnp.asarray(np.eye(3, dtype=np.float32)[thing])
+    images = [np.asarray(jsecon.render(scene, cameras[t], one_hot).features) for t in range(6)]
+    labels = np.stack([np.where(image.sum(-1) > 0.5, image.argmax(-1), -1) for image in images]).astype(np.int32)
+    return scene, cameras, labels, thing
+
+
+@pytest.mark.parametrize("masks", ["all", "of the fridge alone", "of the fridge in one view"])
+def test_what_a_wall_hides_is_not_part_of_what_stands_before_it(two_rooms, masks):
+    scene, cameras, labels, thing = two_rooms
+    labels = labels.copy()
+    if masks == "of the fridge alone":
+        labels[labels != FRIDGE] = -1
+    if masks == "of the fridge in one view":
+        labels[1:][labels[1:] == FRIDGE] = -1
+    votes = jsecon.region_votes(scene, cameras, jnp.asarray(labels), 3, by_view=True)
+    hidden = np.asarray(votes.dense())[thing == SOFA, FRIDGE]
+    assert hidden.max() > 0  # the wall lets a trace through
+    pixels = np.stack([(labels == r).sum((1, 2)) for r in range(3)])
+    regions = Regions(np.eye(3, dtype=np.float32), pixels)
+    field = field_of(finish_votes(votes, regions), regions)
+    chosen = np.asarray(jsecon.query_region(field, FRIDGE).mask)
+    assert chosen[thing == FRIDGE].mean() > 0.9
+    assert not chosen[thing == SOFA].any()
+
+
+def ask(file, out, *options):
+    """The figures of the one answer of a query at the middle of the first frame."""
+    asked = ["query", file, "--at", "#0", 25, 19, "--views", 0, "--out", out, *options]
+    assert command_line.main([str(word) for word in asked]) == 0
+    return json.loads(next(out.glob("*.json")).read_text())
+
+
+def one_region(scene, cameras, means, *, unseen=()):
+    """A field with all Gaussians of `scene` in region 0, at other places, some of them seen by no view."""
+    count = len(means)
+    seen = ~np.isin(np.arange(count), unseen)
+    weight = np.where(seen, 9, 0).astype(np.float32)
+    votes = Votes(
+        np.where(seen, 0, -1).astype(np.int32)[:, None], weight[:, None], weight, weight, weight / 18,
+        seen.astype(np.int32), np.int32(0), 1,
+    )  # fmt: skip
+    gaussians = dataclasses.replace(scene, means=np.asarray(means, np.float32))
+    names = tuple(f"frame_{t}" for t in range(4))
+    field = field_of(votes, Regions(np.eye(1, 8, dtype=np.float32), np.full((1, 4), 500)))
+    return dataclasses.replace(field, gaussians=gaussians, cameras=cameras, names=names)
+
+
+@pytest.mark.parametrize("options", [(), ("--threshold", 0)])
+def test_even_never_selects_what_no_view_saw(scene, cameras, tmp_path, options):
+    means = 0.05 * np.random.default_rng(0).normal(size=(64, 3))
+    save_field(tmp_path / "field.npz", one_region(scene, cameras, means, unseen=[3, 17, 40]))
+    told = ask(tmp_path / "field.npz", tmp_path / "out", "--even", "--keep-outliers", *options)
+    chosen = jsecon.load_gaussians(tmp_path / "out" / told["ply"]).means
+    away = np.linalg.norm(chosen[:, None] - means[None, [3, 17, 40]], axis=-1)
+    assert len(chosen) == 61
+    assert away.min() > 1e-6
+
+
+def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, cameras, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    places = np.repeat([[0, 0, 0], [1, 0, 0], [0, 30, 0]], [32, 26, 6], 0)  # two pieces, and six strays far away
+    means = places + np.where(np.arange(64)[:, None] < 58, 0.05, 8) * rng.normal(size=(64, 3))
+    save_field(tmp_path / "field.npz", one_region(scene, cameras, means))
+    told = ask(tmp_path / "field.npz", tmp_path / "out")
+    assert told["count"] == 58
+    assert told["outliers_dropped"] == 6
+    assert told["outliers"] == {
+        "dropped": 6, "of_selected": 64, "clusters_kept": 2, "clusters_dropped": 0, "keep_with": "--keep-outliers",
+    }  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "6 of 64" in printed
+    assert "--keep-outliers" in printed
+    kept = ask(tmp_path / "field.npz", tmp_path / "kept", "--keep-outliers")
+    assert (kept["count"], kept["outliers_dropped"]) == (64, 0)
+    assert "--keep-outliers" not in capsys.readouterr().out
+
+
+def test_a_cluster_without_support_of_the_views_is_dropped():
+    rng = np.random.default_rng(0)
+    means = np.concatenate([0.1 * rng.normal(size=(200, 3)), 5 + 0.1 * rng.normal(size=(150, 3))])
+    whole = np.ones(350, bool)
+    weight = np.repeat([1.0, 0.01], [200, 150])
+    assert jsecon.remove_outliers(means, whole, keep="supported")[200:].mean() > 0.95
+    kept = jsecon.remove_outliers(means, whole, keep="supported", weight=weight)
+    assert kept[:200].mean() > 0.95
+    assert not kept[200:].any()
+    assert not jsecon.remove_outliers(means, whole)[200:].any()  # the largest alone
+
+
+def painted(wall, things):
+    """Regions of a frame that a wall fills but for a row of lit things, and their pixels."""
+    rng = np.random.default_rng(0)
+    frame = np.tile(np.asarray(wall, np.float64), (90, 160, 1))
+    masks = np.zeros((len(things) + 1, 90, 160), bool)
+    for k, colour in enumerate(things):
+        masks[k, 60:75, 15 * k : 15 * k + 14] = True
+        frame[masks[k]] = np.outer(np.linspace(0.7, 1.1, masks[k].sum()), colour)
+    masks[-1] = ~masks.any(0)
+    frame = np.clip(frame + rng.normal(0, 4, frame.shape), 0, 255).astype(np.uint8)
+    return COLOURS.embed_regions(frame, masks), masks.sum((1, 2))
+
+
+def asked_of(embeddings, pixels, text):
+    """The region that a text finds in ten views of such a frame, and the score of it."""
+    count = len(embeddings)
+    own = np.arange(count, dtype=np.int32)[:, None]
+    ones = np.ones(count, np.float32)
+    votes = Votes(own, ones[:, None], ones, ones, ones, ones.astype(np.int32), np.int32(0), count)
+    field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)))
+    field = dataclasses.replace(field, canonical=COLOURS.canonical)
+    found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]))
+    return int(found.region), float(found.score)
+
+
+THINGS = ("red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white")
+SHADES = {
+    "red": ("dark red", "burgundy", "crimson", "maroon", "light red"),
+    "orange": ("dark orange", "light orange"),
+    "yellow": ("dark yellow", "light yellow", "mustard"),
+    "green": ("dark green", "light green"),
+    "blue": ("dark blue", "light blue", "navy", "sky"),
+    "purple": ("dark purple", "light purple"),
+    "pink": ("dark pink", "light pink"),
+    "brown": ("dark brown", "light brown"),
+    "black": ("charcoal",),
+    "white": ("ivory", "cream"),
+    "grey": ("dark grey",),
+}
+
+
+@pytest.mark.parametrize("family", SHADES)
+def test_a_bare_colour_word_names_the_shades_that_fill_a_room(family):
+    for shade in SHADES[family]:
+        embeddings, pixels = painted(PALETTE[shade], [PALETTE[name] for name in THINGS if name != family])
+        region, score = asked_of(embeddings, pixels, "gray" if family == "grey" else family)
+        assert region == len(embeddings) - 1, shade
+        assert score > 0.14, shade
+
+
+def test_a_modifier_narrows_the_family_and_the_typical_colour_comes_first():
+    row = ["red", "dark red", "green", "dark green", "light green", "blue", "light blue"]
+    embeddings, pixels = painted((128, 126, 120), [PALETTE[name] for name in row])
+    for text in row:
+        assert row[asked_of(embeddings, pixels, text)[0]] == text
+    assert row[asked_of(embeddings, pixels, "bright red")[0]] == "red"
+    of_dark, of_bright = embeddings[1], embeddings[0]
+    red, dark, bright = COLOURS.embed_text(["red", "dark red", "bright red"])
+    assert red @ of_dark > bright @ of_dark + 0.2  # the family includes it, the plain colour does not
+    assert dark @ of_dark > dark @ of_bright + 0.3
