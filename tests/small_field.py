@@ -6,6 +6,7 @@ import numpy as np
 
 from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
+from jsecon.language.shares import LABELLED_PART, SEEN_PART
 from jsecon.language.votes import region_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
@@ -60,13 +61,21 @@ def make_field(scene, cameras, *, dim=12, latent=8):
     return field, labels
 
 
+def seen_of(votes):
+    """(N, K) float64 what each vote is a share of."""
+    total = np.repeat(np.asarray(votes.total, np.float64)[:, None], votes.regions.shape[1], 1)
+    if votes.shown is None:
+        return total
+    least = np.maximum(LABELLED_PART * np.asarray(votes.labelled, np.float64)[:, None], SEEN_PART * total)
+    return np.maximum(np.asarray(votes.shown, np.float64), least)
+
+
 def shares(field, regions):
     """(N,) float64: the part that lies on the regions of the weight in the views that show them, or of all weight."""
     votes = field.votes
     inside = np.isin(np.asarray(votes.regions), regions)
     weight = np.where(inside, np.asarray(votes.weights, np.float64), 0).sum(1)
-    seen = np.asarray(votes.total[:, None] if votes.shown is None else votes.shown, np.float64)
-    seen = np.where(inside, seen, 0).max(1)
+    seen = np.where(inside, seen_of(votes), 0).max(1)
     return np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0)
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_field import unit_rows
+from small_field import seen_of, unit_rows
 
 from jsecon.query.classes import query_classes
 from jsecon.query.retrieval import contrasts
@@ -44,7 +44,7 @@ def exact(field, similarity, least, clear):
     votes, found, parts = field.votes, [], []
     similarity = np.asarray(similarity, np.float64)
     speaks, best = similarity.max(1) >= least, similarity.argmax(1)
-    for ids, weights, shown in zip(*(np.asarray(a) for a in (votes.regions, votes.weights, votes.shown))):
+    for ids, weights, shown in zip(*(np.asarray(a) for a in (votes.regions, votes.weights, seen_of(votes)))):
         share = {r: float(w) / float(s) for r, w, s in zip(ids, weights, shown) if r >= 0}
         own = [[(float(w), float(s)) for r, w, s in zip(ids, weights, shown) if r >= 0 and speaks[r] and best[r] == q]
                for q in range(similarity.shape[1])]  # fmt: skip
@@ -150,8 +150,9 @@ def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     field = made_field(3, regions=3)
     known = Regions(np.eye(3, SIZE, dtype=np.float32), field.regions.pixels)
     ids = np.int32([[2, 0, -1], [2, -1, -1], [1, 2, -1]])
-    weights = np.float32([[8, 1, 0], [8, 0, 0], [8, 1, 0]])
-    votes = dataclasses.replace(field.votes, regions=ids, weights=weights, shown=np.float32([[8, 2, 0]] * 3))
+    weights = np.float32([[8, 4, 0], [8, 0, 0], [8, 1, 0]])
+    seen = {"shown": np.float32([[8, 8, 0]] * 3), "labelled": weights.sum(1), "total": weights.sum(1)}
+    votes = dataclasses.replace(field.votes, regions=ids, weights=weights, **seen)
     field = dataclasses.replace(field, regions=known, votes=votes)
     texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
     labels, found = query_classes(field, texts, retrieval="cosine", every=True)
@@ -187,7 +188,7 @@ def test_a_probability_refuses_classes_as_it_refuses_texts():
     logits = Logits(40.0, float(np.log(0.01 / 0.99) - 40 * (own[2] + own[3]) / 2))
     there = 1 / (1 + np.exp(-40 * cosines[rows, best] - logits.bias)) >= 0.01
     assert there.sum() == 3
-    ids, weights, shown = (np.asarray(a) for a in (field.votes.regions, field.votes.weights, field.votes.shown))
+    ids, weights, shown = (np.asarray(a) for a in (field.votes.regions, field.votes.weights, seen_of(field.votes)))
     part = np.zeros((600, 5))
     for q in range(5):
         inside = (ids >= 0) & np.isin(ids, rows[there & (best == q)])

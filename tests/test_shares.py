@@ -12,11 +12,10 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import beta
+from small_field import seen_of
 
 from jsecon.language.shares import (
     CORRELATION,
-    LABELLED_PART,
-    SEEN_PART,
     finish_votes,
     membership_probability,
     probability_inside,
@@ -60,15 +59,6 @@ def exact_shown(votes, regions):
     of_region = np.stack([np.asarray(votes.by_view, np.float64)[row].sum(0) for row in shows], 1)
     place = np.asarray(votes.regions)
     return np.where(place >= 0, np.take_along_axis(of_region, np.maximum(place, 0), 1), 0.0)
-
-
-def seen_of(votes):
-    """(N, K) float64 what each vote is a share of."""
-    total = np.repeat(np.asarray(votes.total, np.float64)[:, None], votes.regions.shape[1], 1)
-    if votes.shown is None:
-        return total
-    least = np.maximum(LABELLED_PART * np.asarray(votes.labelled, np.float64)[:, None], SEEN_PART * total)
-    return np.maximum(np.asarray(votes.shown, np.float64), least)
 
 
 def exact_share(votes, chosen):

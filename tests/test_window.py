@@ -16,7 +16,7 @@ import test_distill as of_distill
 import test_retrieval as of_retrieval
 import test_shares as of_shares
 from conftest import look_at
-from small_field import unit_rows
+from small_field import seen_of, unit_rows
 from test_direct import exact_cosines, exact_relevancy
 
 from jsecon.fit.photometric import l1, psnr
@@ -96,9 +96,9 @@ def field(count):
 
 
 def share(field, regions):
-    """(N,) float64: the regions' votes as a part of what the views show that show them."""
+    """(N,) float64: the regions' votes as a part of what they are shares of."""
     chosen = np.isin(field.votes.regions, regions)
-    weight, seen = (np.where(chosen, a, 0).astype(np.float64) for a in (field.votes.weights, field.votes.shown))
+    weight, seen = (np.where(chosen, a, 0).astype(np.float64) for a in (field.votes.weights, seen_of(field.votes)))
     return np.divide(weight.sum(1), seen.max(1), out=np.zeros(len(weight)), where=chosen.any(1)).clip(max=1)
 
 

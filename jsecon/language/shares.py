@@ -178,12 +178,12 @@ def vote_shares(votes: Votes) -> Float[Array, "n k"]:
 
 
 def vote_columns(votes: Votes) -> Iterator[tuple[Int[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]:
-    """r (N,), w_nr (N,) and what that is a share of (N,), for every Gaussian's k-th vote, k = 1 to K, for compiled code.
-    r is -1 where there is no vote.
+    """r (N,), w_nr (N,) and what that is a share of (N,), for every Gaussian's k-th vote, k = 1 to K. r is -1 where
+    there is no vote. For compiled code.
 
     Column by column: a reduction over short rows does not vectorise (1 million Gaussians of 8 votes: 27 ms against 4).
     """
-    least = None if votes.shown is None else _least_seen(votes)
+    least = _least_seen(votes)
     for k in range(votes.regions.shape[1]):
         seen = votes.total if votes.shown is None else jnp.maximum(votes.shown[:, k], least)
         yield votes.regions[:, k], votes.weights[:, k], seen
@@ -207,8 +207,8 @@ def share_of(votes: Votes, chosen: Bool[Array, " r"]) -> Share:
         p_n = min(sum_r w_nr / max(max_r W_nr, LABELLED_PART L_n, SEEN_PART W_n), 1)
 
     with r the chosen regions among the K that n has votes for. The largest W_nr is that of all views that show any of
-    them, where one is shown wherever the others are, and no more elsewhere. Not known are Gaussians that no view sees, without a vote for a chosen region, or with one that is not
-    finite. Pure; differentiable in the votes' weights.
+    them, where one is shown wherever the others are, and no more elsewhere. Not known are Gaussians that no view sees,
+    without a vote for a chosen region, or with one that is not finite. Pure; differentiable in the votes' weights.
     """
     inside, weight = _lookup(chosen), jnp.zeros(votes.total.shape, votes.weights.dtype)
     seen = jnp.zeros_like(weight)

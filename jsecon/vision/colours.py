@@ -52,7 +52,7 @@ _SURROUNDINGS = {
 # fmt: on
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
-# A bare basic term names a family: itself and these shades. What is near a shade (burgundy, sky) is near the family too.
+# A bare basic term names a family: itself and these shades. What is near a shade (burgundy, sky) is near it too.
 _SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for basic in BASIC} | {
     "black": ("charcoal",),
     "white": (),
@@ -91,9 +91,9 @@ class ColourEmbedder:
 
     What it understands of a text: colour names, their dark and light variants, `-ish` and compound forms
     (`bluish-green`), bare basic terms with all shades of their family (`red` includes dark red and burgundy, `bright
-    red` and `dark red` do not include each other), several colours of one thing (`red and white striped box`: each counts alike), and whether
-    the thing is part of the surroundings (wall, floor, table ...). Nouns otherwise carry no meaning, shapes and
-    materials neither.
+    red` and `dark red` do not include each other), several colours of one thing (`red and white striped box`: each
+    counts alike), and whether the thing is part of the surroundings (wall, floor, table ...). Nouns otherwise carry no
+    meaning, shapes and materials neither.
 
     An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
     coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
@@ -252,7 +252,7 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _spread(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (P, 3) and weights (P,) -> each with its darker and lighter neighbour (3 P, 3), and the weights of all."""
+    """Colours (P, 3) and weights (P,) -> each with its darker and lighter neighbour (3 P, 3), and their weights."""
     spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
     return spread.astype(np.float32), (weights[:, None] * _SPREAD_WEIGHTS).reshape(-1)
 
