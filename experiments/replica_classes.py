@@ -51,11 +51,8 @@ class Options:
     words: str = str(results.CAPTURES.parent / "words" / "replica_apartment_0_named_points.npz")
     damage: tuple[tuple[str, float], ...] = (
         ("as they are", 0.0),
-        ("lost", 0.3),
         ("lost", 0.5),
-        ("lost", 0.8),
         ("swallowed", 0.3),
-        ("swallowed", 0.5),
     )
     """what happens to a mask of a view, and how probably"""
     seed: int = 0
