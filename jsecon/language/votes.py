@@ -92,6 +92,7 @@ def region_votes(
     xp = jnp if traced else np  # NumPy compiles nothing
     bare = dataclasses.replace(gaussians, sh=np.zeros((count, 1, 3), gaussians.means.dtype))  # colour has no part in it
     totals: Any = None
+    labelled: Any = None
     kept = (np.full((count, 0), -1, np.int32), np.zeros((count, 0), gaussians.means.dtype))
     for b in range(blocks):
         start = _empty(xp, count, block, gaussians.means.dtype)
@@ -111,7 +112,7 @@ def region_votes(
         votes = state.pop("votes")
         kept, own = _keep_strongest(kept, votes, b * block, min(top, max(num_regions, 1)))
         del votes
-        labelled = own if b == 0 else labelled + own
+        labelled = own if labelled is None else labelled + own
     seen = totals if by_view else None
     return Votes(
         kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions, seen
