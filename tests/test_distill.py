@@ -255,7 +255,7 @@ def test_shapes_that_disagree_are_told(task):
     for wrong, match in (
         ({"labels": labels[:2]}, "labels"),
         ({"labels": labels[:, :3]}, "labels"),
-        ({"region_codes": codes[:0]}, "0 regions"),
+        ({"region_codes": codes[:0]}, "labels below 0"),
         ({"init": "mean"}, "init: got 'mean'"),
         ({"init": jnp.zeros((3, 3))}, "init"),
         ({"steps": 0}, "0 steps"),

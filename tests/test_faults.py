@@ -122,7 +122,8 @@ def test_two_runs_in_one_folder_are_told_apart(capture, tmp_path):
         pipeline.run(pipeline.Options(capture), tmp_path / "out")
     with alone(tmp_path / "out"):
         pass
-    with refused(".lock", "on writing to", "free some room"), alone(tmp_path / "gone"):
+    (tmp_path / "file").touch()
+    with refused(".lock", "on writing to", "free some room"), alone(tmp_path / "file"):
         pass
 
 

@@ -86,7 +86,7 @@ def test_damaged_json_is_named(tmp_path, content, words):
 
 
 def test_folders_without_masks_are_refused(tmp_path):
-    with pytest.raises(InputError, match="called like a frame"):
+    with pytest.raises(InputError, match="it holds 0 masks"):
         proposals_from_disk(tmp_path, ("a",), SIZE)
     with pytest.raises(InputError, match="no such folder"):
         proposals_from_disk(tmp_path / "nowhere", ("a",), SIZE)

@@ -30,10 +30,13 @@ def loaded(work: Work) -> list[Stage]:
 
 def _bare(capture: Path) -> bool:
     """Whether it is a video, or a folder of photographs without a file of poses."""
-    from jsecon.data.capture import bare_photographs
+    if capture.is_dir():
+        from jsecon.data.capture import bare_photographs
+
+        return len(bare_photographs(capture)) > 0
     from jsecon.data.video import is_video
 
-    return is_video(capture) or len(bare_photographs(capture)) > 0
+    return is_video(capture)
 
 
 def poses(work: Work) -> Stage:

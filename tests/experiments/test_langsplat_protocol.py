@@ -108,5 +108,5 @@ def test_pairs_are_counted_whatever_is_missing():
     assert (told["pairs"], told["missing"]) == (3, 1)
     assert told["miou"] == pytest.approx(rows[0].iou / 3)
     assert told["loc_acc"] == pytest.approx(1 / 3)
-    with pytest.raises(InputError, match=r"3 \(frame, query\) pairs; expected 56"):
+    with pytest.raises(InputError, match=r"3 \(frame, query\) pairs, expected 56"):
         evaluate_langsplat_2d([frame], lambda *_: None, expected_pairs=56)
