@@ -34,12 +34,14 @@ from jsecon.fit.view import cameras_extent
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Camera, Capture, Gaussians
 
-VISITS, PROBES = 20, 4
+VISITS, PROBES = 30, 4
 """of each frame by a probe, and probes one after the other at most"""
-POINTS = 8_000
+POINTS = 12_000
 """that a probe starts from at most, where it has more than the capture's sparse ones"""
-ALIGNING_VISITS = 40
-"""of each frame that has no part in a probe, by its alignment"""
+ALIGNING_VISITS = 120
+"""of each frame held out, by its alignment to the last probe"""
+DECIDING_VISITS = 24
+"""of each frame kept aside, by its alignment to a probe of the decision"""
 FINE = 0.5
 """size of the frames in the last probe, which measures as well as all of it here, in half the time"""
 COARSE_PX, COARSE_LEAST = 100, 0.25
@@ -59,7 +61,7 @@ TOO_MANY = (
     "{} frames are too many to correct them within half of the fit's time (use more --steps, fewer --frames, or "
     "--refine both, which takes longer)"
 )
-_STEP_PIXELS, _STEP_ONCE = 0.6, 0.1
+_STEP_PIXELS, _STEP_ONCE = 0.46, 0.072
 """time of a probe's step, in steps of the fit: for frames of the fit's size, and for its Gaussians"""
 _REFINE = Refine()
 _STILL = Refine(poses=False, exposure=False)
@@ -75,8 +77,6 @@ class _Plan(NamedTuple):
     probes: int
     visits: int
     """of each frame by each probe"""
-    aligning: int
-    """visits of each frame held out, and of each kept aside"""
 
 
 def _planned(
@@ -91,11 +91,12 @@ def _planned(
     small, large = (_STEP_PIXELS * size**2 + _STEP_ONCE for size in (coarse, FINE))
     # The decision takes a probe more, which sees no corrections; where there is one alone, two.
     each = train * (large + small * (probes - 1 + decide + (decide and probes == 1)))
-    aligned = ALIGNING_VISITS * (out * large + min(ASIDE[1], train // 3) * small * 2 * decide)
-    share = 1.0 if at_most is None else min(1.0, at_most / (visits * each + aligned))
-    if share * visits < min(FEWEST_VISITS, visits):
+    aligned = ALIGNING_VISITS * out * large + DECIDING_VISITS * min(ASIDE[1], train // 3) * small * 2 * decide
+    # Alignments are not cut short: a frame held out would be measured by a pose on its way.
+    allowed = visits if at_most is None else min(visits, int((at_most - aligned) / each))
+    if allowed < min(FEWEST_VISITS, visits):
         return None
-    return _Plan(coarse, probes, max(1, int(share * visits)), max(1, int(share * ALIGNING_VISITS)))
+    return _Plan(coarse, probes, max(1, allowed))
 
 
 def settled(
@@ -145,10 +146,10 @@ def settled(
     told, train, notes = capture, ~np.asarray(capture.held_out), []
     plan = _planned(capture, refine, visits=visits, probes=probes, decide=decide, at_most=at_most)
     if plan is None:
-        refine, plan = None, _Plan(FINE, 1, visits, 0)
+        refine, plan = None, _Plan(FINE, 1, visits)
         notes.append(f"poses and exposures stay as they are: {TOO_MANY.format(len(capture.names))}")
     steps, out = plan.visits * int(train.sum()), int((~train).sum()) if refine is not None else 0
-    total, done = steps * (plan.probes + 2 * decide) + plan.aligning * out, 0
+    total, done = steps * (plan.probes + 2 * decide) + ALIGNING_VISITS * out, 0
 
     def probed(capture: Capture, start: Gaussians, refine: Refine | None, size: float, steps: int, **given: Any):
         nonlocal done
@@ -181,7 +182,7 @@ def settled(
         left = 1 if still else left - 1
     probe, found = probed(capture, begun(), refine, FINE, steps)
     if out:
-        found = _with_aligned(capture, probe, found, ~train, refine, FINE, plan.aligning, probed)
+        found = _with_aligned(capture, probe, found, ~train, refine, FINE, ALIGNING_VISITS, probed)
     # In the probe's own world and colours.
     left_out = weak_frames(probe, _corrected(capture, found, refine, at_home=False)) if drop_weak else np.zeros(0, int)
     better = _corrected(capture, found, refine)
@@ -248,8 +249,8 @@ def _compared(
     even = np.add.outer(rows, columns) % 2 == 0
     ignored = np.zeros(np.shape(capture.frames)[:3], bool) if capture.ignored is None else np.asarray(capture.ignored)
     half = dataclasses.replace(capture, ignored=ignored | even)
-    found = _with_aligned(half, scene, found, aside, refine, plan.coarse, plan.aligning, probed)
-    alike = _with_aligned(half, plain, at_rest(len(aside)), aside, refine, plan.coarse, plan.aligning, probed)
+    found = _with_aligned(half, scene, found, aside, refine, plan.coarse, DECIDING_VISITS, probed)
+    alike = _with_aligned(half, plain, at_rest(len(aside)), aside, refine, plan.coarse, DECIDING_VISITS, probed)
     seen = even & ~ignored
     better = _mean_psnr(scene, capture, found, aside, seen, plan.coarse)
     without = _mean_psnr(plain, capture, alike, aside, seen, plan.coarse)
