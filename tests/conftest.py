@@ -208,13 +208,12 @@ def room(made_once) -> Path:
 
 
 @pytest.fixture(scope="session")
-def room_run(room, made_once):
+def room_run(room, made_once, tmp_path_factory):
     """A finished run on that room with its true masks given, and a folder as it was written, this worker's own."""
     from jsecon.pipeline import pipeline
 
     options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150)
     with made_once("run") as folder:
-        run = pipeline.run(options, folder)
-        # Beside the folder that it was written to: a field names the folders of its run as seen from its own.
-        own = folder.with_name(f"{folder.name}_{os.environ.get('PYTEST_XDIST_WORKER', 'main')}")
-        return run, Path(shutil.copytree(folder, own))
+        pipeline.run(options, folder)
+        own = Path(shutil.copytree(folder, tmp_path_factory.mktemp("run") / "out"))
+    return pipeline.run(options, own), own  # a field names the folders of its run as seen from its own
