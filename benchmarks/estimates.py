@@ -108,7 +108,7 @@ def measured(capture: Path, options: dict[str, Any], work: Path) -> dict[str, An
 
 def measure_all(captures: list[Path], kept: dict[str, Any], keep: Callable[[], object]) -> None:
     """Adds to `kept` what is not measured yet."""
-    from jsecon.data.synthetic import write_room
+    from jsecon.demo import write_room
 
     cases = [(f"room {room['views']}x{room['width']}", None, room) for room in ROOMS]
     cases += [(f"{path.name} {o['frames']}x{o['long_side']}", path, o) for path in captures for o in CAPTURES]

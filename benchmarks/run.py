@@ -49,7 +49,7 @@ def rgbd_room(folder: Path, *, seed: int = 0, views: int = 100, width: int = 400
     import cv2
     import numpy as np
 
-    from jsecon.data.synthetic import make_room, render_views, room_cameras
+    from jsecon.demo import make_room, render_views, room_cameras
 
     if (folder / "transforms.json").exists():
         return folder

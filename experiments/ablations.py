@@ -23,7 +23,7 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import State, tracked
-from jsecon.app.demo import PLAIN, demo
+from jsecon.demo.demo import PLAIN, demo
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
 from jsecon.pipeline.progress import Listener

@@ -34,9 +34,9 @@ from scipy.spatial import cKDTree
 
 from experiments import replica_apartment_0, results
 from experiments.cells import append_cell, read_cells
-from jsecon.app.demo import PLAIN, demo
 from jsecon.app.verbs import Demo
 from jsecon.data.capture import load_capture
+from jsecon.demo.demo import PLAIN, demo
 from jsecon.language.field import load_field
 from jsecon.pipeline import cache
 from jsecon.pipeline.masklet_stages import associated, proposals_of

@@ -22,8 +22,8 @@ from experiments import results
 from experiments.places import Options as Places, asked_for, fields_of, room_of
 from jsecon.app.question import ask_outline, ask_text
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
-from jsecon.data.synthetic.raycast import trace
-from jsecon.data.synthetic.room import Room
+from jsecon.demo.raycast import trace
+from jsecon.demo.room import Room
 from jsecon.evaluate.metrics import iou
 from jsecon.pipeline.networks import embedder_of_field
 from jsecon.query.masks import selection_mask

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from experiments import results
-from jsecon.app.demo import PLAIN, demo
 from jsecon.app.place import locate
 from jsecon.app.verbs import Demo
-from jsecon.data.synthetic.crowd import crowded_room
-from jsecon.data.synthetic.raycast import trace
-from jsecon.data.synthetic.room import Room, make_room
+from jsecon.demo.crowd import crowded_room
+from jsecon.demo.demo import PLAIN, demo
+from jsecon.demo.raycast import trace
+from jsecon.demo.room import Room, make_room
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import embedder_of_field

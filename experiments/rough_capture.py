@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from experiments import results
-from jsecon.data.synthetic import make_room, render_views, room_cameras
+from jsecon.demo import make_room, render_views, room_cameras
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.quality import quality
 from jsecon.fit.settle import settled

@@ -198,7 +198,7 @@ def made_once(tmp_path_factory):
 @pytest.fixture(scope="session")
 def room(made_once) -> Path:
     """The demo room on disk, as small as it can be and still have objects to find: 8 views of 160x120, 2 held out."""
-    from jsecon.data.synthetic import write_room
+    from jsecon.demo import write_room
 
     with made_once("room") as folder:
         if not (folder / "written").exists():

@@ -233,7 +233,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=400, help="of the fit")
     parser.add_argument("--seed", type=int, default=0, metavar="S")
     asked = parser.parse_args(argv)
-    from jsecon.data.synthetic import write_room
+    from jsecon.demo import write_room
 
     os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)  # the program's own choice, beneath XDG_CACHE_HOME
     after, wrong = {"kill": collections.Counter(), "disk": collections.Counter()}, 0

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jsecon.app import demo, film as film_of, pictures
+from jsecon.app import pictures
 from jsecon.data.ply import load_ply
+from jsecon.demo import demo, film as film_of
 from jsecon.language.field import load_field
 from jsecon.pipeline.progress import Listener
 from jsecon.process import peak_memory_mib

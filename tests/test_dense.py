@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from jsecon.data.synthetic.capture import captured, room_cameras
-from jsecon.data.synthetic.room import make_room
+from jsecon.demo.capture import captured, room_cameras
+from jsecon.demo.room import make_room
 from jsecon.errors import InputError
 from jsecon.fit.dense import dense_points, random_points
 from jsecon.fit.depth import points_from_depth

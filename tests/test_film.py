@@ -7,8 +7,8 @@ from conftest import look_at
 from PIL import Image
 from small_field import make_field, true_regions
 
-from jsecon.app import film
 from jsecon.app.question import Answer
+from jsecon.demo import film
 from jsecon.types import Camera, Selection
 
 

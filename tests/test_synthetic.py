@@ -12,13 +12,13 @@ from conftest import look_at
 from jsecon.data.capture import load_capture
 from jsecon.data.lerf_labels import load_lerf_labels
 from jsecon.data.mask_files import load_labels
-from jsecon.data.synthetic import make_room, render_views, room_cameras, room_capture, write_room
-from jsecon.data.synthetic.crowd import ARCH, BEAM, CLUTTER, THINGS, TWICE, crowded_room
-from jsecon.data.synthetic.light import lamp_points, lamp_visibility
-from jsecon.data.synthetic.raycast import trace
-from jsecon.data.synthetic.room import PALETTE, TABLE_HALF, TABLE_HEIGHT, Part
-from jsecon.data.synthetic.shapes import SHAPES, reach
-from jsecon.data.synthetic.solids import (
+from jsecon.demo import make_room, render_views, room_cameras, room_capture, write_room
+from jsecon.demo.crowd import ARCH, BEAM, CLUTTER, THINGS, TWICE, crowded_room
+from jsecon.demo.light import lamp_points, lamp_visibility
+from jsecon.demo.raycast import trace
+from jsecon.demo.room import PALETTE, TABLE_HALF, TABLE_HEIGHT, Part
+from jsecon.demo.shapes import SHAPES, reach
+from jsecon.demo.solids import (
     blocks,
     box,
     contains,
@@ -31,7 +31,7 @@ from jsecon.data.synthetic.solids import (
     place,
     rotation,
 )
-from jsecon.data.synthetic.surfaces import pattern
+from jsecon.demo.surfaces import pattern
 from jsecon.errors import InputError
 from jsecon.types import Camera
 

@@ -26,8 +26,8 @@ from experiments.datasets.scannet import CLASS_SETS, NYU40
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
-from jsecon.data.synthetic.capture import captured, labelled, look_at, room_cameras, write_ids
-from jsecon.data.synthetic.room import TABLE_WOOD, Part, Room, linear, make_room
+from jsecon.demo.capture import captured, labelled, look_at, room_cameras, write_ids
+from jsecon.demo.room import TABLE_WOOD, Part, Room, linear, make_room
 from jsecon.files import write_text, written_whole
 from jsecon.types import Camera, Capture
 

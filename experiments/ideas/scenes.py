@@ -21,8 +21,8 @@ from scipy import sparse
 from experiments import replica_apartment_0, results
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace, load_text_space, made_text_space
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
-from jsecon.app.demo import PLAIN, demo
 from jsecon.app.verbs import Demo
+from jsecon.demo.demo import PLAIN, demo
 from jsecon.language.field import load_field
 from jsecon.language.votes import region_votes
 from jsecon.pipeline.progress import Listener

@@ -27,8 +27,8 @@ from experiments.simulated_vision.embeddings import SimulatedEmbedder, load_text
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
 from jsecon.data.mask_files import LEVELS
-from jsecon.data.synthetic.raycast import trace
-from jsecon.data.synthetic.room import make_room
+from jsecon.demo.raycast import trace
+from jsecon.demo.room import make_room
 from jsecon.files import write_text
 from jsecon.vision.protocols import CANONICAL
 

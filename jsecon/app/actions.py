@@ -22,9 +22,9 @@ _RUN_FILES = ("field.npz", "report.html", "metrics.json")
 
 def _demo(asked: Demo, console: Console) -> Told:
     with console.progress("start"):
-        from jsecon.app.demo_real import asked_demo
+        from jsecon.demo.demo import demo
 
-    told = asked_demo(asked, console)
+    told = demo(asked.out, seed=asked.seed, steps=asked.steps, listener=console)
     return {"written": [asked.out / name for name in (*_RUN_FILES, "queries", "demo.jpg", "demo.webp")]} | told
 
 

@@ -27,7 +27,7 @@ class Demo:
     Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on it
     what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is used.
     Ends with report.html, metrics.json, field.npz, a short film and a .ply for each query. One to two minutes on two
-    cores. With --real the same of a capture of your own.
+    cores. On a capture of your own, use `jsecon run` and `jsecon query`.
     """
 
     seed: int = 0
@@ -35,11 +35,7 @@ class Demo:
     out: Path = Path("jsecon-demo")
     """folder for all of it"""
     steps: int = 550
-    """of the photometric fit"""
-    real: Folder = None
-    """a capture of your own instead, as `jsecon run` takes it: 60 of its frames at most, and no ground truth"""
-    texts: Annotated[list[str] | None, {"nargs": "+", "metavar": "TEXT"}] = None
-    """with --real: what to ask (default: the colours that its regions answer best)"""
+    """number of optimisation steps of the photometric fit"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

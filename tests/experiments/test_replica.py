@@ -11,7 +11,7 @@ from twin_files import replica_twin
 
 from experiments.datasets.mesh import SURROUNDINGS
 from experiments.datasets.replica import REPLICA_SCENES, load_replica, vertex_classes
-from jsecon.data.synthetic import make_room, room_cameras
+from jsecon.demo import make_room, room_cameras
 
 
 @pytest.fixture(scope="module")

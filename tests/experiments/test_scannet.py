@@ -10,7 +10,7 @@ from twin_files import scannet_twin
 
 from experiments.datasets.scannet import CLASS_SETS, NYU40, SCANNET_SCENES, load_scannet
 from jsecon.data.ply_file import read_vertices
-from jsecon.data.synthetic import make_room, room_cameras
+from jsecon.demo import make_room, room_cameras
 
 SCENE = SCANNET_SCENES[0]
 

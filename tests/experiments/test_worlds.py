@@ -17,7 +17,7 @@ from experiments.simulated_vision.embeddings import SimulatedEmbedder, made_text
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables.rows import TRAINED
 from jsecon.data.lerf_labels import LabelledFrame
-from jsecon.data.synthetic.room import TABLE_WOOD, linear, make_room
+from jsecon.demo.room import TABLE_WOOD, linear, make_room
 from jsecon.errors import InputError
 from jsecon.query.masks import selection_mask
 

@@ -24,6 +24,6 @@ def scannet_twin(root):
 
 def rooms_instances(seed, cameras):
     """(T, H, W) the objects that ray casting finds, asked for again from the room itself."""
-    from jsecon.data.synthetic import make_room, render_views
+    from jsecon.demo import make_room, render_views
 
     return render_views(make_room(seed, num_objects=SMALL["num_objects"]), cameras)

@@ -14,9 +14,9 @@ import numpy as np
 
 from jsecon.app import asking, pictures, question, report, summary
 from jsecon.app.answers import masks_of, write_answer
-from jsecon.app.film import write_film
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
-from jsecon.data.synthetic import write_room
+from jsecon.demo import write_room
+from jsecon.demo.film import write_film
 from jsecon.evaluate.lerf import Row
 from jsecon.files import write_text, written_whole
 from jsecon.pipeline import networks, pipeline

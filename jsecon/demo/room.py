@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jsecon.data.synthetic.shapes import SHAPES, Body, reach
-from jsecon.data.synthetic.solids import Solid, box, place, rotation
+from jsecon.demo.shapes import SHAPES, Body, reach
+from jsecon.demo.solids import Solid, box, place, rotation
 from jsecon.errors import require
 
 PALETTE = {

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jsecon.data.synthetic.room import Room, around, radius_of, scatter, stand
-from jsecon.data.synthetic.shapes import SHAPES, Body
-from jsecon.data.synthetic.solids import box, place
+from jsecon.demo.room import Room, around, radius_of, scatter, stand
+from jsecon.demo.shapes import SHAPES, Body
+from jsecon.demo.solids import box, place
 
 TWICE = "red"
 """the colour of the two of a kind"""

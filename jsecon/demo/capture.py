@@ -14,9 +14,9 @@ from jaxtyping import Bool, Int16, UInt
 from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_options, held_out
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
-from jsecon.data.synthetic.crowd import crowded_room
-from jsecon.data.synthetic.raycast import render_views
-from jsecon.data.synthetic.room import Room, make_room
+from jsecon.demo.crowd import crowded_room
+from jsecon.demo.raycast import render_views
+from jsecon.demo.room import Room, make_room
 from jsecon.errors import require
 from jsecon.files import write_text, written_whole
 from jsecon.types import Camera, Capture

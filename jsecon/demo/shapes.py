@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from jsecon.data.synthetic.solids import Solid, box, contains, cut, ellipsoid, frustum, place, rotation
+from jsecon.demo.solids import Solid, box, contains, cut, ellipsoid, frustum, place, rotation
 
 Body: TypeAlias = Sequence[tuple[Solid, Solid | None, float]]
 """solids, what is hollow of each, and its tone"""

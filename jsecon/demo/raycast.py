@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32, Int16, UInt8
 
-from jsecon.data.synthetic.light import LAMP, LIFT, SKY, direct, lamp_points, lamp_visibility
-from jsecon.data.synthetic.room import TABLE_HEIGHT, Room
-from jsecon.data.synthetic.solids import first_hit, normals
-from jsecon.data.synthetic.surfaces import bake, pattern
+from jsecon.demo.light import LAMP, LIFT, SKY, direct, lamp_points, lamp_visibility
+from jsecon.demo.room import TABLE_HEIGHT, Room
+from jsecon.demo.solids import first_hit, normals
+from jsecon.demo.surfaces import bake, pattern
 from jsecon.types import Camera
 
 _OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))

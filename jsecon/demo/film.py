@@ -9,7 +9,7 @@ from PIL import Image
 
 from jsecon.app.pictures import Renderer
 from jsecon.app.question import Answer
-from jsecon.data.synthetic.capture import look_at
+from jsecon.demo.capture import look_at
 from jsecon.files import written_whole
 from jsecon.fit.schedule import resized
 from jsecon.splat.sh import C0

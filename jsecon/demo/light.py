@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Float32
 
-from jsecon.data.synthetic.room import Part, Room
-from jsecon.data.synthetic.solids import blocks
+from jsecon.demo.room import Part, Room
+from jsecon.demo.solids import blocks
 
 SKY, LAMP = 0.84, 0.48
 """radiance of a white surface under the whole sky, and facing the whole lamp; together a colour keeps its lightness"""

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.synthetic.light import LAMP, LIFT, SKY, contact, direct, lamp_points, lamp_visibility
-from jsecon.data.synthetic.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Room, Texture, linear
+from jsecon.demo.light import LAMP, LIFT, SKY, contact, direct, lamp_points, lamp_visibility
+from jsecon.demo.room import TABLE_HALF, TABLE_HEIGHT, TABLE_WOOD, Room, Texture, linear
 
 
 @dataclasses.dataclass(frozen=True)
