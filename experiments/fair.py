@@ -2,8 +2,8 @@
 
     python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
                                [--seeds 10 11 ...] [--choosing 0 ...] [--seeds-trained ...] [--choosing-trained ...]
-                               [--scenes-trained NAME ...] [--methods NAME ...] [--quick] [--out FOLDER]
-                               [--processes N]
+                               [--scenes-trained NAME ...] [--methods NAME ...] [--read READING ...] [--quick]
+                               [--out FOLDER] [--processes N]
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.rows`), and none may refuse a
 text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
@@ -16,6 +16,7 @@ ours is compared with each on its own ("ours there").
 import argparse
 import contextlib
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -53,6 +54,8 @@ class Asked:
     """the scenes of those methods; empty: the same as the others'."""
     methods: tuple[str, ...]
     """empty: all."""
+    read: tuple[str, ...]
+    """the readings that are chosen from, without the methods' own constants; empty: all."""
     quick: bool
     out: str
 
@@ -149,6 +152,12 @@ def by_scene(cells: list[dict], figure: str, fold: Callable[[list[float]], float
     return {scene: fold([cell[figure] for cell in cells if cell["scene"] == scene]) for scene in scenes}
 
 
+def reading_of(row: str) -> str:
+    """A row's reading without the constants that a method has a row for each of ("16 roots", "no quantile", 0.98)."""
+    way = row.split(": ", 1)[1]
+    return re.sub(r"^(\d+ roots|no quantile|ScanNet's \w+), | 0\.\d+$|, one mask$", "", way)
+
+
 def figures_of(table: str) -> tuple[str, ...]:
     """What of a table's cells is compared: at the points there is one figure."""
     return ("miou",) if table == "replica" else ("miou", "miou_vala")
@@ -170,6 +179,7 @@ def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
     methods = rows_of(name == "replica")
     rows = [row for row in methods if not asked.methods or row.split(": ")[0] in asked.methods]
     rows = [row for row in rows if not asked.quick or row.split(": ")[1] in QUICK_READ]
+    rows = [row for row in rows if not asked.read or reading_of(row) in (*asked.read, PUBLISHED)]
 
     def filled(rows: list[str], seeds: tuple[int, ...]) -> list[dict]:
         plan = plan_of(name, level, asked, processes, seeds, rows)
@@ -218,6 +228,7 @@ if __name__ == "__main__":
     parser.add_argument("--choosing-trained", nargs="+", type=int, help="of them, for methods that train; default: all")
     parser.add_argument("--scenes-trained", nargs="+", default=[], help="of the one table asked for, for those methods")
     parser.add_argument("--methods", nargs="+", default=[], help="that are compared, ours among them; default: all")
+    parser.add_argument("--read", nargs="+", default=[], help="readings that are chosen from; default: all")
     parser.add_argument("--quick", action="store_true", help="one tiny scene of each, one seed: two minutes")
     parser.add_argument("--out", default="")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
@@ -235,6 +246,7 @@ if __name__ == "__main__":
         tuple(given.choosing_trained or choosing),
         tuple(given.scenes_trained),
         tuple(given.methods),
+        tuple(given.read),
         given.quick,
         place,
     )

@@ -21,6 +21,7 @@ from scipy import sparse
 from experiments import replica_apartment_0, results
 from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace, load_text_space, made_text_space
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
+from experiments.simulated_vision.worlds import world_of
 from jsecon.app.verbs import Demo
 from jsecon.demo.demo import PLAIN, demo
 from jsecon.language.field import load_field
@@ -152,12 +153,16 @@ def text_space(folder: Path) -> TextSpace:
 
 
 def look(scene: Scene, level: str, space: TextSpace) -> Sight:
-    """Simulated vision of a named level. The objects' classes are drawn by the scene's seed, the same at each level."""
-    faults, views = LEVELS[level], np.arange(len(scene.frames))
+    """Simulated vision of a named level. The objects' classes are drawn by the scene's seed, the same at each level.
+    Errors that views share lean to the space's other names too."""
+    noise, world = world_of(level)
+    faults, views = LEVELS[noise], np.arange(len(scene.frames))
     chosen = np.random.default_rng(scene.seed).choice(len(space.names), scene.count, replace=False)
     classes = [space.names[i] for i in chosen]
     masks = simulated_masks(scene.labels, faults, seed=scene.seed)
-    embedder = SimulatedEmbedder(scene.frames, scene.labels, classes, space, faults, seed=scene.seed)
+    others = np.delete(space.vectors, chosen, axis=0)
+    hard = {"world": world, "others": others}
+    embedder = SimulatedEmbedder(scene.frames, scene.labels, classes, space, faults, seed=scene.seed, **hard)
     regions = len(masks.origin)
     pixels = np.zeros((len(views), regions), np.int64)
     embeddings = np.zeros((len(views), regions, embedder.dim), np.float32)

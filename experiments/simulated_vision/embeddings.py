@@ -29,6 +29,11 @@ HARMONICS = 4
 """of the noise that follows the azimuth"""
 MOST_NOISE = 4.0
 """the view noise of a tiny mask, in units of that of a mask of `reference_pixels`"""
+LEANING = 0.75
+"""part of an object's text that others take the place of where `World.shared` is 1. Chosen so that the own text is then
+the best of the scene's for about a quarter of the regions by the contrast (experiments/shared_errors.py)"""
+CONFUSED = 2
+"""other classes of the scene in an object's mixture; where names that nothing has are given, as many of these too"""
 
 
 PLAIN = World()
@@ -58,19 +63,23 @@ def load_text_space(vectors: str | Path, names: str | Path) -> TextSpace:
     return TextSpace(tuple(texts), _unit(rows))
 
 
-def named_after(space: TextSpace, names: Sequence[str], *, near: bool, seed: int = 0) -> TextSpace:
-    """The names under vectors of a real space: of words drawn by lot, or of one word and those nearest to it.
+def named_after(
+    space: TextSpace, names: Sequence[str], *, near: bool, seed: int = 0, others: Sequence[str] = ()
+) -> TextSpace:
+    """The names under vectors of a real space: of words drawn by lot, or of one word and those nearest to it. `others`,
+    which come last, have those that are drawn next, or are next nearest.
 
     Raises InputError where the space has too few.
     """
-    if len(names) > len(space.names):
-        got, wanted = f"{len(space.names)} words", f"{len(names)} or more"
-        raise InputError("the text space", got, wanted, "Take a larger one.")
+    count = len(names) + len(others)
+    if count > len(space.names):
+        raise InputError("the text space", f"{len(space.names)} words", f"{count} or more", "Take a larger one.")
     draw = np.random.default_rng([seed, 13])
     rows = draw.permutation(len(space.names))
     if near:
         rows = np.argsort(-(space.vectors @ space.vectors[rows[0]]), kind="stable")
-    return TextSpace(tuple(names), space.vectors[draw.permutation(rows[: len(names)])])
+    own = draw.permutation(rows[: len(names)])
+    return TextSpace((*names, *others), space.vectors[np.concatenate([own, rows[len(names) : count]])])
 
 
 def made_text_space(names: Sequence[str], *, dim: int = 512, seed: int = 0, common: float | int = 0.0) -> TextSpace:
@@ -100,7 +109,11 @@ class SimulatedEmbedder:
     isotropic of unit length. The gap is drawn once per space: across the texts' mean, plus `gap_along` of it.
 
     In a hard `world`, labels may be pieces of `objects` (L,), each set apart from its object's text by a direction of
-    its own; the gap's length differs by class; and v follows the views' `azimuths` (T,), radians.
+    its own; the gap's length differs by class; v follows the views' `azimuths` (T,), radians; and each object's text is
+
+        (1 - LEANING shared) text_k + LEANING shared sum_j m_kj text_j
+
+    with m_kj the object's mixture (`leanings`) of the other classes and of names that nothing has, `others` (O, E).
     """
 
     def __init__(
@@ -115,6 +128,7 @@ class SimulatedEmbedder:
         world: World = PLAIN,
         objects: Int[np.ndarray, " l"] | None = None,
         azimuths: Float[np.ndarray, " t"] | None = None,
+        others: Float[np.ndarray, "o e"] | None = None,
     ):
         objects = np.arange(len(classes)) if objects is None else np.asarray(objects)
         require(
@@ -134,6 +148,11 @@ class SimulatedEmbedder:
         self._gap = faults.gap * _unit(across - (across @ mean) * mean) + faults.gap_along * mean
         noise = faults.object_noise * _unit(draw.standard_normal((len(classes), self.dim)))
         text = self.embed_text(list(classes)).reshape(len(classes), self.dim)
+        if world.shared:
+            others = np.zeros((0, self.dim)) if others is None else others
+            mixture = leanings(classes, len(others), seed=seed)
+            part = LEANING * world.shared * mixture.sum(1, keepdims=True)
+            text = (1 - part) * text + LEANING * world.shared * mixture @ np.concatenate([text, others])
         content = (text + noise)[objects]
         hard = np.random.default_rng([seed, 9])
         aside = _unit(hard.standard_normal((len(objects), self.dim)))
@@ -189,6 +208,27 @@ class SimulatedEmbedder:
             if text not in self._words:
                 raise InputError(text, "no such name", f"one of {len(self._words)}", "Use a name of the space.")
         return np.array([self._words[text] for text in texts], np.float32).reshape(len(texts), self.dim)
+
+
+def leanings(classes: Sequence[str], others: int, *, seed: int) -> Float[np.ndarray, "k m"]:
+    """(K, K + O) what each of K objects of the named classes is taken for: weights of their K texts and of O others.
+
+    An object's weights are drawn from a flat distribution over CONFUSED other classes of the scene and CONFUSED of the
+    others. They sum to 1; to 0 where there is no other class and no other name. Each object has a draw of its own, by
+    `seed` and its number: what is seen of the scene, and how badly, changes none.
+    """
+    names = np.array(classes)
+    found = np.zeros((len(names), len(names) + others))
+    first = np.sort(np.unique(names, return_index=True)[1])  # an object of each class
+    for k, name in enumerate(names):
+        draw = np.random.default_rng([seed, 16, k])
+        inside = first[names[first] != name]
+        chosen = draw.permutation(inside)[:CONFUSED]
+        beside = len(names) + draw.permutation(others)[:CONFUSED]
+        chosen = np.concatenate([chosen, beside]).astype(int)
+        if len(chosen):
+            found[k, chosen] = draw.dirichlet(np.ones(len(chosen)))
+    return found
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

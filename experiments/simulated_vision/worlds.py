@@ -2,7 +2,7 @@
 
 `Faults` are drawn anew for each mask, so that views outvote them. These are not: halves that are told apart at the same
 place in every view, neighbours that are taken for one again and again, shadows that masks reach over, noise that turns
-with the camera, texts that lie near each other.
+with the camera, texts that lie near each other, objects that look like other classes from every side.
 """
 
 import dataclasses
@@ -38,6 +38,15 @@ class World:
     levels: float = 0.0
     """share of an object's views in which masks overlap in three levels: its two sides, itself, and it with its nearest
     neighbour. In the others the three are alike."""
+    shared: float = 0.0
+    """how far an object's images lean away from its own text, to a mixture of other classes' texts. The mixture is the
+    object's own and the same in all views (`leanings`), so that no mean over views removes it."""
+
+
+SHARED = "shared"
+SHARED_STRENGTH = 0.75
+"""the level "shared" is medium noise with `World.shared` of this strength. Chosen so that by the plain cosine the own
+text is the best of the scene's for a quarter of the regions, as with a real embedder (experiments/shared_errors.py)"""
 
 
 class Seen(NamedTuple):
@@ -55,9 +64,12 @@ class Seen(NamedTuple):
 
 
 def world_of(level: str) -> tuple[str, World]:
-    """The level of noise and the world of a name such as "medium+parts=1+gap=0.5". Raises ValueError for a switch that
-    there is none of, and one beyond 0 to 1."""
+    """The level of noise and the world of a name such as "medium+parts=1+gap=0.5"; "shared" is "medium+shared=0.75".
+    Raises ValueError for a switch that there is none of, and one beyond 0 to 1."""
     noise, *switches = level.split("+")
+    if noise == SHARED:
+        noise = "medium"
+        switches = [f"{SHARED}={SHARED_STRENGTH}", *switches]
     values = dict(switch.split("=") for switch in switches)
     known = [field.name for field in dataclasses.fields(World)]
     for name, value in values.items():

@@ -47,6 +47,8 @@ class Setting:
     seed: int
     folder: Path
     """of the scene's files: masks, language_features, text_features.json."""
+    level: str = ""
+    """of a twin's simulated vision."""
     shared: Shared = dataclasses.field(default_factory=Shared, compare=False)
     """what methods have in common."""
 
@@ -90,6 +92,7 @@ def prepare(
         names,
         seed,
         folder,
+        level,
     )
 
 

@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,8 +24,14 @@ from experiments.datasets.mesh import SURROUNDINGS, surfaces_of
 from experiments.datasets.ovs3d import load_ovs3d
 from experiments.datasets.replica import load_replica
 from experiments.datasets.scannet import load_scannet
-from experiments.simulated_vision.embeddings import SimulatedEmbedder, load_text_space, made_text_space, named_after
-from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, simulated_masks
+from experiments.simulated_vision.embeddings import (
+    SimulatedEmbedder,
+    TextSpace,
+    load_text_space,
+    made_text_space,
+    named_after,
+)
+from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
 from jsecon.data.mask_files import LEVELS
 from jsecon.demo.raycast import trace
@@ -46,10 +53,12 @@ WRITERS = {
 
 LVIS = "clip_vitb32_lvis.npy", "lvis_names.json"
 """text vectors of real names, in a folder `text` beside the captures"""
+ABSENT = 200
+"""names that nothing in a twin has: to refuse, and for errors that views share to lean to"""
 
 
 def faults_of(level: str) -> Faults:
-    """Of a named level of noise: perfect, low, medium or high; what follows a "+" is `world_of`'s."""
+    """Of a named level of noise: perfect, low, medium, high or shared; what follows a "+" is `world_of`'s."""
     noise, _ = world_of(level)
     return PERFECT if noise == "perfect" else NOISE[noise]
 
@@ -85,9 +94,21 @@ def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict
     return place
 
 
-def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
-    """Writes simulated masks, tracks and embeddings, with the faults of `level`, of the frames that may be learnt
-    from."""
+class Sight(NamedTuple):
+    """What simulated vision sees of a twin's frames that may be learnt from."""
+
+    names: list[str]
+    frames: np.ndarray
+    """(T, H, W, 3) uint8."""
+    truth: np.ndarray
+    """(T, H, W) int16 true objects, -1 = none."""
+    masks: list[SimulatedMasks]
+    """of each of LEVELS."""
+    embedder: SimulatedEmbedder
+
+
+def sight(bench: Benchmark, root: Path, level: str, seed: int) -> Sight:
+    """Simulated vision of a twin's frames, with the faults of `level`."""
     told = json.loads((root / "twin.json").read_text())["scenes"][bench.name]
     shown = np.flatnonzero(~np.asarray(bench.capture.held_out))
     names = [bench.capture.names[t] for t in shown]
@@ -103,16 +124,22 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
         points, _ = surfaces_of(room, dataclasses.replace(bench.capture, cameras=cameras, depths=depths), truth)
         table = len(room.objects) + SURROUNDINGS.index("table")
         seen = seen_in(world, truth, points, room, table, seed=seed)
-    space = _space(words, world, seed)
+    space, others = space_of(words, world, seed)
     masks = simulated_masks(seen.masks, faults, seed=seed)
     levels = [masks] * len(LEVELS)
     if seen.small is not None and seen.large is not None:
         small, large = (simulated_masks(m, faults, seed=seed + 1000 * k) for k, m in ((1, seen.small), (2, seen.large)))
         levels = [masks, small, masks, large]
     azimuths = np.arctan2(cameras.centres[:, 1], cameras.centres[:, 0])
-    hard = {"world": world, "objects": seen.objects, "azimuths": azimuths}
+    hard = {"world": world, "objects": seen.objects, "azimuths": azimuths, "others": others}
     embedder = SimulatedEmbedder(frames, seen.content, told["objects"], space, faults, seed=seed, **hard)
-    folder = root / bench.name
+    return Sight(names, frames, truth, levels, embedder)
+
+
+def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
+    """Writes the masks, tracks and embeddings of `sight`."""
+    names, frames, _, levels, embedder = sight(bench, root, level, seed)
+    folder, masks = root / bench.name, levels[0]
     for t, (name, frame) in enumerate(zip(names, frames, strict=True)):
         found, rows, first = [], [], {}
         for level in levels:
@@ -128,11 +155,26 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
 
 
-def _space(words: list[str], world: World, seed: int):
+def space_of(words: list[str], world: World, seed: int) -> tuple[TextSpace, np.ndarray]:
+    """The texts of a twin's words, and the vectors (ABSENT, E) of names that nothing in it has."""
+    absent = [f"absent{n}" for n in range(ABSENT)]
     if not world.lvis:
-        return made_text_space(words, seed=seed, common=world.names)
+        # Made twice: a product of more rows need not give the words the same bits.
+        every = made_text_space([*words, *absent], seed=seed, common=world.names)
+        return made_text_space(words, seed=seed, common=world.names), every.vectors[len(words) :]
     real = load_text_space(*(results.CAPTURES.parent / "text" / name for name in LVIS))
-    return named_after(real, words, near=world.lvis == 1, seed=seed)
+    every = named_after(real, words, near=world.lvis == 1, seed=seed, others=absent)
+    return TextSpace(every.names[: len(words)], every.vectors[: len(words)]), every.vectors[len(words) :]
+
+
+def absent_texts(bench: Benchmark, root: Path, level: str, seed: int) -> np.ndarray:
+    """(ABSENT, E) vectors of names that nothing in a twin has, in the space of its own texts."""
+    return space_of(sorted({*objects_of(bench, root), *bench.queries}), world_of(level)[1], seed)[1]
+
+
+def objects_of(bench: Benchmark, root: Path) -> list[str]:
+    """The names of a twin's objects, by their labels; its surroundings come last."""
+    return json.loads((root / "twin.json").read_text())["scenes"][bench.name]["objects"]
 
 
 @dataclasses.dataclass(frozen=True)

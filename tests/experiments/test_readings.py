@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
 
-from experiments import default_fit, fair, lerf
+from experiments import default_fit, fair, lerf, shared_errors
 from experiments.rivals.lifting import smoothed
 from experiments.tables import fill
 from experiments.tables.readings import as_share
@@ -58,7 +58,7 @@ def test_each_method_is_read_as_suits_each_figure_and_ours_also_by_one_reading()
     assert best["VALA"] == {"miou": "VALA: cosine", "miou_vala": "VALA: contrast"}
     assert best["ours, consensus"] == {"miou": "ours, consensus: x", "miou_vala": "ours, consensus: y"}
     assert set(best["ours, consensus" + fair.ONE_READING].values()) == {"ours, consensus: y"}
-    asked = fair.Asked(("lerf",), (), ("medium",), (10,), (0,), (10,), (0,), (), (), False, "")
+    asked = fair.Asked(("lerf",), (), ("medium",), (10,), (0,), (10,), (0,), (), (), (), False, "")
     text, told = fair.report("lerf", "medium", cells, asked)
     assert told["VALA, miou"]["ahead"] == pytest.approx((0.2, 0.2, 0.2))
     assert told["VALA, miou_vala"]["ahead"] == pytest.approx((0.1, 0.1, 0.1))
@@ -69,7 +69,7 @@ def test_ours_is_compared_with_a_method_on_the_scenes_and_seeds_that_it_has():
     cells = [cell("VALA: cosine", seed, 0.5, 0.4) for seed in (0, 10)]
     cells += [cell("ours, consensus: x", seed, value, 0.5) for seed, value in ((0, 0.7), (10, 0.7), (11, 0.9))]
     cells += [cell("ours, consensus: x", 10, 0.1, 0.5) | {"scene": "another"}]
-    asked = fair.Asked(("lerf",), (), ("medium",), (10, 11), (0,), (10,), (0,), ("s",), (), False, "")
+    asked = fair.Asked(("lerf",), (), ("medium",), (10, 11), (0,), (10,), (0,), ("s",), (), (), False, "")
     _, told = fair.report("lerf", "medium", cells, asked)
     assert told["VALA, miou"]["ours there"] == pytest.approx(0.7)
     assert told["VALA, miou"]["scenes"] == ["s"]
@@ -98,6 +98,30 @@ def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F81
             assert len(every) == found["pairs"]
             assert np.mean(every) == pytest.approx(found[name], abs=1e-4)
     assert cells[1]["miou"] > 0.1
+
+
+def test_shared_errors_are_measured_on_a_twin(folder):  # noqa: F811
+    """At full strength fewer regions have their own text as the best, and no figure moves at strength 0."""
+    data = small(lerf.QUICK, folder, "shared").data
+    root = data.place("figurines", 0, "perfect")
+    bench = data.load(root, "figurines")
+    plain, off, full = (
+        shared_errors.pooled(bench, root, level, 0) for level in ("perfect", "perfect+shared=0", "perfect+shared=1")
+    )
+    np.testing.assert_array_equal(off.masks, plain.masks)
+    told = {name: shared_errors.figures_of(found) for name, found in (("plain", plain), ("full", full))}
+    assert set(told["full"]) == set(shared_errors.REAL)
+    own = "own text is the best, by cosine"
+    assert told["plain"][own] == 1
+    assert told["full"][own] < 0.8
+    assert told["full"]["mask to its own text"] < told["plain"]["mask to its own text"] - 0.01
+    assert told["full"]["same region, another view"] == pytest.approx(1, abs=1e-5)
+
+
+def test_readings_are_named_without_the_constants_of_methods():
+    named = {fair.reading_of(row) for points in (False, True) for row in rows_of(points)}
+    assert "contrast, threshold" in named
+    assert not any("roots" in name or "codebook" in name or "0." in name for name in named)
 
 
 def test_a_table_on_another_fit_keeps_its_own_cells_and_takes_those_of_the_table():

@@ -10,11 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiments.test_simulated import NONE, frames, space  # noqa: F401
+from hypothesis import given, settings, strategies as st
 
 from experiments import kinds, worlds
 from experiments.datasets.twins import by_kind, camouflaged
-from experiments.simulated_vision.embeddings import SimulatedEmbedder, made_text_space, named_after
+from experiments.simulated_vision.embeddings import (
+    CONFUSED,
+    LEANING,
+    SimulatedEmbedder,
+    leanings,
+    made_text_space,
+    named_after,
+)
+from experiments.simulated_vision.masks import LEVELS
 from experiments.simulated_vision.worlds import World, seen_in, world_of
+from experiments.tables import twins
 from experiments.tables.rows import TRAINED
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, linear, make_room
@@ -51,6 +61,7 @@ def seen(made, **switches):
 def test_a_level_names_the_noise_and_the_switches():
     assert world_of("high") == ("high", World())
     assert world_of("medium+parts=1+gap=0.5") == ("medium", World(parts=1, gap=0.5))
+    assert world_of("shared") == ("medium", World(shared=0.75))
     for wrong in ("medium+sharks=1", "medium+parts=2"):
         with pytest.raises(ValueError, match="a number from 0 to 1"):
             world_of(wrong)
@@ -143,6 +154,71 @@ def test_the_gap_differs_by_class_and_not_by_view(frames, space):  # noqa: F811
     np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-6)
     along = alike[0].mean(0) - space.vectors[:6].mean(0)
     assert np.ptp(apart[0] @ along) > 3 * np.ptp(alike[0] @ along)
+
+
+PLAIN = dataclasses.replace(NONE, gap=0.0, gap_along=0.0)
+"""embeddings are their texts' directions"""
+
+
+def shared_rows(space, strength, seed=0, views=1, faults=NONE, others=None):  # noqa: F811
+    """(views, 12, E) embeddings of the true masks of twelve things, and the vectors of their names."""
+    labels = np.repeat(np.arange(12, dtype=np.int16).reshape(1, 1, 12), views, 0).repeat(8, 1).repeat(8, 2)
+    pictures = np.random.default_rng(0).integers(0, 256, (*labels.shape, 3)).astype(np.uint8)
+    world = World(shared=strength)
+    embedder = SimulatedEmbedder(
+        pictures, labels, space.names[:12], space, faults, seed=seed, world=world, others=others
+    )
+    masks = labels == np.arange(12)[:, None, None, None]
+    return np.stack([embedder.embed_regions(p, masks[:, t]) for t, p in enumerate(pictures)]), space.vectors[:12]
+
+
+def test_a_shared_error_is_the_same_in_every_view_and_leans_to_other_classes(space):  # noqa: F811
+    right, texts = shared_rows(space, 0.0, views=3, faults=PLAIN)
+    wrong, _ = shared_rows(space, 1.0, views=3, faults=PLAIN)
+    np.testing.assert_array_equal(wrong, np.broadcast_to(wrong[0], wrong.shape))
+    assert np.abs(wrong - right).max() > 0.01
+    mixture = leanings(space.names[:12], 0, seed=0)
+    leant = (1 - LEANING) * texts + LEANING * mixture @ texts
+    assert not np.diagonal(mixture).any()
+    np.testing.assert_array_equal((mixture > 0).sum(1), CONFUSED)
+    np.testing.assert_allclose(wrong[0], leant / np.linalg.norm(leant, axis=1, keepdims=True), atol=1e-6)
+
+
+def test_shared_errors_lean_to_names_of_nothing_too(space):  # noqa: F811
+    others = space.vectors[100:140]
+    wrong, texts = shared_rows(space, 1.0, faults=PLAIN, others=others)
+    mixture = leanings(space.names[:12], 40, seed=0)
+    np.testing.assert_allclose(mixture.sum(1), 1)
+    np.testing.assert_array_equal((mixture[:, 12:] > 0).sum(1), CONFUSED)
+    leant = (1 - LEANING) * texts + LEANING * mixture @ np.concatenate([texts, others])
+    np.testing.assert_allclose(wrong[0], leant / np.linalg.norm(leant, axis=1, keepdims=True), atol=1e-6)
+    assert not leanings(("cup", "cup"), 0, seed=0).any()  # no other class: its own text stays
+
+
+def test_without_strength_the_simulation_is_as_it_was_to_the_bit(space):  # noqa: F811
+    faults = LEVELS["high"]
+    labels = np.repeat(np.arange(12, dtype=np.int16).reshape(1, 1, 12), 1, 0).repeat(8, 1).repeat(8, 2)
+    pictures = np.random.default_rng(0).integers(0, 256, (*labels.shape, 3)).astype(np.uint8)
+    plain = SimulatedEmbedder(pictures, labels, space.names[:12], space, faults, seed=4)
+    masks = labels[0] == np.arange(12)[:, None, None]
+    off, _ = shared_rows(space, 0.0, seed=4, faults=faults, others=space.vectors[100:])
+    np.testing.assert_array_equal(off[0], plain.embed_regions(pictures[0], masks))
+    words = ["dog", "cup", "red mug"]
+    found, others = twins.space_of(words, World(), 3)
+    np.testing.assert_array_equal(found.vectors, made_text_space(words, seed=3).vectors)
+    assert others.shape == (twins.ABSENT, found.vectors.shape[1])
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_more_errors_are_shared_the_fewer_regions_have_their_own_text(space, seed):  # noqa: F811
+    """Who is right at some strength is right at every smaller one, as each other text gains in proportion to it."""
+    before = np.ones(12, bool)
+    for strength in (0.0, 0.25, 0.5, 0.75, 1.0):
+        rows, texts = shared_rows(space, strength, seed=seed, faults=PLAIN)
+        right = (rows[0] @ texts.T).argmax(1) == np.arange(12)
+        assert (before | ~right).all()
+        before = right
 
 
 def test_names_with_words_in_common_lie_near_each_other():
