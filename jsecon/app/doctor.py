@@ -40,6 +40,7 @@ EXTRAS = {
     "serve": (("starlette", "uvicorn"), "jsecon serve"),
     "viewer": (("viser",), "jsecon view"),
     "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),
+    "words": (("ai_edge_litert",), "the experiment on real words"),
     "export": (("torch", "open_clip", "segment_anything", "sam2", "onnx"), "SAM, SAM 2 and CLIP from checkpoints"),
 }
 """extra -> the modules that it installs, what it gives"""

@@ -1,0 +1,1 @@
+"""What `experiments.real_words` is made of: an embedder of real words, real scenes, and rules that answer from both."""
