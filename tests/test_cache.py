@@ -199,6 +199,7 @@ def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeyp
 
     def digests():
         cache._imports_of_module.cache_clear()
+        cache._source_digest.cache_clear()
         return {stage: cache.source_digest(stage) for stage in names}
 
     before, read = digests(), Path.read_text

@@ -462,6 +462,7 @@ key = Stage.key
 def key_and_cover(stage, *given):
     digested.clear()
     cache._imports_of_module.cache_clear()
+    cache._source_digest.cache_clear()
     found = key(stage, *given)
     entries = (stage.compute, *(type(used) for used in stage.uses if used is not None))
     own = {sys.modules[entry.__module__].__file__ for entry in entries}
@@ -489,8 +490,8 @@ def watched(path, compute, **kwargs):
     return fetch(path, alone, **kwargs)
 
 Stage.key, cache.fetch = key_and_cover, watched
-threading.setprofile(listen)
-sys.setprofile(listen)
+threading.settrace(listen)  # it returns no function for the lines within
+sys.settrace(listen)
 pipeline.run(Options(Path(sys.argv[1]), holdout=4, steps=20), Path(sys.argv[2]) / "out")
 on_the_way += ran_since() + [file for told in ran.values() for file in told["ran"]]
 field = load_field(Path(sys.argv[2]) / "out/field.npz")

@@ -7,6 +7,7 @@ What a type does not say stands beside it: `Annotated[int, {"metavar": "N", "lea
 import argparse
 import ast
 import dataclasses
+import functools
 import inspect
 import itertools
 import types
@@ -33,11 +34,12 @@ class Argument:
         return self.name.upper() if self.positional else f"--{self.name.replace('_', '-')}"
 
 
-def arguments_of(kind: type) -> list[Argument]:
+@functools.cache
+def arguments_of(kind: type) -> tuple[Argument, ...]:
     """The fields of a dataclass as arguments, in order, those that must be given first."""
     hints, helps = typing.get_type_hints(kind, include_extras=True), _docstrings(kind)
     fields = sorted(dataclasses.fields(kind), key=lambda field: field.default is not dataclasses.MISSING)
-    return [_argument(field, hints[field.name], helps[field.name]) for field in fields]
+    return tuple(_argument(field, hints[field.name], helps[field.name]) for field in fields)
 
 
 def add_arguments(parser: argparse.ArgumentParser, kind: type, groups: Mapping[str, str] | None = None) -> None:
@@ -91,8 +93,15 @@ def _docstrings(kind: type) -> dict[str, str]:
     """field -> the string beneath it, on one line; inherited ones too."""
     found: dict[str, str] = {}
     for base in kind.__mro__[-2::-1]:
-        body = typing.cast(ast.ClassDef, ast.parse(inspect.getsource(base)).body[0]).body
-        for field, beneath in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(beneath, ast.Expr):
-                found[ast.unparse(field.target)] = " ".join(ast.literal_eval(beneath.value).split())
+        found |= _own_docstrings(base)
+    return found
+
+
+@functools.cache
+def _own_docstrings(kind: type) -> dict[str, str]:
+    found: dict[str, str] = {}
+    body = typing.cast(ast.ClassDef, ast.parse(inspect.getsource(kind)).body[0]).body
+    for field, beneath in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(beneath, ast.Expr):
+            found[ast.unparse(field.target)] = " ".join(ast.literal_eval(beneath.value).split())
     return found

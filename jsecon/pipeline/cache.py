@@ -94,14 +94,19 @@ def source_digest(*entries: Callable) -> str:
     """Digest of the source that functions and classes of jsecon stand on, as the imports tell.
 
     Of the file of each entry, the definitions that it uses, one by way of the other, count; of the modules that these
-    import, and of all that those import in turn, inside functions too, the whole files.
+    import, and of all that those import in turn, inside functions too, the whole files. Read once a process.
     """
+    return _source_digest(*((entry.__module__, entry.__qualname__.partition(".")[0]) for entry in entries))
+
+
+@functools.cache
+def _source_digest(*entries: tuple[str, str]) -> str:
+    """Of entries as their modules and names."""
     digest, modules = hashlib.blake2b(digest_size=8), set()
-    for entry in entries:
-        home = sys.modules[entry.__module__]
-        tree = ast.parse(Path(str(home.__file__)).read_text())
+    for module, entry in entries:
+        tree = ast.parse(Path(str(sys.modules[module].__file__)).read_text())
         defined = {name: node for node in tree.body for name in _names_of(node)}
-        wanted, used = [entry.__qualname__.partition(".")[0]], set()
+        wanted, used = [entry], set()
         while wanted:
             name = wanted.pop()
             if name in used:
