@@ -109,12 +109,19 @@ def stop_by_signals() -> None:
     def shown(dropped: Any) -> None:
         if dropped.exc_type is not KeyboardInterrupt:
             return show(dropped)
-        by = [signal.SIGTERM]  # SIGINT may be ignored, as in a shell's background
-        again = threading.Timer(AGAIN_SECONDS, _thread.interrupt_main, by)
+        again = threading.Timer(AGAIN_SECONDS, _stop_main)
         again.daemon = True
         again.start()
 
     sys.unraisablehook = shown
+
+
+def _stop_main() -> None:
+    """Sends SIGTERM to the main thread; SIGINT may be ignored, as in a shell's background."""
+    if hasattr(signal, "pthread_kill"):  # it also ends a call that waits, such as a sleep
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+    else:
+        _thread.interrupt_main(signal.SIGTERM)
 
 
 def cores() -> int:

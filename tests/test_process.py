@@ -144,7 +144,9 @@ def test_a_stop_that_python_drops_comes_again():
         "except KeyboardInterrupt:\n"
         "    sys.exit(130)"
     )
+    began = time.monotonic()
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert time.monotonic() - began < 30, "it waited for the sleep to end"
     assert (done.returncode, done.stdout) == (130, "went on\n")
     assert "ZeroDivisionError" in done.stderr
     assert "KeyboardInterrupt" not in done.stderr
