@@ -9,7 +9,6 @@ of them that its lists of neighbours leave memory for.
 """
 
 import dataclasses
-import resource
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import point_miou, tracked
+from jsecon.process import peak_memory_mib
 from jsecon.query.outliers import EPS_SPACINGS, MIN_SAMPLES, dbscan, default_eps, remove_outliers
 
 LARGE = 0.25
@@ -109,7 +109,7 @@ def main(options: Options = Options()) -> dict:
         began = time.process_time()
         ours = dbscan(points, eps, MIN_SAMPLES)
         spent, began = time.process_time() - began, time.process_time()
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        peak = peak_memory_mib()
         theirs = DBSCAN(eps=eps, min_samples=MIN_SAMPLES).fit_predict(points)
         other = time.process_time() - began
         unlike, clusters = int((ours != theirs).sum()), int(ours.max()) + 1

@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 import hashlib
 import json
-import resource
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from experiments.tables import twins
 from experiments.tables.answers import Answers, Method, Steps
 from experiments.tables.setting import Fitted, Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
-from jsecon.process import cores, forget_programs
+from jsecon.process import cores, forget_programs, peak_memory_mib
 
 DIGITS = 4
 """of the IoU of single texts and frames"""
@@ -125,7 +124,7 @@ def _complete(plan: Plan, methods: Mapping[str, Method], where: tuple, keys: dic
             cell = measure(setting, methods[name](setting, plan.steps))
             cell |= {"scene": scene, "seed": seed, "level": level, "method": name, "twin": setting.bench.twin}
             cell["seconds"] = round(time.perf_counter() - began + setting.shared.settle(), 2)
-            cell["peak_memory_mib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+            cell["peak_memory_mib"] = round(peak_memory_mib(), 1)
             append_cell(file, keys[name], cell)
             tell(f"{scene} seed {seed} {level}: {name}: mIoU {cell['miou']:.3f}, {cell['seconds']:.1f} s")
 
