@@ -64,18 +64,26 @@ gc.set_threshold(20_000, 20, 20)
 
 LONGEST = (
     "test_pipeline",
-    "test_fit",
-    "test_stability",
-    "test_corrections",
     "test_rivals",
+    "test_fit",
+    "test_corrections",
     "test_demo",
-    "test_tables",
+    "test_cli",
+    "test_processes",
+    "test_cores",
+    "test_stability",
     "test_capacity",
-    "test_readme",
-    "test_autoencoder",
+    "test_silhouette",
+    "test_synthetic",
     "test_render",
-    "test_distill",
+    "test_process",
+    "test_blocks",
     "test_codes",
+    "test_distill",
+    "test_plan",
+    "test_autoencoder",
+    "test_tables",
+    "test_networks",
 )
 
 
