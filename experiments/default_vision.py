@@ -214,7 +214,7 @@ def main(options: Options = Options()) -> dict:
         scenes["replica_apartment_0"] = functools.partial(replica, options.capture)
     run = RunOptions(capture=Path())
     file, found = Path(options.out) / "cells.jsonl", {scene: {} for scene in scenes}
-    source = cache.source_digest(associated, proposals_of)
+    source = cache.source_digest("association")
     for ways in (WAYS[:-1], WAYS[-1:]):
         for scene, make in scenes.items():
             keys = {way: f"{scene}, {way}, {source}" for way in ways}

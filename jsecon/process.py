@@ -20,7 +20,6 @@ import re
 import signal
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,8 +41,6 @@ AGAIN_SECONDS = 0.05
 _UNKEPT = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
 """how jax warns of a program that it cannot read from disk, or keep there"""
 _built: dict[str, int] = {}
-_under_way: dict[int, float] = {}
-"""thread -> when jax began to compile the program that it waits for"""
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
@@ -191,28 +188,14 @@ def programs_built() -> dict[str, int]:
     if not _built:
         _built.update(all=0, from_disk=0)
 
-        def began(event: str, *_: object, **__: object) -> None:
-            if event.endswith("/backend_compile_duration"):
-                _under_way[threading.get_ident()] = time.monotonic()
-
         def count(event: str, *_: object, **__: object) -> None:
             name = {"backend_compile_duration": "all", "cache_hits": "from_disk"}.get(event.rpartition("/")[2])
             if name is not None:
                 _built[name] += 1
-            if name == "all":
-                _under_way.pop(threading.get_ident(), None)
 
-        jax.monitoring.register_scalar_listener(began)  # jax tells when it begins, and then how long it took
         jax.monitoring.register_event_listener(count)
         jax.monitoring.register_event_duration_secs_listener(count)
     return dict(_built)
-
-
-def compiling(*, longer: float = 0.5) -> bool:
-    """Whether jax compiles a program now, and that for `longer` than it takes to read one from disk, s."""
-    if not _built and hasattr(sys.modules.get("jax"), "monitoring"):
-        programs_built()
-    return any(time.monotonic() - began > longer for began in list(_under_way.values()))
 
 
 def show_whole_traces() -> None:

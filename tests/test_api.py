@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import jsecon
+from jsecon.pipeline import cache
 
 PACKAGE = Path(jsecon.__file__).parent
 
@@ -97,6 +98,11 @@ def test_rooms_import_downwards_only():
         for name in jsecon_imports(path):
             other = [*name.split("."), "__version__"][1]
             assert other in allowed, f"{path.relative_to(PACKAGE)} imports {name}, upwards"
+
+
+def test_stages_compute_with_the_lowest_rooms():
+    """A stage's key covers the source of the rooms up to one of these, so nothing may stand between them."""
+    assert FLOORS[: len(cache.ROOMS)] == cache.ROOMS
 
 
 def test_modules_import_without_circles():

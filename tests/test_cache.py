@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -12,8 +13,6 @@ from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
 from jsecon.pipeline import cache
-from jsecon.pipeline.language_stages import codes, votes
-from jsecon.pipeline.scene_stages import _as_it_is as load
 from jsecon.pipeline.stages import Outcome
 
 
@@ -194,30 +193,32 @@ def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
     assert cache.files_digest([capture], leave_out=tmp_path / "out") != before
 
 
-def test_a_key_follows_the_source_that_a_function_stands_on_and_no_other(monkeypatch):
-    names = {load: "load", codes: "codes", votes: "votes"}
+def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path, monkeypatch):
+    package = shutil.copytree(cache.PACKAGE, tmp_path / "jsecon", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(cache, "PACKAGE", package)
 
     def digests():
-        cache._imports_of_module.cache_clear()
-        cache._source_digest.cache_clear()
-        return {stage: cache.source_digest(stage) for stage in names}
+        cache.source_digest.cache_clear()
+        return {room: cache.source_digest(room) for room in cache.ROOMS}
 
-    before, read = digests(), Path.read_text
+    before = digests()
     assert digests() == before
+    assert len(set(before.values())) == len(cache.ROOMS)
 
-    def changed(module, text):
-        """The digests that differ where a module's source has `text` behind it."""
-        real = cache._file_of(module)
-        monkeypatch.setattr(Path, "read_bytes", lambda path: read(path).encode() + text * (path == real))
-        monkeypatch.setattr(Path, "read_text", lambda path: read(path) + text.decode() * (path == real))
-        return {names[stage] for stage, digest in digests().items() if digest != before[stage]}
+    def changed(file):
+        """The rooms whose digest differs when a file has one more line."""
+        text = (package / file).read_bytes()
+        (package / file).write_bytes(text + b"# more\n")
+        rooms = {room for room, digest in digests().items() if digest != before[room]}
+        (package / file).write_bytes(text)
+        return rooms
 
-    assert changed("jsecon.splat.tiles", b"# more") == {"votes"}
-    assert changed("jsecon.data.colmap", b"# more") == {"load"}
-    assert changed("jsecon.language.autoencoder", b"# more") == {"codes"}
-    assert changed("jsecon.types", b"# more") == {"load", "codes", "votes"}
-    assert changed("jsecon.query.anchored", b"# more") == set()
-    assert changed("jsecon.pipeline.language_stages", b"def other(): pass") == set()
+    assert changed("app/viewer.py") == changed("query/anchored.py") == changed("evaluate/lerf.py") == set()
+    assert changed("association/consensus.py") == {"association"}
+    assert changed("language/votes.py") == {"language", "association"}
+    assert changed("networks/sam2/bank.py") == {"networks", "language", "association"}
+    assert changed("data/colmap.py") == {"data", "fit", "networks", "language", "association"}
+    assert changed("types.py") == changed("pipeline/stages.py") == changed("splat/tiles.py") == set(cache.ROOMS)
 
 
 def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):

@@ -5,8 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import jax
@@ -15,7 +13,7 @@ import pytest
 
 from jsecon import process
 from jsecon.errors import InputError
-from jsecon.process import compiling, forget_programs, programs_built, settings
+from jsecon.process import forget_programs, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -93,24 +91,6 @@ def test_programs_are_forgotten_where_there_are_too_many_maps_and_work_again():
     assert forget_programs(above=0)
     assert twice._cache_size() == 0
     assert twice(jnp.float32(4)) == 8
-
-
-def test_a_compilation_is_told_while_it_lasts():
-    programs_built()
-    ended, seen = threading.Event(), []
-
-    def look():
-        while not ended.wait(0.001):
-            seen.append(compiling(longer=0.0))
-
-    looking = threading.Thread(target=look)
-    looking.start()
-    now = time.time()  # a program that no cache holds
-    jax.jit(lambda x: sum(jnp.sin(x * (k + now)) for k in range(100)))(jnp.ones(3))
-    ended.set()
-    looking.join()
-    assert any(seen)
-    assert not compiling(longer=0.0)
 
 
 def test_room_for_columns_is_half_of_what_is_free_or_what_the_user_says(monkeypatch):

@@ -33,7 +33,7 @@ examples
   jsecon run my_capture --out my_field --segmenter sam --embedder clip
                                                         with SAM and CLIP from model folders
   jsecon models check clip                              what a model folder holds and lacks
-  jsecon run my_capture --out my_field --dry-run        what would run, for how long
+  jsecon run my_capture --out my_field --dry-run        what would run, and why
   jsecon doctor                                         whether this machine has what runs need
 
 A run that is stopped goes on where it stopped when the same command is given again.

@@ -50,8 +50,7 @@ class Run(Options):
     out: Path
     """folder for the field, the report and the cache"""
     dry_run: bool = False
-    """only say which stages would run, and about how many seconds, how much memory and disk each takes; writes
-    nothing"""
+    """only list the stages that would run, and check their inputs; writes nothing"""
     processes: Annotated[int, {"metavar": "N", "least": 1}] = 1
     """that share the masklets, the embeddings, the votes and the held-out frames, to the same field: all on this
     machine, each with its part of the cores, or one a machine, see --coordinator"""
@@ -74,8 +73,7 @@ class Fit(SceneOptions):
     out: Annotated[Path, {"metavar": "FILE"}]
     """the .ply, .spz or .glb to write"""
     dry_run: bool = False
-    """only say which stages would run, and about how many seconds, how much memory and disk each takes; writes
-    nothing"""
+    """only list the stages that would run, and check their inputs; writes nothing"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

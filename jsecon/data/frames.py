@@ -248,18 +248,19 @@ def room_for(shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Extent(NamedTuple):
-    """How much a capture holds."""
+    """Number, size and names of a capture's frames.
+
+    Attributes:
+      frames: Number of frames.
+      size: (width, height) of the frames, px.
+      names: Names of the frames; empty if they are not known yet.
+      files: Image of each named frame.
+    """
 
     frames: int
     size: tuple[int, int]
-    """(width, height) of the frames, px"""
-    source: tuple[int, int]
-    """of most of the images"""
-    points: int
     names: tuple[str, ...] = ()
-    """of the frames, where they are known."""
     files: tuple[ImageFile, ...] = ()
-    """the frames' images."""
 
 
 def extent_of(posed: Posed, downscale: float | int | None, long_side: int | None, frames: int | None) -> Extent:
@@ -273,13 +274,12 @@ def extent_of(posed: Posed, downscale: float | int | None, long_side: int | None
     lenses, orientations, _ = _as_read(shots)
     for lens in set(lenses):
         undistorted(lens, posed.where)
-    source = _commonest(lenses)
     files = tuple(
         ImageFile(shot.name, lens.width, lens.height, orientation)
         for shot, lens, orientation in zip(shots, lenses, orientations)
     )
-    size = shrunk(source, downscale, long_side)
-    return Extent(len(shots), size, source, len(posed.points), tuple(names[i] for i in chosen), files)
+    size = shrunk(_commonest(lenses), downscale, long_side)
+    return Extent(len(shots), size, tuple(names[i] for i in chosen), files)
 
 
 def _in_order(posed: Posed) -> tuple[list[Shot], np.ndarray, tuple[str, ...]]:

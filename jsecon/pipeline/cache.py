@@ -7,7 +7,6 @@ stages it reads. So a stopped run goes on where it stopped, a changed option rer
 stale result can be taken for a fresh one. A file holds arrays and a JSON description of their tree: no pickle.
 """
 
-import ast
 import contextlib
 import dataclasses
 import functools
@@ -15,7 +14,6 @@ import hashlib
 import importlib
 import json
 import os
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -37,6 +35,9 @@ from jsecon.files import (
     written_whole,
 )
 
+PACKAGE = Path(jsecon.__file__).parent
+ROOMS = ("splat", "vision", "data", "fit", "networks", "language", "association")
+"""subpackages that stages compute with, in import order: each imports only those before it"""
 _TREE = "__tree__"
 MAPPED = 1 << 30
 """bytes from which an array is not read but mapped"""
@@ -90,80 +91,28 @@ def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str
     return hashlib.blake2b(b"\n".join(entries), digest_size=8).hexdigest()
 
 
-def source_digest(*entries: Callable) -> str:
-    """Digest of the source that functions and classes of jsecon stand on, as the imports tell.
+@functools.cache
+def source_digest(room: str) -> str:
+    """Hashes the installed source files that results of a room of the package can depend on.
 
-    Of the file of each entry, the definitions that it uses, one by way of the other, count; of the modules that these
-    import, and of all that those import in turn, inside functions too, the whole files. Read once a process.
+    A room imports only the modules at the top of the package and the rooms before it in `ROOMS`, so these and the
+    pipeline are hashed. The rooms behind all stages (query, evaluate, app) are left out: a change of the viewer does
+    not recompute a fit.
+
+    Args:
+      room: Last room of `ROOMS` that a computation imports.
+
+    Returns:
+      32 hex digits.
     """
-    return _source_digest(*((entry.__module__, entry.__qualname__.partition(".")[0]) for entry in entries))
-
-
-@functools.cache
-def _source_digest(*entries: tuple[str, str]) -> str:
-    """Of entries as their modules and names."""
-    digest, modules = hashlib.blake2b(digest_size=8), set()
-    for module, entry in entries:
-        tree = ast.parse(Path(str(sys.modules[module].__file__)).read_text())
-        defined = {name: node for node in tree.body for name in _names_of(node)}
-        wanted, used = [entry], set()
-        while wanted:
-            name = wanted.pop()
-            if name in used:
-                continue
-            used.add(name)
-            node = defined[name]
-            modules |= _imports(node)
-            if not isinstance(node, (ast.Import, ast.ImportFrom)):
-                digest.update(ast.dump(node).encode())
-                wanted += [n.id for n in ast.walk(node) if isinstance(n, ast.Name) and n.id in defined]
-    for name in sorted(modules_beneath(modules)):
-        digest.update(name.encode())
-        digest.update(_file_of(name).read_bytes())
+    digest = hashlib.blake2b(digest_size=16)
+    folders = (PACKAGE, PACKAGE / "pipeline", *(PACKAGE / name for name in ROOMS[: ROOMS.index(room) + 1]))
+    for folder in folders:
+        files = folder.glob("*.py") if folder == PACKAGE else folder.rglob("*.py")
+        for file in sorted(files):
+            digest.update(file.relative_to(PACKAGE).as_posix().encode())
+            digest.update(hashlib.blake2b(file.read_bytes()).digest())
     return digest.hexdigest()
-
-
-def modules_beneath(names: Iterable[str]) -> set[str]:
-    """The named modules of jsecon and all of its modules that they import, one by way of the other."""
-    found, wanted = set(), list(names)
-    while wanted:
-        name = wanted.pop()
-        if name not in found:
-            found.add(name)
-            wanted += _imports_of_module(name)
-    return found
-
-
-@functools.cache
-def _imports_of_module(name: str) -> frozenset[str]:
-    return frozenset(_imports(ast.parse(_file_of(name).read_text())))
-
-
-def _imports(tree: ast.AST) -> set[str]:
-    """The modules of jsecon that are imported within a tree. The package itself is a table of contents: no module
-    draws from it more than its version."""
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jsecon."):
-            inner = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name for name in inner if _file_of(name).exists()} or {str(node.module)}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names if alias.name.startswith("jsecon.")}
-    return found
-
-
-def _file_of(module: str) -> Path:
-    place = Path(jsecon.__file__).parent.joinpath(*module.split(".")[1:])
-    return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-
-
-def _names_of(node: ast.stmt) -> set[str]:
-    """The names that a statement at the top of a module binds."""
-    if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-        return {node.name}
-    if isinstance(node, (ast.Import, ast.ImportFrom)):
-        return {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
-    return {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
 
 
 def path_of(folder: Path, stage: str, key: str) -> Path:

@@ -1,75 +1,116 @@
-"""What a dry run looks at, so that a run that it says can start does start: the inputs of the stages that would run.
+"""Checks of a dry run: it refuses the inputs that a run would refuse.
 
-Every check is one that a stage makes itself before its long work; none reads more than headers and a few files.
+Each check is one that a stage makes itself before its long work. None reads more than headers and a few files.
 """
 
+import contextlib
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.frames import Extent, held_out
+from jsecon.data.capture import capture_extent
+from jsecon.data.frames import Extent, frame_names, held_out, shrunk, spread
+from jsecon.data.images import image_size
 from jsecon.data.motion import check_photographs, photographs, require_motion
-from jsecon.data.video import is_video, size_of
+from jsecon.data.video import VIDEO_FRAMES, is_video, size_of
 from jsecon.errors import InputError
+from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import Work, require_training
+from jsecon.types import ImageFile
 
 
-def check_inputs(work: Work, running: Collection[str], extent: Extent) -> None:
-    """Looks at the inputs of a run.
+def check_inputs(work: Work, running: Collection[str], results: Mapping[str, Path]) -> None:
+    """Checks the inputs of a run.
 
     Args:
       work: The run.
-      running: Names of the stages that would run; the inputs of the others are not looked at.
-      extent: The frames that it would load. Without names where only a video's frames will have them.
+      running: Names of the stages that would run. Inputs of the other stages are not checked.
+      results: Cache file of each stage by its name; files of stages that would run need not exist.
 
     Raises:
       InputError: The output folder cannot be written, an extra is missing, photographs or a video cannot be used, too
-        few frames are left to fit to, or masks, proposals or features do not belong to the frames.
+        few frames are left to fit to, a file of Gaussians cannot be read, or masks, proposals or features do not belong
+        to the frames.
     """
     options = work.options
     require_place(work.out)
     if "poses" in running:
         require_motion(options.capture)
-        if is_video(options.capture):
-            if min(size_of(options.capture)) < 1:
-                remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
-                raise InputError(options.capture, "no frame that OpenCV can read", "a video", remedy)
-        else:
-            check_photographs(photographs(options.capture), options.capture)
+        if is_video(options.capture) and min(size_of(options.capture)) < 1:
+            remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
+            raise InputError(options.capture, "no frame that OpenCV can read", "a video", remedy)
+    extent = _extent(work, running, results)
     train = np.flatnonzero(~held_out(extent.frames, options.holdout))
     require_training(len(train) if extent.frames > 1 else extent.frames, extent.frames)
-    if extent.names and isinstance(options, Options):
+    if options.gaussians is not None and "gaussians" in running:
+        from jsecon.pipeline.scene_stages import given_gaussians
+
+        given_gaussians(options.gaussians)
+    if extent.names:
         _check_masks(options, running, extent, [extent.names[t] for t in train])
 
 
 def require_place(folder: Path) -> None:
-    """Raises InputError where no output folder could be made; makes none."""
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not there.is_dir():
-        raise InputError(folder, f"{there} is a file", "a folder that can be written", "Choose another output folder.")
-    if not os.access(there, os.W_OK | os.X_OK):
+    """Checks that an output folder can be created, without creating it.
+
+    Args:
+      folder: The output folder.
+
+    Raises:
+      InputError: A parent of the folder is a file, or cannot be written.
+    """
+    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not parent.is_dir():
+        raise InputError(folder, f"{parent} is a file", "a folder that can be written", "Choose another output folder.")
+    if not os.access(parent, os.W_OK | os.X_OK):
         remedy = "Choose another output folder, or mend its permissions."
-        raise InputError(folder, f"{there} cannot be written", "a folder that can be written", remedy)
+        raise InputError(folder, f"{parent} cannot be written", "a folder that can be written", remedy)
 
 
-def _check_masks(options: Options, running: Collection[str], extent: Extent, names: list[str]) -> None:
+def _extent(work: Work, running: Collection[str], results: Mapping[str, Path]) -> Extent:
+    """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
+    options = work.options
+    size_options = {name: getattr(options, name) for name in ("downscale", "long_side", "frames")}
+    if "load" not in running:
+        with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
+            capture = cache.load(results["load"]).value
+            size = capture.cameras.width, capture.cameras.height
+            return Extent(len(capture.names), size, capture.names, capture.files)
+    if "poses" not in results:
+        return capture_extent(options.capture, **size_options)
+    if "poses" not in running:
+        return capture_extent(work.out / "poses", **size_options)
+    if is_video(options.capture):
+        size = shrunk(size_of(options.capture), options.downscale, options.long_side)
+        return Extent(options.frames or VIDEO_FRAMES, size)
+    photos = photographs(options.capture)
+    paths = check_photographs(photos, options.capture)
+    names = frame_names(paths, options.capture)
+    sizes = [image_size(photo) for photo in photos]
+    chosen = spread(len(photos), options.frames)
+    size = shrunk(max(set(sizes), key=sizes.count), options.downscale, options.long_side)
+    files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
+    return Extent(len(chosen), size, tuple(names[i] for i in chosen), files)
+
+
+def _check_masks(options: Options, running: Collection[str], extent: Extent, train_names: list[str]) -> None:
+    """Checks that files of masks, proposals and features belong to the frames."""
     width, height = extent.size
-    size = (height, width)
-    files: Mapping = dict(zip(extent.names, extent.files))
-    how = {"level": options.level, "order": extent.names, "files": files}
+    files = dict(zip(extent.names, extent.files))
+    layout = {"level": options.level, "order": extent.names, "files": files}
     if options.masks is not None and "masklets" in running:
         from jsecon.data.mask_files import check_labels
 
-        check_labels(options.masks, names, size, **how)
+        check_labels(options.masks, train_names, (height, width), **layout)
     if options.proposals is not None and "masklets" in running:
         from jsecon.data.proposal_files import proposals_from_disk
 
-        read, _ = proposals_from_disk(options.proposals, names, size, **how)
+        read, _ = proposals_from_disk(options.proposals, train_names, (height, width), **layout)
         read(0)
     if options.features is not None and "regions" in running:
         from jsecon.data.langsplat_files import load_features
 
-        load_features(options.features, names[:1], size, **how)
+        load_features(options.features, train_names[:1], (height, width), **layout)

@@ -59,10 +59,10 @@ def regions(work: Work) -> Stage:
         "regions",
         f"{how}, views weighted by {options.weighting}",
         embedded if options.features is None else read,
+        "language",
         after=("load", "masklets"),
         given=work.given("weighting") | given,
         files=options.features,
-        uses=(embedder,),
         left_out=left,
         shared=options.features is None,
     )
@@ -91,10 +91,10 @@ def parts(work: Work) -> Stage:
         "parts",
         "of the scene, by what single masks say of them",
         compute,
+        "association",
         after=("load", "gaussians", "masklets"),
         given=work.given("seed", "level", "granularity", "centre") | {"embedder": embedder.name},
         files=options.features,
-        uses=(embedder, work.networks.segmenter),
     )
 
 
@@ -137,7 +137,7 @@ def codes(work: Work) -> Stage:
 
     auto = options.latent == "auto"
     how = "as few numbers per region as keep them apart" if auto else f"at most {options.latent} numbers per region"
-    return Stage("codes", how, compute, after=("regions",), given=work.given("latent", "seed"))
+    return Stage("codes", how, compute, "language", after=("regions",), given=work.given("latent", "seed"))
 
 
 def votes(work: Work) -> Stage:
@@ -169,6 +169,7 @@ def votes(work: Work) -> Stage:
         "votes",
         f"the {work.options.top} strongest regions of each Gaussian",
         compute,
+        "language",
         after=("load", "gaussians", "masklets"),
         given=work.given("top", "centre"),
         shared=True,
@@ -189,7 +190,7 @@ def distil(work: Work) -> Stage:
         return Outcome(distill_votes(cast, table, reduce=work.options.reduce))
 
     how = f"a Gaussian's code is its votes' {work.options.reduce}"
-    return Stage("distil", how, compute, after=("votes", "codes"), given=work.given("reduce"))
+    return Stage("distil", how, compute, "language", after=("votes", "codes"), given=work.given("reduce"))
 
 
 def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:

@@ -40,7 +40,7 @@ def _read(work: Work) -> Stage:
 
     how, given, why = f"read from {folder.name}", work.given("level"), f"masks are given ({folder.name})"
     left = {"segmenter": why, "association": why}
-    return Stage("masklets", how, compute, after=("load",), given=given, files=folder, left_out=left)
+    return Stage("masklets", how, compute, "data", after=("load",), given=given, files=folder, left_out=left)
 
 
 def _found(work: Work) -> Stage:
@@ -75,10 +75,10 @@ def _found(work: Work) -> Stage:
         "masklets",
         how,
         compute,
+        "association",
         after=("load", "gaussians"),
         given=given | {"association": options.associated_by, "tracker": None if tracker is None else tracker.name},
         files=options.proposals,
-        uses=(segmenter, tracker),
         shared=options.associated_by == "consensus",
     )
 

@@ -225,15 +225,32 @@ def _since(before: dict[str, int]) -> dict[str, int]:
 
 
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
-    """Says what `run` (`scene_only`: `fit`) would do and what it would cost, and returns that; writes nothing."""
-    from jsecon.pipeline.estimates import tell
+    """Lists the stages that `run` would compute, and writes nothing.
+
+    Args:
+      options: Options of the run.
+      out: Its output folder.
+      scene_only: List the stages of `fit` instead.
+      listener: Receives the list.
+
+    Returns:
+      {"stages": list of `Step`}.
+
+    Raises:
+      InputError: A run would refuse its options or inputs.
+    """
+    from jsecon.pipeline.checks import check_inputs
 
     with listener.progress("plan"):
         work = Work(options, networks.networks_of(options, out / "cache"), out)
         stages = [*loaded(work), gaussians(work), held_out(work)] if scene_only else stages_of(work)
         plan = _planned(work, stages, out / "cache")
-        work.networks.require_ready([step.name for step in plan.steps if step.status == "run"])
-    return tell(work, plan.steps, plan.place, listener)
+        running = [step.name for step in plan.steps if step.status == "run"]
+        work.networks.require_ready(running)
+        check_inputs(work, running, plan.place)
+    listener.steps(f"{options.capture} -> {out}, a dry run", plan.steps)
+    listener.say("Nothing was written.")
+    return {"stages": plan.steps}
 
 
 def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:

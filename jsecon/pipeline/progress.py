@@ -1,9 +1,12 @@
-"""What a run says while it works, and to whom: the stages that it will run, each as it is done, notes, time left."""
+"""Progress of a run: its stages, notes, results, and the time that is left.
+
+A run reports to a `Listener`. The command line passes a `Console`, which prints results to standard output and draws
+progress on standard error.
+"""
 
 import contextlib
 import dataclasses
-import functools
-import os
+import io
 import sys
 import threading
 import time
@@ -12,64 +15,75 @@ from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 from tqdm import tqdm
 
-from jsecon.process import compiling
-
 Progress: TypeAlias = Callable[[int, int], None]
-"""told how far a step has come: (done, total)"""
+"""callback with the progress of a step: (done, total)"""
 Status: TypeAlias = Literal["run", "cached", "left out"]
+
+QUIET_SECONDS = 2.0
+"""s; shorter steps show no progress"""
+BAR_SECONDS = 0.5
+"""s between two drawings of a bar, so that its clock runs while a step reports no count"""
+LINE_SECONDS = 15.0
+"""s between two lines of progress where standard error is not a terminal"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """A stage, or a part of one, and what becomes of it."""
+    """A stage of a run, or a part of a stage that the run leaves out.
+
+    Attributes:
+      name: Name of the stage or part.
+      status: Whether it runs, is read from the cache, or is left out.
+      why: How it is computed, or why it is left out.
+    """
 
     name: str
-    """stage, or the part of one that is left out."""
     status: Status
     why: str
-    """how it will be done, or why not."""
 
 
 class Listener:
-    """Whoever is told of a run: the command line (`Console`), a test. This one keeps it to itself."""
+    """Receives the messages of a run. This base class ignores them; tests and the command line override methods."""
 
     def steps(self, title: str, steps: Sequence[Step]) -> None:
-        """All that is known before any of it runs."""
+        """Receives all that is known before the first stage runs.
+
+        Args:
+          title: Input and output of the run.
+          steps: Stages in order, then the parts that are left out.
+        """
 
     def step(self, step: Step) -> None:
-        """A line that only the data could settle."""
+        """Receives a step that only the data could settle."""
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
-        """A stage has ended; `fresh`: it was computed now."""
+        """Receives the end of a stage.
+
+        Args:
+          name: Name of the stage.
+          seconds: Wall time of its computation.
+          fresh: True if it was computed in this run, False if its result was read from the cache.
+        """
 
     def note(self, text: str) -> None:
-        """Something the user should know about the input or the run."""
+        """Receives a sentence about the input or the run."""
 
     def say(self, text: str) -> None:
-        """A line of results."""
+        """Receives a line of results."""
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Progress]:
-        """A callback `(done, total)` for the time of a step."""
+        """Yields a callback `(done, total)` for the duration of a step.
+
+        Args:
+          name: Name of the step.
+        """
         yield lambda done, total: None
-
-
-class _Tqdm(tqdm):
-    """A bar whose lock is one of C: a stop could leave tqdm's own, two in Python, half taken."""
-
-
-_Tqdm.set_lock(threading.RLock())
-QUIET_SECONDS = 2.0
-"""a step shorter than this shows nothing"""
-LINE_SECONDS = 15.0
-"""between two lines of progress where standard error is no terminal"""
-TICK_SECONDS = 0.5
-"""between two looks at a step that tells nothing itself"""
 
 
 @runtime_checkable
 class Stream(Protocol):
-    """Where lines go: sys.stdout, sys.stderr, or what stands in for them."""
+    """A text stream: sys.stdout, sys.stderr, or a replacement."""
 
     def write(self, text: str, /) -> object: ...
 
@@ -79,120 +93,119 @@ class Stream(Protocol):
 
 
 class Console(Listener):
-    """The listener of the command line: results on standard output, progress and time left on standard error."""
+    """The listener of the command line.
+
+    Args:
+      out: Stream for results; by default standard output.
+      err: Stream for progress; by default standard error.
+    """
 
     def __init__(self, out: Stream | None = None, err: Stream | None = None):
-        self._out, self._err = out or sys.stdout, err or sys.stderr
+        self._out = out or sys.stdout
+        self._err = err or sys.stderr
 
     def steps(self, title: str, steps: Sequence[Step]) -> None:
+        """Prints the stages, one a line."""
         self.say(title)
         for step in steps:
             self.step(step)
 
     def step(self, step: Step) -> None:
+        """Prints a line for a step."""
         self.say(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
     def done(self, name: str, seconds: float, fresh: bool) -> None:
+        """Prints the wall time of a stage that was computed in this run."""
         if fresh:
             self.say(f"  {name:<16} {'done':<9} {seconds:.1f} s")
 
     def say(self, text: str) -> None:
-        with _Tqdm.external_write_mode(file=self._out):
+        """Prints a line, above the bar if one is drawn."""
+        with _Bar.external_write_mode(file=self._out):
             print(text, file=self._out, flush=True)
 
     def note(self, text: str) -> None:
+        """Prints a sentence behind the word "note"."""
         self.say(f"  note: {text}")
 
     @contextlib.contextmanager
     def progress(self, name: str) -> Iterator[Progress]:
-        """Draws a bar with the time left, or writes a line now and then. What tells nothing for a while, as jax does
-        while it compiles, shows its own time."""
-        shown, ended = (_Bar if self._err.isatty() else _Lines)(name, self._err), threading.Event()
+        """Draws a bar with the time left on a terminal, and prints a line now and then elsewhere.
 
-        def tick() -> None:
-            while not ended.wait(TICK_SECONDS):
-                shown.tick()
+        Args:
+          name: Name of the step.
+        """
+        terminal = self._err.isatty()
+        shown = (_Bar if terminal else _Lines)(name, self._err)
+        ended = threading.Event()
 
-        ticking = threading.Thread(target=tick, daemon=True)
-        ticking.start()
+        def draw() -> None:
+            pause = QUIET_SECONDS
+            while not ended.wait(pause):
+                shown.draw()
+                pause = BAR_SECONDS if terminal else LINE_SECONDS
+
+        drawing = threading.Thread(target=draw, daemon=True)
+        drawing.start()
         try:
-            yield shown.update
+            yield shown.count
         finally:
             ended.set()
-            ticking.join()
-            shown.close()
+            drawing.join()
+            shown.end()
 
 
-def _doing(name: str) -> str:
-    """The step, and that jax compiles for it where it does."""
-    kept = ", once on this machine" if os.environ.get("JAX_COMPILATION_CACHE_DIR") else ""
-    return f"  {name}: compiling{kept}" if compiling() else f"  {name}"
+class _Bar(tqdm):
+    """A tqdm bar on a terminal. `count` does not draw it, so that short steps show no bar."""
+
+    monitor_interval = 0  # without the thread of tqdm that redraws bars
+
+    def __init__(self, name: str, file: Stream):
+        self._drawn = False
+        super().__init__(desc=f"  {name}", file=file, leave=False, dynamic_ncols=True, delay=QUIET_SECONDS)
+
+    def count(self, done: int, total: int) -> None:
+        """Sets the progress. A new total or a smaller count starts the estimate of the time left afresh."""
+        with self.get_lock():
+            if total != self.total or done < self.n:
+                self.total = total
+                self.initial = done
+                self.start_t = self._time()
+            self.n = done
+
+    def draw(self) -> None:
+        """Draws the bar."""
+        self.refresh()
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Writes the bar to the terminal."""
+        self._drawn = True
+        super().display(msg, pos)
+
+    def end(self) -> None:
+        """Removes the bar."""
+        if self._drawn:
+            self.clear()
+        self.close()
 
 
-class _Bar:
-    """A tqdm bar that appears after two seconds and starts afresh when the total changes or the count falls back; until
-    something is counted, a clock."""
-
-    def __init__(self, name: str, err: Stream):
-        self._name, self._started, self._bar, self._alone = name, time.monotonic(), None, threading.Lock()
-        self._new = functools.partial(_Tqdm, file=err, leave=False, dynamic_ncols=True)
-
-    def update(self, done: int, total: int) -> None:
-        with self._alone:
-            if self._bar is not None and (total != self._bar.total or done < self._bar.n):
-                self._end()
-            if self._bar is None:
-                left = max(0.0, QUIET_SECONDS - (time.monotonic() - self._started))
-                self._bar = self._new(total=total, initial=done, desc=f"  {self._name}", delay=left)
-            self._bar.update(done - self._bar.n)
-
-    def tick(self) -> None:
-        with self._alone:
-            if time.monotonic() - self._started < QUIET_SECONDS:
-                return
-            if self._bar is None:
-                self._bar = self._new(bar_format="{desc}[{elapsed}]", delay=QUIET_SECONDS)
-                self._bar.start_t -= time.monotonic() - self._started
-            self._bar.set_description(_doing(self._name))
-
-    def _end(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-    def close(self) -> None:
-        with self._alone:
-            self._end()
+_Bar.set_lock(threading.RLock())  # one lock of C: a signal could leave tqdm's own pair of locks half taken
 
 
-class _Lines:
-    """A line after two seconds and then every so many, for logs."""
+class _Lines(_Bar):
+    """A line of text at each `draw`, for logs."""
 
-    def __init__(self, name: str, err: Stream):
-        self._name, self._err, self._alone = name, err, threading.Lock()
-        self._begin(0, 0)
-        self._first_of_all, self._due = self._started, self._started + QUIET_SECONDS
+    def __init__(self, name: str, file: Stream):
+        self._began = time.monotonic()
+        self._log = file
+        super().__init__(name, io.StringIO())
 
-    def _begin(self, done: int, total: int) -> None:
-        self._started, self._first, self._total, self._done = time.monotonic(), done, total, done
-
-    def update(self, done: int, total: int) -> None:
-        with self._alone:
-            if total != self._total or done < self._done:
-                self._begin(done, total)
-            self._done = done
-        self.tick()
-
-    def tick(self) -> None:
-        with self._alone:
-            if (now := time.monotonic()) < self._due:
-                return
-            told, counted = f"{now - self._first_of_all:.0f} s so far", self._done - self._first
-            if counted > 0 and self._done < self._total:
-                left = (now - self._started) / counted * (self._total - self._done)
-                told = f"{self._done} of {self._total}, about {left:.0f} s left"
-            print(f"{_doing(self._name)}: {told}", file=self._err, flush=True)
-            self._due = now + LINE_SECONDS
-
-    def close(self) -> None:
-        pass
+    def draw(self) -> None:
+        """Prints the time left, or the time so far if it cannot be estimated."""
+        with self.get_lock():
+            if self.total and self.initial < self.n < self.total:
+                left = (self._time() - self.start_t) / (self.n - self.initial) * (self.total - self.n)
+                text = f"{self.n} of {self.total}, about {left:.0f} s left"
+            else:
+                text = f"{time.monotonic() - self._began:.0f} s so far"
+        print(f"{self.desc}: {text}", file=self._log, flush=True)

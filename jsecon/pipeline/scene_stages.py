@@ -67,14 +67,14 @@ def poses(work: Work) -> Stage:
         what = f"{len(photographs(capture))} photographs, which have none"
     how = f"found by structure from motion (pycolmap) for {what}"
     if video:
-        return Stage("poses", how, compute, given=work.given("frames"), files=capture, leaves=out)
+        return Stage("poses", how, compute, "data", given=work.given("frames"), files=capture, leaves=out)
     given = {"names": [photo.relative_to(capture).as_posix() for photo in photographs(capture)]}
-    return Stage("poses", how, compute, given=given, files=lambda: photographs(capture), leaves=out)
+    return Stage("poses", how, compute, "data", given=given, files=lambda: photographs(capture), leaves=out)
 
 
 STEP_SECONDS = 0.024, 0.2
-"""of a step of the fit: in all, and for a million pixels of the frames, as benchmarks/estimates.py measured; says how
-many steps --minutes allows about"""
+"""seconds of a step of the fit, and seconds more per million pixels of a frame, measured on two cores of an AMD EPYC;
+estimates how many steps --minutes allows"""
 
 
 def load(work: Work) -> Stage:
@@ -129,7 +129,7 @@ def _put_right(work: Work) -> Stage:
         how = f"corrected by short fits (--refine {asked})" if asked != "none" else ""
     left = "frames that a short fit does not explain left out" if options.drop_frames == "auto" else ""
     how = ", ".join(part for part in (plain.how, how, left) if part)
-    return Stage("load", how, compute, given={**plain.given, **given}, files=plain.files)
+    return Stage("load", how, compute, "fit", given={**plain.given, **given}, files=plain.files)
 
 
 def _fit_steps(options: SceneOptions, capture: Capture) -> float:
@@ -159,7 +159,7 @@ def _as_it_is(work: Work) -> Stage:
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
     held = f"1 in {options.holdout} held out" if options.holdout else "none held out"
     given = asked | {"loader": getattr(work.load, "__qualname__", None)}
-    return Stage("load", f"{count}, {size}, {held}", compute, given=given, files=options.capture)
+    return Stage("load", f"{count}, {size}, {held}", compute, "data", given=given, files=options.capture)
 
 
 def _checked(capture: Capture, size: str) -> Outcome:
@@ -196,7 +196,7 @@ def _read(work: Work) -> Stage:
     given = {"trained": trained.read_text(errors="replace")} if trained.is_file() else {}
     left = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     return Stage(
-        "gaussians", f"read from {path.name}", compute, after=("load",), given=given, files=path, left_out=left
+        "gaussians", f"read from {path.name}", compute, "fit", after=("load",), given=given, files=path, left_out=left
     )
 
 
@@ -328,7 +328,7 @@ def _fitted(work: Work) -> Stage:
     number = "" if most is None or options.growth == "none" else f", at most {most} Gaussians"
     how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
     given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "start", "seed")
-    return Stage("gaussians", how, compute, after=("load",), given=given, left_out=left)
+    return Stage("gaussians", how, compute, "fit", after=("load",), given=given, left_out=left)
 
 
 def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: float = 0.01) -> None:
@@ -360,4 +360,4 @@ def held_out(work: Work) -> Stage:
         return Outcome(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
     how = "PSNR and SSIM of the rendered colours"
-    return Stage("held_out", how, compute, after=("load", "gaussians"), shared=True)
+    return Stage("held_out", how, compute, "fit", after=("load", "gaussians"), shared=True)

@@ -102,14 +102,14 @@ class Stage:
     how: str
     """what it will do, for the lines that a run prints first."""
     compute: Compute
+    room: str
+    """the last room of `cache.ROOMS` that `compute` imports; the source up to there is a part of the key."""
     after: tuple[str, ...] = ()
     """the stages whose results it reads."""
     given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """options and models that its result depends on; models by their content, not by the place of their files."""
     files: Path | Callable[[], Sequence[Path]] | None = None
     """input file or folder, or what lists the input files."""
-    uses: tuple[Any, ...] = ()
-    """what it calls beside what it imports: a segmenter, a tracker, an embedder; None where there is none."""
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """what the options alone make needless: part -> why."""
     shared: bool = False
@@ -118,12 +118,20 @@ class Stage:
     """folder that it leaves for those after it, with its key in KEY_FILE; where another run left it, it runs again."""
 
     def key(self, work: Work, keys: Mapping[str, str], files: str | None) -> str:
-        """Digest of the source that computes it (`cache.source_digest`), of the keys of the stages that it reads, of
-        what it is given and of its files: `files`, their digest."""
+        """Hashes all that the result depends on.
+
+        Args:
+          work: The run.
+          keys: Keys of the stages before this one.
+          files: Digest of the input files, from `files_digest`.
+
+        Returns:
+          16 hex digits that cover source, options, input files and the results that the stage reads.
+        """
         return cache.key_of(
             self.name,
             {
-                "source": cache.source_digest(self.compute, *(type(used) for used in self.uses if used is not None)),
+                "source": cache.source_digest(self.room),
                 "after": [keys[other] for other in self.after],
                 "given": dict(self.given),
                 "files": files,
