@@ -1,7 +1,7 @@
 """The command line: what each verb leaves behind, and one clear message and exit code 2 for each kind of bad input."""
 
-import dataclasses
 import json
+import re
 import shutil
 import struct
 import time
@@ -15,7 +15,6 @@ from jsecon.app import command_line, verbs
 from jsecon.app.question import BY_VOTES, METHODS
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.pipeline import pipeline, progress
-from jsecon.pipeline.arguments import parsed
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console, Listener
 from jsecon.process import peak_memory_mib
@@ -206,30 +205,88 @@ def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, 
     assert told["error"]["found"]
 
 
-def test_help_of_every_verb_has_words_for_every_option(capsys):
-    for verb in ("demo", "run", "query", "eval", "models"):
+VERB_NAMES = ("demo", "run", "fit", "query", "export", "view", "eval", "serve", "models", "doctor", "completion")
+
+
+def test_help_of_every_verb_has_words_for_every_option(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert _run("--help") == 0
+    told = capsys.readouterr().out
+    assert "jsecon run my_capture --out my_field" in told, "examples"
+    for verb in VERB_NAMES:
+        assert re.search(rf"^\W+{verb} +[A-Z]", told, re.MULTILINE)
+        capsys.readouterr()
         assert _run(verb, "--help") == 0
-        assert len(capsys.readouterr().out) > 300
-    for action in command_line.parser()._subparsers._group_actions[0].choices.values():
-        assert all(option.help for option in action._actions), action.prog
+        rows = [line.strip("│| ") for line in capsys.readouterr().out.splitlines()]
+        options = [n for n, row in enumerate(rows) if re.match("-h|--[a-z]|FIELD |CAPTURE ", row)]
+        assert len(options) >= 3
+        for n in options:  # words follow on the same row, or on the next one
+            assert len(rows[n].split()) > 4 or len(rows[n + 1].split()) > 2, rows[n]
+        assert not any("None" in row or "[STR" in row for row in rows)
+
+
+def test_options_of_a_run_are_grouped(capsys):
+    assert _run("run", "--help") == 0
+    told = capsys.readouterr().out
+    order = ["--out", "scene options", "--downscale", "masks options", "--granularity", "models options", "--segmenter"]
+    places = [told.index(word) for word in [*order, "field options", "--latent"]]
+    assert places == sorted(places)
 
 
 def test_what_is_not_given_has_the_default_of_the_dataclass():
-    parse = command_line.parser().parse_args
-    run = parsed(verbs.Run, parse(["run", "room", "--out", "out"]))
-    options = Options(Path("room"))
-    assert {field.name: getattr(run, field.name) for field in dataclasses.fields(Options)} == vars(options)
+    run = command_line.parse(["run", "room", "--out", "out"])
+    assert run.options == Options(Path("room"))
     changed = ["--latent", "auto", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
-    run = parsed(verbs.Run, parse(["run", "room", "--out", "out", *changed]))
-    assert (run.latent, run.sh_degree, run.masks, run.downscale, run.weighting) == ("auto", 2, Path("m"), 2, "uniform")
-    query = parsed(verbs.Query, parse(["query", "f", "a", "b", "--all", "--at", "0", "1", "2", "--out", "o"]))
-    assert (query.texts, query.at, query.all, query.keep_outliers) == (["a", "b"], [["0", "1", "2"]], True, False)
+    options = command_line.parse(["run", "room", "--out=out", *changed]).options
+    found = options.latent, options.sh_degree, options.masks, options.downscale, options.weighting
+    assert found == ("auto", 2, Path("m"), 2, "uniform")
+    assert command_line.parse(["fit", "room", "--out", "a.ply", "--steps", "7"]).options == Options(
+        Path("room"), steps=7
+    )
 
 
-def test_wrong_usage_is_exit_code_2(capsys):
-    assert _run("run") == 2
-    assert _run("fly") == 2
-    assert "usage" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("line", "options"),
+    [
+        ("f a b --all --at 0 1 2 --out o", {"texts": ["a", "b"], "at": [("0", "1", "2")], "all": True}),
+        ("f --out o --at #1 2 3 --at x 4 5", {"texts": [], "at": [("#1", "2", "3"), ("x", "4", "5")]}),
+        ("f --mask 0 a.png 1 b.png --mask 2 c.png --out o", {"mask": [["0", "a.png", "1", "b.png"], ["2", "c.png"]]}),
+        ("f --box x 1 2 3 4 --out o", {"box": [("x", "1", "2", "3", "4")]}),
+        ("--out o f a --threshold -0.5 --by code --by one_step", {"texts": ["a"], "threshold": -0.5, "by": "one_step"}),
+        ("f a --out o --template x --template y --json", {"template": ["x", "y"], "output": verbs.Output(json=True)}),
+        ("f --out o --keep_outliers -- -ish", {"texts": ["-ish"], "keep_outliers": True}),
+    ],
+)
+def test_options_of_a_query_are_read(line, options):
+    query = command_line.parse(["query", *line.split()])
+    assert (query.field, query.out) == (Path("f"), Path("o"))
+    assert {name: getattr(query, name) for name in options} == options
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("run", "CAPTURE --out PATH"),
+        ("fly", "fly is not a verb"),
+        ("qurey f x", "Did you mean query?"),
+        ("", "{demo, run,"),
+        ("query f x --out o --thresold 3", "Perhaps you meant: --threshold FLOAT"),
+        ("query f x --out o --threshold a", "--threshold does not take 'a'"),
+        ("run c --out o --steps 1.5", "--steps does not take '1.5'"),
+        ("run c --out o --latent few", "--latent does not take 'few'"),
+        ("query f x --out o --by magic", "'lenient_silhouette'"),
+        ("query f --out o --at 0 1", "--at'. Expected 3"),
+        ("query f x --out", "--out'. Expected 1"),
+        ("models look x", "'check'"),
+    ],
+)
+def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
+    assert _run(*line.split()) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("jsecon: jsecon")
+    assert told.count("\n") == 1
+    assert "--help lists the" in told
+    assert says in told
 
 
 def test_a_stop_by_the_user_is_exit_code_130_and_says_that_it_can_go_on(room, tmp_path, monkeypatch, capsys):

@@ -5,8 +5,7 @@ import subprocess
 
 import pytest
 
-from jsecon.app.command_line import parser
-from jsecon.app.completion import script_of
+from jsecon.app.command_line import completion_script
 
 TRY = """
 source {script}
@@ -26,7 +25,7 @@ def _shell(name):
 def script(tmp_path):
     def made(shell):
         path = tmp_path / f"jsecon.{shell}"
-        path.write_text(script_of(parser(), shell))
+        path.write_text(completion_script(shell))
         return path
 
     return made
@@ -40,7 +39,7 @@ def script(tmp_path):
         (["run", "x", "--granularity", ""], {"fine", "medium", "coarse"}),
         (["query", "x", "--by", "sil"], {"silhouette"}),
         (["completion", ""], {"bash", "zsh", "fish"}),
-        (["run", "som"], {"somewhere"}),
+        (["run", "som"], {"somewhere", "some.npz"}),
         (["query", "so"], {"somewhere", "some.npz"}),
     ],
 )
@@ -56,7 +55,8 @@ def test_bash_completes(script, tmp_path, words, expected):
 def test_every_verb_is_completed(script):
     text = TRY.format(script=script("bash"), words="jsecon ''", at=1)
     found = subprocess.run([_shell("bash"), "-c", text], capture_output=True, text=True, check=True)
-    assert set(found.stdout.split()) == set(parser()._subparsers._group_actions[0].choices)
+    verbs = {"demo", "run", "fit", "query", "export", "view", "eval", "serve", "models", "doctor", "completion"}
+    assert verbs <= set(found.stdout.split())
 
 
 def test_fish_completes(script):

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from jsecon.app.ending import Told
-from jsecon.app.verbs import Asking, Demo, Doctor, Eval, Export, Fit, Models, Query, Run, Serve, View
+from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, View
 from jsecon.errors import InputError
-from jsecon.pipeline.options import Options, SceneOptions, require_writable
+from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import member
 
@@ -33,7 +33,7 @@ def _run(asked: Run, console: Console) -> Told:
         from jsecon.app.summary import write_run
         from jsecon.pipeline import pipeline, processes
 
-    options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(Options)})
+    options = asked.options
     if asked.dry_run:
         return pipeline.dry_run(options, asked.out, listener=console)
     if (own := member()) is None and (asked.processes, asked.coordinator, asked.process) != (1, None, None):
@@ -57,20 +57,19 @@ def _fit(asked: Fit, console: Console) -> Told:
         from jsecon.pipeline import pipeline
     require_written(asked.out)
 
-    options = Options(**{field.name: getattr(asked, field.name) for field in dataclasses.fields(SceneOptions)})
     folder = asked.out.with_suffix("")
     if asked.dry_run:
-        return pipeline.dry_run(options, folder, scene_only=True, listener=console)
-    return write_scene(*pipeline.fit(options, folder, listener=console), asked.out, console)
+        return pipeline.dry_run(asked.options, folder, scene_only=True, listener=console)
+    return write_scene(*pipeline.fit(asked.options, folder, listener=console), asked.out, console)
 
 
 def _query(asked: Query, console: Console) -> Told:
     if not (asked.texts or asked.at or asked.mask or asked.box):
         remedy = 'For example: jsecon query field.npz "red mug" --out answers'
         raise InputError("query", "nothing to find", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
-    pixels = [(frame, *_whole("--at", x, y)) for frame, x, y in asked.at or ()]
-    boxes = [(frame, *_whole("--box", *ends)) for frame, *ends in asked.box or ()]
-    for given in asked.mask or ():
+    pixels = [(frame, *_whole("--at", x, y)) for frame, x, y in asked.at]
+    boxes = [(frame, *_whole("--box", *ends)) for frame, *ends in asked.box]
+    for given in asked.mask:
         if len(given) % 2:
             remedy = "For example: --mask frame_00012 mug.png"
             raise InputError("--mask", " ".join(given), "FRAME PNG, in pairs", remedy)
@@ -97,7 +96,7 @@ def _query(asked: Query, console: Console) -> Told:
         if large:
             answers, refused = asking.answered_in_blocks(field, embedder, **how)
         else:
-            how |= {"masks": asked.mask or (), "boxes": boxes, "even": asked.even}
+            how |= {"masks": asked.mask, "boxes": boxes, "even": asked.even}
             answers, refused = asking.asked_each(asking.questions_of(field, embedder, **how))
     answers, refused = by_phrase + answers, unread + refused
     files = {"views": asked.views, "ending": asked.format}
@@ -117,7 +116,7 @@ def _check_phrases(asked: Query) -> None:
         remedy = 'For example: jsecon query field.npz "red mug" --phrases sam3 --out answers'
         raise InputError("--phrases", "no text is given, which is the phrase", remedy=remedy)
     given = {"by": asked.by != "votes", "all": asked.all, "even": asked.even}
-    given |= {"template": asked.template is not None, "embedder": asked.embedder is not None}
+    given |= {"template": bool(asked.template), "embedder": asked.embedder is not None}
     if any(given.values()):
         found = " ".join(f"--{name}" for name, there in given.items() if there)
         why_not = f"{found} cannot be combined with it: SAM 3 reads the texts and finds all of a kind"
@@ -196,7 +195,7 @@ def _serve(asked: Serve, console: Console) -> Told:
         from jsecon.app import server
 
     given = {"host": asked.host, "port": asked.port, "token": asked.token, "embedder": asked.embedder}
-    given["hosts"] = asked.allow_host or ()
+    given["hosts"] = asked.allow_host
     with console.progress("fields"):
         told, answer = server.ready([Path(file) for file in asked.fields], **given)
     for scene in told["fields"]:
@@ -224,7 +223,7 @@ def _doctor(asked: Doctor, console: Console) -> Told:
     return {"checks": checks, "refused": wrong(checks)}
 
 
-def _embedder(field: Any, asked: Asking) -> Any:
+def _embedder(field: Any, asked: FieldVerb) -> Any:
     from jsecon.pipeline import networks
 
     return networks.embedder_of_field(field, asked.embedder, templates=asked.template or ("{}",))

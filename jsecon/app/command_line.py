@@ -1,23 +1,31 @@
-"""The command line. Bad input ends in one message and exit code 2, Ctrl-C in 130; what a verb takes is in verbs.py,
-what it does in actions.py."""
+"""The command line: finds the verb, lets tyro read its options, and runs it.
 
-import argparse
+Bad input ends in one message and exit code 2, Ctrl-C in exit code 130. The options of a verb are in verbs.py, its work
+is in actions.py.
+"""
+
 import contextlib
+import difflib
 import inspect
+import io
+import re
 import sys
-from collections.abc import Iterator, Sequence
-from typing import NoReturn
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Any, Union
+
+import tyro
 
 import jsecon
 from jsecon.app.actions import VERBS
 from jsecon.app.ending import Told, ended
-from jsecon.app.verbs import Completion, Output, Run
+from jsecon.app.verbs import Completion, Output, Verb
 from jsecon.errors import InputError, why
-from jsecon.pipeline.arguments import add_arguments, parsed
 from jsecon.pipeline.progress import Console
 from jsecon.process import show_whole_traces
 
-EPILOG = """
+ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.
+
 examples
   jsecon demo                                           a made-up room, from frames to answers and a report
   jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.npz
@@ -36,24 +44,34 @@ examples
   jsecon run my_capture --out my_field --dry-run        what would run, and why
   jsecon doctor                                         whether this machine has what runs need
 
-A run that is stopped goes on where it stopped when the same command is given again.
-"""
-RUN_GROUPS = {"downscale": "frames and scene", "masks": "masks", "segmenter": "models", "weighting": "field"}
+A stopped run resumes when the same command is given again. jsecon --version prints the version."""
+
+MARKERS = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code."""
+    """Runs the command line.
+
+    Args:
+      argv: Arguments behind the program's name; by default those of the process.
+
+    Returns:
+      The exit code.
+    """
     argv = sys.argv[1:] if argv is None else list(argv)
-    output = Output("--json" in argv, "--debug" in argv)  # also of a line that cannot be parsed
+    output = Output("--json" in argv, "--debug" in argv)  # also for a line that cannot be read
     try:
-        arguments = parser().parse_args(argv)
-        output = parsed(Output, arguments)
+        if argv == ["--version"]:
+            print(f"jsecon {jsecon.__version__}")
+            return 0
+        asked = parse(argv)
+        output = asked.output
         if output.debug:
             show_whole_traces()
-        act, kind = _VERBS[arguments.verb]
+        act, _ = _VERBS[argv[0]]
         console = Console(sys.stderr if output.json else None)
-        told = act(parsed(kind, arguments), console)
-    except SystemExit as stop:  # --help, --version
+        told = act(asked, console)
+    except SystemExit as stop:  # --help
         return int(stop.code or 0)
     except (KeyboardInterrupt, Exception) as error:
         if any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):  # libraries make errors of stops
@@ -74,41 +92,100 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
+def parse(argv: Sequence[str]) -> Verb:
+    """Reads a command line.
+
+    Args:
+      argv: Arguments behind the program's name, the verb first.
+
+    Returns:
+      The verb with its options.
+
+    Raises:
+      InputError: The command line is wrong.
+      SystemExit: It asks for help, which is printed.
+    """
+    if argv and argv[0] in _VERBS:
+        return _read(_VERBS[argv[0]][1], f"jsecon {argv[0]}", argv[1:])
+    if argv and not argv[0].startswith("-"):
+        similar = "".join(f"Did you mean {name}? " for name in difflib.get_close_matches(argv[0], _VERBS, 1))
+        raise InputError("jsecon", f"{argv[0]} is not a verb", remedy=f"{similar}jsecon --help lists the verbs.")
+    return _read(_all_verbs(), "jsecon", argv, description=ABOUT)
+
+
+def _all_verbs() -> Any:
+    """Returns the union of the verbs, of which tyro makes subcommands, with the first line of each description."""
+    verbs = []
+    for name, (_, kind) in _VERBS.items():
+        summary = (inspect.getdoc(kind) or "").partition("\n")[0]
+        verbs.append(Annotated[kind, tyro.conf.subcommand(name=name, description=summary, prefix_name=False)])
+    return Union[tuple(verbs)]  # noqa: UP007
+
+
+def _read(kind: Any, prog: str, argv: Sequence[str], description: str | None = None) -> Any:
+    """Lets tyro read `argv`. What it prints on standard error about a wrong line becomes an InputError."""
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed):
+            return tyro.cli(kind, prog=prog, args=argv, description=description, config=MARKERS)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        remedy = f"{prog} --help lists the {'options' if ' ' in prog else 'verbs'}."
+        raise InputError(prog, _sentence(printed.getvalue(), prog), remedy=remedy) from None
+
+
+def _sentence(box: str, prog: str) -> str:
+    """Returns the message of a box that tyro draws: its first part, and the options that were perhaps meant."""
+    parts = [""]
+    for row in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()[1:]:  # without colours and title
+        row = row.strip("│").rstrip("╯╰ ")
+        if set(row) <= set(" ─-"):
+            parts.append("")
+        elif not row.startswith(" " * 9):  # a help text
+            parts[-1] += f" {row.strip()}"
+    message, *more = filter(None, parts)
+    message = message.strip().replace(f"Missing from {prog}:", "Missing:")
+    if (value := re.match(r"Error parsing (\S+):.*'([^']*)'", message)) is not None:
+        message = f"{value[1]} does not take {value[2]!r}"
+    more = [part.strip() for part in more if part.startswith((" Perhaps", " Unrecognized"))]
+    return ". ".join([message.rstrip("."), *more])
+
+
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, and those amid which it was raised."""
+    """Yields an error, and those during whose handling it was raised."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
 
 
-class _Parser(argparse.ArgumentParser):
-    """Raises what is wrong with a command line as InputError, behind the usage."""
+def completion_script(shell: str) -> str:
+    """Makes the script that completes verbs, options, choices and paths in a shell.
 
-    def error(self, message: str) -> NoReturn:
-        self.print_usage(sys.stderr)
-        raise InputError(self.prog, message, remedy=f"{self.prog} --help lists the options.")
+    shtab makes it from tyro's parser. The scripts of tyro 1.0 itself do not complete positional arguments, such as the
+    path of a capture, and start Python at each key press.
 
+    Args:
+      shell: "bash", "zsh" or "fish".
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    raw = argparse.RawDescriptionHelpFormatter
-    about = "Find things in 3D Gaussian scenes by text, at the level of points, on a plain CPU."
-    top = _Parser(prog="jsecon", formatter_class=raw, epilog=EPILOG, description=about)
-    top.add_argument("--version", action="version", version=f"jsecon {jsecon.__version__}")
-    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, (_, kind) in _VERBS.items():
-        short, _, long = (inspect.getdoc(kind) or "").partition("\n\n")
-        verb = verbs.add_parser(name, help=short, description=long, formatter_class=raw)
-        add_arguments(verb, kind, RUN_GROUPS if kind is Run else None)
-        add_arguments(verb, Output, {"json": "what is said"})
-    return top
+    Returns:
+      The script.
+    """
+    import shtab
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # tyro names no other way to a parser
+        parser: Any = tyro.extras.get_parser(_all_verbs(), prog="jsecon", config=MARKERS)
+    return shtab.complete(parser, shell)
 
 
 def _completion(asked: Completion, console: Console) -> Told:
-    from jsecon.app.completion import script_of
-
-    console.say(script := script_of(parser(), asked.shell))
+    script = completion_script(asked.shell)
+    console.say(script)
     return {"shell": asked.shell, "script": script}
 
 
-_VERBS = VERBS | {"completion": (_completion, Completion)}
+_VERBS: dict[str, tuple[Callable[[Any, Console], Told], type[Verb]]] = {
+    **VERBS,
+    "completion": (_completion, Completion),
+}

@@ -1,256 +1,334 @@
-"""The verbs of the command line: what each does and takes, in the words of its help."""
+"""The verbs of the command line: options and help text of each.
+
+tyro makes the command line from these classes: the first line of a docstring is the verb's short description, its
+attributes are the help texts of the options.
+"""
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias, TypeVar
 
-from jsecon.pipeline.options import Folder, Options, SceneOptions
+from tyro.conf import Positional, UseAppendAction, arg
 
+from jsecon.pipeline.options import (
+    FieldOptions,
+    InputOptions,
+    MaskOptions,
+    ModelOptions,
+    Option,
+    Options,
+    SceneOptions,
+)
+
+T = TypeVar("T")
+Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
+"""an option that may be given several times"""
 By = Literal["votes", "silhouette", "strict_silhouette", "lenient_silhouette", "code", "one_step", "canonical"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """What every verb takes."""
+    """Options of every verb.
 
-    json: bool = False
-    """print one JSON object on standard output at the end, {"error": ...} with message, name, found, expected and
-    remedy where it went wrong; all else goes to standard error"""
-    debug: bool = False
-    """the whole trace of an error"""
+    Attributes:
+      json: Prints one JSON object on standard output at the end, with {"error": ...} of message, name, found, expected
+        and remedy if the verb fails. Everything else goes to standard error.
+      debug: Prints the whole trace of an error.
+    """
+
+    json: Option[bool] = False
+    debug: Option[bool] = False
 
 
-@dataclasses.dataclass(frozen=True)
-class Demo:
-    """make a room, build its field, query it and write a report
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verb:
+    """Base of the verbs."""
 
-    Makes a procedural room of named, coloured objects, writes it to disk as an ordinary COLMAP capture, and runs on it
-    what `jsecon run`, `query` and `eval` run: nothing of the ground truth but frames, poses and sparse points is used.
-    Ends with report.html, metrics.json, field.npz, a short film and a .ply for each query. One to two minutes on two
+    output: Output = Output()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo(Verb):
+    """Makes a room, builds its field, queries it and writes a report.
+
+    The room is procedural, with named, coloured objects. It is written to disk as an ordinary COLMAP capture, and
+    `jsecon run`, `query` and `eval` then use nothing of the ground truth but frames, poses and sparse points. The demo
+    writes report.html, metrics.json, field.npz, a short film and a .ply for each query, in one to two minutes on two
     cores. On a capture of your own, use `jsecon run` and `jsecon query`.
+
+    Attributes:
+      seed: Seed of the room.
+      out: Output folder.
+      steps: Number of optimisation steps of the photometric fit.
     """
 
-    seed: int = 0
-    """which room"""
-    out: Path = Path("jsecon-demo")
-    """folder for all of it"""
-    steps: int = 550
-    """number of optimisation steps of the photometric fit"""
+    seed: Option[int] = 0
+    out: Option[Path] = Path("jsecon-demo")
+    steps: Option[int] = 550
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Run(Options):
-    """build the language field of a capture
+class Run(Verb, InputOptions):
+    """Builds the language field of a capture.
 
-    From frames to a language field: poses (found where the capture has none), Gaussians (fitted, or given as a .ply),
-    masklets (found in the frames and brought together, or given as masks), one embedding per region, codes distilled
-    into the Gaussians. Prints its stages first. Writes OUT/field.npz, OUT/report.html, OUT/metrics.json and OUT/cache.
+    Its stages find poses if the capture has none, fit Gaussians or read them, find masklets or read masks, embed each
+    region, and distil codes into the Gaussians. It lists the stages first, and writes field.npz, report.html,
+    metrics.json and cache to the output folder.
+
+    Attributes:
+      out: Output folder.
+      dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
+      processes: Number of processes that share the masklets, the embeddings, the votes and the held-out frames. The
+        field stays the same. All of them run on this machine, each with its part of the cores, unless --coordinator
+        is given.
+      coordinator: HOST:PORT where process 0 listens, an address of its own machine, for a run on several machines.
+        Every machine runs the same command with the same capture and models at the same paths, and its own name must
+        stand for an address that the others reach.
+      process: Index of this process on several machines, 0 to N - 1. Process 0 writes the output folder.
     """
 
-    out: Path
-    """folder for the field, the report and the cache"""
-    dry_run: bool = False
-    """only list the stages that would run, and check their inputs; writes nothing"""
-    processes: Annotated[int, {"metavar": "N", "least": 1}] = 1
-    """that share the masklets, the embeddings, the votes and the held-out frames, to the same field: all on this
-    machine, each with its part of the cores, or one a machine, see --coordinator"""
-    coordinator: Annotated[str | None, {"metavar": "HOST:PORT"}] = None
-    """several machines: where process 0 listens, an address of its own machine; every machine runs this command, with
-    the same capture and models at the same paths, and its own name must stand for an address that the others reach"""
-    process: Annotated[int | None, {"metavar": "I"}] = None
-    """which of the processes this is, 0 to N - 1; process 0 writes OUT"""
+    out: Option[Path]
+    dry_run: Option[bool] = False
+    processes: Option[int] = 1
+    coordinator: Option[str | None] = None
+    process: Option[int | None] = None
+    scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
+    masks: MaskOptions = dataclasses.field(default_factory=MaskOptions)
+    models: ModelOptions = dataclasses.field(default_factory=ModelOptions)
+    field: FieldOptions = dataclasses.field(default_factory=FieldOptions)
+
+    @property
+    def options(self) -> Options:
+        """Options of the run without the groups."""
+        groups = self.scene, self.masks, self.models, self.field
+        return Options(self.capture, self.gaussians, **{name: x for group in groups for name, x in vars(group).items()})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fit(SceneOptions):
-    """fit Gaussians to a capture, and no more
+class Fit(Verb):
+    """Fits Gaussians to a capture, and no more.
 
-    From posed frames to a scene of 3D Gaussians in the capture's own world, as a .ply (INRIA's layout; SuperSplat opens
-    it), .spz or .glb, with PSNR and SSIM of the frames held out. What it keeps lies in a folder of the
-    same name without the ending, from which it goes on when it was stopped, and `jsecon run` into that folder too.
+    Writes a scene of 3D Gaussians in the capture's own world, with PSNR and SSIM of the held-out frames. A folder
+    named like the file without its ending keeps what is computed: a stopped fit resumes from it, and `jsecon run`
+    into that folder goes on from it too.
+
+    Attributes:
+      capture: The same captures as for jsecon run.
+      out: The .ply (INRIA's layout, which SuperSplat opens), .spz or .glb to write.
+      dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
     """
 
-    out: Annotated[Path, {"metavar": "FILE"}]
-    """the .ply, .spz or .glb to write"""
-    dry_run: bool = False
-    """only list the stages that would run, and check their inputs; writes nothing"""
+    capture: Positional[Path]
+    out: Option[Path]
+    dry_run: Option[bool] = False
+    scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
+
+    @property
+    def options(self) -> Options:
+        """Options of the fit without the groups."""
+        return Options(self.capture, **vars(self.scene))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Asking:
-    """What `jsecon query`, `view` and `eval` take."""
+class FieldVerb(Verb):
+    """Options of the verbs that read a field and understand texts.
 
-    field: Annotated[Path, {"positional": True}]
-    """field.npz of a run"""
-    embedder: Folder = None
-    """the CLIP model folder that the field was made with (default: where the run had it)"""
-    template: Annotated[list[str] | None, {"action": "append", "metavar": "PHRASE"}] = None
-    """CLIP: a phrase for the text, such as "a photo of a {}."; several are averaged (default: the bare text)"""
+    Attributes:
+      field: Path of field.npz, written by jsecon run.
+      embedder: Folder of the CLIP model that the field was made with. By default it is where the run had it.
+      template: Phrase for the texts, such as "a photo of a {}.", with CLIP. Several phrases are averaged. By default
+        the bare text is used.
+    """
+
+    field: Positional[Path]
+    embedder: Option[Path | None] = None
+    template: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(Asking):
-    """the Gaussians that a text names, that lie under a pixel, or that somebody outlined
+class Query(FieldVerb):
+    """Selects the Gaussians of a text, of a pixel, or of an outline.
 
-    For each text, pixel or outline, writes to OUT: the selected Gaussians as a .ply (INRIA's layout, in the capture's
-    own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks of the frames
-    that show it best, and answers.html with the pictures. A field of more than half of the free memory, or than
-    JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, to the same answers: texts and --at, by
-    votes or code.
+    For each text, pixel or outline, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
+    the capture's own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks
+    of the frames that show it best, and answers.html with the pictures. A field of more than half of the free memory,
+    or than JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, with the same answers: texts
+    and --at, by votes or code.
+
+    Attributes:
+      texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle".
+      at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them. A
+        frame is named by its name, the end of its name, or its place such as #10.
+      mask: Selects what a mask outlines in a frame, or a thing that masks outline in several frames. Black is outside.
+      box: Selects the regions that are seen by more than half in a box of a frame.
+      out: Output folder.
+      by: How Gaussians are selected. With votes and code, the text selects a region, and the region the Gaussians with
+        its votes or with its code. With silhouette, each Gaussian of the votes is then kept or dropped by what the
+        outline of all gains in the views, either strict (where it is opaque) or lenient (where it is there at all).
+        With one_step and canonical, each Gaussian's code is compared with the text.
+      threshold: Threshold of the measure of --by. By default it is 0.5 for votes, silhouettes and canonical, 0.9 for
+        code, and 0.8 for one_step, which is too high for CLIP.
+      all: Selects every region that answers a text, such as all the chairs, and not only the best one: those whose
+        similarity has come 0.75 of the way from the middle region's to the best one's (by votes or a silhouette).
+      even: Smooths the votes over the ten neighbours of each Gaussian before the threshold. Rims become sharper if the
+        masks are noisy.
+      keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. Without it, DBSCAN drops them, and
+        clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
+      phrases: Folder of a SAM 3 model (.onnx). Each text is put to it as a phrase in some frames of the capture, and
+        selects what lies in its masks in most of the frames that see it, all things of the kind.
+      images: With --phrases, the capture whose frames are used. By default it is where the run had it.
+      looks: With --phrases, number of frames, evenly spaced. A frame takes long.
+      views: Number of masks to write for each query.
+      format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds
+        their codes and regions too.
     """
 
-    texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
-    """what to find: "red mug" "dark green bottle" "mug or bowl but not handle" ..."""
-    at: Annotated[list[list[str]] | None, {"action": "append", "nargs": 3, "metavar": ("FRAME", "X", "Y")}] = None
-    """what lies under pixel (column X, row Y) of a frame, in the frames as the run used them; needs no text. A frame is
-    named by its name, the end of it, or its place, #10"""
-    mask: Annotated[list[list[str]] | None, {"action": "append", "nargs": "+", "metavar": ("FRAME", "PNG")}] = None
-    """what a mask outlines in a frame, or one thing in several: FRAME PNG FRAME PNG; black is outside"""
-    box: Annotated[
-        list[list[str]] | None, {"action": "append", "nargs": 5, "metavar": ("FRAME", "X0", "Y0", "X1", "Y1")}
-    ] = None
-    """what lies in a box of a frame: the regions that are seen there by more than half"""
-    out: Path
-    """folder for the answers"""
-    by: By = "votes"
-    """votes, code: text -> the region that answers it -> the Gaussians with its votes, or with its code; silhouette: by
-    votes, then each taken or left by what the outline of all gains in the views: strict where it is opaque, lenient
-    where it is there at all; one_step, canonical: each Gaussian's code against the text"""
-    threshold: float | None = None
-    """on what --by measures (default: 0.5 votes and silhouettes, 0.9 code, 0.8 one_step, too high
-    for CLIP, 0.5 canonical)"""
-    all: bool = False
-    """every region that answers a text, such as all the chairs, not only the best: those whose similarity has come 0.75
-    of the way from the middle region's to the best one's (by votes or a silhouette)"""
-    even: bool = False
-    """even the votes out over each Gaussian's ten neighbours before they are cut: sharper rims where masks are noisy"""
-    keep_outliers: bool = False
-    """keep the Gaussians that stand apart from the rest of an answer. Without it DBSCAN drops them, and clusters with
-    less than a tenth of the largest one's weight in the views; the .json counts them"""
-    phrases: Folder = None
-    """a SAM 3 model folder (.onnx): each text is put to it as a phrase, in some frames of the capture; selected is what
-    lies in its masks in most of the frames that see it, all things of the kind"""
-    images: Folder = None
-    """with --phrases: the capture, whose frames are asked (default: where the run had it)"""
-    looks: Annotated[int, {"metavar": "N"}] = 8
-    """with --phrases: in how many frames, evenly spaced; a frame takes long"""
-    views: Annotated[int, {"metavar": "N"}] = 3
-    """masks to write per query"""
-    format: Literal["ply", "spz", "glb"] = "ply"
-    """of the selected Gaussians; glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds their codes and
-    regions too"""
+    texts: Positional[list[str]]
+    at: Annotated[Repeated[tuple[str, str, str]], arg(metavar="FRAME X Y")] = dataclasses.field(default_factory=list)
+    mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
+    box: Annotated[Repeated[tuple[str, str, str, str, str]], arg(metavar="FRAME X0 Y0 X1 Y1")] = dataclasses.field(
+        default_factory=list
+    )
+    out: Option[Path]
+    by: Option[By] = "votes"
+    threshold: Option[float | None] = None
+    all: Option[bool] = False
+    even: Option[bool] = False
+    keep_outliers: Option[bool] = False
+    phrases: Option[Path | None] = None
+    images: Option[Path | None] = None
+    looks: Option[int] = 8
+    views: Option[int] = 3
+    format: Option[Literal["ply", "spz", "glb"]] = "ply"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Export:
-    """write the whole scene of a field for other programs
+class Export(Verb):
+    """Writes the whole scene of a field for other programs.
 
-    As .ply (INRIA's layout), .spz or .glb, in the capture's own world. The .glb is glTF with Khronos'
-    KHR_gaussian_splatting, y up, and holds each Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
+    The scene is in the capture's own world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds each
+    Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
+
+    Attributes:
+      field: Path of field.npz, written by jsecon run.
+      out: The .ply (INRIA's layout), .spz or .glb to write.
     """
 
-    field: Annotated[Path, {"positional": True}]
-    """field.npz of a run"""
-    out: Annotated[Path, {"metavar": "FILE"}]
-    """the .ply, .spz or .glb to write"""
+    field: Positional[Path]
+    out: Option[Path]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class View(Asking):
-    """look at a field and ask it, in a browser
+class View(FieldVerb):
+    """Shows a field in a browser and answers queries there.
 
-    A page on loopback: the Gaussians, to turn and come near; each text lights up what it selects, a click what lies
-    there; thresholds, other candidates, frames, files of the selection, a link that keeps what is seen (extra viewer).
-    With --export instead one HTML file that opens by double click, without a server.
+    A page on loopback shows the Gaussians (extra viewer). A text highlights what it selects, a click what lies there.
+    The page has thresholds, other candidates, frames, files of the selection, and a link that restores what is seen.
+    With --export, jsecon writes one HTML file instead, which opens by double click, without a server.
+
+    Attributes:
+      texts: Texts to highlight.
+      export: HTML file to write instead of opening a page.
+      link: Link that the viewer showed, to restore its state.
+      host: Address to listen on. Beyond loopback a token is required.
+      port: Port to listen on.
+      token: Token that the page's address must carry, as the printed address does. By default it is JSECON_TOKEN of
+        the environment.
+      allow_host: Name by which browsers reach this server besides localhost and --host, such as that of a proxy.
     """
 
-    texts: Annotated[list[str], {"positional": True, "nargs": "*", "metavar": "TEXT"}]
-    """what to light up"""
-    export: Annotated[Path | None, {"metavar": "HTML"}] = None
-    """write a page, and open none"""
-    link: Annotated[str, {"metavar": "LINE"}] = ""
-    """what the viewer gave as its link, to have it back"""
-    host: str = "127.0.0.1"
-    """address to listen on; beyond loopback a token is required"""
-    port: Annotated[int, {"least": 0}] = 8766
-    """port to listen on"""
-    token: str = ""
-    """what the page's address must carry, as the printed one does (default: JSECON_TOKEN of the environment)"""
-    allow_host: Annotated[list[str] | None, {"action": "append", "metavar": "NAME"}] = None
-    """a name by which browsers reach this server beside localhost and --host, such as that of a proxy"""
+    texts: Positional[list[str]]
+    export: Option[Path | None] = None
+    link: Option[str] = ""
+    host: Option[str] = "127.0.0.1"
+    port: Option[int] = 8766
+    token: Option[str] = ""
+    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Eval(Asking):
-    """measure a field against labels
+class Eval(FieldVerb):
+    """Measures a field against labels.
 
-    Point-level rendered protocol on LERF-style labels (one .json per frame): the selected Gaussians alone are rendered,
-    alpha > 0.7, against each labelled mask; a missing prediction counts as 0. Prints mIoU, mAcc@0.25 and localisation
-    accuracy of each kind of query, and writes OUT/evaluation.json with every pair.
+    The protocol is point-level and rendered, on LERF-style labels (one .json per frame): the selected Gaussians alone
+    are rendered, and alpha > 0.7 is compared with each labelled mask. A missing prediction counts as 0. Prints mIoU,
+    mAcc@0.25 and localisation accuracy of each kind of query, and writes evaluation.json with every pair.
+
+    Attributes:
+      labels: Folder of LERF label files (frame.json).
+      out: Folder for evaluation.json. By default it is the field's folder.
     """
 
-    labels: Annotated[Path, {"metavar": "DIR"}]
-    """folder of LERF label files (frame.json)"""
-    out: Path | None = None
-    """folder for evaluation.json (default: the field's)"""
+    labels: Option[Path]
+    out: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Serve:
-    """answer over HTTP, loaded once
+class Serve(Verb):
+    """Answers queries over HTTP, with fields that are loaded once.
 
-    POST /query {"text": "red mug"} as application/json and more, see GET / and /openapi.json. On loopback unless --host
-    names another address, which needs a token (extra serve).
+    Answers POST /query {"text": "red mug"} with Content-Type application/json, and more: see GET / and /openapi.json
+    (extra serve).
+
+    Attributes:
+      fields: Paths of field.npz files. Each field is known by the name of its folder.
+      host: Address to listen on. Beyond loopback a token is required.
+      port: Port to listen on.
+      token: Token that clients must send as "Authorization: Bearer TOKEN". By default it is JSECON_TOKEN of the
+        environment, and without that no token is needed.
+      allow_host: Name by which clients reach this server besides localhost and --host, such as that of a proxy. Without
+        a token, requests by other names are refused.
+      embedder: Folder of the CLIP model that the fields were made with. By default it is where the runs had it.
     """
 
-    fields: Annotated[list[Path], {"positional": True, "nargs": "+", "metavar": "FIELD"}]
-    """field.npz of runs; each is known by its folder's name"""
-    host: str = "127.0.0.1"
-    """address to listen on"""
-    port: Annotated[int, {"least": 0}] = 8765
-    """port to listen on"""
-    token: str = ""
-    """what clients must send as "Authorization: Bearer TOKEN" (default: the environment's JSECON_TOKEN, else none)"""
-    allow_host: Annotated[list[str] | None, {"action": "append", "metavar": "NAME"}] = None
-    """a name by which clients reach this server beside localhost and --host, such as that of a proxy; without a token a
-    request by any other name is refused"""
-    embedder: Folder = None
-    """the CLIP model folder that the fields were made with (default: where the runs had it)"""
+    fields: Positional[list[Path]]
+    host: Option[str] = "127.0.0.1"
+    port: Option[int] = 8765
+    token: Option[str] = ""
+    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
+    embedder: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True)
-class Models:
-    """look into a folder of models
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Models(Verb):
+    """Examines a folder of models.
 
-    check DIR: what models a folder holds, each graph's inputs and outputs, what it can be used for, what is missing,
-    and where such exports are published. Exit code 2 where nothing in it can be used.
+    For each graph it lists inputs, outputs and what jsecon can use it for, then what is missing, and where such exports
+    are published. The exit code is 2 if jsecon can use none of them.
+
+    Attributes:
+      action: Lists what a model folder holds.
+      folder: Folder with .onnx files.
     """
 
-    action: Annotated[str, {"positional": True, "choices": ("check",), "metavar": "check"}]
-    """tell what a model folder holds"""
-    folder: Annotated[Path, {"positional": True, "metavar": "DIR"}]
-    """folder with .onnx files"""
+    action: Positional[Literal["check"]]
+    folder: Positional[Path]
 
 
-@dataclasses.dataclass(frozen=True)
-class Doctor:
-    """look whether this machine has what runs need
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Doctor(Verb):
+    """Checks whether this machine has what runs need.
 
-    A line each: the backend's numbers, jax and its devices, cores, memory, disk, where compiled programs are kept,
-    models, and each extra with the command that installs it. Exit code 2 where something is wrong that every run needs.
+    It prints a line each about the backend's numbers, jax and its devices, cores, memory, disk, the folder of compiled
+    programs, models, and each extra with the command that installs it. The exit code is 2 if a check fails that every
+    run depends on.
+
+    Attributes:
+      models: Folder with .onnx files, or of such folders, to examine.
     """
 
-    models: Folder = None
-    """folder with .onnx files, or of such folders, to look into"""
+    models: Option[Path | None] = None
 
 
-@dataclasses.dataclass(frozen=True)
-class Completion:
-    """a script that completes jsecon's words in a shell
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Completion(Verb):
+    """Prints a script that completes jsecon's words in a shell.
 
-    bash: jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon. zsh: > a folder of $fpath, as
-    _jsecon. fish: > ~/.config/fish/completions/jsecon.fish. Then open a new shell.
+    For bash: jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon. For zsh, write it as _jsecon
+    to a folder of $fpath. For fish, write it to ~/.config/fish/completions/jsecon.fish. Then open a new shell.
+
+    Attributes:
+      shell: The shell.
     """
 
-    shell: Annotated[Literal["bash", "zsh", "fish"], {"positional": True, "metavar": "SHELL"}]
-    """bash, zsh or fish"""
+    shell: Positional[Literal["bash", "zsh", "fish"]]

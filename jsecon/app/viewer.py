@@ -298,7 +298,7 @@ def view(asked: Any, embedder_of: Callable[..., Any], say: Callable[[str], objec
     if not asked.texts and asked.embedder is None:
         dim = given_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
     embedder = embedder_of(field, asked) if dim is None else GivenSpace(dim)
-    place = {"host": asked.host, "port": asked.port, "token": token, "hosts": asked.allow_host or ()}
+    place = {"host": asked.host, "port": asked.port, "token": token, "hosts": asked.allow_host}
     viewer = open_viewer(field, embedder, name=name, state=state, **place)
     say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
     carried = f"/?{urlencode({'token': token})}" if token else ""

@@ -1,157 +1,256 @@
-"""What a run is asked to do, and whether that can be done at all: checked before any work.
+"""Options of a run, and checks of them before any work.
 
-The command line is made from this class: an option's docstring is its help, its type what it takes (arguments.py).
+The command line is made from these classes by tyro: an attribute's docstring is its help text, and its type says which
+values it accepts. Each class is a group of the help.
 """
 
 import dataclasses
 import tempfile
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias, TypeVar
+
+import tyro
 
 from jsecon.errors import InputError, why
-from jsecon.pipeline.arguments import arguments_of
 
-Folder = Annotated[Path | None, {"metavar": "DIR"}]
+T = TypeVar("T")
+
+
+def default_hint(default: str) -> str:
+    """Returns the default of an option for its help text, or nothing for a flag or an option without a default."""
+    return "" if default in ("", "None", "False") else f"(default: {default})"
+
+
+Option: TypeAlias = Annotated[T, tyro.conf.arg(prefix_name=False, help_behavior_hint=default_hint)]
+"""an option of the command line; its flag does not name the group"""
+
+
+@dataclasses.dataclass(frozen=True)
+class InputOptions:
+    """Input of a run.
+
+    Attributes:
+      capture: Folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
+        ScanNet, TUM, ARKitScenes, Polycam or Record3D; or a folder of photographs, or a video, without poses (extra
+        sfm).
+      gaussians: File with the 3D Gaussians of the scene: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's
+        compressed one), .glb, .spz, .splat, with the extra formats also .sog. Its world may be that of the capture's
+        files, of its poses, of a dataparser_transforms.json beside it, or the one that gsplat or nerfstudio normalise
+        to: jsecon renders a few frames to find out, and warns if none fits. Without it, Gaussians are fitted to the
+        frames.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    gaussians: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneOptions:
-    """What the Gaussians of a capture depend on."""
+    """Options of the frames and of the photometric fit.
 
-    capture: Annotated[Path, {"positional": True}]
-    """a folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); of ScanNet, TUM,
-    ARKitScenes, Polycam or Record3D; of photographs, or a video, whose poses are then found (extra sfm)"""
-    downscale: Annotated[float | None, {"metavar": "K", "least": 1}] = None
-    """make frames K times smaller (default: so that the longer side is at most --long-side)"""
-    long_side: Annotated[int, {"metavar": "PX", "least": 16}] = 400
-    """of the frames, where --downscale is not given"""
-    frames: Annotated[int | None, {"metavar": "N", "least": 2}] = None
-    """use at most N frames, evenly spaced (default: all; of a video 150)"""
-    holdout: Annotated[int, {"metavar": "K", "least": 0}] = 8
-    """keep every K-th frame for measuring only; 0 = none"""
-    refine: Literal["none", "poses", "exposure", "both", "auto"] = "auto"
-    """correct camera poses, exposures or both by short fits before anything else; held-out frames are aligned to the
-    last of these, frozen. auto corrects both for captures with depth, if that lowers the error of training frames kept
-    aside, within half of the fit's time; it changes nothing for captures without depth or with --gaussians"""
-    drop_frames: Literal["none", "auto"] = "none"
-    """auto: leave out training frames that a probe fit does not explain"""
-    steps: Annotated[int, {"least": 1}] = 2000
-    """of the photometric fit"""
-    minutes: Annotated[float | None, {"metavar": "M", "least": 0.05}] = None
-    """of the photometric fit, instead of --steps: the best that can be had in that time on this machine"""
-    gaussians_at_most: Annotated[int | None, {"metavar": "N", "least": 1}] = None
-    """that the fit may have; a start with more keeps its number (default: one for every other pixel of a frame, in fits
-    from 3 minutes or 3000 steps on one for each, at most 100,000)"""
-    growth: Literal["votes", "mcmc", "none"] = "votes"
-    """of their number during the fit: where the picture is wrong; by opacity, with noise; or none"""
-    sh_degree: Annotated[int, {"choices": range(4)}] = 2
-    """of the fitted colours"""
-    start: Literal["auto", "sparse", "dense", "random"] = "auto"
-    """of the fit: from the capture's own points, or points triangulated; by stereo between neighbouring views; at
-    random; auto: from depth where there is depth, else as sparse"""
-    seed: int = 0
-    """of whatever is drawn at random"""
+    Attributes:
+      downscale: Makes the frames this many times smaller, at least 1. By default their longer side becomes at most
+        --long-side.
+      long_side: Longest side of the frames in pixels, at least 16, unless --downscale is given.
+      frames: Maximum number of frames, evenly spaced, at least 2. By default all frames are used, of a video 150.
+      holdout: Every how many frames one is held out for measuring; 0 holds out no frame.
+      refine: What to correct by short fits before anything else: camera poses, exposures or both. Held-out frames are
+        aligned to the last of these fits, frozen. With auto, both are corrected for captures with depth if that lowers
+        the error of training frames kept aside, within half of the fit's time; captures without depth, and runs with
+        --gaussians, stay as they are.
+      drop_frames: With auto, training frames that a short fit does not explain are left out.
+      steps: Number of optimisation steps of the photometric fit.
+      minutes: Time limit of the photometric fit in minutes, at least 0.05. It replaces --steps, and the schedule makes
+        the best of it on this machine.
+      gaussians_at_most: Maximum number of Gaussians of the fit. A denser initial point cloud is kept as it is. By
+        default there is one for every other pixel of a frame, for every pixel in fits of at least 3 minutes or 3000
+        steps, and at most 100,000.
+      growth: How the fit adds Gaussians: where the image error is largest (votes), by opacity with noise (mcmc), or not
+        at all (none).
+      sh_degree: Degree of the spherical harmonics of the fitted colours.
+      start: Initial points of the fit: the capture's own points or triangulated ones (sparse), stereo between
+        neighbouring views (dense), or random points. With auto they come from depth if the capture has depth, else as
+        with sparse.
+      seed: Seed of all random numbers.
+    """
+
+    downscale: Option[float | None] = None
+    long_side: Option[int] = 400
+    frames: Option[int | None] = None
+    holdout: Option[int] = 8
+    refine: Option[Literal["none", "poses", "exposure", "both", "auto"]] = "auto"
+    drop_frames: Option[Literal["none", "auto"]] = "none"
+    steps: Option[int] = 2000
+    minutes: Option[float | None] = None
+    gaussians_at_most: Option[int | None] = None
+    growth: Option[Literal["votes", "mcmc", "none"]] = "votes"
+    sh_degree: Option[Literal[0, 1, 2, 3]] = 2
+    start: Option[Literal["auto", "sparse", "dense", "random"]] = "auto"
+    seed: Option[int] = 0
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(SceneOptions):
-    """All that the result of a run depends on, but for the files themselves."""
+class MaskOptions:
+    """Options of the masks of objects.
 
-    gaussians: Annotated[Path | None, {"metavar": "FILE"}] = None
-    """a scene of 3D Gaussians: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's compressed one), .glb, .spz,
-    .splat, with the extra formats .sog; in the world of the capture's files, of its poses, of a
-    dataparser_transforms.json beside it, or in that which gsplat or nerfstudio normalise to: a few frames are rendered
-    to tell which, and a warning says where none shows them; without it, Gaussians are fitted to the frames"""
-    masks: Folder = None
-    """instance masks: one integer PNG or .npy per frame under the frame's name (0 = none), in folders like the images'
-    where those have some; <object>/<frame>.png in black and white; or LangSplat's _s.npy; without it, masks are found
-    in the frames"""
-    proposals: Folder = None
-    """masks of single frames, to be brought together: <frame>.json of SAM's own generator, a COCO file of all frames,
-    LangSplat's _s.npy, PNGs, or .npy; named like the masks of --masks"""
-    granularity: Literal["fine", "medium", "coarse"] = "medium"
-    """of the proposals, without masks: fine parts things; coarse joins the colours of one thing, and tells things apart
-    by the depth that the Gaussians render"""
-    association: Literal["consensus", "tracking"] = "consensus"
-    """of the frames' proposals: what most views agree on, or Algorithm 1 of the paper with a tracker through the
-    Gaussians"""
-    agreement: Annotated[float, {"metavar": "SHARE"}] = 0.4
-    """consensus: share of the views that must put two things into one proposal; less joins more"""
-    iou_threshold: Annotated[float, {"metavar": "KAPPA"}] = 0.5
-    """tracking: a proposal that overlaps a masklet by more is not new"""
-    segmenter: Folder = None
-    """a SAM model folder (.onnx) to find proposals with, instead of colour and texture"""
-    level: Literal["default", "s", "m", "l"] = "l"
-    """of SAM's proposals and of LangSplat's files: subparts, parts, wholes, or all"""
-    points_per_side: Annotated[int, {"metavar": "N", "least": 1}] = 32
-    """SAM: asked on a grid of NxN points"""
-    crop_layers: Annotated[int, {"metavar": "N", "least": 0}] = 0
-    """SAM: asked on 4^k crops too, for each layer k; 1 is LangSplat's setting and takes five times longer"""
-    tracker: Folder = None
-    """a SAM 2 model folder (.onnx) that follows the proposals (the paper's Algorithm 1), instead of consensus"""
-    embedder: Folder = None
-    """a CLIP model folder (.onnx, tokenizer.json) for regions and texts, instead of colours"""
-    features: Folder = None
-    """LangSplat's language_features: regions take their embeddings from <frame>_s.npy and _f.npy; texts then need the
-    CLIP that made them (--embedder, here or of query)"""
-    weighting: Literal["pixels", "uniform"] = "pixels"
-    """of the views in a region's embedding"""
-    parts: bool = False
-    """embed each frame's own masks too, so that `query` finds what no region holds, and `query --all` leaves out what
-    most views took for one with its neighbour; takes twice as many embeddings"""
-    latent: Annotated[int | Literal["auto"], {"metavar": "D", "least": 1}] = 16
-    """most numbers a code may have; 3 as in the paper; auto for as few as keep the regions apart"""
-    reduce: Literal["mode", "median", "mean"] = "mode"
-    """from a Gaussian's votes to its code"""
-    top: Annotated[int, {"metavar": "N", "least": 1}] = 8
-    """regions whose votes a Gaussian keeps"""
-    centre: Annotated[float, {"metavar": "W", "least": 0.0}] = 0.0
-    """how far a Gaussian is what the pixel of its centre shows, not all that it covers: 1 where the answer is points"""
+    Attributes:
+      masks: Folder of instance masks: an integer PNG or .npy per frame under the frame's name (0 is background), in
+        subfolders like the images' if those have some; or <object>/<frame>.png in black and white; or LangSplat's
+        _s.npy. Without it, jsecon finds the objects in the frames.
+      proposals: Folder of masks of single frames, to be brought together over the frames: <frame>.json of SAM's own
+        generator, a COCO file of all frames, LangSplat's _s.npy, PNGs or .npy, named like the masks of --masks.
+      granularity: Without --masks, how large the objects are that jsecon finds by itself. Fine separates parts of
+        things. Coarse joins the colours of a thing, and separates things by the depth that the Gaussians render.
+      association: How the proposals of the frames are brought together: what most views agree on (consensus), or
+        Algorithm 1 of the paper with a tracker through the Gaussians (tracking).
+      agreement: For consensus, share of the views that must put two things into one proposal. A lower share joins more.
+      iou_threshold: For tracking, IoU with a masklet above which a proposal is not a new object.
+    """
+
+    masks: Option[Path | None] = None
+    proposals: Option[Path | None] = None
+    granularity: Option[Literal["fine", "medium", "coarse"]] = "medium"
+    association: Option[Literal["consensus", "tracking"]] = "consensus"
+    agreement: Option[float] = 0.4
+    iou_threshold: Option[float] = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelOptions:
+    """Options of the models that take the place of colours.
+
+    Attributes:
+      segmenter: Folder of a SAM model (.onnx) that finds the proposals, instead of colour and texture.
+      level: Level of SAM's proposals and of LangSplat's files: subparts (s), parts (m), wholes (l), or all (default).
+      points_per_side: For SAM, number of points along each side of the grid of prompts.
+      crop_layers: For SAM, number of layers of crops that are prompted too, 4^k crops in layer k. LangSplat uses 1,
+        which takes five times longer.
+      tracker: Folder of a SAM 2 model (.onnx) that follows the proposals (Algorithm 1 of the paper), instead of
+        consensus.
+      embedder: Folder of a CLIP model (.onnx and tokenizer.json) for regions and texts, instead of colours.
+      features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
+        texts then need the CLIP model that made them (--embedder, here or of query).
+    """
+
+    segmenter: Option[Path | None] = None
+    level: Option[Literal["default", "s", "m", "l"]] = "l"
+    points_per_side: Option[int] = 32
+    crop_layers: Option[int] = 0
+    tracker: Option[Path | None] = None
+    embedder: Option[Path | None] = None
+    features: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldOptions:
+    """Options of the language field.
+
+    Attributes:
+      weighting: How the views of a region are weighted in its embedding: by their pixels, or all alike.
+      parts: Embeds each frame's own masks too, so that query finds things that no region holds, and query --all leaves
+        out what most views took for one with its neighbour. Takes twice as many embeddings.
+      latent: Maximum length of a code. The paper uses 3; auto takes as few numbers as keep the regions apart.
+      reduce: How a Gaussian's code follows from its votes.
+      top: Number of regions whose votes a Gaussian keeps.
+      centre: Weight of the pixel at a Gaussian's centre against all pixels that it covers, 0 to 1. Use 1 if the answer
+        is evaluated on points.
+    """
+
+    weighting: Option[Literal["pixels", "uniform"]] = "pixels"
+    parts: Option[bool] = False
+    latent: Option[int | Literal["auto"]] = 16
+    reduce: Option[Literal["mode", "median", "mean"]] = "mode"
+    top: Option[int] = 8
+    centre: Option[float] = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(FieldOptions, ModelOptions, MaskOptions, SceneOptions, InputOptions):
+    """All that the result of a run depends on, except for the content of its files."""
 
     @property
     def associated_by(self) -> Literal["consensus", "tracking"]:
-        """`association`; where a tracker is given, tracking."""
+        """How masks are associated over the frames: by tracking if a tracker is given, else by `association`."""
         return self.association if self.tracker is None else "tracking"
 
 
+LEAST: dict[str, float] = {
+    "downscale": 1,
+    "long_side": 16,
+    "frames": 2,
+    "holdout": 0,
+    "steps": 1,
+    "minutes": 0.05,
+    "gaussians_at_most": 1,
+    "points_per_side": 1,
+    "crop_layers": 0,
+    "latent": 1,
+    "top": 1,
+    "centre": 0,
+}
+"""smallest value of an option"""
+
+
 def require_inputs(options: Options) -> None:
-    """Raises InputError where a file or folder that the options name is not there, or a number is out of its range."""
-    for argument in arguments_of(Options):
-        value = getattr(options, argument.name)
+    """Checks that the files and folders of a run exist and that its numbers are in their ranges.
+
+    Args:
+      options: Options of the run.
+
+    Raises:
+      InputError: A file or folder is missing, a number is out of its range, or there are several sources of masks.
+    """
+    for name, value in vars(options).items():
+        flag = f"--{name.replace('_', '-')}"
         if isinstance(value, Path) and not value.exists():
-            remedy = f"Mend the path{'' if argument.positional else f', or leave out {argument.flag}'}."
-            raise InputError(value, "nothing there", argument.help.partition(";")[0], remedy)
-        if argument.least is not None and isinstance(value, int | float) and not value >= argument.least:
-            raise InputError(argument.flag, str(value), f"at least {argument.least}", "Mend the option.")
+            remedy = "Check the path." if name == "capture" else f"Check the path, or leave out {flag}."
+            raise InputError(value, "no such file or folder", remedy=remedy)
+        if name in LEAST and isinstance(value, int | float) and not value >= LEAST[name]:
+            raise InputError(flag, str(value), f"at least {LEAST[name]}", "Change the option.")
     sources = [f"--{name}" for name in ("masks", "proposals", "segmenter") if getattr(options, name) is not None]
     if len(sources) > 1:
         expected = "one: tracked masks, masks of single frames, or a model that finds them"
         raise InputError(" ".join(sources), "more than one source of masks", expected, "Leave out the others.")
     if not 0 < options.agreement <= 1:
-        given, remedy = str(options.agreement), "Leave it out, or use 0.3 to 0.6."
-        raise InputError("--agreement", given, "a share above 0 and at most 1", remedy)
+        remedy = "Leave it out, or use 0.3 to 0.6."
+        raise InputError("--agreement", str(options.agreement), "a share above 0 and at most 1", remedy)
     if options.centre > 1:
         raise InputError("--centre", str(options.centre), "0 to 1", "Use 1 for the pixel of the centre alone.")
 
 
-def require_own_folder(options: Options | SceneOptions, out: Path) -> None:
-    """Raises InputError where the output folder is one of the input folders, or a folder of the capture's own files."""
+def require_own_folder(options: Options, out: Path) -> None:
+    """Checks that the output folder is not one of the input folders, nor a folder of the capture's own files.
+
+    Args:
+      options: Options of the run.
+      out: Its output folder.
+
+    Raises:
+      InputError: It is.
+    """
     capture = options.capture
-    inputs = {"capture": [capture, *(capture / name for name in ("images", "sparse", "sparse/0", "keyframes"))]}
-    inputs |= {argument.name: [getattr(options, argument.name, None)] for argument in arguments_of(Options)[1:]}
+    inputs = {name: [value] for name, value in vars(options).items() if isinstance(value, Path)}
+    inputs["capture"] = [capture, *(capture / name for name in ("images", "sparse", "sparse/0", "keyframes"))]
     for name, folders in inputs.items():
         for folder in folders:
-            if isinstance(folder, Path) and folder.is_dir() and folder.resolve() == out.resolve():
+            if folder.is_dir() and folder.resolve() == out.resolve():
                 problem = f"it is the input folder ({name}) and the output folder at once"
                 remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
                 raise InputError(out, problem, "", remedy)
 
 
 def require_writable(folder: Path) -> None:
-    """Raises InputError where no file can be made in `folder`; makes the folder itself."""
+    """Creates a folder, and checks that files can be created in it.
+
+    Args:
+      folder: The output folder.
+
+    Raises:
+      InputError: The folder cannot be created or written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        found, remedy = why(error), "Choose another output folder, or mend its permissions."
-        raise InputError(folder, found, "a folder that can be written", remedy) from error
+        remedy = "Choose another output folder, or mend its permissions."
+        raise InputError(folder, why(error), "a folder that can be written", remedy) from error

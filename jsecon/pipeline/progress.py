@@ -163,6 +163,8 @@ class _Bar(tqdm):
     def __init__(self, name: str, file: Stream):
         self._drawn = False
         super().__init__(desc=f"  {name}", file=file, leave=False, dynamic_ncols=True, delay=QUIET_SECONDS)
+        self._time = time.monotonic  # a clock that cannot be set back
+        self.start_t = self.last_print_t = time.monotonic()
 
     def count(self, done: int, total: int) -> None:
         """Sets the progress. A new total or a smaller count starts the estimate of the time left afresh."""
@@ -170,7 +172,7 @@ class _Bar(tqdm):
             if total != self.total or done < self.n:
                 self.total = total
                 self.initial = done
-                self.start_t = self._time()
+                self.start_t = time.monotonic()
             self.n = done
 
     def draw(self) -> None:
@@ -204,7 +206,7 @@ class _Lines(_Bar):
         """Prints the time left, or the time so far if it cannot be estimated."""
         with self.get_lock():
             if self.total and self.initial < self.n < self.total:
-                left = (self._time() - self.start_t) / (self.n - self.initial) * (self.total - self.n)
+                left = (time.monotonic() - self.start_t) / (self.n - self.initial) * (self.total - self.n)
                 text = f"{self.n} of {self.total}, about {left:.0f} s left"
             else:
                 text = f"{time.monotonic() - self._began:.0f} s so far"
