@@ -193,9 +193,10 @@ def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
     assert cache.files_digest([capture], leave_out=tmp_path / "out") != before
 
 
-def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path, monkeypatch):
+def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path, monkeypatch, request):
     package = shutil.copytree(cache.PACKAGE, tmp_path / "jsecon", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(cache, "PACKAGE", package)
+    request.addfinalizer(cache.source_digest.cache_clear)
 
     def digests():
         cache.source_digest.cache_clear()
