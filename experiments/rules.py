@@ -1,14 +1,17 @@
 """Each rule of retrieval on and off, at several levels: which of them hold where views share their errors?
 
     python -m experiments.rules [--scenes NAME ...] [--seeds 0 1] [--levels medium high shared] [--quick] [--out FOLDER]
-                                [--processes N]
 
-Twins of LERF. A row changes one rule of `jsecon query`. The first row has all rules as they are, and refuses no text.
+Twins of LERF, their points as Gaussians, one each: nothing is fitted or rendered. A row changes one rule of
+`jsecon query`. The first row has all rules as they are, and refuses no text. An answer is judged at the points: its IoU
+with the points that the true masks of all views put into the object.
+
 Then refusal: texts of the scene, and of names that nothing in it has (`twins.absent_texts`), are held against
 thresholds on the similarity of their best region. The thresholds are constants, or quantiles of the similarities of
 reference words in the same field. One half of the absent names are the reference words, the other half are refused.
 """
 
+import argparse
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -19,82 +22,142 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import lerf, results
-from experiments.fair import ahead, by_text
+from experiments.cells import append_cell, read_cells
+from experiments.fair import ahead
 from experiments.points import without_evidence
+from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
-from experiments.tables.answers import Answers, Method, Steps
-from experiments.tables.fill import fill, place_of, twins_asked
-from experiments.tables.ours import field_of
-from experiments.tables.rows import NO_REFUSAL, own
+from experiments.tables.association import associated
+from experiments.tables.ours import field_of, parts_of
 from experiments.tables.setting import Setting
+from jsecon.fit.start import gaussians_from_points
+from jsecon.language.votes import region_votes
+from jsecon.process import forget_programs
 from jsecon.query.anchored import query_anchored
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.parts import parts_instead, query_parts
 from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD, answers
-from jsecon.types import LanguageField, Selection
+from jsecon.query.several import query_several
+from jsecon.types import LanguageField
 
-FIGURES = ("miou", "miou_vala")
 AS_IT_IS = "as it is"
-TRACKS = "tracks, as it is"
+NO_REFUSAL = -1.0
+"""below every similarity"""
+LEAST = 5
+"""points of an object that is judged"""
 QUANTILES = (0.8, 0.9, 0.95, 0.98)
 """of the reference words' similarities with their best regions, above which a text is answered"""
 CONSTANTS = {"contrast": CONTRAST_THRESHOLD, "cosine": RETRIEVAL_THRESHOLD}
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """What the command line asked for."""
+class Options:
+    """What the experiment can vary."""
 
-    scenes: tuple[str, ...]
-    seeds: tuple[int, ...]
-    levels: tuple[str, ...]
-    quick: bool
-    out: str
-
-
-def rule(
-    by: str = "consensus",
-    change: Callable[[LanguageField], LanguageField] = lambda field: field,
-    *,
-    refuses: bool = False,
-    level: bool = False,
-    **query: Any,
-) -> Method:
-    """jsecon's answers by regions of `by`, its field changed, or asked with other options `query` of `query_anchored`.
-    Unless it `refuses`, no text is refused. `level`: with the figures of `refusal` beside."""
-
-    def row(setting: Setting, steps: Steps) -> Answers:
-        field = change(field_of(setting, by=by))
-        options = {"retrieval_threshold": None if refuses else NO_REFUSAL, **query}
-
-        def select(k: int) -> Selection:
-            found = query_anchored(field, jnp.asarray(setting.texts[k]), **options)
-            kept = remove_outliers(np.asarray(setting.evidence.gaussians.means), np.asarray(found.mask))
-            return dataclasses.replace(found, mask=jnp.asarray(kept))
-
-        return Answers(select, lambda: np.zeros(0, np.int32), beside=refusal(setting, field) if level else {})
-
-    return row
+    data: twins.Data = lerf.PLAN.data
+    scenes: tuple[str, ...] = lerf.PLAN.data.scenes
+    seeds: tuple[int, ...] = (0, 1)
+    levels: tuple[str, ...] = ("medium", "high", "shared")
+    out: str = str(results.HOME / "results" / "rules")
 
 
-ROWS: dict[str, Method] = {
-    AS_IT_IS: rule(level=True),
-    "region by the plain cosine": rule(retrieval="cosine"),
-    "evidence does not count": rule(change=without_evidence),
-    "no pieces": rule(piece_nearness=None),
-    "pieces at 0.25 of the way": rule(piece_nearness=0.25),
-    "pieces at 0.75 of the way": rule(piece_nearness=0.75),
-    "none alike": rule(alike_threshold=None),
-    "all regions that answer": own("consensus", "contrast", "threshold", way="all"),
-    "parts that answer": own("consensus", "contrast", "threshold", way="parts"),
-    "parts where no region answers": own("consensus", "contrast", "threshold", instead=True),
-    "refusing below the constant": rule(refuses=True),
-    "by the plain cosine, refusing below the constant": rule(retrieval="cosine", refuses=True),
-    TRACKS: rule("tracks"),
-    "tracks, region by the plain cosine": rule("tracks", retrieval="cosine"),
-    "tracks, evidence does not count": rule("tracks", without_evidence),
-    "tracks, no pieces": rule("tracks", piece_nearness=None),
-    "tracks, none alike": rule("tracks", alike_threshold=None),
+QUICK = Options(
+    lerf.QUICK.data, lerf.QUICK.data.scenes, (0,), ("shared",), str(results.HOME / "results" / "quick" / "rules")
+)
+
+
+def on_points(data: twins.Data, scene: str, seed: int, level: str) -> tuple[Setting, np.ndarray]:
+    """A twin under simulated vision of a level with its points as Gaussians, and the true object of each point (N,), -1
+    where most of its weight lies on none. The twin's files are those of "medium", of which the frames are taken."""
+    root = data.place(scene, seed, "medium")
+    bench = data.load(root, scene)
+    names, frames, truth, (seen, *_), embedder = twins.sight(bench, root, level, seed)
+    masks, rows, owners = np.full(truth.shape, -1, np.int32), [], []
+    for t, image in enumerate(seen.labels):
+        here = np.unique(image[image >= 0])
+        masks[t] = np.where(image >= 0, len(owners) + np.searchsorted(here, image), -1)
+        rows.append(embedder.embed_regions(frames[t], image[None] == here[:, None, None]))
+        owners += [t] * len(here)
+    capture = bench.capture
+    gaussians = gaussians_from_points(capture.points, capture.point_colors, opacity=0.8, scale=0.4)
+    gaussians = jax.tree.map(jnp.asarray, gaussians)
+    cameras = jax.tree.map(jnp.asarray, capture.cameras[np.flatnonzero(~np.asarray(capture.held_out))])
+    tracks = np.asarray(seen.labels, np.int32)
+    evidence = Evidence(gaussians, cameras, masks, np.concatenate(rows), np.array(owners), tracks)
+    texts, levels = embedder.embed_text(list(bench.queries)), (evidence,)
+    known = (bench, evidence, frames, levels, associated(levels, tracks), texts, embedder.canonical)
+    setting = Setting(*known, {}, tuple(names), seed, root / scene, level)
+    votes = region_votes(gaussians, cameras, jnp.asarray(truth, jnp.int32), int(truth.max()) + 1)
+    inside, outside = np.asarray(votes.weights[:, 0]), np.asarray(votes.total - votes.labelled)
+    return setting, np.where(inside > outside, np.asarray(votes.regions[:, 0]), -1)
+
+
+Row = Callable[[Setting, LanguageField, int], Any]
+"""the setting, its field and the number of a query -> a Selection"""
+
+
+def anchored(change: Callable[[LanguageField], LanguageField] = lambda field: field, **query: Any) -> Row:
+    """A field that is changed, asked with other options `query` of `query_anchored`."""
+    options = {"retrieval_threshold": NO_REFUSAL, **query}
+    return lambda setting, field, k: query_anchored(change(field), jnp.asarray(setting.texts[k]), **options)
+
+
+def every_region(setting: Setting, field: LanguageField, k: int) -> Any:
+    """All regions that answer."""
+    return query_several(field, jnp.asarray(setting.texts[k])[None], retrieval_threshold=NO_REFUSAL)
+
+
+def answering(setting: Setting, field: LanguageField, k: int) -> Any:
+    """Of them the parts that answer."""
+    field = dataclasses.replace(field, parts=parts_of(setting))
+    return query_parts(field, every_region(setting, field, k), jnp.asarray(setting.texts[k])[None])
+
+
+def instead(setting: Setting, field: LanguageField, k: int) -> Any:
+    """The parts that answer where no region does."""
+    text = jnp.asarray(setting.texts[k])
+    found = query_anchored(field, text, retrieval_threshold=NO_REFUSAL)
+    other = parts_instead(dataclasses.replace(field, parts=parts_of(setting)), text, found.score)
+    return found if other is None else other.selection
+
+
+ROWS: dict[str, Row] = {
+    AS_IT_IS: anchored(),
+    "the region by the plain cosine": anchored(retrieval="cosine"),
+    "a few pixels are evidence enough": anchored(without_evidence),
+    "no pieces": anchored(piece_nearness=None),
+    "pieces at 0.25 of the way": anchored(piece_nearness=0.25),
+    "pieces at 0.75 of the way": anchored(piece_nearness=0.75),
+    "none alike": anchored(alike_threshold=None),
+    "all regions that answer": every_region,
+    "parts that answer": answering,
+    "parts where no region answers": instead,
+    "refusing by the constant": anchored(retrieval_threshold=None),
+    "by the plain cosine, refusing by its constant": anchored(retrieval="cosine", retrieval_threshold=None),
 }
+OF_PARTS = ("parts that answer", "parts where no region answers")
+"""rows that are asked of consensus alone"""
+
+
+def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
+    """{"consensus": {row: {text: IoU}}, "tracks": {...}, "refusal": shares} of one setting."""
+    setting, truth = on_points(data, scene, seed, level)
+    names = twins.objects_of(setting.bench, setting.folder.parent)
+    means = np.asarray(setting.evidence.gaussians.means)
+    told: dict[str, dict] = {}
+    for by in ("consensus", "tracks"):
+        field = field_of(setting, by=by)
+        told[by] = {}
+        for row in ROWS if by == "consensus" else [row for row in ROWS if row not in OF_PARTS]:
+            told[by][row] = {}
+            for k, query in enumerate(setting.bench.queries):
+                own = truth == names.index(query)
+                if own.sum() >= LEAST:
+                    kept = remove_outliers(means, np.asarray(ROWS[row](setting, field, k).mask))
+                    told[by][row][query] = round(float((kept & own).sum() / (kept | own).sum()), 4)
+        if by == "consensus":
+            told["refusal"] = refusal(setting, field)
+    return told
 
 
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:
@@ -127,52 +190,56 @@ def refusal(setting: Setting, field: LanguageField) -> dict[str, float]:
     return told
 
 
-def report(cells: list[dict], level: str) -> tuple[str, dict]:
+def report(found: dict[tuple, dict], level: str) -> tuple[str, dict]:
     """Markdown tables of one level, and its figures."""
-    of = lambda row: [cell for cell in cells if cell["method"] == row]
-    told, rows = {}, []
-    for row in ROWS:
-        base = TRACKS if row.startswith("tracks") else AS_IT_IS
-        means = [float(np.mean([cell[figure] for cell in of(row)])) for figure in FIGURES]
-        apart = [ahead(by_text(of(row), n), by_text(of(base), n)) for n in range(len(FIGURES))]
-        told[row] = {"mean": means, "more": apart}
-        columns = [(f"{mean:.3f}", f"{d[0]:+.3f} [{d[1]:+.3f}, {d[2]:+.3f}]") for mean, d in zip(means, apart)]
-        rows.append((row, *(value for pair in columns for value in pair)))
-    heads = [head for figure in FIGURES for head in (figure, "more than as it is [95 %]")]
-    names = [name for name in of(AS_IT_IS)[0] if name.endswith(("kept", "refused", "ordered"))]
-    told["refusal"] = {name: float(np.mean([cell[name] for cell in of(AS_IT_IS)])) for name in names}
+    here = {where: told for where, told in found.items() if where[2] == level}
+    by_text = lambda by, row: {
+        (*where, text): value for where, told in here.items() for text, value in told[by][row].items()
+    }
+    kept, rows = {}, []
+    for by in ("consensus", "tracks"):
+        for row in next(iter(here.values()))[by]:
+            values, apart = by_text(by, row), ahead(by_text(by, row), by_text(by, AS_IT_IS))
+            kept[f"{by}: {row}"] = {"mean": float(np.mean(list(values.values()))), "more": apart}
+            rows.append((by, row, kept[f"{by}: {row}"]["mean"], f"{apart[0]:+.3f} [{apart[1]:+.3f}, {apart[2]:+.3f}]"))
+    text = results.table((f"{level}: regions by", "rule", "mean IoU", "more than as it is [95 %]"), rows)
+    names = list(next(iter(here.values()))["refusal"])
+    shares = {name: float(np.mean([told["refusal"][name] for told in here.values()])) for name in names}
+    kept["refusal"] = shares
     cuts = [name.removesuffix(": kept") for name in names if name.endswith("kept")]
-    shares = [(cut, told["refusal"][f"{cut}: kept"], told["refusal"][f"{cut}: refused"]) for cut in cuts]
-    ordered = "; ".join(f"{name} {told['refusal'][name]:.3f}" for name in names if name.endswith("ordered"))
-    second = results.table((f"{level}: threshold", "present kept", "absent refused"), shares)
-    return f"{results.table((level, *heads), rows)}\n\n{second}\n\nPresent above absent: {ordered}.", told
+    lines = [(cut, shares[f"{cut}: kept"], shares[f"{cut}: refused"]) for cut in cuts]
+    ordered = ", ".join(f"{name.split(':')[0]} {shares[name]:.3f}" for name in names if name.endswith("ordered"))
+    second = results.table((f"{level}: threshold", "present kept", "absent refused"), lines)
+    return f"{text}\n\n{second}\n\nA present text is above an absent one: {ordered}.", kept
 
 
-def main(asked: Asked, processes: int) -> str:
-    """The tables, written."""
-    table = lerf.QUICK if asked.quick else lerf.PLAN
-    data = dataclasses.replace(table.data, scenes=table.data.scenes if asked.quick else asked.scenes, seeds=asked.seeds)
-    place = {"out": asked.out, "cells": str(Path(asked.out) / "cells.jsonl")}
-    parts, kept = [], {}
-    for level in asked.levels:
-        options = {"methods": tuple(ROWS), "level": level, "sweep": (), "processes": processes}
-        plan = dataclasses.replace(table, data=data, **options, **place)
-        try:
-            cells = fill(plan, ROWS, tell=lambda line: print(line, flush=True))
-        except SystemExit:  # of a helper, which has no table to write
-            continue
-        text, kept[level] = report(cells, level)
+def main(options: Options = Options()) -> dict:
+    """Runs what is not measured yet, writes the tables and returns the figures by level."""
+    file = Path(options.out) / "cells.jsonl"
+    kept, parts, found = {}, [], {}
+    for level in options.levels:
+        for where in ((scene, seed, level) for seed in options.seeds for scene in options.scenes):
+            key = f"{'-'.join(map(str, where))}-{dict(options.data.size)}"
+            if key not in read_cells(file):
+                forget_programs()
+                append_cell(file, key, measure(options.data, *where))
+                print(*where, "measured", flush=True)
+            found[where] = read_cells(file)[key]
+        text, kept[level] = report(found, level)
         parts.append(text)
         print(text, flush=True)
-    if processes:
-        results.save(Path(asked.out), asked, kept, "\n\n".join(parts))
-    return "\n\n".join(parts)
+    results.save(Path(options.out), options, kept, "\n\n".join(parts))
+    return kept
 
 
 if __name__ == "__main__":
-    parser = twins_asked("rules", "one tiny scene, one seed")
-    parser.add_argument("--levels", nargs="+", default=["medium", "high", "shared"])
-    parser.set_defaults(scenes=list(lerf.PLAN.data.scenes), seeds=[0, 1])
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", nargs="+", default=list(Options.scenes), help="twins of LERF")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
+    parser.add_argument("--levels", nargs="+", default=list(Options.levels))
+    parser.add_argument("--quick", action="store_true", help="one tiny scene, one level")
+    parser.add_argument("--out", default="", help="where the results go")
     given = parser.parse_args()
-    seeds, levels = ((0,), ("shared",)) if given.quick else (tuple(given.seeds), tuple(given.levels))
-    main(Asked(tuple(given.scenes), seeds, levels, given.quick, place_of(given, "rules")), given.processes)
+    wanted = {"scenes": tuple(given.scenes), "seeds": tuple(given.seeds), "levels": tuple(given.levels)}
+    chosen = QUICK if given.quick else dataclasses.replace(Options(), **wanted)
+    main(dataclasses.replace(chosen, out=given.out) if given.out else chosen)

@@ -1,9 +1,9 @@
 """Errors that all views of an object share: what they do to simulated embeddings, against a real embedder.
 
     python -m experiments.shared_errors [--scenes NAME ...] [--seeds 0 1 2 3 4] [--strengths 0 0.25 0.5 0.75 1]
-                                        [--quick] [--out FOLDER]
+                                        [--noise medium] [--quick] [--out FOLDER]
 
-Twins of LERF at medium noise, with `World.shared` at each strength. Regions are those of the simulated tracker, each
+Twins of LERF at a level of noise, `World.shared` at each strength. Regions are those of the simulated tracker, each
 with the mean of its masks' embeddings by their pixels. Measured are cosines between texts, masks and regions; how many
 regions have their own object's text as the best of the scene's texts; how many texts find their object; and how often a
 text of what is there is more similar to its best region than one of the names that nothing has. The last column is a
@@ -16,12 +16,14 @@ import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from experiments import lerf, results
 from experiments.datasets.benchmark import Benchmark
 from experiments.ideas.state import unit
 from experiments.tables import twins
+from jsecon.query.retrieval import evidence
 
 REAL = {
     "text to text": "0.29 to 0.33",
@@ -34,6 +36,8 @@ REAL = {
     "own text is the best, by contrast": "",
     "text finds its object, by cosine": "",
     "text finds its object, by contrast": "",
+    "text finds its object, by contrast times evidence": "",
+    "text finds its object, by contrast of equal weights": "",
     "present above absent, by cosine": "0.92",
     "present above absent, by contrast": "0.84",
 }
@@ -48,6 +52,7 @@ class Options:
     scenes: tuple[str, ...] = lerf.PLAN.data.scenes
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     strengths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    noise: str = "medium"
     out: str = str(results.HOME / "results" / "shared_errors")
 
 
@@ -56,6 +61,7 @@ QUICK = Options(
     lerf.QUICK.data.scenes,
     (0,),
     (0.0, 1.0),
+    "medium",
     str(results.HOME / "results" / "quick" / "shared_errors"),
 )
 
@@ -99,9 +105,11 @@ def pooled(bench: Benchmark, root: Path, level: str, seed: int) -> Pooled:
     return Pooled(embeddings, pixels, labels.origin, masks, texts, asked, absent, embedder.canonical)
 
 
-def contrasts(found: Pooled, texts: np.ndarray) -> np.ndarray:
-    """(Q, R) the contrast of texts with regions, as `jsecon.query.retrieval.contrasts` has it."""
+def contrasts(found: Pooled, texts: np.ndarray, *, equal: bool = False) -> np.ndarray:
+    """(Q, R) the contrast of texts with regions, as `jsecon.query.retrieval.contrasts` has it; with `equal` weights of
+    the regions in the scene's mean, in place of their pixels."""
     weight = found.pixels.sum(1)
+    weight = (weight > 0).astype(float) if equal else weight
     mean = weight @ found.embeddings / weight.sum()
     count = int((weight > 0).sum())
     apart = unit(np.where(weight[:, None] > 0, found.embeddings - count / (count + 1) * mean, 0))
@@ -139,6 +147,12 @@ def figures_of(found: Pooled) -> dict[str, float]:
         told[f"text finds its object, by {rule}"] = (found.objects[answer] == found.asked).mean()
         above = texts[found.asked].max(1)[:, None] > absent.max(1)
         told[f"present above absent, by {rule}"] = above.mean()
+    standing = np.asarray(evidence(jnp.asarray(found.pixels)))
+    asked = contrasts(found, found.texts[found.asked])
+    weighed = np.where(asked > 0, asked * standing, asked).argmax(1)
+    told["text finds its object, by contrast times evidence"] = (found.objects[weighed] == found.asked).mean()
+    even = contrasts(found, found.texts[found.asked], equal=True).argmax(1)
+    told["text finds its object, by contrast of equal weights"] = (found.objects[even] == found.asked).mean()
     return {name: float(told[name]) for name in REAL}
 
 
@@ -150,7 +164,7 @@ def main(options: Options = Options()) -> dict:
             root = options.data.place(scene, seed, "medium")
             bench = options.data.load(root, scene)
             for strength in options.strengths:
-                told[strength].append(figures_of(pooled(bench, root, f"medium+shared={strength:g}", seed)))
+                told[strength].append(figures_of(pooled(bench, root, f"{options.noise}+shared={strength:g}", seed)))
     mean = lambda each: {name: float(np.nanmean([figures[name] for figures in each])) for name in REAL}
     means = {strength: mean(each) for strength, each in told.items()}
     header = ("measured", *(f"strength {strength:g}" for strength in means), "a real embedder")
@@ -166,9 +180,11 @@ if __name__ == "__main__":
     parser.add_argument("--scenes", nargs="+", default=list(Options.scenes), help="twins of LERF")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
     parser.add_argument("--strengths", nargs="+", type=float, default=list(Options.strengths), help="0 to 1")
+    parser.add_argument("--noise", default="medium", help="low, medium or high")
     parser.add_argument("--quick", action="store_true", help="one tiny scene, two strengths")
     parser.add_argument("--out", default="", help="where the results go")
     given = parser.parse_args()
     wanted = {"scenes": tuple(given.scenes), "seeds": tuple(given.seeds), "strengths": tuple(given.strengths)}
+    wanted |= {"noise": given.noise}
     chosen = QUICK if given.quick else dataclasses.replace(Options(), **wanted)
     main(dataclasses.replace(chosen, out=given.out) if given.out else chosen)

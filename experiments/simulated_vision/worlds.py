@@ -44,7 +44,7 @@ class World:
 
 
 SHARED = "shared"
-SHARED_STRENGTH = 0.75
+SHARED_STRENGTH = 0.85
 """the level "shared" is medium noise with `World.shared` of this strength. Chosen so that by the plain cosine the own
 text is the best of the scene's for a quarter of the regions, as with a real embedder (experiments/shared_errors.py)"""
 
@@ -64,7 +64,7 @@ class Seen(NamedTuple):
 
 
 def world_of(level: str) -> tuple[str, World]:
-    """The level of noise and the world of a name such as "medium+parts=1+gap=0.5"; "shared" is "medium+shared=0.75".
+    """The level of noise and the world of a name such as "medium+parts=1+gap=0.5"; "shared" is "medium+shared=0.85".
     Raises ValueError for a switch that there is none of, and one beyond 0 to 1."""
     noise, *switches = level.split("+")
     if noise == SHARED:

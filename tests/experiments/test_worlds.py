@@ -61,7 +61,7 @@ def seen(made, **switches):
 def test_a_level_names_the_noise_and_the_switches():
     assert world_of("high") == ("high", World())
     assert world_of("medium+parts=1+gap=0.5") == ("medium", World(parts=1, gap=0.5))
-    assert world_of("shared") == ("medium", World(shared=0.75))
+    assert world_of("shared") == ("medium", World(shared=0.85))
     for wrong in ("medium+sharks=1", "medium+parts=2"):
         with pytest.raises(ValueError, match="a number from 0 to 1"):
             world_of(wrong)
