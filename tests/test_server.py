@@ -12,18 +12,20 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("starlette", reason="the extra serve is not installed")
+pytest.importorskip("fastapi", reason="the extra serve is not installed")
 from small_field import make_field
 from starlette.testclient import TestClient
 
+from jsecon.app.api import application
 from jsecon.app.guard import Busy, Guard, Limits, Workers
-from jsecon.app.server import Scene, application, open_scenes, ready
+from jsecon.app.scenes import Question, Scene, open_scenes
+from jsecon.app.server import ready
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.process import cores
 from jsecon.vision.colours import ColourEmbedder
 
-LIMITS = Limits(body=2000, seconds_to_send=0.3, waiting=4, text=80)
+LIMITS = Limits(body=2000, seconds_to_send=0.3, waiting=4)
 KINDS = {200, 400, 401, 404, 405, 408, 413, 422, 503}
 HERE, JSON = "http://127.0.0.1:8765", {"content-type": "application/json"}
 
@@ -42,7 +44,7 @@ def client(scenes):
 def test_a_text_and_a_pixel_are_answered(client, scenes):
     told = client.post("/query", json={"text": "red"}).json()
     assert told["field"] == "desk"
-    assert told["count"] == int(scenes["desk"].ask("red").mask.sum())
+    assert told["count"] == int(scenes["desk"].answer(Question("red")).mask.sum())
     pixel = client.post("/query", json={"at": ["frame_1", 24, 20], "field": "shelf"}).json()
     assert pixel["field"] == "shelf"
     assert pixel["count"] > 0
@@ -56,17 +58,17 @@ def test_what_is_known_is_told_while_all_threads_are_taken_and_no_thread_is_adde
     held, limits = threading.Event(), Limits(waiting=cores() + 3, seconds=0.05)
     desk, asked = scenes["desk"], []
 
-    def slow(*question):
-        asked.append(question)
+    def slow(question):
+        asked.append(question.text)
         assert held.wait(60)
-        return {"question": question[0]}
+        return {"question": question.text}
 
     with TestClient(application({"desk": desk}, limits=limits), HERE) as client:
         ask = lambda text: client.post("/query", json={"text": text})
         first = ask("red")
         while first.status_code == 503:  # it was computed for longer than 0.05 s
             first = ask("red")
-        monkeypatch.setattr(desk, "_tell", slow)
+        monkeypatch.setattr(desk, "_record", slow)
         before = threading.active_count()
         answers = [ask(f"thing {k}") for k in range(20)]
         assert {answer.status_code for answer in answers} == {503}
@@ -81,8 +83,8 @@ def test_what_is_known_is_told_while_all_threads_are_taken_and_no_thread_is_adde
         while answer.status_code == 503:
             answer = ask("green")
         assert answer.json() == {"question": "green"}
-        assert not any(question[0].startswith("more") for question in asked)
-    desk._known.clear()
+        assert not any(text.startswith("more") for text in asked)
+    desk._records.clear()
 
 
 def test_places_are_bounded_and_given_back():
@@ -136,7 +138,7 @@ def test_a_page_of_another_site_cannot_ask(scenes, status, headers):
 def test_get_takes_what_it_lists_and_nothing_else(client):
     paths = client.get("/openapi.json").json()["paths"]
     for path in ("/regions", "/selection.ply", "/mask.png", "/healthz"):
-        listed = [parameter["name"] for parameter in paths[path]["get"]["parameters"]]
+        listed = [parameter["name"] for parameter in paths[path]["get"].get("parameters", [])]
         usual = {"text": "red", "field": "desk", "by": "votes", "frame": "#0"}
         found = client.get(path, params={name: usual[name] for name in listed})
         assert found.status_code == 200 or "selects nothing" in found.text, found.text
@@ -154,7 +156,9 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
     regions = client.get("/regions").json()["regions"]
     assert len(regions) == 5
     assert regions[0]["frame"].startswith("frame_")
-    words = next(w for w in ("red", "green", "blue", "white", "black", "brown") if scenes["desk"].ask(w).mask.any())
+    words = next(
+        w for w in ("red", "green", "blue", "white", "black", "brown") if scenes["desk"].answer(Question(w)).mask.any()
+    )
     ply = client.get("/selection.ply", params={"text": words})
     assert ply.content.startswith(b"ply\n")
     image = client.get("/mask.png", params={"text": words, "frame": "#2"})

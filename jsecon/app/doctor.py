@@ -32,12 +32,14 @@ PACKAGES = (
     "tokenizers",
     "ftfy",
     "tqdm",
+    "tyro",
     "shtab",
+    "lazy_loader",
 )
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
     "formats": (("gsply", "pillow_heif"), ".sog, .spz of version 4, HEIC photographs"),
-    "serve": (("starlette", "uvicorn"), "jsecon serve"),
+    "serve": (("fastapi", "uvicorn"), "jsecon serve"),
     "viewer": (("viser",), "jsecon view"),
     "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),
     "words": (("ai_edge_litert",), "the experiment on real words"),

@@ -1,57 +1,75 @@
-"""What stands before the server's application: who may ask, how much, how slowly; how many questions are computed; and
-what can be asked."""
+"""Limits of the server: who may send requests, how large and slow they may be, how many are computed at once."""
 
 import asyncio
 import dataclasses
-import json
 import threading
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-import jsecon
+from starlette.datastructures import Headers
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse
+
 from jsecon.app.access import named, right_token
-from jsecon.app.question import METHODS
 
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """What one request may take."""
+    """Limits of one request.
+
+    Attributes:
+      body: Size of the body, bytes.
+      seconds_to_send: Time to send the body, s.
+      seconds: Time to compute an answer, s.
+      waiting: Number of queries that are computed or wait for it.
+      requests: Number of requests at once, the cheap ones included.
+    """
 
     body: int = 64 * 1024
-    """bytes."""
     seconds_to_send: float = 10.0
     seconds: float = 30.0
-    """of an answer."""
     waiting: int = 64
-    """questions that are computed or wait for it."""
     requests: int = 256
-    """at once, the cheap ones too."""
-    text: int = 500
-    """characters."""
 
 
 LIMITS = Limits()
 
 
 class Busy(Exception):
-    """As many questions wait as may."""
+    """The maximum number of queries waits already."""
 
 
 class Workers:
-    """Threads that compute answers: never more than `threads`, and never more than `most` questions in them or waiting.
+    """Threads that compute answers.
 
-    A question keeps its place until its thread is done with it, also where its client was told that it took too long.
+    A query keeps its place until its thread has finished it, also after its client was told that it took too long.
+
+    Args:
+      threads: Maximum number of threads.
+      most: Maximum number of queries in the threads or waiting for one.
     """
 
     def __init__(self, threads: int, most: int):
-        self.most, self.taken = most, 0
+        self.most = most
+        self.taken = 0
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="jsecon-answer")
         self._lock = threading.Lock()
 
     async def compute(self, work: Callable[[], Any], seconds: float) -> Any:
-        """What `work` returns or raises. Raises Busy, and TimeoutError after `seconds`: work that has not begun by then
-        never does."""
+        """Runs a function in a thread.
+
+        Args:
+          work: The function.
+          seconds: Time limit, s. Work that has not begun by then never does.
+
+        Returns:
+          What `work` returns; its exceptions are raised here.
+
+        Raises:
+          Busy: All places are taken.
+          TimeoutError: The time limit has passed.
+        """
         with self._lock:
             if self.taken >= self.most:
                 raise Busy
@@ -65,116 +83,87 @@ class Workers:
             self.taken -= 1
 
     def close(self) -> None:
-        """Ends the threads: what has begun is computed to its end, what waits is not begun."""
+        """Ends the threads. Work that has begun is finished, work that waits is dropped."""
         self._pool.shutdown(cancel_futures=True)
 
 
 class Guard:
-    """Before the application: who may ask, how much, how slowly, and how many at once.
+    """Middleware in front of the application.
 
-    With a token it must be sent; without one a request must name this machine, by a loopback name or one of `hosts`.
+    With a token, requests must carry it. Without one they must name this machine in their Host header, so that a page
+    of another site cannot send requests under a name of its own (DNS rebinding).
+
+    Args:
+      app: The ASGI application.
+      token: The token, or "".
+      limits: Limits of a request.
+      hosts: Names of this machine besides those of loopback.
     """
 
     def __init__(self, app: Any, token: str, limits: Limits, hosts: Collection[str] = ()):
-        self.app, self.token, self.limits, self.hosts, self.now = app, token, limits, hosts, 0
+        self.app = app
+        self.token = token
+        self.limits = limits
+        self.hosts = hosts
+        self.active = 0
 
     async def __call__(self, scope: dict, receive: Callable, send: Callable) -> None:
+        """Answers a request that is refused, and passes the others on with their whole body."""
         if scope["type"] == "lifespan":
             return await self.app(scope, receive, send)
         if scope["type"] != "http":
             return await send({"type": "websocket.close", "code": 1008})
-        status, told, content = 503, "Too many requests at once. Try again.", b""
-        if self.now < self.limits.requests:
-            self.now += 1
-            try:
-                status, told, content = await self._body(scope, receive)
-                if status == 200:
-                    return await self.app(scope, _once(content, receive), send)
-            finally:
-                self.now -= 1
-        headers = [(b"content-type", b"application/json"), (b"connection", b"close")]
-        await send({"type": "http.response.start", "status": status, "headers": headers})
-        await send({"type": "http.response.body", "body": json.dumps({"error": told}).encode()})
+        if self.active >= self.limits.requests:
+            return await _refusal(503, "Too many requests at once. Try again.")(scope, receive, send)
+        self.active += 1
+        try:
+            response = self._refused(Headers(scope=scope), scope.get("method", "GET"))
+            if response is None:
+                body, response = await self._body(Request(scope, receive))
+            if response is not None:
+                return await response(scope, receive, send)
+            await self.app(scope, _replay(body, receive), send)
+        finally:
+            self.active -= 1
 
-    async def _body(self, scope: dict, receive: Callable) -> tuple[int, str, bytes]:
-        """(200, "", body), or a status and why."""
-        headers = dict(scope["headers"])
+    def _refused(self, headers: Headers, method: str) -> JSONResponse | None:
+        """Returns the refusal that follows from the headers, or None."""
         if self.token:
-            if not right_token(headers.get(b"authorization", b""), f"Bearer {self.token}"):
-                return 401, "A token is required. Send the header Authorization: Bearer TOKEN.", b""
-        elif not named(headers.get(b"host", b"").decode("latin-1"), self.hosts):
-            return 403, "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME.", b""
-        kind = headers.get(b"content-type", b"").partition(b";")[0].strip().lower()
-        if scope.get("method") == "POST" and kind != b"application/json":
-            return 415, "The body must be JSON. Send the header Content-Type: application/json.", b""
-        parts, size = [], 0
+            if not right_token(headers.get("authorization", "").encode("latin-1"), f"Bearer {self.token}"):
+                return _refusal(401, "A token is required. Send the header Authorization: Bearer TOKEN.")
+        elif not named(headers.get("host", ""), self.hosts):
+            words = "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME."
+            return _refusal(403, words)
+        kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+        if method == "POST" and kind != "application/json":
+            return _refusal(415, "The body must be JSON. Send the header Content-Type: application/json.")
+        return None
+
+    async def _body(self, request: Request) -> tuple[bytes, JSONResponse | None]:
+        """Reads the body. Returns it, or a refusal."""
+        body = bytearray()
         try:
             async with asyncio.timeout(self.limits.seconds_to_send):
-                while True:
-                    message = await receive()
-                    if message["type"] != "http.request":
-                        return 400, "The sender closed the connection.", b""
-                    parts.append(message.get("body", b""))
-                    size += len(parts[-1])
-                    if size > self.limits.body:
-                        return 413, f"The body has more than {self.limits.body} bytes.", b""
-                    if not message.get("more_body"):
-                        return 200, "", b"".join(parts)
+                async for part in request.stream():
+                    body += part
+                    if len(body) > self.limits.body:
+                        return b"", _refusal(413, f"The body has more than {self.limits.body} bytes.")
+        except ClientDisconnect:
+            return b"", _refusal(400, "The sender closed the connection.")
         except TimeoutError:
-            return 408, f"The body did not arrive within {self.limits.seconds_to_send:g} s.", b""
+            return b"", _refusal(408, f"The body did not arrive within {self.limits.seconds_to_send:g} s.")
+        return bytes(body), None
 
 
-def _once(content: bytes, receive: Callable) -> Callable:
-    """A `receive` that has the whole body, and then what the server tells."""
-    waiting = [{"type": "http.request", "body": content, "more_body": False}]
+def _refusal(status: int, message: str) -> JSONResponse:
+    return JSONResponse({"error": message}, status, headers={"connection": "close"})
+
+
+def _replay(body: bytes, receive: Callable) -> Callable:
+    """Returns a `receive` with the whole body first, and then the messages of the server."""
+    waiting = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def replay() -> Any:
         return waiting.pop() if waiting else await receive()
 
     return replay
-
-
-TAKES: dict[str, tuple[str, ...]] = {
-    "/query": ("text", "at", "field", "by", "threshold", "all"),
-    "/regions": ("field",),
-    "/selection.ply": ("text", "field", "by"),
-    "/mask.png": ("text", "frame", "field", "by"),
-    "/healthz": (),
-}
-"""path -> the fields of a question there"""
-
-
-def paths_told() -> dict[str, str]:
-    """What can be asked: verb and path -> what it takes and gives."""
-    return {
-        "POST /query": "{text or at: [frame, column, row], field, by, threshold, all}: count, score, and where it is",
-        "GET /regions": "?field: pixels and views of each region",
-        "GET /selection.ply": "?text&field&by: the selected Gaussians, in the capture's own world",
-        "GET /mask.png": "?text&frame&field&by: the selection alone in a frame, alpha above 0.7",
-        "GET /healthz": "the fields and their frames",
-    }
-
-
-def openapi(limits: Limits) -> dict[str, Any]:
-    """The OpenAPI 3.1 document."""
-    whole = {"type": "integer"}
-    text = {"type": "string", "minLength": 1, "maxLength": limits.text}
-    options: dict[str, Any] = {"text": text, "field": {"type": "string"}, "by": {"enum": list(METHODS)}}
-    asked = options | {
-        "at": {"type": "array", "prefixItems": [{"type": ["string", "integer"]}, whole, whole]},
-        "threshold": {"type": "number", "minimum": -1, "maximum": 1},
-        "all": {"type": "boolean"},
-    }
-    paths: dict[str, Any] = {}
-    for line, told in paths_told().items():
-        verb, path = line.split()
-        kinds = [(name, options.get(name, {"type": "string"})) for name in TAKES[path]]
-        inputs = [{"name": name, "in": "query", "required": name == "text", "schema": kind} for name, kind in kinds]
-        operation: dict[str, Any] = {"summary": told, "responses": {"200": {"description": "the answer"}}}
-        if verb == "POST":
-            schema = {"type": "object", "properties": asked, "additionalProperties": False}
-            operation["requestBody"] = {"content": {"application/json": {"schema": schema}}}
-        else:
-            operation["parameters"] = inputs
-        paths[path] = {verb.lower(): operation}
-    return {"openapi": "3.1.0", "info": {"title": "jsecon", "version": jsecon.__version__}, "paths": paths}

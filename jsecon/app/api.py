@@ -1,0 +1,242 @@
+"""The HTTP interface of the server: its paths, the models of its requests, and its error messages.
+
+FastAPI makes /openapi.json from them. Its own page of documentation loads scripts of another host and is left out; the
+page at / lists the paths instead.
+"""
+
+import contextlib
+import json
+import re
+from collections.abc import AsyncIterator, Callable, Collection
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse, Response
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, StrictStr, StringConstraints
+from starlette.exceptions import HTTPException as AnyHTTPException
+
+import jsecon
+from jsecon.app.guard import LIMITS, Busy, Guard, Limits, Workers
+from jsecon.app.question import frame_index
+from jsecon.app.scenes import Question, Scene
+from jsecon.app.verbs import By
+from jsecon.errors import InputError
+from jsecon.process import cores
+
+Text = Annotated[str, StringConstraints(strict=True, min_length=1, max_length=500, pattern=r"\S")]
+
+
+class Fields(BaseModel):
+    """A request for a field."""
+
+    model_config = ConfigDict(extra="forbid")
+    field: Any = Field(None, description="Name of a field; the first by default.", json_schema_extra={"type": "string"})
+
+
+class TextQuery(Fields):
+    """A text for a field."""
+
+    text: Text
+    by: By = "votes"
+
+
+class MaskQuery(TextQuery):
+    """A text, and a frame to show its answer in."""
+
+    frame: str | None = None
+
+
+class AnyQuery(Fields):
+    """A text or a pixel for a field."""
+
+    text: Text | None = None
+    at: tuple[StrictStr | StrictInt, StrictInt, StrictInt] | None = Field(None, description="[frame, column, row]")
+    by: By = "votes"
+    threshold: Annotated[StrictFloat | StrictInt, Field(ge=-1, le=1)] | None = None
+    all: StrictBool = False
+
+
+MODELS: dict[str, type[BaseModel]] = {
+    "/query": AnyQuery,
+    "/regions": Fields,
+    "/selection.ply": TextQuery,
+    "/mask.png": MaskQuery,
+}
+
+
+class Failure(BaseModel):
+    """The answer to a request that is refused."""
+
+    error: str
+
+
+class AsciiResponse(JSONResponse):
+    """JSON in ASCII, which can hold any text of a request."""
+
+    def render(self, content: Any) -> bytes:
+        """Returns the JSON of plain values."""
+        return json.dumps(content, allow_nan=False).encode()
+
+
+def application(
+    scenes: dict[str, Scene], *, token: str = "", limits: Limits = LIMITS, hosts: Collection[str] = ()
+) -> FastAPI:
+    """Makes the ASGI application.
+
+    Args:
+      scenes: Fields by name. The first is the default.
+      token: Token that requests must carry, or "" for requests that name this machine.
+      limits: Limits of a request.
+      hosts: Names of this machine besides those of loopback.
+
+    Returns:
+      The application, behind its `Guard`.
+    """
+    workers = Workers(cores(), limits.waiting)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        workers.close()
+
+    app = FastAPI(
+        title="jsecon",
+        version=jsecon.__version__,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        default_response_class=AsciiResponse,
+        responses={status: {"model": Failure} for status in (400, 404, 422, 503)},
+        lifespan=lifespan,
+    )
+    app.add_middleware(Guard, token=token, limits=limits, hosts=hosts)
+
+    def scene_of(name: Any) -> Scene:
+        if name is None:
+            return next(iter(scenes.values()))
+        if not isinstance(name, str) or name not in scenes:
+            raise _wrong("field", f"no field {_short(name)}. There are {', '.join(scenes)}.", 404)
+        return scenes[name]
+
+    async def computed(work: Callable[[], Any], field: str) -> Any:
+        try:
+            return await workers.compute(work, limits.seconds)
+        except InputError as error:
+            raise _wrong(field, _in_words_of_the_api(str(error))) from error
+        except TimeoutError as error:
+            raise HTTPException(503, f"No answer within {limits.seconds:g} s. Try again.") from error
+        except Busy as error:
+            raise HTTPException(503, "Too many queries wait for an answer. Try again.") from error
+
+    @app.post("/query", summary="Count, score and place of the answer to a text or a pixel")
+    async def query(asked: AnyQuery) -> Response:
+        if (asked.text is None) == (asked.at is None):
+            raise _wrong("text", 'missing, and "at" too.' if asked.at is None else 'give it, or "at", and not both.')
+        if asked.at is not None and asked.all:
+            raise _wrong("all", 'it needs a text, and "at" has none.')
+        scene = scene_of(asked.field)
+        question = Question(asked.text or "", asked.at, asked.by, asked.threshold, asked.all)
+        record = scene.known(question)
+        if record is None:
+            record = await computed(lambda: scene.record(question), "text" if asked.at is None else "at")
+        return AsciiResponse(record)
+
+    @app.get("/regions", summary="Pixels and views of each region")
+    async def regions(asked: Annotated[Fields, Query()]) -> Response:
+        scene = scene_of(asked.field)
+        rows = [
+            {
+                "region": region,
+                "pixels": int(pixels.sum()),
+                "views": int((pixels > 0).sum()),
+                "frame": scene.field.names[pixels.argmax()],
+            }
+            for region, pixels in enumerate(np.asarray(scene.field.regions.pixels))
+        ]
+        return AsciiResponse({"field": scene.name, "regions": rows})
+
+    @app.get("/selection.ply", summary="The selected Gaussians in the capture's own world")
+    async def selection(asked: Annotated[TextQuery, Query()]) -> Response:
+        scene = scene_of(asked.field)
+
+        def work() -> bytes:
+            answer = scene.answer(Question(asked.text, by=asked.by))
+            if not answer.mask.any():
+                raise InputError(f"query {answer.question!r}", "it selects nothing", remedy="Ask with other words.")
+            return scene.ply(answer)
+
+        return Response(await computed(work, "text"), media_type="application/octet-stream")
+
+    @app.get("/mask.png", summary="The selection alone in a frame, alpha above 0.7")
+    async def mask(asked: Annotated[MaskQuery, Query()]) -> Response:
+        scene = scene_of(asked.field)
+        try:
+            frame = None if asked.frame is None else frame_index(scene.field, asked.frame)
+        except InputError as error:
+            raise _wrong("frame", str(error)) from error
+        question = Question(asked.text, by=asked.by)
+        name, image = await computed(lambda: scene.mask(scene.answer(question), frame), "text")
+        return Response(image, media_type="image/png", headers={"x-frame": re.sub("[^ -~]", "?", name)})
+
+    @app.get("/healthz", summary="The fields and their frames")
+    async def health() -> Response:
+        return AsciiResponse({"status": "ok", "fields": [scene.described() for scene in scenes.values()]})
+
+    @app.get("/", include_in_schema=False)
+    async def page() -> Response:
+        rows = ""
+        for path, operations in app.openapi()["paths"].items():
+            for method, operation in operations.items():
+                rows += f"<li><code>{method.upper()} {path}</code> {operation['summary']}</li>"
+        return HTMLResponse(f"<!doctype html><title>jsecon</title><h1>jsecon</h1><ul>{rows}</ul>")
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        status, message = _invalid(request.url.path, error)
+        return AsciiResponse({"error": message}, status)
+
+    @app.exception_handler(AnyHTTPException)
+    async def refused(request: Request, error: Exception) -> Response:
+        assert isinstance(error, AnyHTTPException)
+        return AsciiResponse({"error": error.detail}, error.status_code)
+
+    @app.exception_handler(500)
+    async def failed(request: Request, error: Exception) -> Response:
+        return AsciiResponse({"error": "Internal error. The server's log has it."}, 500)
+
+    return app
+
+
+def _invalid(path: str, error: RequestValidationError) -> tuple[int, str]:
+    """Returns the status and the message of a request that does not fit its model."""
+    faults = error.errors()
+    known = MODELS[path].model_fields
+    unknown = [fault["loc"][1] for fault in faults if fault["type"] == "extra_forbidden"]
+    if isinstance(error.body, dict):  # of odd names pydantic does not tell which
+        unknown = [name for name in error.body if name not in known]
+    if unknown:
+        names = ", ".join(sorted(map(_short, unknown))[:5])
+        return 422, f"Unknown fields: {names}. {path} takes {', '.join(known)}."
+    if faults[0]["type"] == "json_invalid":
+        return 400, f"The body is not JSON: {faults[0]['ctx']['error']}."
+    if len(faults[0]["loc"]) < 2:
+        return 400, 'The body must be a JSON object, such as {"text": "red mug"}.'
+    return 422, f'Field "{faults[0]["loc"][1]}": {faults[0]["msg"]}.'
+
+
+def _wrong(field: str, message: str, status: int = 422) -> HTTPException:
+    return HTTPException(status, f'Field "{field}": {message}')
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]} ..."
+
+
+def _in_words_of_the_api(message: str) -> str:
+    """Replaces the options of the command line in a message by the fields of a request: --at becomes "at"."""
+    message = message.replace("--at FRAME X Y", '"at": [frame, column, row]')
+    return re.sub(r"--([a-z]+)", r'"\1"', message)

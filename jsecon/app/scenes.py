@@ -1,0 +1,149 @@
+"""The fields of a server, loaded once, with the answers that they gave."""
+
+import contextlib
+import functools
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.app.answers import best_frames, selected
+from jsecon.app.place import place_of
+from jsecon.app.question import Answer, ask_pixel, ask_text
+from jsecon.data.ply import save_ply
+from jsecon.errors import InputError
+from jsecon.language.field import load_field
+from jsecon.pipeline.networks import embedder_of_field
+from jsecon.query.masks import selection_mask
+from jsecon.types import LanguageField
+
+KEPT = 64
+"""number of answers that are kept, of five bytes a Gaussian each"""
+
+
+class Question(NamedTuple):
+    """A query.
+
+    Attributes:
+      text: The text; "" for a pixel.
+      pixel: Frame (name or index), column and row, or None.
+      by: One of `METHODS`.
+      threshold: Threshold of the method; None is its default.
+      several: Whether to select all regions that answer the text.
+    """
+
+    text: str
+    pixel: tuple[str | int, int, int] | None = None
+    by: str = "votes"
+    threshold: float | None = None
+    several: bool = False
+
+
+class Scene:
+    """A loaded field.
+
+    Args:
+      name: Its name.
+      field: The field.
+      embedder: The embedder of its regions.
+    """
+
+    def __init__(self, name: str, field: LanguageField, embedder: Any):
+        self.name = name
+        self.field = field
+        self.embedder = embedder
+        self.answer = functools.lru_cache(KEPT)(self._answer)
+        self._records: dict[Question, dict[str, Any]] = {}
+        self._gaussians = jax.device_put(field.gaussians)
+        self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
+
+    def _answer(self, question: Question) -> Answer:
+        """Answers a query; `answer` keeps the last ones."""
+        options: dict[str, Any] = {"by": question.by, "threshold": question.threshold}
+        if question.pixel is not None:
+            return ask_pixel(self.field, *question.pixel, **options)
+        return ask_text(self.field, self.embedder, question.text, several=question.several, **options)
+
+    def record(self, question: Question) -> dict[str, Any]:
+        """Returns what and where the answer to a query is, as plain values. It is kept for longer than the answer."""
+        record = self._record(question)
+        if len(self._records) >= KEPT * KEPT:
+            self._records.clear()
+        self._records[question] = record
+        return record
+
+    def known(self, question: Question) -> dict[str, Any] | None:
+        """Returns the record of a query that was answered before, or None."""
+        return self._records.get(question)
+
+    def _record(self, question: Question) -> dict[str, Any]:
+        answer = self.answer(question)
+        region = int(answer.selection.region)
+        return {
+            "question": answer.question,
+            "field": self.name,
+            "count": int(answer.mask.sum()),
+            "region": region if region >= 0 else None,
+            "score": round(float(answer.selection.score), 6),
+            "place": place_of(self.field, answer).as_dict() if answer.mask.any() else None,
+        }
+
+    def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
+        """Renders an answer alone in a frame.
+
+        Args:
+          answer: The answer.
+          frame: Index of the frame; None is the one that shows most of it.
+
+        Returns:
+          Name of the frame, and the mask as a PNG.
+        """
+        frames = [frame] if frame is not None else best_frames(self.field, answer, 1) or [0]
+        shown = selection_mask(self._gaussians, self._cameras[frames[0]], jnp.asarray(answer.mask))
+        return self.field.names[frames[0]], cv2.imencode(".png", np.asarray(shown, np.uint8) * 255)[1].tobytes()
+
+    def ply(self, answer: Answer) -> bytes:
+        """Returns the selected Gaussians as a .ply in the capture's own world."""
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "selection.ply"
+            save_ply(file, selected(self.field.gaussians, answer.mask), similarity=self.field.to_source)
+            return file.read_bytes()
+
+    def described(self) -> dict[str, Any]:
+        """Returns name, sizes and frames of the field as plain values."""
+        return {
+            "name": self.name,
+            "gaussians": self.field.gaussians.count,
+            "regions": self.field.regions.count,
+            "frames": list(self.field.names),
+            "size": [self.field.cameras.width, self.field.cameras.height],
+        }
+
+
+def open_scenes(files: list[Path], embedder: Path | None) -> dict[str, Scene]:
+    """Loads fields, and asks each once so that its programs are compiled.
+
+    Args:
+      files: Paths of field.npz files. A field is named like its folder.
+      embedder: Folder of the CLIP model of the fields; None where the runs had it.
+
+    Returns:
+      The fields by name.
+
+    Raises:
+      InputError: A field cannot be read, or two have the same name.
+    """
+    scenes: dict[str, Scene] = {}
+    for file in files:
+        name = file.parent.name if file.stem == "field" and file.parent.name else file.stem
+        if name in scenes:
+            raise InputError(file, f"it is a second field named {name!r}", remedy="Rename one of the folders.")
+        field = load_field(file)
+        scenes[name] = Scene(name, field, embedder_of_field(field, embedder))
+        with contextlib.suppress(InputError):  # an embedder that has no word for it
+            scenes[name].mask(scenes[name].answer(Question("red")), 0)
+    return scenes
