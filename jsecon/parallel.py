@@ -94,11 +94,13 @@ def spread_over_devices(
     common: Any,
     views: Any,
     *,
+    prepare: Callable | None = None,
     static: tuple = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, Any]:
     """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`. Returns the
-    state, and each view's `out`, stacked, in NumPy.
+    state, and each view's `out`, stacked, in NumPy. With `prepare`, the step gets `prepare(common, view, *static)` in
+    place of the view, from a program of its own, which states of other sizes share.
 
     View t is added up in lane t mod LANES, and `merge`, whose neutral state is `start`, joins the lanes in their order.
     So the number of devices and of processes (up to LANES) changes no bit of the sum. A device works on one lane at a
@@ -116,7 +118,7 @@ def spread_over_devices(
     mesh = Mesh(np.array(jax.local_devices()[:width]), (AXIS,), axis_types=(AxisType.Auto,))
     whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
     # Where half of the cores and more have no lane, XLA cuts the kernels of the others for them.
-    run = _advance[width > 1 and jax.local_device_count() < 2 * width]
+    crowded = width > 1 and jax.local_device_count() < 2 * width
     # XLA reads NumPy's memory in place where it is aligned as its own is: all devices share one copy.
     common = jax.tree.map(lambda a: np.asarray(jax.device_put(a, may_alias=True)), common)
     common = jax.device_put(common, whole)
@@ -145,8 +147,10 @@ def spread_over_devices(
             if min(chosen) == count:
                 continue
             wave = jax.tree.map(lambda a, chosen=chosen: a[np.minimum(chosen, count - 1)], views)
-            wave = jax.device_put((np.array(chosen) < count, wave), rows)
-            states, out = run(states, wave, common, step, static, mesh)
+            there, wave = jax.device_put((np.array(chosen) < count, wave), rows)
+            if prepare is not None:
+                wave = _prepare[crowded](wave, common, prepare, static, mesh)
+            states, out = _advance[crowded](states, (there, wave), common, step, static, mesh)
             dispatched.append((chosen, out))
             keep(_AHEAD)
             done += sum(t < count for t in chosen)
@@ -161,7 +165,9 @@ def spread_over_devices(
         del states
     if not outs:  # a process without views
         view = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), views)
-        blank = jax.eval_shape(lambda *given: step(*given, *static)[1], start, common, view)
+        if prepare is not None:
+            view = jax.eval_shape(lambda *inputs: prepare(*inputs, *static), common, view)
+        blank = jax.eval_shape(lambda *inputs: step(*inputs, *static)[1], start, common, view)
         outs.append(jax.tree.map(lambda a: np.zeros((count, *a.shape), a.dtype), blank))
     if world > 1:
         rank_of = np.arange(count) % lanes % world
@@ -174,6 +180,16 @@ def spread_over_devices(
                 theirs = np.flatnonzero(rank_of == p)
                 of_all[theirs] = part[: len(theirs)]
     return merged, outs[0]
+
+
+def _prepare_lanes(wave: Any, common: Any, prepare: Callable, static: tuple, mesh: Mesh) -> Any:
+    """`prepare` of each lane's view of the wave."""
+
+    def local(_, wave, common):
+        prepared = prepare(common, jax.tree.map(lambda a: a[0], wave), *static)
+        return jax.tree.map(lambda a: a[None], prepared)
+
+    return over_devices(local, wave, common, mesh)
 
 
 def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Callable, static: tuple, mesh: Mesh):
@@ -193,6 +209,7 @@ def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Call
 
 
 # where lanes leave cores idle, and where they do not
+_prepare = [jax.jit(_prepare_lanes, static_argnums=(2, 3, 4), compiler_options=o) for o in (None, MESH_OPTIONS)]
 _advance = [
     jax.jit(_advance_lanes, static_argnums=(3, 4, 5), donate_argnums=0, compiler_options=options)
     for options in (None, MESH_OPTIONS)

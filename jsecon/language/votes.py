@@ -21,7 +21,7 @@ from jsecon.numerics import NEAR, WHOLE, is_traced, require_labels
 from jsecon.parallel import lanes_at_once, spread_over_devices
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.fusion import stored
-from jsecon.splat.plan import plan_view
+from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
 from jsecon.types import Array, Camera, Gaussians, Votes
 
@@ -98,12 +98,15 @@ def region_votes(
         start = _empty(xp, count, block, gaussians.means.dtype)
         common = bare, np.array([b * block, min((b + 1) * block, num_regions)], np.int32)
         if traced:
-            one_view = lambda state, view, common=common: _add_view(state, common, view, *static)
+
+            def one_view(state, view, common=common):
+                return _add_view(state, common, _plan_view(common, view, *static), *static)
+
             state, totals = lax.scan(one_view, start, (cameras, labels))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
             state, totals = spread_over_devices(
-                _add_view, start, _merge, common, (cameras, labels), static=static, progress=report
+                _add_view, start, _merge, common, (cameras, labels), prepare=_plan_view, static=static, progress=report
             )
             if capacity is None and (missing := np.asarray(state["missing"])):
                 again = functools.partial(region_votes, top=top, by_view=by_view, centre=centre, near=near)
@@ -158,10 +161,17 @@ def _keep_strongest(
     return (jnp.where(weights > 0, jnp.take_along_axis(ids, place, axis=1), -1), weights), votes.sum(-1)
 
 
+def _plan_view(
+    common: tuple[Gaussians, Array], view: tuple[Camera, Array], capacity: int, near: float, *_: Any
+) -> tuple[ViewPlan, Array]:
+    """The plan of a view, and its labels. Pure."""
+    return plan_view(common[0], view[0], capacity=capacity, near=near), view[1]
+
+
 def _add_view(
     state: dict[str, Array],
     common: tuple[Gaussians, Array],
-    view: tuple[Camera, Array],
+    view: tuple[ViewPlan, Array],
     capacity: int,
     near: float,
     by_view: bool,
@@ -169,10 +179,9 @@ def _add_view(
 ) -> tuple[dict[str, Array], Array | None]:
     """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted.
     `common`: the scene, and the first region of the block and the one after its last. Pure."""
-    (gaussians, (first, after)), (camera, labels) = common, view
+    (_, (first, after)), (plan, labels) = common, view
     labels = jnp.asarray(labels, jnp.int32)
     labels = jnp.where((labels >= first) & (labels < after), labels - first, -1)
-    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, plan.width)
     tiles = to_tiles(labels + 1, lists.tile) - 1
