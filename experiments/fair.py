@@ -2,20 +2,22 @@
 
     python -m experiments.fair [--tables lerf ovs3d replica] [--scenes NAME ...] [--levels medium high]
                                [--seeds 10 11 ...] [--choosing 0 ...] [--seeds-trained ...] [--choosing-trained ...]
-                               [--scenes-trained NAME ...] [--methods NAME ...] [--read READING ...] [--quick]
-                               [--out FOLDER] [--processes N]
+                               [--scenes-trained NAME ...] [--methods NAME ...] [--read READING ...]
+                               [--read-as FILE] [--quick] [--out FOLDER] [--processes N]
 
 Each method is read by every text rule and way of choosing Gaussians (`experiments.tables.rows`), and none may refuse a
 text. A method's reading is the one that is best on the seeds `--choosing` at the level of noise, for each figure its
 own; one row of ours, "one reading", takes the same for both. Those readings alone, and the published one, are then
 measured on the seeds that `--seeds` names, on which nothing was chosen, with a paired bootstrap over (scene, seed,
 text) of ours against each. Methods that train take minutes a setting: they may be given fewer seeds and scenes, and
-ours is compared with each on its own ("ours there").
+ours is compared with each on its own ("ours there"). `--read-as` takes the readings of another run's metrics.json, and
+chooses none.
 """
 
 import argparse
 import contextlib
 import dataclasses
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -56,6 +58,8 @@ class Asked:
     """empty: all."""
     read: tuple[str, ...]
     """the readings that are chosen from, without the methods' own constants; empty: all."""
+    read_as: str
+    """a metrics.json whose readings are taken; empty: they are chosen."""
     quick: bool
     out: str
 
@@ -92,6 +96,19 @@ def chosen(cells: list[dict], seeds: tuple[int, ...], figures: tuple[str, ...]) 
     return best
 
 
+def taken(name: str, asked: Asked) -> dict[str, dict[str, str]]:
+    """The readings that `--read-as` names for a table, of the methods that are compared; none where it names none."""
+    if not asked.read_as:
+        return {}
+    every = json.loads(Path(asked.read_as).read_text())
+    best: dict[str, dict[str, str]] = {}
+    for key, told in next(told for level, told in every.items() if level.startswith(f"{name} ")).items():
+        method, figure = key.rsplit(", ", 1)
+        if not method.endswith(ONE_READING) and (not asked.methods or method in asked.methods):
+            best.setdefault(method, {})[figure] = told["row"]
+    return best
+
+
 def mine_of(cells: list[dict]) -> str:
     """The method that is held against the others."""
     known = {cell["method"].split(": ")[0] for cell in cells}
@@ -101,7 +118,9 @@ def mine_of(cells: list[dict]) -> str:
 def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str, dict]:
     """A Markdown table of one table and level, and its figures."""
     figures = figures_of(name)
-    best, ours_is = chosen([cell for cell in cells if cell["level"] == level], asked.choosing, figures), mine_of(cells)
+    here = [cell for cell in cells if cell["level"] == level]
+    best = taken(name, asked) or chosen(here, asked.choosing, figures)
+    ours_is = mine_of(cells)
     held = [cell for cell in cells if cell["seed"] in asked.seeds]
     of = lambda row: [cell for cell in held if cell["method"] == row]
     mean = lambda own, figure: by_scene(own, figure, lambda values: float(np.mean(values)))
@@ -193,9 +212,13 @@ def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
         own = [row for row in rows if (row.split(": ")[0] in TRAINED) == trains]
         if not own:
             continue
-        choosing = filled(own, asked.choosing_trained if trains else asked.choosing)
-        seeds = tuple(cell["seed"] for cell in choosing)
-        best = {row for ways in chosen(choosing, seeds, figures_of(name)).values() for row in ways.values()}
+        choosing: list[dict] = []
+        if asked.read_as:
+            readings = taken(name, asked)
+        else:
+            choosing = filled(own, asked.choosing_trained if trains else asked.choosing)
+            readings = chosen(choosing, tuple(cell["seed"] for cell in choosing), figures_of(name))
+        best = {row for ways in readings.values() for row in ways.values()}
         kept = [row for row in own if row in best or row.endswith(f": {PUBLISHED}")]
         cells += choosing + filled(kept, asked.seeds_trained if trains else asked.seeds)
     return cells
@@ -229,6 +252,7 @@ if __name__ == "__main__":
     parser.add_argument("--scenes-trained", nargs="+", default=[], help="of the one table asked for, for those methods")
     parser.add_argument("--methods", nargs="+", default=[], help="that are compared, ours among them; default: all")
     parser.add_argument("--read", nargs="+", default=[], help="readings that are chosen from; default: all")
+    parser.add_argument("--read-as", default="", help="a metrics.json of another run: take its readings, choose none")
     parser.add_argument("--quick", action="store_true", help="one tiny scene of each, one seed: two minutes")
     parser.add_argument("--out", default="")
     parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
@@ -247,6 +271,7 @@ if __name__ == "__main__":
         tuple(given.scenes_trained),
         tuple(given.methods),
         tuple(given.read),
+        given.read_as,
         given.quick,
         place,
     )
