@@ -33,10 +33,10 @@ from experiments.tables.setting import Setting
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.votes import region_votes
 from jsecon.process import forget_programs
-from jsecon.query.anchored import query_anchored
+from jsecon.query.anchored import found_of, query_anchored
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import parts_instead, query_parts
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD, answers
+from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField
 
@@ -162,16 +162,8 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
 
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:
     """(Q,) the similarity of each text's best region."""
-    given = (jnp.asarray(a) for a in (field.regions.embeddings, field.canonical, field.regions.pixels))
-    return np.asarray(_best(*given, jnp.asarray(texts, jnp.float32), retrieval))
-
-
-def _best_body(embeddings, canonical, pixels, texts, retrieval):
-    score, known = jax.vmap(lambda text: answers(embeddings, text, canonical, pixels, retrieval))(texts)
-    return jnp.where(known, score, -jnp.inf).max(1)
-
-
-_best = jax.jit(_best_body, static_argnames="retrieval")
+    ask = lambda text: found_of(field, text, retrieval=retrieval, retrieval_threshold=NO_REFUSAL).score
+    return np.array([float(ask(jnp.asarray(text))) for text in texts])
 
 
 def refusal(setting: Setting, field: LanguageField) -> dict[str, float]:
