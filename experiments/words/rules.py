@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
+from experiments.rivals.lifting import NEIGHBOURS
 from jsecon.language.shares import SHARE_THRESHOLD, share_of
-from jsecon.query.direct import TEMPERATURE, relevancies
-from jsecon.query.retrieval import contrasts
+from jsecon.query.direct import TEMPERATURE
+from jsecon.query.retrieval import apart_from_scene
 from jsecon.types import Votes
 
 SCORES = ("cosine", "relevancy", "contrast")
@@ -25,18 +27,24 @@ def scores(
     pixels: Int[np.ndarray, "r t"],
     kind: str,
 ) -> Float[np.ndarray, "q r"]:
-    """Scores of all texts with all regions, by one of SCORES; -inf for a region without an embedding."""
+    """Scores of all texts with all regions, by one of SCORES; -inf for a region without an embedding.
+
+    "relevancy" is LERF's; "contrast" is `jsecon.query.retrieval.contrasts` for all texts at once.
+    """
     known = np.asarray(embeddings).any(axis=1)
-    if kind == "cosine":
-        table = texts @ embeddings.T
-    elif kind == "relevancy":
-        against = (canonical @ embeddings.T).max(axis=0)
-        table = 1 / (1 + np.exp(-TEMPERATURE * (texts @ embeddings.T - against)))
+    if kind == "contrast":
+        apart = np.asarray(apart_from_scene(jnp.asarray(embeddings), jnp.asarray(pixels))[0])
+        cone = _units(_units(canonical).sum(axis=0)[None])
+        table = _units(texts - texts @ cone.T * cone) @ _units(apart).T
     else:
-        given = jax.tree.map(jnp.asarray, (embeddings, canonical, pixels))
-        one = jax.jit(lambda text: contrasts(given[0], text, given[1], given[2])[0])
-        table = np.stack([np.asarray(one(text)) for text in jnp.asarray(texts)])
+        table = texts @ embeddings.T
+        if kind == "relevancy":
+            table = 1 / (1 + np.exp(-TEMPERATURE * (table - (canonical @ embeddings.T).max(axis=0))))
     return np.where(known[None], table, -np.inf)
+
+
+def _units(rows: Float[np.ndarray, "n e"]) -> Float[np.ndarray, "n e"]:
+    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
 
 
 def best_of(table: Float[np.ndarray, "q r"]) -> Bool[np.ndarray, "q r"]:
@@ -93,15 +101,24 @@ def point_scores(
     kind: str,
 ) -> Float[np.ndarray, "q n"]:
     """Scores of all texts with all Gaussians, "cosine" or "relevancy"; -inf where a feature is zero."""
-    known = np.asarray(features).any(axis=1)
-    if kind == "cosine":
-        return np.where(known[None], texts @ features.T, -np.inf)
-    given = jnp.asarray(features), jnp.asarray(canonical)
-    rows = [np.asarray(_relevancies(given[0], jnp.asarray(text), given[1])[0]) for text in texts]
-    return np.where(known[None], np.stack(rows), -np.inf)
+    known, table = np.asarray(features).any(axis=1), texts @ features.T
+    if kind == "relevancy":
+        table = 1 / (1 + np.exp(-TEMPERATURE * (table - (canonical @ features.T).max(axis=0))))
+    return np.where(known[None], table, -np.inf)
 
 
-_relevancies = jax.jit(relevancies)
+def smoothed(means: Float[np.ndarray, "n 3"], table: Float[np.ndarray, "q n"]) -> Float[np.ndarray, "q n"]:
+    """VALA's readout of each text's scores (`experiments.rivals.lifting.smoothed`), with the neighbours found once."""
+    there = np.flatnonzero(np.isfinite(table).all(axis=0))
+    found = np.zeros(table.shape, np.float32)
+    if len(there) > 1:
+        points = np.asarray(means, np.float64)[there]
+        near = KDTree(points).query(points, k=min(NEIGHBOURS + 1, len(there)))[1][:, 1:]
+        for row, scores in zip(found, table[:, there]):
+            smooth = 0.5 * (scores + scores[near].mean(axis=1))
+            spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1e-9)
+            row[there] = np.clip(2 * spread - 1, 0, 1)
+    return found
 
 
 def ious(

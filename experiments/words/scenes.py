@@ -4,7 +4,8 @@ Three scenes, each with the masks that it is asked with:
 
     replica_apartment_0  instance masks that are given, and those of jsecon's vision without weights
     apc_bin              the same two
-    bonsai               jsecon's vision without weights; its truth is outlined by hand in held-out frames
+    bonsai               jsecon's vision without weights; COLMAP's points as Gaussians, nothing fitted; its truth is
+                         outlined by hand in held-out frames
 
 What takes long lies in one file for a scene and its masks, the labeller's scores for a crop in another. All rules
 (`experiments.words.rules`) are pure functions of what `load_scene` returns.
@@ -24,29 +25,54 @@ from scipy.spatial import KDTree
 
 from experiments import apc_bin, bonsai_outlines, results
 from experiments.datasets.depth_points import labels_of_points
-from experiments.default_vision import CONSENSUS, connected_parts, measure
+from experiments.default_vision import connected_parts
 from experiments.replica_apartment_0 import Options as Scan, load_replica, points_as_gaussians
 from experiments.replica_classes import CLASSES, NEAR_M, names_of_objects
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
 from experiments.words.conse import WORDS, Conse
+from jsecon.association.atoms import cast_on_atoms
+from jsecon.data.capture import load_capture
 from jsecon.errors import InputError
 from jsecon.files import written_whole
+from jsecon.fit.start import starting_gaussians
 from jsecon.language.votes import region_votes
-from jsecon.pipeline import pipeline
+from jsecon.pipeline.masklet_stages import associated, proposals_of
 from jsecon.pipeline.options import Options as RunOptions
+from jsecon.pipeline.stages import Work
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
+from jsecon.vision.colours import ColourEmbedder
+from jsecon.vision.protocols import Networks
 
 VERSION = 1
 """of what is kept of a scene: counted up when this module changes. Remove the folder when jsecon's masks or votes do"""
 GIVEN, DEFAULT = "given", "default"
 """masks of the data, and of jsecon's vision without weights"""
-RIVALS: dict[str, Callable[[Evidence], lifting.Lifted]] = {
-    "weighted back-projection": lifting.train_backprojection,
-    "Occam's LGS": lifting.train_occam,
-    "VALA": lifting.train_vala,
+
+
+def back_projected(evidence: Evidence) -> sparse.csr_matrix:
+    """(N, M) the sum of alpha T of each Gaussian over the pixels of each mask: the weights of
+    `lifting.train_backprojection`, without a dense row for each Gaussian, as scenes here have many masks."""
+    masks, frame = np.asarray(evidence.masks), np.asarray(evidence.frame)
+    blocks = []
+    for t, image in enumerate(masks):
+        own = np.flatnonzero(frame == t)
+        place = np.full(len(frame) + 1, -1, np.int32)
+        place[own] = np.arange(len(own))
+        cast = cast_on_atoms(evidence.gaussians, evidence.cameras[t], place[image], negligible=0.0).tocoo()
+        blocks.append((cast.data, cast.row, own[cast.col]))
+    values, rows, columns = (np.concatenate(parts) for parts in zip(*blocks))
+    return sparse.csr_matrix((values, (rows, columns)), shape=(evidence.gaussians.count, len(frame)))
+
+
+RIVALS: dict[str, Callable[[Evidence], sparse.csr_matrix]] = {
+    "weighted back-projection": back_projected,
+    "Occam's LGS": lambda evidence: lifting.train_occam(evidence).weights.tocsr(),
+    "VALA": lambda evidence: lifting.train_vala(evidence).weights.tocsr(),
 }
 """what gives each Gaussian an embedding of its own"""
+BONSAI_EVERY = 3
+"""of the frames that are not held out, every so many-th votes"""
 JUDGED = 20
 """held-out views, at most, evenly spaced, in which selections are rendered"""
 APC_TEXTS = ("chenille stems", "children book", "tissue box", "joke book")
@@ -152,9 +178,27 @@ class _Raw:
     """(X,) name of each thing, -1 = none that is asked for."""
 
 
-def _default_masks(capture: Capture, gaussians: Gaussians) -> np.ndarray:
-    """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it."""
-    return measure(RunOptions(capture=Path()), capture, jax.tree.map(jnp.asarray, gaussians), CONSENSUS)[0]
+def _default_masks(capture: Capture, gaussians: Gaussians, folder: Path) -> np.ndarray:
+    """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it; each view's
+    proposals are kept in `folder`, so that a run that was stopped goes on."""
+    work, scene = Work(RunOptions(capture=Path()), Networks(ColourEmbedder()), folder), _on_device(gaussians)
+    propose, size = proposals_of(work, capture, scene)[0], capture.frames.shape[1:3]
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def proposals(t: int) -> np.ndarray:
+        kept = folder / f"proposals_{t}.npy"
+        if not kept.exists():
+            found = propose(t)
+            with written_whole(kept) as temporary, open(temporary, "wb") as stream:
+                np.save(stream, np.packbits(found.reshape(len(found), -1), axis=1))
+        bits = np.unpackbits(np.load(kept), axis=1, count=size[0] * size[1])
+        return bits.astype(bool).reshape(-1, *size)
+
+    return associated(work, capture, scene, proposals, lambda done, total: None)
+
+
+def _on_device(tree):
+    return jax.tree.map(jnp.asarray, tree)
 
 
 def _named(ids: Int[np.ndarray, "..."], name_of: Int[np.ndarray, " r"]) -> Int[np.ndarray, "..."]:
@@ -193,7 +237,7 @@ def _replica(sources: Sources, masks: str, folder: Path) -> _Raw:
     if masks == GIVEN:
         labels, region_names = objects[voting], by_all
     else:
-        labels = _default_masks(capture, gaussians)
+        labels = _default_masks(capture, gaussians, folder)
         named = _named(objects[voting], by_all)
         region_names = _majority(labels, named, int(labels.max()) + 1, len(names))
     return _Raw(
@@ -221,7 +265,7 @@ def _apc(sources: Sources, masks: str, folder: Path) -> _Raw:
     voting, judged, count = np.flatnonzero(~capture.held_out), np.flatnonzero(capture.held_out), len(APC_TEXTS)
     labels, region_names = objects[voting], np.arange(count + 1)
     if masks == DEFAULT:
-        labels = _default_masks(capture, gaussians)
+        labels = _default_masks(capture, gaussians, folder)
         region_names = _majority(labels, objects[voting], int(labels.max()) + 1, count + 1)
     truth = _names_by_views(gaussians, capture.cameras[judged], objects[judged], count + 1)
     return _Raw(
@@ -241,9 +285,20 @@ def _apc(sources: Sources, masks: str, folder: Path) -> _Raw:
     )
 
 
+def _bonsai_frames(sources: Sources) -> Capture:
+    """bonsai's frames that are held out, and every BONSAI_EVERY-th of the others."""
+    options = RunOptions(Path(sources.bonsai))
+    capture = load_capture(options.capture, long_side=options.long_side, holdout=options.holdout)
+    held = np.asarray(capture.held_out)
+    kept = np.sort(np.concatenate([np.flatnonzero(held), np.flatnonzero(~held)[::BONSAI_EVERY]]))
+    own = {"frames": capture.frames[kept], "cameras": capture.cameras[kept], "held_out": held[kept]}
+    names, files = (tuple(values[t] for t in kept) for values in (capture.names, capture.files))
+    return dataclasses.replace(capture, names=names, files=files, **own)
+
+
 def _bonsai(sources: Sources, masks: str, folder: Path) -> _Raw:
-    run = pipeline.run(RunOptions(Path(sources.bonsai)), folder / "run")
-    capture = run.capture
+    capture = _bonsai_frames(sources)
+    gaussians = starting_gaussians(capture)[0]
     names = tuple(dict.fromkeys(BONSAI_TEXTS.values()))
     things = bonsai_outlines.outlines(capture)
     frames = np.array(sorted({t for own in things.values() for t in own}))
@@ -253,23 +308,22 @@ def _bonsai(sources: Sources, masks: str, folder: Path) -> _Raw:
             outlined[np.searchsorted(frames, t)][mask] = k
     thing_names = np.array([names.index(BONSAI_TEXTS[thing]) for thing in things])
     outlines = np.where(outlined >= 0, thing_names[outlined], len(names)).astype(np.int16)
-    gaussians = jax.tree.map(jnp.asarray, run.field.gaussians)
     truth = _names_by_views(gaussians, capture.cameras[frames], outlines, len(names) + 1)
-    voting, labels = np.flatnonzero(~np.asarray(capture.held_out)), np.asarray(run.labels)
-    # No frame has both an outline and a region: a region's name is that of most of the weight on its Gaussians.
-    votes = run.field.votes
-    strongest = np.asarray(votes.regions)[:, 0]
-    region_names = names_of_objects(strongest, truth, int(labels.max()) + 1, len(names) + 1)
+    voting, labels = np.flatnonzero(~np.asarray(capture.held_out)), _default_masks(capture, gaussians, folder)
+    # No frame has both an outline and a region: a region's name is that of most Gaussians that it is strongest on.
+    count = int(labels.max()) + 1
+    votes = region_votes(*_on_device((gaussians, capture.cameras[voting])), _on_device(labels), count, top=1)
+    region_names = names_of_objects(np.asarray(votes.regions)[:, 0], truth, count, len(names) + 1)
     return _Raw(
-        run.field.gaussians,
-        jax.tree.map(np.asarray, capture.cameras)[voting],
+        gaussians,
+        capture.cameras[voting],
         np.asarray(capture.frames)[voting],
         labels,
         names,
         np.arange(len(names), dtype=np.int32),
         {"T2": truth},
         region_names,
-        jax.tree.map(np.asarray, capture.cameras)[frames],
+        capture.cameras[frames],
         outlines,
         np.asarray(capture.frames)[frames],
         outlined,
@@ -399,7 +453,7 @@ def rival_weights(folder: str | Path, scene: WordScene, method: str, sources: So
             labels = np.asarray(arrays["labels"], np.int32)
         gaussians, cameras = jax.tree.map(jnp.asarray, (scene.gaussians, scene.cameras))
         masks, nothing = _masks_of(labels)[0], np.zeros((len(scene.view), 1), np.float32)
-        found = RIVALS[method](Evidence(gaussians, cameras, masks, nothing, scene.view, labels)).weights.tocsr()
+        found = RIVALS[method](Evidence(gaussians, cameras, masks, nothing, scene.view, labels))
         _write(kept, {part: getattr(found, part) for part in ("data", "indices", "indptr")})
     with np.load(kept) as arrays:
         parts = tuple(arrays[part] for part in ("data", "indices", "indptr"))
