@@ -45,6 +45,7 @@ from experiments.words.scenes import (
     scores_of,
     things_of,
 )
+from jsecon.errors import InputError
 from jsecon.evaluate.metrics import iou
 from jsecon.language.shares import finish_votes
 from jsecon.query.anchored import query_anchored
@@ -427,12 +428,18 @@ def main(options: Options = Options(), tell: Callable[[str], None] = print) -> d
             metrics["cases"][own] = figures
             tell(f"{own}: measured")
     chosen_on = [f"{name}, {masks}" for name, masks in choosing]
-    whole = [v for v in VARIANTS if all(f"{k}, {v}" in metrics["cases"] for k in chosen_on)]
+    chosen_on = [k for k in chosen_on if all(f"{k}, {variant}" in metrics["cases"] for variant in VARIANTS)]
+    if not chosen_on:
+        remedy = "Run it without --only-kept, and with a scene that chooses."
+        raise InputError(
+            options.cache, "no rule can be chosen: nothing of apc_bin and bonsai is measured", remedy=remedy
+        )
+    metrics["chosen_on"] = chosen_on
     score = {
         (row, variant): float(
             np.mean([np.mean(metrics["cases"][f"{k}, {variant}"]["points"]["T2"][row]) for k in chosen_on])
         )
-        for variant in whole
+        for variant in VARIANTS
         for row in ROWS
     }
     rule, variant = max((key for key in score if key[0] in RULES), key=lambda key: score[key])
