@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from jsecon.app import command_line, verbs
-from jsecon.app.ending import ended
+from jsecon.app.ending import finish
 from jsecon.app.verbs import Output
 from jsecon.errors import InputError, why
 
@@ -20,19 +20,19 @@ def _errors():
 
 
 def test_figures_and_paths_are_one_object(capsys):
-    assert ended(Output(json=True), {"written": {"field": Path("out/field.npz")}, "gaussians": 3}) == 0
+    assert finish(Output(json=True), {"written": {"field": Path("out/field.npz")}, "gaussians": 3}) == 0
     assert json.loads(capsys.readouterr().out) == {"written": {"field": "out/field.npz"}, "gaussians": 3}
-    assert ended(Output(), {"gaussians": 3}) == 0
+    assert finish(Output(), {"gaussians": 3}) == 0
     assert capsys.readouterr() == ("", "")
 
 
 def test_what_was_refused_is_told_beside_what_was_not(capsys):
-    assert ended(Output(json=True), {"answers": [1], "refused": _errors()}) == 2
+    assert finish(Output(json=True), {"answers": [1], "refused": _errors()}) == 2
     out, err = capsys.readouterr()
     told = json.loads(out)
     assert told["error"] == told["refused"][1] == ERROR
     assert (told["refused"][0]["name"], told["answers"], err) == ("cup.png", [1], "")
-    assert ended(Output(), {"refused": _errors()}) == 2
+    assert finish(Output(), {"refused": _errors()}) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert [line.split(":")[1] for line in err.splitlines()] == [" cup.png", " mug.png"]

@@ -1,7 +1,7 @@
-"""Who may reach a server of jsecon: where it listens, and what a request must carry.
+"""Access rules of jsecon's servers: where they listen, and what a request must carry.
 
-A page of another site can send requests to a server on loopback, under a name that it has made to stand for 127.0.0.1
-(DNS rebinding). So without a token a request must name this machine in its Host header; beyond loopback it must carry
+A page of another site can send requests to a server on loopback under a name that it has made to stand for 127.0.0.1
+(DNS rebinding). So without a token, a request must name this machine in its Host header. Beyond loopback it must carry
 the token.
 """
 
@@ -15,11 +15,15 @@ from urllib.parse import urlsplit
 from jsecon.errors import InputError, why
 
 TOKEN = "JSECON_TOKEN"
-"""environment variable with the token, where --token is not given"""
+"""environment variable with the token, used without --token"""
 
 
-def loopback(host: str) -> bool:
-    """Whether a host is this machine and no other can reach it: localhost, 127.0.0.0/8 or ::1."""
+def is_loopback(host: str) -> bool:
+    """Returns whether a host is this machine and cannot be reached by others: localhost, 127.0.0.0/8 or ::1.
+
+    Args:
+      host: Name or address.
+    """
     try:
         return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_loopback
     except ValueError:
@@ -27,7 +31,14 @@ def loopback(host: str) -> bool:
 
 
 def host_of(header: str) -> str:
-    """The host of a Host header or an Origin, in lower case without port and brackets; "" for what names none."""
+    """Reads the host of a Host header or an Origin.
+
+    Args:
+      header: Value of the header.
+
+    Returns:
+      The host in lower case, without port and brackets; "" if the header has no host.
+    """
     try:
         name = urlsplit(header if "://" in header else f"//{header}").hostname
     except ValueError:
@@ -35,34 +46,62 @@ def host_of(header: str) -> str:
     return (name or "").rstrip(".")
 
 
-def named(header: str, hosts: Collection[str]) -> bool:
-    """Whether a Host header names this machine: by a loopback name, or by one of `hosts`."""
+def is_allowed_host(header: str, hosts: Collection[str]) -> bool:
+    """Returns whether a Host header names this machine.
+
+    Args:
+      header: Value of the header.
+      hosts: Names of this machine besides those of loopback.
+    """
     host = host_of(header)
-    return bool(host) and (loopback(host) or host in {host_of(bracketed(name)) for name in hosts})
+    return bool(host) and (is_loopback(host) or host in {host_of(bracketed(name)) for name in hosts})
 
 
-def right_token(given: str | bytes, token: str) -> bool:
-    """Whether a token is the right one, in a time that tells nothing about it."""
-    given = given.encode("utf-8", "surrogateescape") if isinstance(given, str) else given
-    return hmac.compare_digest(given, token.encode("utf-8", "surrogateescape"))
+def token_matches(sent: str | bytes, token: str) -> bool:
+    """Compares tokens in a time that does not depend on where they differ.
+
+    Args:
+      sent: Token of the request.
+      token: The right token.
+    """
+    sent = sent.encode("utf-8", "surrogateescape") if isinstance(sent, str) else sent
+    return hmac.compare_digest(sent, token.encode("utf-8", "surrogateescape"))
 
 
 def token_for(host: str, token: str) -> str:
-    """The token that clients must have: as given, else of the environment. Raises InputError where others can reach
-    the host and there is none."""
+    """Returns the token that clients must have.
+
+    Args:
+      host: Address to listen on.
+      token: Token of the user; "" is that of the environment.
+
+    Returns:
+      The token, or "" if no token is needed.
+
+    Raises:
+      InputError: Others can reach the host, and there is no token.
+    """
     token = token or os.environ.get(TOKEN, "")
-    if not token and not loopback(host):
-        found = f"others can reach {host}, so there must be a token that clients must have"
-        raise InputError("--host", found, remedy="Set --token, or leave --host out to listen on 127.0.0.1 alone.")
+    if not token and not is_loopback(host):
+        problem = f"others can reach {host}, so there must be a token that clients must have"
+        raise InputError("--host", problem, remedy="Set --token, or leave --host out to listen on 127.0.0.1 alone.")
     return token
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens, of IPv4 or IPv6. Raises InputError where the address cannot be had."""
+    """Opens a socket that listens, of IPv4 or IPv6.
+
+    Args:
+      host: Name or address of this machine.
+      port: Port; 0 takes a free one.
+
+    Raises:
+      InputError: The address cannot be used.
+    """
     try:
-        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
-        family, _, _, _, place = min(found, key=lambda info: info[0] != socket.AF_INET)
-        return socket.create_server((place[0], port, *place[2:]), family=family)
+        addresses = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+        family, _, _, _, address = min(addresses, key=lambda info: info[0] != socket.AF_INET)
+        return socket.create_server((address[0], port, *address[2:]), family=family)
     except (OSError, OverflowError, ValueError) as error:
         reason = why(error) if isinstance(error, OSError) else "it is not an address"
         remedy = "Take another --port, or 0 to have one chosen. --host must be an address of this machine."
@@ -70,5 +109,5 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def bracketed(host: str) -> str:
-    """A host as it stands in an address: IPv6 in brackets."""
+    """Returns a host as it stands in a URL: IPv6 addresses in brackets."""
     return f"[{host}]" if ":" in host and not host.startswith("[") else host

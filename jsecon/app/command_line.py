@@ -18,7 +18,7 @@ import tyro
 
 import jsecon
 from jsecon.app.actions import VERBS
-from jsecon.app.ending import Told, ended
+from jsecon.app.ending import VerbResult, finish
 from jsecon.app.verbs import Completion, Output, Verb
 from jsecon.errors import InputError, why
 from jsecon.pipeline.progress import Console
@@ -64,29 +64,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         if argv == ["--version"]:
             print(f"jsecon {jsecon.__version__}")
             return 0
-        asked = parse(argv)
-        output = asked.output
+        verb = parse(argv)
+        output = verb.output
         if output.debug:
             show_whole_traces()
         act, _ = _VERBS[argv[0]]
         console = Console(sys.stderr if output.json else None)
-        told = act(asked, console)
+        result = act(verb, console)
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     except (KeyboardInterrupt, Exception) as error:
         if any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):  # libraries make errors of stops
             remedy = "Run the same command again to resume."
             print(f"\njsecon: interrupted. {remedy}", file=sys.stderr)
-            told = {"error": InputError("", "interrupted", remedy=remedy)}
-            return ended(output, told, 130)
+            result = {"error": InputError("", "interrupted", remedy=remedy)}
+            return finish(output, result, 130)
         if isinstance(error, InputError):
-            return ended(output, {"refused": [error]})
+            return finish(output, {"refused": [error]})
         # a bug, whose trace the interpreter prints
         remedy = "Report it with the trace on standard error."
-        ended(output, {"error": InputError("jsecon", f"internal error: {why(error)}", remedy=remedy)})
+        finish(output, {"error": InputError("jsecon", f"internal error: {why(error)}", remedy=remedy)})
         raise
-    then = told.pop("then", lambda: None)
-    code = ended(output, told)
+    then = result.pop("then", lambda: None)
+    code = finish(output, result)
     with contextlib.suppress(KeyboardInterrupt):  # so a server ends
         then()
     return code
@@ -179,13 +179,13 @@ def completion_script(shell: str) -> str:
     return shtab.complete(parser, shell)
 
 
-def _completion(asked: Completion, console: Console) -> Told:
-    script = completion_script(asked.shell)
+def _completion(verb: Completion, console: Console) -> VerbResult:
+    script = completion_script(verb.shell)
     console.say(script)
-    return {"shell": asked.shell, "script": script}
+    return {"shell": verb.shell, "script": script}
 
 
-_VERBS: dict[str, tuple[Callable[[Any, Console], Told], type[Verb]]] = {
+_VERBS: dict[str, tuple[Callable[[Any, Console], VerbResult], type[Verb]]] = {
     **VERBS,
     "completion": (_completion, Completion),
 }

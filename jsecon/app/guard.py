@@ -11,7 +11,7 @@ from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse
 
-from jsecon.app.access import named, right_token
+from jsecon.app.access import is_allowed_host, token_matches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,9 +129,9 @@ class Guard:
     def _refused(self, headers: Headers, method: str) -> JSONResponse | None:
         """Returns the refusal that follows from the headers, or None."""
         if self.token:
-            if not right_token(headers.get("authorization", "").encode("latin-1"), f"Bearer {self.token}"):
+            if not token_matches(headers.get("authorization", "").encode("latin-1"), f"Bearer {self.token}"):
                 return _refusal(401, "A token is required. Send the header Authorization: Bearer TOKEN.")
-        elif not named(headers.get("host", ""), self.hosts):
+        elif not is_allowed_host(headers.get("host", ""), self.hosts):
             words = "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME."
             return _refusal(403, words)
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()

@@ -1,4 +1,4 @@
-"""Who sees the viewer's page: viser serves it to everybody, so each of its requests is looked at before."""
+"""Access rules of the viewer's page: viser serves it to everybody, so each of its requests is checked before."""
 
 import contextlib
 import hashlib
@@ -8,26 +8,34 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from jsecon.app.access import named, right_token
+from jsecon.app.access import is_allowed_host, token_matches
 
 
 @contextlib.contextmanager
 def guarded_pages(token: str, hosts: Collection[str]) -> Iterator[None]:
-    """Within it viser servers are made whose pages and sockets need the token, or without one a name of this machine.
+    """Guards the viser servers that are started inside of this context.
 
-    viser takes no hook for requests, so the function of the package websockets that it listens by is wrapped while the
-    server starts. Raises RuntimeError where a viser listens otherwise: it would be open to everybody.
+    Their pages and sockets need the token, or without a token a Host header that names this machine. viser has no hook
+    for requests, so this wraps the function of the package websockets by which it listens, while the server starts.
+
+    Args:
+      token: The token, or "".
+      hosts: Names of this machine besides those of loopback.
+
+    Raises:
+      RuntimeError: This viser listens in another way, so its page would be open to everybody.
     """
     import websockets.asyncio.server as sockets
 
-    listen, wrapped = sockets.serve, []
+    listen = sockets.serve
+    wrapped = []
 
-    def serve(handler: Any, *place: Any, process_request: Callable[..., Any], **given: Any) -> Any:
-        def looked_at(connection: Any, request: Any) -> Any:
+    def serve(handler: Any, *address: Any, process_request: Callable[..., Any], **kwargs: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
             return refusal(request, token, hosts) or process_request(connection, request)
 
         wrapped.append(True)
-        return listen(handler, *place, process_request=looked_at, **given)
+        return listen(handler, *address, process_request=checked, **kwargs)
 
     sockets.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
     try:
@@ -39,28 +47,38 @@ def guarded_pages(token: str, hosts: Collection[str]) -> Iterator[None]:
 
 
 def refusal(request: Any, token: str, hosts: Collection[str]) -> Any:
-    """The response to a request that must not see the page, or that brings the token for the first time, which then
-    becomes a cookie; None for a request that may go on."""
-    host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+    """Checks a request.
+
+    Args:
+      request: Request of the package websockets.
+      token: The token, or "".
+      hosts: Names of this machine besides those of loopback.
+
+    Returns:
+      The response to a request that may not see the page, or whose address carries the token, which then becomes a
+      cookie; None for a request that may go on.
+    """
+    host = request.headers.get("Host", "")
+    origin = request.headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
         return _response(http.HTTPStatus.FORBIDDEN, "A page of another site asked for this one.")
     if not token:
-        if named(host, hosts):
+        if is_allowed_host(host, hosts):
             return None
         words = "The Host header does not name this server. Allow it with jsecon view --allow-host NAME."
         return _response(http.HTTPStatus.FORBIDDEN, words)
     name = f"jsecon_{hashlib.sha256(token.encode('utf-8', 'surrogateescape')).hexdigest()[:12]}"
     try:
-        kept = SimpleCookie(request.headers.get("Cookie", "")).get(name)
+        cookie = SimpleCookie(request.headers.get("Cookie", "")).get(name)
     except CookieError:
-        kept = None
+        cookie = None
     secret = hashlib.sha256(b"cookie " + token.encode("utf-8", "surrogateescape")).hexdigest()
-    if kept is not None and right_token(kept.value, secret):
+    if cookie is not None and token_matches(cookie.value, secret):
         return None
-    given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-    if right_token(given, token):
-        cookie = f"{name}={secret}; Path=/; HttpOnly; SameSite=Strict"
-        return _response(http.HTTPStatus.FOUND, "", {"Location": "/", "Set-Cookie": cookie})
+    sent = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+    if token_matches(sent, token):
+        headers = {"Location": "/", "Set-Cookie": f"{name}={secret}; Path=/; HttpOnly; SameSite=Strict"}
+        return _response(http.HTTPStatus.FOUND, "", headers)
     return _response(http.HTTPStatus.UNAUTHORIZED, "A token is required. Open the address that jsecon view printed.")
 
 
@@ -69,5 +87,6 @@ def _response(status: http.HTTPStatus, words: str, headers: dict[str, str] | Non
     from websockets.http11 import Response
 
     body = words.encode()
-    told = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Cache-Control": "no-store"}
-    return Response(status, status.phrase, Headers(**told, **(headers or {})), body)
+    fields = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+    fields |= {"Cache-Control": "no-store"} | (headers or {})
+    return Response(status, status.phrase, Headers(**fields), body)

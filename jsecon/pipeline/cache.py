@@ -1,10 +1,10 @@
-"""What a run has already computed: one file per stage, named by a digest of all that its content depends on.
+"""The cache of a run: one file per stage, named by a digest of all that its content depends on.
 
     OUT/cache/<stage>-<key>.npz
 
-The key covers the stage's options, its input files, the source that computes it, and the keys of the
-stages it reads. So a stopped run goes on where it stopped, a changed option reruns only what depends on it, and no
-stale result can be taken for a fresh one. A file holds arrays and a JSON description of their tree: no pickle.
+The key covers the stage's options, its input files, the installed source that computes it, and the keys of the stages
+that it reads. So a stopped run resumes, a changed option reruns only what depends on it, and a stale result is never
+used. A file holds arrays and a JSON description of their tree, without pickle.
 """
 
 import contextlib
@@ -40,48 +40,64 @@ ROOMS = ("splat", "vision", "data", "fit", "networks", "language", "association"
 """subpackages that stages compute with, in import order: each imports only those before it"""
 _TREE = "__tree__"
 MAPPED = 1 << 30
-"""bytes from which an array is not read but mapped"""
+"""bytes; larger arrays are memory-mapped"""
 STALE_SECONDS = 600.0
-"""a half-written file that has not grown for this long has no writer any more"""
+"""s; a half-written file that has not grown for this long has no writer any more"""
 
 
 class CorruptCacheError(Exception):
-    """A cache file that cannot be read back; the stage must be computed again."""
+    """A cache file cannot be read, so the stage must be computed again."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Kept:
-    """A stage's result, with how it came about."""
+    """The result of a stage.
+
+    Attributes:
+      value: The result, with NumPy arrays.
+      seconds: Wall time of its computation, also of one in an earlier run.
+      fresh: Whether it was computed in this run, and not read from the cache.
+    """
 
     value: Any
-    """The result, every array a NumPy array."""
     seconds: float
-    """Wall time of the computation, also where it happened in an earlier run."""
     fresh: bool
-    """Computed now, rather than read from the cache."""
 
 
 def key_of(stage: str, parts: Mapping[str, Any]) -> str:
-    """16 hex digits that name a stage's result; `parts` holds plain values: numbers, texts, None, lists, dicts."""
+    """Hashes all that a stage's result depends on.
+
+    Args:
+      stage: Name of the stage.
+      parts: Plain values: numbers, texts, None, lists, dicts.
+
+    Returns:
+      16 hex digits.
+    """
     text = json.dumps([stage, parts], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 _WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")
-"""endings of files that programs write beside a capture and that no capture is read from"""
+"""endings of files that programs write beside a capture, and that are never input"""
 
 
 def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
-    """Digest of files, and of all files beneath folders (`files_beneath`), by name, size and time of change.
+    """Hashes names, sizes and times of files, and of all files beneath folders (`files_beneath`).
 
-    `leave_out`, the run's own output, does not count where it lies inside of such a folder: the folder, and the scene
-    of the same name beside it, which `jsecon fit` writes.
+    Args:
+      paths: Files and folders.
+      leave_out: Output folder of the run. If it lies inside of one of the folders, it is skipped, and so is the scene
+        of the same name beside it, which `jsecon fit` writes.
+
+    Returns:
+      16 hex digits.
     """
     entries = []
     for root in paths:
-        own = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out
-        written = None if own is None else own.resolve().with_name(f"{own.name}.ply")
-        for path in files_beneath(root, leave_out=own) if root.is_dir() else [root]:
+        output = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out
+        written = None if output is None else output.resolve().with_name(f"{output.name}.ply")
+        for path in files_beneath(root, leave_out=output) if root.is_dir() else [root]:
             inside = path.relative_to(root) if path != root else Path(path.name)
             if path != root and (path.suffix.lower() in _WRITTEN or path.absolute() == written):
                 continue
@@ -116,17 +132,17 @@ def source_digest(room: str) -> str:
 
 
 def path_of(folder: Path, stage: str, key: str) -> Path:
-    """Where a stage's result lies."""
+    """Returns the file of a stage's result."""
     return folder / f"{stage}-{key}.npz"
 
 
 def record_path_of(path: Path) -> Path:
-    """Where the stage whose result lies at `path` keeps, while it runs, how far it has come."""
+    """Returns the file of the checkpoint that a stage writes while it computes the result at `path`."""
     return path.with_suffix(".checkpoint.npz")
 
 
 def prepare(folder: Path) -> None:
-    """Makes the folder, marks it as a cache for backup programs, and removes what killed writers left behind."""
+    """Creates the folder, marks it as a cache for backup programs, and removes half-written files of killed runs."""
     tag = folder / "CACHEDIR.TAG"
     if not tag.exists():
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
@@ -141,13 +157,21 @@ def fetch(
     compute: Callable[[], Any],
     *,
     note: Callable[[str], None] | None = None,
-    begin: Callable[[], None] = lambda: None,
+    begin: Callable[[], None] | None = None,
 ) -> Kept:
-    """A stage's result: read where `path` holds it, else computed, after `begin`, and kept there.
+    """Reads the result of a stage, or computes and stores it.
 
-    A file that cannot be read is said through `note` and computed again. A fresh result is passed through the same
-    packing as a stored one, so that what follows sees the same arrays whether the run was stopped here or not; one that
-    lies in files of its own is read back, so that they may go.
+    A fresh result passes through the same packing as a stored one, so that later stages see the same arrays after a
+    stop. A memory-mapped one is read back, so that its files may be deleted.
+
+    Args:
+      path: File of the result.
+      compute: Computes the result if the file is missing or damaged.
+      note: Receives a sentence about a damaged file.
+      begin: Called before `compute`.
+
+    Returns:
+      The result.
     """
     if path.exists():
         try:
@@ -158,7 +182,8 @@ def fetch(
                 stage = path.stem.partition("-")[0]
                 note(f"{path.name} cannot be read ({error}); {stage} is computed again")
     started = time.monotonic()
-    begin()
+    if begin is not None:
+        begin()
     value = compute()
     jax.block_until_ready(value)
     seconds = time.monotonic() - started
@@ -169,12 +194,19 @@ def fetch(
 
 
 def save(path: Path, value: Any) -> None:
-    """Keeps `value` (a tree of plain values, arrays and jsecon's records) at `path`, whole or not at all."""
+    """Writes a tree of plain values, arrays and jsecon's records to a file, atomically."""
     _write(path, *pack(value), seconds=0.0)
 
 
 def load(path: Path) -> Any:
-    """What `save` kept. Raises CorruptCacheError where the file cannot be read."""
+    """Reads what `save` wrote.
+
+    Args:
+      path: The file.
+
+    Raises:
+      CorruptCacheError: The file cannot be read.
+    """
     return _read(path)[0]
 
 
@@ -196,7 +228,7 @@ def _read(path: Path) -> tuple[Any, float]:
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """`packed` of plain values, arrays and jsecon's records: the description, and the arrays by path."""
+    """Splits a tree of plain values, arrays and jsecon's records into its description and its arrays by path."""
     arrays: dict[str, np.ndarray] = {}
 
     def name_of(kind: type) -> str | None:
@@ -207,13 +239,21 @@ def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The value that `pack` took apart. Raises one of UNREADABLE on a tree that `pack` did not write."""
+    """Joins what `pack` split.
+
+    Args:
+      tree: The description.
+      arrays: Arrays by path.
+
+    Raises:
+      Exception: One of UNREADABLE, if `pack` did not write the tree.
+    """
 
     def kind_of(name: str) -> type:
         module, _, kind = name.partition(":")
-        found = getattr(importlib.import_module(module), kind) if module.startswith("jsecon.") else None
-        if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
-            raise ValueError(f"{name} is no record of jsecon's")
-        return found
+        record = getattr(importlib.import_module(module), kind) if module.startswith("jsecon.") else None
+        if not (isinstance(record, type) and dataclasses.is_dataclass(record)):
+            raise ValueError(f"{name} is not a record of jsecon")
+        return record
 
     return unpacked(tree, arrays, kind_of)

@@ -191,7 +191,7 @@ class _Bar(tqdm):
         self.close()
 
 
-_Bar.set_lock(threading.RLock())  # one lock of C: a signal could leave tqdm's own pair of locks half taken
+_Bar.set_lock(threading.RLock())  # one lock of C: a signal could leave the pair of locks of tqdm half taken
 
 
 class _Lines(_Bar):
