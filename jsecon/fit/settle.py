@@ -1,10 +1,13 @@
 """A capture put right before anything is made of it: poses, exposures, and frames that nothing explains.
 
 A probe, a short fit with corrections (corrections.py), says how far each frame is off. What comes of it is a capture
-again, its cameras where they stood and its frames as one exposure shows them, for all that follows. Points from depth
-stand where their own frame's wrong pose puts them, and hold it there: so a probe has few of them, which several frames
-must share, and after each of the first probes the next starts from points made anew with the poses found. The first
-probes see small frames and end as soon as the poses settle; the last sees larger ones.
+again, its cameras where they stood and its frames as one exposure shows them, for all that follows.
+
+Where frames have depth, the cameras are first aligned to each other by colour and depth (alignment.py), if that makes
+the frames agree: then one probe is enough. Otherwise points from depth stand where their own frame's wrong pose puts
+them, and hold it there: so a probe has few of them, which several frames must share, and after each of the first probes
+the next starts from points made anew with the poses found. The first probes see small frames and end as soon as the
+poses settle; the last sees larger ones.
 
 Whether corrections help is decided by `decide` on training frames kept aside: a first probe with corrections and one
 without, both fitted to the other training frames, are compared on them. A kept-aside frame is aligned to either probe,
@@ -25,6 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jsecon.errors import require
+from jsecon.fit.alignment import aligned
 from jsecon.fit.corrections import Corrections, Refine, at_rest, corrected_camera, exponential, exposed
 from jsecon.fit.optimise import FitState, fit_gaussians
 from jsecon.fit.quality import GLANCE, quality, weak
@@ -53,6 +57,8 @@ GAIN_DB = 0.5
 where poses are off by 3 mm and 0.15 degrees, 2 to 3 by three times as much (experiments/rough_capture.py)"""
 ASIDE = 2, 8
 """training frames kept aside for the decision at least (of three times as many), and at most"""
+PLACED_RATE = 5e-4
+"""radians, of the first steps of poses that depth has placed already: what is left is small"""
 FEWEST_VISITS = 6
 """of each frame by a probe: with fewer the poses do not come to rest"""
 SQUARES = 8
@@ -63,6 +69,8 @@ TOO_MANY = (
 )
 _STEP_PIXELS, _STEP_ONCE = 0.46, 0.072
 """time of a probe's step, in steps of the fit: for frames of the fit's size, and for its Gaussians"""
+_PLACING_STEPS = 1.0
+"""time of aligning a frame by colour and depth, in steps of the fit"""
 _REFINE = Refine()
 _STILL = Refine(poses=False, exposure=False)
 """of a probe without corrections that shares the program of one with them"""
@@ -91,9 +99,11 @@ def _planned(
     small, large = (_STEP_PIXELS * size**2 + _STEP_ONCE for size in (coarse, FINE))
     # The decision takes a probe more, which sees no corrections; where there is one alone, two.
     each = train * (large + small * (probes - 1 + decide + (decide and probes == 1)))
-    aligned = ALIGNING_VISITS * out * large + DECIDING_VISITS * min(ASIDE[1], train // 3) * small * 2 * decide
+    fixed = ALIGNING_VISITS * out * large + DECIDING_VISITS * min(ASIDE[1], train // 3) * small * 2 * decide
+    if capture.depths is not None:
+        fixed += _PLACING_STEPS * len(held) * (1 + decide)
     # Alignments are not cut short: a frame held out would be measured by a pose on its way.
-    allowed = visits if at_most is None else min(visits, int((at_most - aligned) / each))
+    allowed = visits if at_most is None else min(visits, int((at_most - fixed) / each))
     if allowed < min(FEWEST_VISITS, visits):
         return None
     return _Plan(coarse, probes, max(1, allowed))
@@ -144,6 +154,12 @@ def settled(
     require(visits > 0, "visits", visits, "at least 1", f"{VISITS} are usual.")
     require(probes > 0, "probes", probes, "at least 1", f"{PROBES} are usual.")
     told, train, notes = capture, ~np.asarray(capture.held_out), []
+    placed = None
+    if refine is not None and refine.poses and capture.depths is not None:
+        placed = _placed(capture, train, ~train)
+    if placed is not None:
+        assert refine is not None
+        probes, refine = 1, dataclasses.replace(refine, pose_rate=PLACED_RATE)
     plan = _planned(capture, refine, visits=visits, probes=probes, decide=decide, at_most=at_most)
     if plan is None:
         refine, plan = None, _Plan(FINE, 1, visits)
@@ -161,12 +177,12 @@ def settled(
 
         return _probed(capture, start, refine, key=key, steps=steps, size=size, progress=tell, **given)
 
-    def begun() -> Gaussians:
+    def begun(capture: Capture) -> Gaussians:
         return starting_gaussians(capture, at_most=POINTS)[0] if start is None else start
 
     left = plan.probes
     if decide and refine is not None:
-        found, better, plain = _compared(capture, begun(), refine, plan, probed)
+        found, better, plain = _compared(capture, begun, refine, plan, probed, by_depth=placed is not None)
         notes.append(_decision(found, better, plain))
         if found is None:
             refine, left = None, 1
@@ -175,12 +191,13 @@ def settled(
             capture, left = _corrected(capture, found, moved), left - 1
     if refine is None and not drop_weak:
         return dataclasses.replace(told, notes=(*told.notes, *notes))
+    capture = capture if placed is None or refine is None else placed
     while refine is not None and left > 1:
-        scene, found = probed(capture, begun(), refine, plan.coarse, steps)
+        scene, found = probed(capture, begun(capture), refine, plan.coarse, steps)
         before, capture = capture, _corrected(capture, found, dataclasses.replace(refine, exposure=False))
         still = _moved_px(scene, before.cameras[train], capture.cameras[train]) < SETTLED_PX
         left = 1 if still else left - 1
-    probe, found = probed(capture, begun(), refine, FINE, steps)
+    probe, found = probed(capture, begun(capture), refine, FINE, steps)
     if out:
         found = _with_aligned(capture, probe, found, ~train, refine, FINE, ALIGNING_VISITS, probed)
     # In the probe's own world and colours.
@@ -188,8 +205,26 @@ def settled(
     better = _corrected(capture, found, refine)
     if progress is not None:
         progress(total, total)
-    notes = (*told.notes, *notes, *_told(told, better, found, refine))
+    notes = (*told.notes, *notes, *_told(told, better, found, refine, by_depth=placed is not None))
     return _without(dataclasses.replace(better, notes=notes), left_out)
+
+
+def _placed(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
+    """With the cameras of `train` aligned to each other by colour and depth, in the world that they had, and each of
+    the `others` to these; None where that does not bring them nearer to each other (`aligned`)."""
+    given = np.asarray(capture.cameras.world_to_camera, np.float64)
+    moved = aligned(capture, train)
+    if moved is None:
+        return None
+    moved = moved @ _drift(moved[train], given[train], cameras_extent(capture.cameras[train]))
+    placed = _with_poses(capture, moved)
+    moved = aligned(placed, others, train)
+    return placed if moved is None else _with_poses(placed, moved)
+
+
+def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
+    cameras = dataclasses.replace(capture.cameras, world_to_camera=poses.astype(np.float32))
+    return dataclasses.replace(capture, cameras=cameras)
 
 
 def _probed(
@@ -227,10 +262,12 @@ def _with_aligned(
 
 def _compared(
     capture: Capture,
-    start: Gaussians,
+    start: Callable[[Capture], Gaussians],
     refine: Refine,
     plan: _Plan,
     probed: Callable[..., tuple[Gaussians, Corrections]],
+    *,
+    by_depth: bool,
 ) -> tuple[Corrections | None, float, float]:
     """Corrections of the training frames, or None where they do not help; and the mean PSNR (dB) of frames kept aside,
     aligned to a probe with corrections and to one without (NaN where there are too few frames to keep any aside)."""
@@ -240,19 +277,20 @@ def _compared(
         return None, math.nan, math.nan
     aside = np.zeros(len(capture.names), bool)
     aside[train[((np.arange(count) + 0.5) * len(train) / count).astype(int)]] = True
-    fitted = dataclasses.replace(capture, held_out=np.asarray(capture.held_out) | aside)
-    steps = plan.visits * int((~fitted.held_out).sum())
-    scene, found = probed(fitted, start, refine, plan.coarse, steps)
-    plain, _ = probed(fitted, start, _STILL, plan.coarse, steps)
     # Aligned on the squares of one colour of a chequerboard, compared on the others.
     rows, columns = (np.arange(length) * SQUARES // length for length in np.shape(capture.frames)[1:3])
     even = np.add.outer(rows, columns) % 2 == 0
     ignored = np.zeros(np.shape(capture.frames)[:3], bool) if capture.ignored is None else np.asarray(capture.ignored)
-    half = dataclasses.replace(capture, ignored=ignored | even)
-    found = _with_aligned(half, scene, found, aside, refine, plan.coarse, DECIDING_VISITS, probed)
+    held_out = np.asarray(capture.held_out) | aside
+    half = dataclasses.replace(capture, ignored=ignored | (even & aside[:, None, None]), held_out=held_out)
+    steps = plan.visits * int((~held_out).sum())
+    placed = (_placed(half, ~held_out, aside) if by_depth else None) or half
+    scene, found = probed(placed, start(placed), refine, plan.coarse, steps)
+    plain, _ = probed(half, start(half), _STILL, plan.coarse, steps)
+    found = _with_aligned(placed, scene, found, aside, refine, plan.coarse, DECIDING_VISITS, probed)
     alike = _with_aligned(half, plain, at_rest(len(aside)), aside, refine, plan.coarse, DECIDING_VISITS, probed)
     seen = even & ~ignored
-    better = _mean_psnr(scene, capture, found, aside, seen, plan.coarse)
+    better = _mean_psnr(scene, placed, found, aside, seen, plan.coarse)
     without = _mean_psnr(plain, capture, alike, aside, seen, plan.coarse)
     return found if better >= without + GAIN_DB else None, better, without
 
@@ -318,8 +356,7 @@ def _corrected(capture: Capture, found: Corrections, refine: Refine | None, *, a
         moved = np.asarray(jax.vmap(exponential)(found.twists), np.float64) @ given
         if at_home:
             moved = moved @ _drift(moved[train], given[train], cameras_extent(cameras[train]))
-        cameras = dataclasses.replace(cameras, world_to_camera=moved.astype(np.float32))
-        capture = dataclasses.replace(capture, cameras=cameras)
+        capture = _with_poses(capture, moved)
     if refine.exposure:
         squared = lambda maps: np.concatenate([maps, np.broadcast_to(np.eye(4)[3:], (len(maps), 1, 4))], axis=1)
         maps = squared(np.asarray(found.colours, np.float64))
@@ -350,7 +387,7 @@ def _drift(moved: Float[Array, "t 4 4"], given: Float[Array, "t 4 4"], extent: f
     return motion
 
 
-def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | None) -> list[str]:
+def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | None, *, by_depth: bool) -> list[str]:
     """How far the frames were off, a sentence each."""
     notes, out = [], np.asarray(before.held_out)
     if refine is None:
@@ -361,7 +398,8 @@ def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | 
         cosine = (np.einsum("tij,tij->t", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         far = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
-        notes.append(f"poses refined by probe fits: {far}, {shift.max():.3g} and {turn.max():.2g} at most")
+        by = "by colour and depth of their frames, then by a probe fit" if by_depth else "by probe fits"
+        notes.append(f"poses refined {by}: {far}, {shift.max():.3g} and {turn.max():.2g} at most")
     if refine.exposure:
         gains = np.asarray(found.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain
         notes.append(f"exposures evened out: frames were {gains.min():.2f} to {gains.max():.2f} times as bright")

@@ -1,0 +1,86 @@
+"""Cameras of RGB-D frames aligned by colour and depth: what is known is found again, and what is right stays."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import look_at
+from scipy.linalg import expm
+
+from jsecon.fit.alignment import aligned
+from jsecon.types import Camera, Capture
+
+VIEWS, WIDTH, HEIGHT, FOCAL = 10, 120, 90, 110.0
+
+
+def in_a_corner() -> Capture:
+    """Views of three textured walls, 3 m wide, that meet in a corner, with their depth; the last is held out."""
+    sides = [(1.0 + 0.15 * k, 2.6 - 0.1 * k, 1.4 + 0.4 * np.sin(k)) for k in range(VIEWS)]
+    poses = np.stack([look_at(side, (0.2, 0.1, 0.3)) for side in sides]).astype(np.float64)
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], axis=-1)
+    frames, depths = [], []
+    for pose in poses:
+        centre, directions = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
+        with np.errstate(divide="ignore"):
+            reach = -centre / directions
+        depth = np.where(reach > 0, reach, np.inf).min(axis=-1)
+        point = centre + depth[..., None] * directions
+        shades = [np.sin(point @ wave + phase) for wave, phase in (((5, 3, 7), 0), ((-4, 8, 2), 1), ((9, -6, 5), 2))]
+        frames.append(np.rint(110 + 60 * np.stack(shades, axis=-1)))
+        depths.append(depth)
+    lens = (np.full(VIEWS, value, np.float32) for value in (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
+    cameras = Camera(poses.astype(np.float32), *lens, width=WIDTH, height=HEIGHT)
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    held_out, depths = np.arange(VIEWS) == VIEWS - 1, np.float32(depths)
+    names, to_source = tuple(f"f{t}" for t in range(VIEWS)), np.eye(4, dtype=np.float32)
+    return Capture(np.uint8(frames), cameras, *nothing, held_out, depths, to_source, names)
+
+
+def moved(capture: Capture, centimetres: float, degrees: float) -> Capture:
+    """The capture with poses off by so much along and about each of the camera's axes (normal)."""
+    draw, poses = np.random.default_rng(3), np.asarray(capture.cameras.world_to_camera, np.float64)
+    twists = np.zeros((VIEWS, 4, 4))
+    for twist in twists:
+        twist[:3, :3] = np.cross(np.eye(3), np.radians(degrees) * draw.normal(size=3))
+        twist[:3, 3] = centimetres / 100 * draw.normal(size=3)
+    return posed(capture, np.stack([expm(twist) @ pose for twist, pose in zip(twists, poses)]))
+
+
+def posed(capture: Capture, poses: np.ndarray) -> Capture:
+    return dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=np.float32(poses)))
+
+
+def off(poses: np.ndarray, truth: Capture) -> tuple[float, float]:
+    """Largest distance, cm, and turn, degrees, from the true poses, in the first frame's axes."""
+    true = np.asarray(truth.cameras.world_to_camera, np.float64)
+    motions = (poses @ np.linalg.inv(poses[0])) @ np.linalg.inv(true @ np.linalg.inv(true[0]))
+    cosine = (np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    distances = np.linalg.norm(motions[:, :3, 3], axis=1)
+    return 100 * float(distances.max()), float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max())
+
+
+@pytest.mark.parametrize(("noise", "unknown"), [(0.0, 0.0), (0.01, 0.2)])
+def test_poses_off_by_centimetres_and_degrees_are_found_again(noise, unknown):
+    """Whatever the frames' gains, with noise in the depth and holes, and of a frame held out by itself."""
+    truth, draw = in_a_corner(), np.random.default_rng(5)
+    gains = draw.uniform(0.8, 1.2, (VIEWS, 1, 1, 1))
+    depths = truth.depths * (1 + noise * draw.normal(size=truth.depths.shape))
+    depths[draw.uniform(size=depths.shape) < unknown] = 0
+    rough = dataclasses.replace(truth, frames=np.uint8(np.rint(truth.frames * gains)), depths=np.float32(depths))
+    rough = moved(rough, 2.0, 1.0)
+    before, train = off(np.float64(rough.cameras.world_to_camera), truth), ~truth.held_out
+    poses = aligned(rough, train)
+    assert np.array_equal(np.float32(poses[-1]), rough.cameras.world_to_camera[-1])
+    poses = aligned(posed(rough, poses), truth.held_out, train)
+    after = off(poses, truth)
+    assert before[0] > 10
+    assert before[1] > 5
+    assert after[0] < 0.4
+    assert after[1] < 0.15
+
+
+def test_exact_poses_stay_and_frames_that_share_nothing_have_none():
+    truth = in_a_corner()
+    assert aligned(truth, ~truth.held_out) is None
+    assert aligned(dataclasses.replace(truth, depths=np.zeros_like(truth.depths)), ~truth.held_out) is None
