@@ -128,7 +128,7 @@ def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level
     grey, slopes, planes = (np.zeros((*shape, *own), np.float32) for own in ((), (2,), (3,)))
     points, shades = np.ones((len(chosen), POINTS, 3)), np.zeros((len(chosen), POINTS))
     counted = np.zeros((len(chosen), POINTS), bool)
-    shrink = lambda a: cv2.resize(np.float32(a), shape[:0:-1], interpolation=cv2.INTER_AREA)
+    shrink = lambda a: cv2.resize(np.asarray(a, np.float32), shape[:0:-1], interpolation=cv2.INTER_AREA)
     draw = np.random.default_rng(0)
     assert capture.depths is not None
     for k, t in enumerate(chosen):
@@ -270,7 +270,7 @@ def _step(
     i, j = (np.broadcast_to(6 * at[:, None, None] + grid, blocks.shape) for at, grid in zip((rows, columns), _GRID))
     matrix = csc_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape=(6 * n, 6 * n))
     twists = np.zeros((count, 6))
-    twists[moves] = spsolve(matrix, right[moves].ravel()).reshape(-1, 6)
+    twists[moves] = np.reshape(np.asarray(spsolve(matrix, right[moves].ravel())), (-1, 6))
     motions = np.tile(np.eye(4), (count, 1, 1))
     motions[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
     motions[:, :3, 3] = twists[:, 3:]
