@@ -1,5 +1,7 @@
 """Held-out figures, and the frames that a scene does not explain."""
 
+import dataclasses
+
 import numpy as np
 
 from jsecon.fit.quality import quality, weak
@@ -37,3 +39,26 @@ def test_large_frames_are_compared_at_the_size_asked():
         found = quality(scene, capture, long_side=long_side)
         np.testing.assert_allclose(found.psnr, expected, atol=1e-4)
     assert not np.allclose(quality(scene, capture, long_side=8).ssim, found.ssim)
+
+
+def test_pixels_that_are_ignored_do_not_count():
+    """What is under the mask has no influence, and the mean is over the rest; a frame without any other is left out."""
+    rng = np.random.default_rng(2)
+    frames = rng.integers(0, 256, (3, 24, 32, 3), np.uint8)
+    lens = [np.full(3, v, np.float32) for v in (30, 30, 16, 12)]
+    cameras = Camera(np.tile(np.eye(4, dtype=np.float32), (3, 1, 1)), *lens, width=32, height=24)
+    ignored = rng.random((3, 24, 32)) < 0.3
+    ignored[2] = True
+    points = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    names = "a", "b", "c"
+    capture = Capture(frames, cameras, *points, np.ones(3, bool), None, np.eye(4), names, ignored=ignored)
+    scene = gaussians_from_points(np.array([[0, 0, -5.0]], np.float32), np.zeros((1, 3), np.uint8))
+    result = quality(scene, capture)
+    for t in range(2):
+        squares = (frames[t][~ignored[t]] / 255.0) ** 2
+        np.testing.assert_allclose(result.psnr[t], -10 * np.log10(squares.mean()), atol=1e-4)
+    np.testing.assert_array_equal(result.frames, [0, 1])
+    other = np.where(ignored[..., None], 255 - frames, frames)
+    again = quality(scene, dataclasses.replace(capture, frames=other))
+    np.testing.assert_array_equal(again.psnr, result.psnr)
+    np.testing.assert_array_equal(again.ssim, result.ssim)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.fit.photometric import psnr, ssim
-from jsecon.fit.schedule import resized, resized_frame
+from jsecon.fit.photometric import psnr, ssim_map
+from jsecon.fit.schedule import resized, resized_frame, resized_mask
 from jsecon.parallel import dealt_out
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Capture, Gaussians, Quality
@@ -22,9 +22,13 @@ SPREADS = 5.0
 
 
 @jax.jit
-def _compared(image: Array, frame: UInt8[Array, "h w 3"]) -> tuple[Array, Array]:
+def _compare(image: Array, frame: UInt8[Array, "h w 3"], counted: Bool[Array, "h w"]) -> tuple[Array, Array]:
+    """PSNR over the counted pixels, and the mean SSIM with the frame as rendered elsewhere."""
     image, target = jnp.clip(image, 0, 1), frame.astype(jnp.float32) / 255.0
-    return psnr(image, target), ssim(image, target)
+    target = jnp.where(counted[..., None], target, image)
+    share = jnp.mean(counted.astype(image.dtype))
+    similarity = 1 - jnp.sum((1 - ssim_map(image, target)) * counted[..., None]) / (share * image.size)
+    return psnr(image, target) + 10 * jnp.log10(share), similarity
 
 
 def quality(
@@ -35,10 +39,22 @@ def quality(
     long_side: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Quality:
-    """PSNR and SSIM of `frames` (by default those held out) against the photographs; renderings clamped to [0, 1].
-    `long_side`: px that larger frames are shrunk to first. Over several processes (`jax.distributed`) the frames are
-    dealt out."""
+    """Compares renderings, clamped to [0, 1], with photographs. Pixels that the capture ignores do not count.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      capture: Photographs and their cameras.
+      frames: Indices of the frames to compare; by default those held out.
+      long_side: Longer side that larger frames are shrunk to first, px.
+      progress: Called with the number of frames done and of all.
+
+    Returns:
+      PSNR and SSIM of each frame; frames that are ignored whole are left out. Over several processes
+      (`jax.distributed`) the frames are shared out, and all get the same result.
+    """
     chosen = np.flatnonzero(capture.held_out) if frames is None else np.asarray(frames)
+    if capture.ignored is not None:
+        chosen = np.array([t for t in chosen if not np.all(capture.ignored[t])], int)
     gaussians, cameras = jax.device_put(gaussians), capture.cameras
     if long_side is not None:
         cameras = resized(cameras, min(1.0, long_side / max(cameras.width, cameras.height)))
@@ -47,7 +63,10 @@ def quality(
         for t in chosen[list(own)]:
             image = render_rgb(gaussians, cameras[int(t)]).features
             frame = resized_frame(np.asarray(capture.frames[t]), cameras)
-            yield [float(value) for value in _compared(image, frame)]
+            counted = np.ones(frame.shape[:2], bool)
+            if capture.ignored is not None:
+                counted = ~resized_mask(capture.ignored[t], cameras)
+            yield [float(value) for value in _compare(image, frame, counted)]
 
     values = dealt_out(len(chosen), rows, progress)
     by_frame = np.array(values).reshape(-1, 2)

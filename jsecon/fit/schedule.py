@@ -117,3 +117,9 @@ def resized_frame(frame: np.ndarray, cameras: Camera) -> np.ndarray:
     if frame.shape[:2] == (cameras.height, cameras.width):
         return np.asarray(frame)
     return cv2.resize(np.asarray(frame), (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
+
+
+def resized_mask(mask: np.ndarray, cameras: Camera) -> np.ndarray:
+    """A mask (h, w) bool at the size of `cameras`: a pixel is set where any of those that it covers is."""
+    size = cameras.width, cameras.height
+    return cv2.resize(np.asarray(mask, np.float32), size, interpolation=cv2.INTER_AREA) > 0

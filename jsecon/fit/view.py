@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 from jsecon.errors import InputError
 from jsecon.fit.corrections import Corrections, away_from_rest, corrected_camera, exposed
 from jsecon.fit.photometric import photometric_loss
-from jsecon.fit.schedule import resized, resized_frame
+from jsecon.fit.schedule import resized, resized_frame, resized_mask
 from jsecon.parallel import over_rows
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
@@ -67,8 +67,7 @@ class Views:
             depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
             depth = depth if depth.shape == to[::-1] else _smaller_depth(depth, to)
         if capture.ignored is not None:
-            share = np.asarray(capture.ignored[t], np.float32)
-            ignored = cv2.resize(share, to, interpolation=cv2.INTER_AREA) > 0
+            ignored = resized_mask(capture.ignored[t], self.cameras)
         frame = resized_frame(np.asarray(capture.frames[t]), self.cameras)
         return View(self.cameras[index], frame, depth, ignored)
 
