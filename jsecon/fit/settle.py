@@ -412,7 +412,8 @@ def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | 
 def weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
     """Indices of the training frames that a scene fitted to them does not explain (`quality.weak`)."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    return train[weak(np.asarray(quality(gaussians, capture, frames=train, long_side=GLANCE).psnr))]
+    result = quality(gaussians, capture, frames=train, long_side=GLANCE)
+    return np.asarray(result.frames)[weak(np.asarray(result.psnr))]
 
 
 def _without(capture: Capture, left: np.ndarray) -> Capture:
