@@ -57,7 +57,7 @@ GAIN_DB = 0.5
 where poses are off by 3 mm and 0.15 degrees, 2 to 3 by three times as much (experiments/rough_capture.py)"""
 ASIDE = 2, 8
 """training frames kept aside for the decision at least (of three times as many), and at most"""
-PLACED_RATE = 5e-4
+PLACED_RATE = 1e-4
 """radians, of the first steps of poses that depth has placed already: what is left is small"""
 FEWEST_VISITS = 6
 """of each frame by a probe: with fewer the poses do not come to rest"""
