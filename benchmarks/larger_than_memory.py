@@ -157,14 +157,14 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
     table = regions.embeddings[:, :CODE]
     codes = timed(told, "codes, s", lambda: jsecon.codes_in_blocks(votes, table, folder / "codes.npy"))
     field = field_of(gaussians, votes, codes, cameras, regions)
-    timed(told, "field written, s", lambda: jsecon.save_field(folder / "field.npz", field))
+    timed(told, "field written, s", lambda: jsecon.save_field(folder / "field.safetensors", field))
     return told
 
 
 def query_step(folder: Path, *_: int) -> dict[str, float]:
     """A hundred texts in one pass, one text, and export."""
     told: dict[str, float] = {}
-    field = timed(told, "field opened, s", lambda: jsecon.load_field(folder / "field.npz", mapped=True))
+    field = timed(told, "field opened, s", lambda: jsecon.load_field(folder / "field.safetensors", mapped=True))
     texts = texts_near(field.regions)
     timed(told, "first query, compilation included, s", lambda: jsecon.query_anchored(field, texts[0]).mask)
     timed(told, "one query, s", lambda: jsecon.query_anchored(field, texts[0]).mask)
@@ -176,8 +176,8 @@ def query_step(folder: Path, *_: int) -> dict[str, float]:
 def export_step(folder: Path, *_: int) -> dict[str, float]:
     """The file checked, and a .ply written of it."""
     told: dict[str, float] = {}
-    timed(told, "field checked, s", lambda: jsecon.check_field(folder / "field.npz"))
-    field = jsecon.load_field(folder / "field.npz", mapped=True)
+    timed(told, "field checked, s", lambda: jsecon.check_field(folder / "field.safetensors"))
+    field = jsecon.load_field(folder / "field.safetensors", mapped=True)
     turn = np.array([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
     turned = dataclasses.replace(field, to_source=turn)
     timed(told, "exported, s", lambda: save_scene(turned, folder / "scene.ply"))

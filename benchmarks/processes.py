@@ -17,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from safetensors.numpy import load_file
 
 STAGES = ("masklets", "regions", "votes", "held_out")
 ONE, TWO = "one process", "two processes"
@@ -48,9 +49,9 @@ def main() -> None:
                 for stage, taken in json.loads((out / "metrics.json").read_text())["seconds"].items():
                     if stage in STAGES and repeat:
                         seconds[name][stage].append(taken)
-        with np.load(place / "one_process/field.npz") as a, np.load(place / "two_processes/field.npz") as b:
-            columns = sorted(set(a.files) - {"header"})
-            unlike = [name for name in columns if not np.array_equal(a[name], b[name])]
+        a, b = (load_file(place / name.replace(" ", "_") / "field.safetensors") for name in (ONE, TWO))
+        columns = sorted(a)
+        unlike = [name for name in columns if not np.array_equal(a[name], b[name])]
     print(f"columns of the field that differ: {', '.join(unlike) or f'none of {len(columns)}'}")
     median = {name: [statistics.median(taken) for taken in of.values()] for name, of in seconds.items()}
     print(f"| stage | {ONE}, s | {TWO}, s | ratio |\n|---|---|---|---|")

@@ -102,7 +102,7 @@ def main() -> None:
     environ = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environ["XDG_CACHE_HOME"] = str(out / "home")
     found = {} if arguments.warm else {"cold": run_apart(capture, out, arguments.steps, environ)}
-    for file in (out / "cache").glob("*.npz"):
+    for file in (out / "cache").glob("*.safetensors"):
         if not file.name.startswith(KEPT):
             file.unlink()
     found["warm"] = run_apart(capture, out, arguments.steps, environ)

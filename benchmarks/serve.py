@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--odd", type=int, default=10_000)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "field.npz"
+        file = Path(folder) / "field.safetensors"
         field = copied(load_field(given.field), given.copies)
         save_field(file, field)
         print(f"{field.gaussians.count} Gaussians, {field.regions.count} regions")

@@ -138,7 +138,7 @@ def main() -> None:
     field = copied(load_field(given.field), given.copies)
     print(f"{field.gaussians.count} Gaussians, {field.regions.count} regions")
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "field.npz"
+        file = Path(folder) / "field.safetensors"
         save_field(file, field)
         for name in ("first", "warm", "warm"):
             print(f"opened after {opening(file):.1f} s, {name}", flush=True)

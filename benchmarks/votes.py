@@ -29,8 +29,8 @@ from jsecon.types import Camera, Gaussians
 
 def voting_views(run: Path, width: int) -> tuple[Gaussians, Camera, np.ndarray, int]:
     """Gaussians, the voting views' cameras and labels (T, H, W) at `width` pixels, and the number of regions."""
-    field = jsecon.load_field(run / "field.npz")
-    found = {kind: sorted((run / "cache").glob(f"{kind}-*.npz"), key=lambda file: file.stat().st_mtime)
+    field = jsecon.load_field(run / "field.safetensors")
+    found = {kind: sorted((run / "cache").glob(f"{kind}-*.safetensors"), key=lambda file: file.stat().st_mtime)
              for kind in ("masklets", "load")}  # fmt: skip
     if not all(found.values()):
         raise InputError(run, found="no cache of masklets", expected="the folder of a whole run", remedy="jsecon run")

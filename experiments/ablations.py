@@ -188,7 +188,7 @@ def _told(values: list[tuple[float, float]]) -> dict:
 def quick() -> dict:
     """The experiment on one small room, which is made first."""
     folder = Path(QUICK.demos) / "demo0"
-    if not (folder / "field.npz").exists():
+    if not (folder / "field.safetensors").exists():
         demo(folder, seed=0, steps=150, listener=Listener(), room=QUICK_ROOM)
     return main(QUICK)
 

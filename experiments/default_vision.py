@@ -188,12 +188,12 @@ def connected_parts(capture: Capture, ids: np.ndarray, *, voxel: float = 0.1, le
 
 def demo_room(folder: Path, seed: int) -> Scene:
     """The room of `seed` as `demo` with PLAIN leaves it."""
-    if not (folder / "field.npz").exists():
+    if not (folder / "field.safetensors").exists():
         demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
     capture = load_capture(folder / "capture", holdout=8)
     files = [folder / "capture" / "masks" / f"{name}.png" for name in capture.names]
     truth = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.int32) - 1
-    return capture, load_field(folder / "field.npz").gaussians, {"objects": truth}
+    return capture, load_field(folder / "field.safetensors").gaussians, {"objects": truth}
 
 
 def replica(folder: str) -> Scene:

@@ -69,9 +69,9 @@ def fields_of(options: Options) -> Iterator[tuple[int, Path, LanguageField]]:
     """Seed, folder and field of each room, made where it is missing."""
     for seed in options.seeds:
         folder = Path(options.rooms) / str(seed)
-        if not (folder / "field.npz").exists():
+        if not (folder / "field.safetensors").exists():
             demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=None if options.crowded else PLAIN)
-        yield seed, folder, load_field(folder / "field.npz")
+        yield seed, folder, load_field(folder / "field.safetensors")
 
 
 def room_of(seed: int, options: Options) -> Room:

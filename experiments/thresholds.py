@@ -93,7 +93,7 @@ def main(options: Options = Options()) -> dict:
     hits = []
     for seed in options.seeds:
         folder = options.folder(seed)
-        scene, whole = scenes.demo_scene(folder, seed), load_field(folder / "field.npz")
+        scene, whole = scenes.demo_scene(folder, seed), load_field(folder / "field.safetensors")
         views, true = scenes.held_out_labels(folder, whole.names)
         cameras = jax.tree.map(jnp.asarray, whole.cameras[views])
         chosen = np.random.default_rng(seed).choice(len(space.names), scene.count, replace=False)

@@ -1,6 +1,8 @@
-"""Writing files so that a final name never holds a half-written file, and trees as what a .npz holds without pickle:
-arrays, and JSON that says what they are. Reading both without trust: no more memory is taken than the file's bytes can
-fill, and no Python object is built."""
+"""Atomic writes, and files of arrays.
+
+A file gets its final name when it is complete. Arrays are kept as safetensors, with a JSON description and checksums;
+`packed` describes a tree of records so. Reading takes no more memory than the file's bytes fill, and runs no code.
+"""
 
 import codecs
 import contextlib
@@ -10,7 +12,6 @@ import json
 import math
 import os
 import re
-import struct
 import sys
 import uuid
 import zipfile
@@ -21,20 +22,17 @@ from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
+from safetensors import SafetensorError, safe_open
 
 from jsecon.errors import InputError, require, why
 
 UNREADABLE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
-    *(ArithmeticError, zipfile.BadZipFile, zlib.error),
+    *(ArithmeticError, zipfile.BadZipFile, zlib.error, SafetensorError),
 )
-"""what reading a damaged .npz, and `unpacked` of a damaged description, raise"""
-ALIGNED = 64
-"""bytes: the columns of a .npz that is to be mapped begin at a multiple of them, as jax wants its arrays"""
+"""what readers of damaged files raise"""
 LONGEST_NAME = 80
 """characters of a name that a message quotes"""
-_PADDING = 0xD935
-"""the zip extra field that Android's zipalign fills up with"""
 _WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 """what the system says of a file system that has no locks"""
 MOST_DEFLATED = 1032
@@ -44,7 +42,18 @@ _HEADER = (
     rb"['\"]fortran_order['\"] *: *(True|False)",
     rb"['\"]shape['\"] *: *\(([\dL, ]*)\)",
 )
-"""of a .npy: what is read of its header"""
+"""entries of the header of a .npy"""
+_DTYPES = {"BOOL": np.dtype(bool)} | {
+    f"{letter}{8 * size}": np.dtype(f"<{letter.lower()}{size}")
+    for letter, sizes in {"F": (2, 4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}.items()
+    for size in sizes
+}
+"""types of numbers by safetensors' names for them"""
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+
+
+class ForeignFileError(ValueError):
+    """A safetensors file that `write_arrays` did not write."""
 
 
 @contextlib.contextmanager
@@ -159,63 +168,46 @@ def read_json(path: Path, expected: str, remedy: str) -> Any:
         raise InputError(path, f"it is not JSON ({why(error)})", expected, remedy) from error
 
 
-def array_layout(stream: Any, size: int) -> tuple[tuple[int, ...], np.dtype, bool]:
-    """(shape, type, whether in Fortran's order) of the .npy of `size` bytes in a stream, which is then at its numbers.
+def map_array(path: Path) -> np.ndarray:
+    """Memory-maps the array of a .npy file.
 
-    Read here, since NumPy makes room for all that a header announces, and warns of odd ones. Raises one of UNREADABLE
-    where it is no .npy of plain numbers, or the bytes are not as many as it announces.
+    The header is parsed here: NumPy's parser warns of damaged ones, and raises errors of Python's tokenizer.
+
+    Args:
+      path: A .npy file.
+
+    Returns:
+      The array, read-only.
+
+    Raises:
+      OSError, ValueError, ...: One of UNREADABLE. The file is missing, is damaged, or holds other values than numbers.
     """
-    magic = stream.read(8)
-    length = stream.read(2 if magic[6:7] == b"\1" else 4)
-    header = stream.read(min(int.from_bytes(length, "little"), 1 << 16))
-    found = [re.search(key, header) for key in _HEADER]
-    if not magic.startswith(b"\x93NUMPY") or None in found:
-        raise ValueError("no .npy of plain numbers")
-    kind, order, sizes = (match[1].decode() for match in found if match)
-    dtype, shape = np.dtype(kind), tuple(int(number) for number in re.findall(r"\d+", sizes))
-    left = size - len(magic) - len(length) - len(header)
-    if math.prod(shape) * dtype.itemsize != left:
-        raise ValueError(f"{left} bytes of numbers where the header announces {dtype} of shape {shape}")
-    return shape, dtype, order == "True"
-
-
-def read_array(stream: Any, size: int) -> np.ndarray:
-    """The array of the .npy of `size` bytes in a stream. Raises as `array_layout` does."""
-    shape, dtype, fortran = array_layout(stream, size)
-    array = np.empty(shape[::-1] if fortran else shape, dtype)
-    flat = array.reshape(-1).view(np.uint8)
-    for start in range(0, len(flat), 1 << 24):
-        block = flat[start : start + (1 << 24)]
-        block[:] = np.frombuffer(stream.read(len(block)), np.uint8)  # ValueError where the stream ends before
-    return array.T if fortran else array
-
-
-def map_array(path: Path, start: int = 0, size: int | None = None) -> np.ndarray:
-    """The array of a .npy in the bytes of a file from `start` on, of which the system holds what is in use. Raises as
-    `array_layout` does."""
     with open(path, "rb") as file:
-        file.seek(start)
-        shape, dtype, fortran = array_layout(file, path.stat().st_size - start if size is None else size)
-        return np.memmap(path, dtype, "r", file.tell(), shape, "F" if fortran else "C")
-
-
-def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
-    """Writes a .npz, not compressed, whose numbers begin at multiples of ALIGNED bytes. Equal arrays give equal bytes;
-    memory maps are copied in pieces."""
-    with open(path, "w+b") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy")
-            # behind a local header, the field for sizes above 4 GiB, and our own before its filling
-            begin = file.tell() + 30 + len(entry.filename.encode()) + 20 + 6
-            filling = -begin % ALIGNED
-            entry.extra = struct.pack("<HHH", _PADDING, 2 + filling, ALIGNED) + bytes(filling)
-            with archive.open(entry, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+        magic = file.read(8)
+        length = file.read(2 if magic[6:7] == b"\1" else 4)
+        header = file.read(min(int.from_bytes(length, "little"), 1 << 16))
+        start = file.tell()
+    fields = [re.search(key, header) for key in _HEADER]
+    if not magic.startswith(b"\x93NUMPY") or None in fields:
+        raise ValueError("no .npy of plain numbers")
+    kind, order, sizes = (match[1].decode() for match in fields if match)
+    dtype = np.dtype(kind)
+    shape = tuple(int(number) for number in re.findall(r"\d+", sizes))
+    after = os.path.getsize(path) - start
+    if math.prod(shape) * dtype.itemsize != after:
+        raise ValueError(f"{after} bytes of numbers where the header announces {dtype} of shape {shape}")
+    return np.memmap(path, dtype, "r", start, shape, "F" if order == "True" else "C")
 
 
 def write_column(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:
-    """Writes a .npy of `shape`, block of rows after block: what a disk has no room for is an error here, and a signal
-    in a memory map."""
+    """Writes a .npy block by block. On a full disk a write raises; a memory map would end the process.
+
+    Args:
+      path: The file.
+      shape: Shape of the whole array.
+      dtype: Its type.
+      blocks: Consecutive blocks of rows.
+    """
     with open(path, "wb") as file:
         header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
@@ -223,26 +215,82 @@ def write_column(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, bl
             file.write(np.ascontiguousarray(block, dtype).tobytes())
 
 
-def read_arrays(path: str | os.PathLike, *, mapped: int = sys.maxsize, checked: bool = True) -> dict[str, np.ndarray]:
-    """The arrays of a .npz by name; those of more than `mapped` bytes are mapped, and not read at all unless they are
-    to be `checked` against their checksums. Raises one of UNREADABLE where it is damaged."""
-    arrays, most = {}, os.path.getsize(path)
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            stored = entry.compress_type == zipfile.ZIP_STORED
-            if entry.file_size > most * (1 if stored else MOST_DEFLATED):
-                raise ValueError(f"{entry.filename} of {entry.file_size} bytes in a file of {most}")
-            name = entry.filename.removesuffix(".npy")
-            with archive.open(entry) as member, open(path, "rb") as file:
-                if not (stored and entry.file_size > mapped):
-                    arrays[name] = read_array(member, entry.file_size)
-                    continue
-                while checked and member.read(1 << 24):  # to the end, where its checksum is compared
-                    pass
-                file.seek(entry.header_offset + 26)
-                start = sum(struct.unpack("<HH", file.read(4))) + file.tell()
-            arrays[name] = map_array(Path(path), start, entry.file_size)
-    return arrays
+def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], description: Any = None) -> None:
+    """Writes arrays as a safetensors file. Equal content gives equal bytes; memory maps are not copied into memory.
+
+    Its metadata have two texts: "jsecon", JSON with the description and with each array's CRC-32, and "crc32", the
+    CRC-32 of that JSON.
+
+    Args:
+      path: The file.
+      arrays: Arrays of numbers by name.
+      description: A JSON value to keep beside them.
+
+    Raises:
+      OSError: The file cannot be written.
+    """
+    # safetensors.numpy.save_file makes files of mode 600, and hides a full disk behind an error of its own kind.
+    # The widest first, as there, so that every array is aligned to its type.
+    ordered = sorted(arrays.items(), key=lambda item: (-item[1].dtype.itemsize, item[0]))
+    parts = {name: np.asarray(array, array.dtype.newbyteorder("<"), order="C") for name, array in ordered}
+    text = json.dumps({"description": description, "crc32": {name: _crc32(part) for name, part in parts.items()}})
+    layout: dict[str, Any] = {"__metadata__": {"jsecon": text, "crc32": str(zlib.crc32(text.encode()))}}
+    end = 0
+    for name, part in parts.items():
+        begin, end = end, end + part.nbytes
+        layout[name] = {"dtype": _CODES[part.dtype], "shape": part.shape, "data_offsets": [begin, end]}
+    header = json.dumps(layout).encode()
+    header += b" " * (-len(header) % 8)
+    with open(path, "wb") as file:
+        file.write(len(header).to_bytes(8, "little") + header)
+        for part in parts.values():
+            file.write(part.data if part.size else b"")
+
+
+def read_arrays(
+    path: str | os.PathLike, *, mapped: int = sys.maxsize, checked: bool = True
+) -> tuple[Any, dict[str, np.ndarray]]:
+    """Reads what `write_arrays` wrote.
+
+    Args:
+      path: The file.
+      mapped: Arrays of more bytes are memory-mapped.
+      checked: Also compare the checksums of mapped arrays, which reads them. Those of the others are always compared.
+
+    Returns:
+      The description, and the arrays by name.
+
+    Raises:
+      OSError, ValueError, ...: One of UNREADABLE. The file is missing, is damaged, or was not written by jsecon.
+    """
+    with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, nothing behind the end
+        pass
+    arrays = {}
+    with open(path, "rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        layout = parsed_json(file.read(length))
+        metadata = layout.pop("__metadata__", {})
+        if "jsecon" not in metadata:
+            raise ForeignFileError("it is a safetensors file of another program")
+        if metadata.get("crc32") != str(zlib.crc32(metadata["jsecon"].encode())):
+            raise ValueError("its description does not match its checksum")
+        told = parsed_json(metadata["jsecon"])
+        for name, entry in layout.items():
+            dtype, shape, (begin, end) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
+            is_mapped = end - begin > mapped
+            if is_mapped:
+                array = np.memmap(path, dtype, "r", 8 + length + begin, shape)
+            else:
+                file.seek(8 + length + begin)
+                array = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
+            if (checked or not is_mapped) and _crc32(array) != told["crc32"][name]:
+                raise ValueError(f"{name} does not match its checksum")
+            arrays[name] = array
+    return told["description"], arrays
+
+
+def _crc32(array: np.ndarray) -> int:
+    return zlib.crc32(array.data if array.size else b"")
 
 
 def packed(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None]) -> dict:
@@ -269,7 +317,8 @@ def packed(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callabl
         return {"dict": inner(node.items())}
     array = np.asarray(node, None if hasattr(node, "__array__") else object)
     told = f"{kind.__module__}.{kind.__qualname__} of type {array.dtype}"
-    require(array.dtype.kind in "biuf", path, told, "plain numbers", "Convert it to float32 or an integer type.")
+    is_plain = array.dtype.newbyteorder("<") in _CODES
+    require(is_plain, path, told, "plain numbers", "Convert it to float32 or an integer type.")
     arrays[path] = array
     return {"array": path, "shape": list(array.shape), "dtype": array.dtype.name}
 

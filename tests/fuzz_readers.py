@@ -515,32 +515,34 @@ def field(folder: Path) -> Iterator[Case]:
         "coder": _field(_coder()),
         "bare": dataclasses.replace(_field(rotation), parts=None),
     }.items():
-        save_field(folder / f"{name}.npz", value)
-        yield Case([folder / f"{name}.npz"], lambda name=name: load_field(folder / f"{name}.npz"), whole)
-    save_field(folder / "mapped.npz", _field())
+        save_field(folder / f"{name}.safetensors", value)
+        yield Case(
+            [folder / f"{name}.safetensors"], lambda name=name: load_field(folder / f"{name}.safetensors"), whole
+        )
+    save_field(folder / "mapped.safetensors", _field())
 
     def checked() -> LanguageField:
-        found = load_field(folder / "mapped.npz", mapped=True)
-        check_field(folder / "mapped.npz")
+        found = load_field(folder / "mapped.safetensors", mapped=True)
+        check_field(folder / "mapped.safetensors")
         return found
 
-    yield Case([folder / "mapped.npz"], checked, whole)
+    yield Case([folder / "mapped.safetensors"], checked, whole)
 
 
 def kept(folder: Path) -> Iterator[Case]:
     """The run's cache, and what networks found: what cannot be read is computed again."""
     value = {"a": np.arange(12.0).reshape(3, 4), "cameras": _field().cameras, "told": ("x", 1, None), "list": [1, "b"]}
-    cache.save(folder / "stage-0.npz", value)
+    cache.save(folder / "stage-0.safetensors", value)
 
     def read():
-        return cache.fetch(folder / "stage-0.npz", lambda: value)
+        return cache.fetch(folder / "stage-0.safetensors", lambda: value)
 
     def whole(found: cache.Kept) -> None:
         if found.fresh:
             raise InputError("cache", "computed again", "-", "-")
         assert isinstance(found.seconds, float)
 
-    yield Case([folder / "stage-0.npz"], read, whole)
+    yield Case([folder / "stage-0.safetensors"], read, whole)
     frame, mask = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), bool)
     store = EmbeddingStore(folder, "model")
     store.write(frame, {bytes(range(16)): np.ones(4, np.float32), bytes(16): np.ones(4, np.float32)})

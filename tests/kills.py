@@ -109,7 +109,7 @@ def ended(room: Path, place: Place, steps: int, kill_at: float | None = None) ->
 
 
 def _digest(out: Path) -> str:
-    return hashlib.sha256((out / "field.npz").read_bytes()).hexdigest()
+    return hashlib.sha256((out / "field.safetensors").read_bytes()).hexdigest()
 
 
 def _left(out: Path) -> list[str]:

@@ -21,7 +21,7 @@ def saved(scene, cameras, tmp_path_factory):
     moved = np.eye(4)
     moved[0, 3] = 2
     field = dataclasses.replace(make_field(scene, cameras)[0], to_source=moved)
-    file = tmp_path_factory.mktemp("field") / "field.npz"
+    file = tmp_path_factory.mktemp("field") / "field.safetensors"
     save_field(file, field)
     return field, file
 
@@ -65,7 +65,7 @@ def test_a_selection_is_written_in_every_format(saved, tmp_path, ending):
 
 
 def test_an_ending_that_cannot_be_written_is_refused_before_anything_is_read(tmp_path, capsys):
-    assert run("export", tmp_path / "none.npz", "--out", tmp_path / "scene.sog") == 2
+    assert run("export", tmp_path / "none.safetensors", "--out", tmp_path / "scene.sog") == 2
     told = capsys.readouterr().err
     assert "scene.sog" in told
     assert "npx @playcanvas/splat-transform" in told

@@ -33,7 +33,7 @@ def _query(field, out, *more):
 def test_the_same_files_as_in_memory(room_run, tmp_path, forced, monkeypatch, capsys, more):
     run, out = room_run
     texts = [text for text in TEXTS if " " not in text or "code" not in more]
-    asked = out / "field.npz", *texts, "--at", run.capture.names[1], 80, 60, *more
+    asked = out / "field.safetensors", *texts, "--at", run.capture.names[1], 80, 60, *more
     codes, told = [], []
     for name, budget in (("blocks", "1e-9"), ("memory", "1000")):
         monkeypatch.setenv("JSECON_MEMORY", budget)
@@ -52,13 +52,14 @@ def test_the_same_files_as_in_memory(room_run, tmp_path, forced, monkeypatch, ca
 def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     """The parts of a field of `--parts` divide an answer alike; an answer of nothing is one in blocks too."""
     _, out = room_run
-    rng, field = np.random.default_rng(0), load_field(out / "field.npz")
+    rng, field = np.random.default_rng(0), load_field(out / "field.safetensors")
     rows = rng.normal(size=(20, field.canonical.shape[1])).astype(np.float32)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     parts = Parts(rng.integers(-1, 20, field.gaussians.count).astype(np.int32), rows, np.ones(20, np.float32))
     field = dataclasses.replace(field, parts=parts)
-    save_field(tmp_path / "field.npz", field)
-    mapped, how = load_field(tmp_path / "field.npz", mapped=True), {"texts": ("red", "magenta"), "several": True}
+    save_field(tmp_path / "field.safetensors", field)
+    mapped = load_field(tmp_path / "field.safetensors", mapped=True)
+    how = {"texts": ("red", "magenta"), "several": True}
     assert isinstance(mapped.parts.part, np.memmap)
     for threshold in (None, 2.0):
         how["threshold"] = threshold
@@ -79,7 +80,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
 )
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run
-    assert _query(out / "field.npz", tmp_path / "answers", "red", *more) == 2
+    assert _query(out / "field.safetensors", tmp_path / "answers", "red", *more) == 2
     told = capsys.readouterr().err
     assert more[0] in told
     assert "JSECON_MEMORY=" in told
@@ -88,11 +89,11 @@ def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, c
 
 def test_a_damaged_field_and_a_budget_that_is_none(room_run, tmp_path, forced, monkeypatch, capsys):
     _, out = room_run
-    whole = bytearray((out / "field.npz").read_bytes())
+    whole = bytearray((out / "field.safetensors").read_bytes())
     whole[len(whole) // 2] ^= 255
-    (tmp_path / "field.npz").write_bytes(whole)
-    assert _query(tmp_path / "field.npz", tmp_path, "red") == 2
+    (tmp_path / "field.safetensors").write_bytes(whole)
+    assert _query(tmp_path / "field.safetensors", tmp_path, "red") == 2
     assert "damaged" in capsys.readouterr().err
     monkeypatch.setenv("JSECON_MEMORY", "much")
-    assert _query(out / "field.npz", tmp_path, "red") == 2
+    assert _query(out / "field.safetensors", tmp_path, "red") == 2
     assert "JSECON_MEMORY: 'much', expected GiB" in capsys.readouterr().err

@@ -223,10 +223,10 @@ def fields(scene, cameras, tmp_path, monkeypatch):
 
     field = make_field(scene, cameras)[0]
     field = dataclasses.replace(field, votes=with_overlap(field.votes))
-    save_field(tmp_path / "a.npz", field)
+    save_field(tmp_path / "a.safetensors", field)
     monkeypatch.setattr(home, "MAPPED", 0)
     monkeypatch.setattr(shares, "ROWS", 10)
-    return field, load_field(tmp_path / "a.npz", mapped=True)
+    return field, load_field(tmp_path / "a.safetensors", mapped=True)
 
 
 def test_overlap_and_codes_of_mapped_votes(fields, tmp_path):

@@ -52,16 +52,16 @@ def _same(a, b):
 
 def test_what_is_kept_comes_back(scene, cameras, tmp_path):
     tree = _tree(scene, cameras)
-    cache.save(tmp_path / "x.npz", tree)
-    _same(cache.load(tmp_path / "x.npz"), tree)
+    cache.save(tmp_path / "x.safetensors", tree)
+    _same(cache.load(tmp_path / "x.safetensors"), tree)
 
 
 def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
     def compute():
         return {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")}
 
-    fresh = cache.fetch(tmp_path / "stage-0.npz", compute)
-    again = cache.fetch(tmp_path / "stage-0.npz", lambda: pytest.fail("computed twice"))
+    fresh = cache.fetch(tmp_path / "stage-0.safetensors", compute)
+    again = cache.fetch(tmp_path / "stage-0.safetensors", lambda: pytest.fail("computed twice"))
     assert fresh.fresh
     assert not again.fresh
     assert isinstance(fresh.value["a"], np.ndarray)
@@ -70,9 +70,9 @@ def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
 
 
 def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
-    for name in ("a.npz", "b.npz"):
+    for name in ("a.safetensors", "b.safetensors"):
         cache.save(tmp_path / name, _tree(scene, cameras))
-    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_a_failed_computation_leaves_nothing_behind(tmp_path):
 
 def test_pickles_are_neither_written_nor_read(tmp_path):
     with pytest.raises(ValueError, match=r"root\.a: got builtins\.object .* expected plain numbers"):
-        cache.save(tmp_path / "x.npz", {"a": object()})
+        cache.save(tmp_path / "x.safetensors", {"a": object()})
     np.savez(tmp_path / "y.npz", a=np.array([object()], object), allow_pickle=True)
     with pytest.raises(cache.CorruptCacheError):
         cache.load(tmp_path / "y.npz")
@@ -164,7 +164,7 @@ def test_files_digest_leaves_out_the_output_and_hidden_files(tmp_path):
     (tmp_path / "a.png").write_bytes(b"one")
     before = cache.files_digest([tmp_path], leave_out=tmp_path / "out")
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "field.npz").write_bytes(b"result")
+    (tmp_path / "out" / "field.safetensors").write_bytes(b"result")
     (tmp_path / ".DS_Store").write_bytes(b"x")
     assert cache.files_digest([tmp_path], leave_out=tmp_path / "out") == before
 
@@ -223,8 +223,8 @@ def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path,
 
 
 def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):
-    old, young = tmp_path / ".a.0.partial.npz", tmp_path / ".b.0.partial.npz"
-    to_come = tmp_path / ".c.0.partial.npz"  # written before the clock was set back
+    old, young = tmp_path / ".a.0.partial.safetensors", tmp_path / ".b.0.partial.safetensors"
+    to_come = tmp_path / ".c.0.partial.safetensors"  # written before the clock was set back
     for path in (old, young, to_come):
         path.write_bytes(b"half")
     os.utime(old, (0, 0))
@@ -239,14 +239,14 @@ def test_prepare_marks_the_folder_and_sweeps_what_killed_writers_left(tmp_path):
 def test_large_arrays_are_mapped_and_a_damaged_one_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "MAPPED", 1000)
     value = {"large": np.arange(3000, dtype=np.float32).reshape(30, 100), "small": np.arange(5)}
-    cache.save(tmp_path / "kept.npz", value)
-    found = cache.load(tmp_path / "kept.npz")
+    cache.save(tmp_path / "kept.safetensors", value)
+    found = cache.load(tmp_path / "kept.safetensors")
     assert isinstance(found["large"], np.memmap)
     assert not isinstance(found["small"], np.memmap)
     for name, array in value.items():
         np.testing.assert_array_equal(found[name], array)
-    content = bytearray((tmp_path / "kept.npz").read_bytes())
+    content = bytearray((tmp_path / "kept.safetensors").read_bytes())
     content[content.index(value["large"].tobytes()) + 500] ^= 1
-    (tmp_path / "kept.npz").write_bytes(content)
+    (tmp_path / "kept.safetensors").write_bytes(content)
     with pytest.raises(cache.CorruptCacheError):
-        cache.load(tmp_path / "kept.npz")
+        cache.load(tmp_path / "kept.safetensors")

@@ -64,7 +64,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/") >= 24
     assert "Held-out frames" in page
-    assert (tmp_path / "out" / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
+    assert (tmp_path / "out" / "field.safetensors").read_bytes() == (out / "field.safetensors").read_bytes()
 
 
 def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, room_run, tmp_path, capsys):
@@ -86,7 +86,7 @@ def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, 
 def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, capsys, by):
     run, out = room_run
     names = list(json.loads((run.options.capture / "scene.json").read_text())["objects"].values())[:2]
-    assert _run("query", out / "field.npz", *names, "--out", tmp_path, "--by", by, "--views", 2) == 0
+    assert _run("query", out / "field.safetensors", *names, "--out", tmp_path, "--by", by, "--views", 2) == 0
     told = capsys.readouterr().out
     for name in names:
         slug = name.replace(" ", "-")
@@ -116,7 +116,7 @@ def test_query_at_a_pixel_selects_the_object_under_it(room_run, room, tmp_path):
     largest = np.bincount(masks[masks > 0]).argmax()
     inside = cv2.distanceTransform((masks == largest).astype(np.uint8), cv2.DIST_L2, 5)
     y, x = np.unravel_index(inside.argmax(), inside.shape)
-    assert _run("query", out / "field.npz", "--at", name, x, y, "--out", tmp_path) == 0
+    assert _run("query", out / "field.safetensors", "--at", name, x, y, "--out", tmp_path) == 0
     answer = json.loads(next(tmp_path.glob("*.json")).read_text())
     assert answer["count"] > 0
     assert "text encoder" in answer["left_out"]
@@ -134,7 +134,9 @@ def test_query_by_what_is_outlined(room_run, room, tmp_path):
     rows, columns = np.nonzero(images[0] == largest)
     files = [item for name in names for item in (name, tmp_path / f"thing {name}.png")]
     box = [columns.min(), rows.min(), columns.max(), rows.max()]
-    assert _run("query", out / "field.npz", "--mask", *files, "--box", names[0][-3:], *box, "--out", tmp_path) == 0
+    assert (
+        _run("query", out / "field.safetensors", "--mask", *files, "--box", names[0][-3:], *box, "--out", tmp_path) == 0
+    )
     region = np.flatnonzero(np.unique(masks_of_all(room)) == largest)[0] - 1
     answers = [json.loads(file.read_text()) for file in sorted(tmp_path.glob("*.json"))]
     assert len(answers) == 2
@@ -144,7 +146,7 @@ def test_query_by_what_is_outlined(room_run, room, tmp_path):
         assert answer["count"] > 0
     small = np.zeros((50, 160), np.uint8)
     cv2.imwrite(str(tmp_path / "small.png"), small)
-    assert _run("query", out / "field.npz", "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
+    assert _run("query", out / "field.safetensors", "--mask", names[0], tmp_path / "small.png", "--out", tmp_path) == 2
 
 
 def masks_of_all(room):
@@ -155,7 +157,7 @@ def masks_of_all(room):
 
 def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, capsys):
     _, out = room_run
-    assert _run("eval", out / "field.npz", "--labels", room / "label", "--out", tmp_path) == 0
+    assert _run("eval", out / "field.safetensors", "--labels", room / "label", "--out", tmp_path) == 0
     told = capsys.readouterr().out
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert set(found) == {"anchored", "silhouette", "all", "anchored_code", "one_step", "canonical"}
@@ -178,11 +180,11 @@ def _object(capsys, *arguments):
 def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, capsys):
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")
-    field, fitted = out / "field.npz", ["--holdout", 4, "--steps", 150]
+    field, fitted = out / "field.safetensors", ["--holdout", 4, "--steps", 150]
     line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", *fitted]
     told, _ = _object(capsys, *line, "--dry-run")
     assert {stage["status"] for stage in told["stages"]} == {"cached", "left out"}
-    assert not (tmp_path / "out" / "field.npz").exists()
+    assert not (tmp_path / "out" / "field.safetensors").exists()
     told, err = _object(capsys, *line)
     assert told["gaussians"] == run.field.gaussians.count
     assert "gaussians        cached" in err
@@ -323,8 +325,8 @@ def _refused(capsys, *arguments, says=()):
 
 def _refused_run(capsys, capture, tmp_path, *options, says=()):
     _refused(capsys, "run", capture, "--out", tmp_path / "out", "--holdout", 4, "--steps", 5, *options, says=says)
-    left = {path.name for path in (tmp_path / "out").rglob("*.npz")} if (tmp_path / "out").exists() else set()
-    assert not any("partial" in name or name == "field.npz" for name in left)
+    left = {path.name for path in (tmp_path / "out").rglob("*.safetensors")} if (tmp_path / "out").exists() else set()
+    assert not any("partial" in name or name == "field.safetensors" for name in left)
 
 
 def _image(capture):
@@ -427,8 +429,19 @@ def test_an_output_folder_that_cannot_be_written(capture, room_run, tmp_path, ca
     (tmp_path / "file").write_text("not a folder")
     _refused(capsys, "run", capture, "--out", tmp_path / "file" / "out", says=["out"])
     _refused(capsys, "demo", "--out", tmp_path / "file" / "out", says=["out"])
-    _refused(capsys, "query", room_run[1] / "field.npz", "red", "--out", tmp_path / "file" / "out", says=["out"])
-    _refused(capsys, "eval", room_run[1] / "field.npz", "--labels", capture, "--out", tmp_path / "file", says=["file"])
+    _refused(
+        capsys, "query", room_run[1] / "field.safetensors", "red", "--out", tmp_path / "file" / "out", says=["out"]
+    )
+    _refused(
+        capsys,
+        "eval",
+        room_run[1] / "field.safetensors",
+        "--labels",
+        capture,
+        "--out",
+        tmp_path / "file",
+        says=["file"],
+    )
 
 
 def test_the_capture_itself_as_the_output_folder(capture, capsys):
@@ -436,7 +449,7 @@ def test_the_capture_itself_as_the_output_folder(capture, capsys):
 
 
 def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_path, capsys):
-    field, out = room_run[1] / "field.npz", tmp_path / "answers"
+    field, out = room_run[1] / "field.safetensors", tmp_path / "answers"
     texts = ["red ball", "the meaning of life", "zzz"]
     assert _run("query", field, *texts, "--out", out) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("jsecon: ")]
@@ -463,18 +476,22 @@ def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_pa
     ],
 )
 def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
-    _refused(capsys, "query", room_run[1] / "field.npz", *options, "--out", tmp_path, says=[says])
+    _refused(capsys, "query", room_run[1] / "field.safetensors", *options, "--out", tmp_path, says=[says])
 
 
 def test_a_field_that_is_damaged_or_not_there(room_run, tmp_path, capsys):
-    data = (room_run[1] / "field.npz").read_bytes()
-    (tmp_path / "field.npz").write_bytes(data[: len(data) // 2])
-    _refused(capsys, "query", tmp_path / "field.npz", "red", "--out", tmp_path / "o", says=["field.npz"])
-    _refused(capsys, "query", tmp_path / "none.npz", "red", "--out", tmp_path / "o", says=["none.npz"])
+    data = (room_run[1] / "field.safetensors").read_bytes()
+    (tmp_path / "field.safetensors").write_bytes(data[: len(data) // 2])
+    _refused(
+        capsys, "query", tmp_path / "field.safetensors", "red", "--out", tmp_path / "o", says=["field.safetensors"]
+    )
+    _refused(capsys, "query", tmp_path / "none.safetensors", "red", "--out", tmp_path / "o", says=["none.safetensors"])
 
 
 def test_labels_that_are_not_there(room_run, tmp_path, capsys):
-    _refused(capsys, "eval", room_run[1] / "field.npz", "--labels", tmp_path, "--out", tmp_path / "o", says=["json"])
+    _refused(
+        capsys, "eval", room_run[1] / "field.safetensors", "--labels", tmp_path, "--out", tmp_path / "o", says=["json"]
+    )
 
 
 # What is said while it works

@@ -109,7 +109,7 @@ def test_embeddings_are_kept_by_content(folders, frame, masks, tmp_path, monkeyp
     assert sum(crops) == 4
     embedder.embed_regions(255 - frame, masks[:1])  # another frame
     assert sum(crops) == 5
-    for path in tmp_path.glob("*.npz"):
+    for path in tmp_path.glob("*.safetensors"):
         path.write_bytes(path.read_bytes()[:50])
     np.testing.assert_array_equal(embedder.embed_regions(frame, masks[:3]), rows)
     assert sum(crops) == 8

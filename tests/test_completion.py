@@ -39,13 +39,13 @@ def script(tmp_path):
         (["run", "x", "--granularity", ""], {"fine", "medium", "coarse"}),
         (["query", "x", "--by", "sil"], {"silhouette"}),
         (["completion", ""], {"bash", "zsh", "fish"}),
-        (["run", "som"], {"somewhere", "some.npz"}),
-        (["query", "so"], {"somewhere", "some.npz"}),
+        (["run", "som"], {"somewhere", "some.safetensors"}),
+        (["query", "so"], {"somewhere", "some.safetensors"}),
     ],
 )
 def test_bash_completes(script, tmp_path, words, expected):
     (tmp_path / "somewhere").mkdir()
-    (tmp_path / "some.npz").touch()
+    (tmp_path / "some.safetensors").touch()
     line = " ".join(f"'{word}'" for word in ["jsecon", *words])
     text = TRY.format(script=script("bash"), words=line, at=len(words))
     found = subprocess.run([_shell("bash"), "-c", text], capture_output=True, text=True, cwd=tmp_path, check=True)

@@ -68,7 +68,9 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
 
 
 def answers(folder: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in folder.rglob("*") if file.suffix in (".png", ".npz")}
+    return {
+        file.name: file.read_bytes() for file in folder.rglob("*") if file.suffix in (".png", ".npz", ".safetensors")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,7 @@ def asked(scene, cameras, tmp_path_factory) -> tuple[str, str]:
     """The file of a small field, and a colour that selects a part of it."""
     embedder = ColourEmbedder()
     field = dataclasses.replace(make_field(scene, cameras, dim=embedder.dim)[0], embedder=embedder.name)
-    file = tmp_path_factory.mktemp("asked") / "field.npz"
+    file = tmp_path_factory.mktemp("asked") / "field.safetensors"
     save_field(file, field)
     words = ("red", "green", "blue", "orange", "pink")
     return str(file), next(word for word in words if ask_text(field, embedder, word).mask.any())

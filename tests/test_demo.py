@@ -59,9 +59,9 @@ def test_metrics_have_every_figure_that_is_promised(finished):
 
 def test_the_fields_and_the_answers_are_on_disk(finished):
     metrics, out, _ = finished
-    field = load_field(out / "field.npz")
+    field = load_field(out / "field.safetensors")
     assert field.regions.count == metrics["regions"]
-    assert load_field(out / "true_masks" / "field.npz").regions.count >= 10
+    assert load_field(out / "true_masks" / "field.safetensors").regions.count >= 10
     told = [json.loads(path.read_text()) for path in (out / "queries").glob("*.json")]
     assert len(told) >= 10
     for answer in told:
@@ -71,16 +71,16 @@ def test_the_fields_and_the_answers_are_on_disk(finished):
 
 def test_the_two_runs_share_frames_and_gaussians(finished):
     _, out, _ = finished
-    assert len(list((out / "cache").glob("gaussians-*.npz"))) == 1
-    assert len(list((out / "cache").glob("load-*.npz"))) == 1
-    a, b = (load_field(out / name / "field.npz").gaussians for name in (".", "true_masks"))
+    assert len(list((out / "cache").glob("gaussians-*.safetensors"))) == 1
+    assert len(list((out / "cache").glob("load-*.safetensors"))) == 1
+    a, b = (load_field(out / name / "field.safetensors").gaussians for name in (".", "true_masks"))
     np.testing.assert_array_equal(a.means, b.means)
 
 
 def test_only_frames_poses_and_points_reach_the_default_run(finished):
     """The default field knows nothing of masks, labels or names: its options name none of them."""
     _, out, _ = finished
-    options = json.loads(load_field(out / "field.npz").provenance)["options"]
+    options = json.loads(load_field(out / "field.safetensors").provenance)["options"]
     assert options["masks"] is None
     assert options["gaussians"] is None
 
@@ -111,16 +111,16 @@ def test_the_pictures_show_the_room_and_turn_around_it(finished):
 def test_a_second_call_finds_it_all_done(finished, monkeypatch):
     monkeypatch.setattr(film_of, "SECONDS", 2)
     metrics, out, _ = finished
-    before, ears = (out / "field.npz").read_bytes(), Ears()
+    before, ears = (out / "field.safetensors").read_bytes(), Ears()
     again = demo.demo(out, steps=150, listener=ears, room=ROOM)
     assert {name for name, fresh in ears.fresh.items() if fresh} == {"field"}
-    assert (out / "field.npz").read_bytes() == before
+    assert (out / "field.safetensors").read_bytes() == before
     assert again["anchored"] == metrics["anchored"]
 
 
 def test_codes_are_shown_in_colours_that_tell_regions_apart(finished):
     _, out, _ = finished
-    field = load_field(out / "field.npz")
+    field = load_field(out / "field.safetensors")
     colours = pictures.code_colours(field)
     known = np.abs(np.asarray(field.codes)).max(1) > 0
     assert colours.shape == (field.gaussians.count, 3)

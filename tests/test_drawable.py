@@ -40,7 +40,7 @@ def test_harmonics_of_no_whole_degree_are_refused_everywhere(scene, camera, fiel
         lambda: jsecon.render_rgb(odd, camera),
         lambda: jax.jit(jsecon.render_rgb)(odd, camera),
         lambda: jsecon.render(odd, camera, np.ones((odd.count, 1), np.float32)),
-        lambda: jsecon.save_field(tmp_path / "f.npz", dataclasses.replace(field, gaussians=odd)),
+        lambda: jsecon.save_field(tmp_path / "f.safetensors", dataclasses.replace(field, gaussians=odd)),
         *(lambda ending=e: jsecon.save_gaussians(tmp_path / f"a.{ending}", odd) for e in ("ply", "spz", "glb")),
     ]
     for way in ways:
@@ -74,10 +74,10 @@ def test_what_can_be_drawn_comes_back_from_fields_and_files(scene, camera, field
     assert bool(usable(odd).all())
     drawn = jsecon.render_rgb(odd, camera).features
     assert np.isfinite(np.asarray(drawn)).all()
-    jsecon.save_field(tmp_path / "f.npz", dataclasses.replace(field, gaussians=odd))
-    jsecon.check_field(tmp_path / "f.npz")
+    jsecon.save_field(tmp_path / "f.safetensors", dataclasses.replace(field, gaussians=odd))
+    jsecon.check_field(tmp_path / "f.safetensors")
     jsecon.save_gaussians(tmp_path / "a.ply", odd)
-    for found in (jsecon.load_field(tmp_path / "f.npz").gaussians, jsecon.load_gaussians(tmp_path / "a.ply")):
+    for found in (jsecon.load_field(tmp_path / "f.safetensors").gaussians, jsecon.load_gaussians(tmp_path / "a.ply")):
         jax.tree.map(np.testing.assert_array_equal, found, odd)
     for ending in ("glb", "spz"):
         if (ending, how) == ("spz", "a point"):  # it has a least size
@@ -104,7 +104,7 @@ def test_what_load_refuses_is_not_written(scene, field, tmp_path, how):
     odd = changed(scene, **REFUSED[how])
     (name,) = REFUSED[how]
     with pytest.raises(ValueError, match=name):
-        jsecon.save_field(tmp_path / "f.npz", dataclasses.replace(field, gaussians=odd))
+        jsecon.save_field(tmp_path / "f.safetensors", dataclasses.replace(field, gaussians=odd))
     for ending in ("ply", "spz", "glb"):
         with pytest.raises(jsecon.InputError, match=name):
             jsecon.save_gaussians(tmp_path / f"a.{ending}", odd)

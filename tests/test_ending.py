@@ -20,8 +20,8 @@ def _errors():
 
 
 def test_figures_and_paths_are_one_object(capsys):
-    assert finish(Output(json=True), {"written": {"field": Path("out/field.npz")}, "gaussians": 3}) == 0
-    assert json.loads(capsys.readouterr().out) == {"written": {"field": "out/field.npz"}, "gaussians": 3}
+    assert finish(Output(json=True), {"written": {"field": Path("out/field.safetensors")}, "gaussians": 3}) == 0
+    assert json.loads(capsys.readouterr().out) == {"written": {"field": "out/field.safetensors"}, "gaussians": 3}
     assert finish(Output(), {"gaussians": 3}) == 0
     assert capsys.readouterr() == ("", "")
 
@@ -50,7 +50,7 @@ def test_wrong_usage_is_an_error_object_too(capsys, line):
 
 def test_debug_shows_where_an_error_came_from(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("JAX_TRACEBACK_FILTERING", "auto")  # what the user has set stays
-    line = ["eval", str(tmp_path / "none.npz"), "--labels", str(tmp_path), "--out", str(tmp_path)]
+    line = ["eval", str(tmp_path / "none.safetensors"), "--labels", str(tmp_path), "--out", str(tmp_path)]
     assert command_line.main(line) == 2
     assert "Traceback" not in capsys.readouterr().err
     assert command_line.main([*line, "--debug"]) == 2

@@ -94,8 +94,8 @@ def one_region(scene, cameras, means, *, unseen=()):
 @pytest.mark.parametrize("options", [(), ("--threshold", 0)])
 def test_even_never_selects_what_no_view_saw(scene, cameras, tmp_path, options):
     means = 0.05 * np.random.default_rng(0).normal(size=(64, 3))
-    save_field(tmp_path / "field.npz", one_region(scene, cameras, means, unseen=[3, 17, 40]))
-    told = ask(tmp_path / "field.npz", tmp_path / "out", "--even", "--keep-outliers", *options)
+    save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means, unseen=[3, 17, 40]))
+    told = ask(tmp_path / "field.safetensors", tmp_path / "out", "--even", "--keep-outliers", *options)
     chosen = jsecon.load_gaussians(tmp_path / "out" / told["ply"]).means
     away = np.linalg.norm(chosen[:, None] - means[None, [3, 17, 40]], axis=-1)
     assert len(chosen) == 61
@@ -106,8 +106,8 @@ def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, ca
     rng = np.random.default_rng(0)
     places = np.repeat([[0, 0, 0], [1, 0, 0], [0, 30, 0]], [32, 26, 6], 0)  # two pieces, and six strays far away
     means = places + np.where(np.arange(64)[:, None] < 58, 0.05, 8) * rng.normal(size=(64, 3))
-    save_field(tmp_path / "field.npz", one_region(scene, cameras, means))
-    told = ask(tmp_path / "field.npz", tmp_path / "out")
+    save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means))
+    told = ask(tmp_path / "field.safetensors", tmp_path / "out")
     assert told["count"] == 58
     assert told["outliers_dropped"] == 6
     assert told["outliers"] == {
@@ -116,7 +116,7 @@ def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, ca
     printed = capsys.readouterr().out
     assert "6 of 64" in printed
     assert "--keep-outliers" in printed
-    kept = ask(tmp_path / "field.npz", tmp_path / "kept", "--keep-outliers")
+    kept = ask(tmp_path / "field.safetensors", tmp_path / "kept", "--keep-outliers")
     assert (kept["count"], kept["outliers_dropped"]) == (64, 0)
     assert "--keep-outliers" not in capsys.readouterr().out
 

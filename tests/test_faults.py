@@ -41,8 +41,8 @@ def no_room():
 @pytest.mark.parametrize(
     ("name", "write"),
     [
-        ("a.npz", lambda path: save_field(path, _field())),
-        ("a.npz", lambda path: cache.save(path, np.zeros(9999))),
+        ("a.safetensors", lambda path: save_field(path, _field())),
+        ("a.safetensors", lambda path: cache.save(path, np.zeros(9999))),
         ("a.ply", lambda path: save_ply(path, _field().gaussians)),
         ("a.png", lambda path: write_image(path, np.random.default_rng(0).integers(0, 255, (99, 99, 3), np.uint8))),
         ("a.txt", lambda path: write_text(path, "x" * 5000)),

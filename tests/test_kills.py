@@ -24,20 +24,19 @@ def test_two_runs_killed_and_one_on_a_full_disk_end_in_the_same_field(room, tmp_
     [
         ("import sys; print('x', file=sys.stderr)", "then said: x"),
         ("raise SystemExit(3)", "then exit code 3"),
-        ("open(out / 'field.npz', 'wb').write(b'other')", "ANOTHER FIELD"),
-        ("open(out / 'a.checkpoint.npz', 'wb')", "left ['a.checkpoint.npz']"),
+        ("open(out / 'field.safetensors', 'wb').write(b'other')", "ANOTHER FIELD"),
+        ("open(out / 'a.checkpoint.safetensors', 'wb')", "left ['a.checkpoint.safetensors']"),
         ("pass", ""),
     ],
 )
 def test_each_kind_of_ill_is_told(tmp_path, monkeypatch, ends, told):
     """Of what goes on in place of a run."""
-    program = (
-        f"import sys, pathlib; out = pathlib.Path(sys.argv[4]); open(out / 'field.npz', 'wb').write(b'same'); {ends}"
-    )
+    program = "import sys, pathlib; out = pathlib.Path(sys.argv[4]); "
+    program += f"open(out / 'field.safetensors', 'wb').write(b'same'); {ends}"
     monkeypatch.setattr(kills, "OFTEN", program)
     out = tmp_path / "out"
     out.mkdir()
-    (out / "field.npz").write_bytes(b"same")
+    (out / "field.safetensors").write_bytes(b"same")
     place = kills.Place(out, tmp_path, often=True)
     wrong, _ = kills._went_on(tmp_path, place, 1, kills._digest(out))
     assert wrong.startswith(told)

@@ -355,7 +355,7 @@ def test_colmap_is_given_a_png_for_a_heic(photos, tmp_path):
 
 
 def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):
-    record = Record(tmp_path / "poses-12.checkpoint.npz")
+    record = Record(tmp_path / "poses-12.checkpoint.safetensors")
     (record.folder / "half").mkdir(parents=True)
     assert record.folder == tmp_path / "poses-12.checkpoint"
     record.remove()

@@ -93,20 +93,20 @@ def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path)
 
 
 def test_a_field_file_with_hostile_frames_writes_nothing_elsewhere(field, word, tmp_path):
-    save_field(tmp_path / "field.npz", dataclasses.replace(field, names=HOSTILE[:4]))
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, names=HOSTILE[:4]))
     out = tmp_path / "a" / "b" / "out"
     cv2.imwrite(str(tmp_path / "mug.png"), np.full((40, 48), 255, np.uint8))
     (tmp_path / "other").mkdir()
     cv2.imwrite(str(tmp_path / "other" / "mug.png"), np.full((40, 48), 255, np.uint8))
     masks = [o for folder in (tmp_path, tmp_path / "other") for o in ("--mask", "#1", folder / "mug.png")]
     texts = word, f"{word}!", word.upper()
-    assert run("query", tmp_path / "field.npz", *texts, *masks, "--out", out, "--views", 4) == 0
+    assert run("query", tmp_path / "field.safetensors", *texts, *masks, "--out", out, "--views", 4) == 0
     answers = [json.loads(file.read_text()) for file in out.glob("*.json")]
     assert sorted(told["query"] for told in answers) == sorted((*texts, "mug", "mug"))
     for told in answers:
         assert load_ply(out / told["ply"]).count == told["count"] > 0
     outside = [file for file in tmp_path.rglob("*.*") if out not in file.parents]
-    assert sorted(file.name for file in outside) == ["field.npz", "mug.png", "mug.png"]
+    assert sorted(file.name for file in outside) == ["field.safetensors", "mug.png", "mug.png"]
 
 
 def test_names_lead_out_of_no_folder(tmp_path, room):
@@ -165,12 +165,12 @@ def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):
 
 
 def test_a_pixel_and_an_outline_are_refused_by_what_compares_texts(field, word, tmp_path, capsys):
-    save_field(tmp_path / "field.npz", field)
+    save_field(tmp_path / "field.safetensors", field)
     for by in ("one_step", "canonical"):
         with pytest.raises(InputError, match=f"by {by}"):
             ask_pixel(field, 1, 24, 20, by=by)
     for more in (("--at", "#1", 24, 20, "--by", "canonical"), ("--box", "#1", 0, 0, 40, 30, "--by", "code")):
-        assert run("query", tmp_path / "field.npz", *more, "--out", tmp_path / "out") == 2
+        assert run("query", tmp_path / "field.safetensors", *more, "--out", tmp_path / "out") == 2
         assert "by" in capsys.readouterr().err
         assert not list((tmp_path / "out").glob("*.json"))
 
@@ -197,11 +197,11 @@ def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
 def test_the_centroid_is_printed_with_the_digits_that_it_needs(field, word, tmp_path, capsys, scale, shift):
     moved = np.diag([scale, scale, scale, 1.0])
     moved[:3, 3] = shift
-    save_field(tmp_path / "field.npz", dataclasses.replace(field, to_source=moved))
-    assert run("query", tmp_path / "field.npz", word, "--out", tmp_path / "out", "--views", 0) == 0
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, to_source=moved))
+    assert run("query", tmp_path / "field.safetensors", word, "--out", tmp_path / "out", "--views", 0) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith(repr(word)))
     printed = np.array(line.rpartition("(")[2].rstrip(").").split(","), float)
     told = json.loads(next((tmp_path / "out").glob("*.json")).read_text())["place"]
     size = np.linalg.norm(np.subtract(told["bounding_box"]["max"], told["bounding_box"]["min"]))
     assert np.abs(printed - told["centroid"]).max() <= 0.01 * size
-    assert load_field(tmp_path / "field.npz").to_source[0, 3] == shift
+    assert load_field(tmp_path / "field.safetensors").to_source[0, 3] == shift

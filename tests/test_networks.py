@@ -60,7 +60,7 @@ def seen(room, splat, models, tmp_path_factory):
 def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     run, folder, listener = seen
     assert "proposals of level m by sam, asked at 10x10 points" in listener.planned["masklets"].why
-    field = load_field(folder / "field.npz")
+    field = load_field(folder / "field.safetensors")
     assert field.embedder.startswith("clip-")
     assert field.regions.embeddings.shape[1] == 3
     assert field.regions.count >= 4
@@ -129,7 +129,7 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
         called.clear()
         work, results = stages.Work(options, networks.networks_of(options, folder), folder), {}
         for stage in (load(work), gaussians(work), masklets(work)):
-            record = stages.Record(folder / f"{stage.name}.npz")
+            record = stages.Record(folder / f"{stage.name}.safetensors")
             results[stage.name] = stage.compute(results, lambda done, total: None, record).value
         return results["masklets"]
 
@@ -146,7 +146,7 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
 
 def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):
     _, folder, _ = seen
-    field = folder / "field.npz"
+    field = folder / "field.safetensors"
     assert (
         command_line.main(
             ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
@@ -179,7 +179,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
     work = stages.Work(options, networks.networks_of(options, tmp_path), tmp_path)
     assert work.networks.embedder.name == "given-3"
-    stage, none = regions(work), (lambda done, total: None, stages.Record(tmp_path / "none.npz"))
+    stage, none = regions(work), (lambda done, total: None, stages.Record(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how
     assert "embedder" in stage.left_out
     results = {"load": capture}
@@ -201,10 +201,10 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
 
 
 def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, capsys):
-    known = load_field(seen[1] / "field.npz")
+    known = load_field(seen[1] / "field.safetensors")
     given = dataclasses.replace(known, embedder="given-3", canonical=np.zeros((0, 3), np.float32), provenance="{}")
-    save_field(tmp_path / "field.npz", given)
-    ask = ["query", str(tmp_path / "field.npz"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
+    save_field(tmp_path / "field.safetensors", given)
+    ask = ["query", str(tmp_path / "field.safetensors"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
     assert command_line.main(ask) == 2
     assert "came from files, 3 numbers each" in capsys.readouterr().err
     with pytest.raises(InputError, match="--embedder DIR"):
@@ -241,7 +241,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     np.testing.assert_array_equal(failing(frame, 5), masks)
     with pytest.raises(TypeError):
         failing(255 - frame, 0)
-    path = next(tmp_path.glob("*.npz"))
+    path = next(tmp_path.glob("*.safetensors"))
     path.write_bytes(path.read_bytes()[:60])
     np.testing.assert_array_equal(stored(frame, 0), masks)
     finer = SamSegmenter(models[0], SamSettings(points_per_side=5, crop_layers=0))

@@ -24,7 +24,7 @@ def saved(scene, cameras, tmp_path_factory):
     """A small field whose texts are colours, and its file."""
     field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
     field = dataclasses.replace(field, embedder=ColourEmbedder().name)
-    file = tmp_path_factory.mktemp("field") / "field.npz"
+    file = tmp_path_factory.mktemp("field") / "field.safetensors"
     save_field(file, field)
     return field, file
 

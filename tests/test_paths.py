@@ -44,7 +44,7 @@ def ran(room, room_run, tmp_path_factory):
     save_ply(base / "Szene ö.ply", room_run[0].field.gaussians)
     given = "--gaussians", base / "Szene ö.ply", "--masks", capture / "masks", "--holdout", 4
     assert _run("run", capture, "--out", base / "Ausgabe ß 出力", *given) == 0
-    return base, base / "Ausgabe ß 出力" / "field.npz", sorted(names.values())
+    return base, base / "Ausgabe ß 出力" / "field.safetensors", sorted(names.values())
 
 
 def test_a_run_in_odd_folders_makes_the_field_of_plain_ones(ran, room_run):
@@ -55,7 +55,7 @@ def test_a_run_in_odd_folders_makes_the_field_of_plain_ones(ran, room_run):
     assert field.names == tuple(names)
     np.testing.assert_array_equal(field.votes.weights, plain.votes.weights)
     assert json.loads(field.provenance)["options"]["capture"] == str(base / "Aufnahme 撮影")
-    assert {"field.npz", "metrics.json", "report.html"} < {path.name for path in file.parent.iterdir()}
+    assert {"field.safetensors", "metrics.json", "report.html"} < {path.name for path in file.parent.iterdir()}
     assert "Bild ä" in (file.parent / "report.html").read_text(encoding="utf-8")
 
 

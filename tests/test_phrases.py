@@ -46,7 +46,7 @@ def test_query_selects_what_a_phrase_names_in_the_frames(room_run, painted, mode
     run, out = room_run
     capture, region = painted
     asked = "red mug", "green mug", "mug " * 40, "--phrases", model, "--images", capture, "--looks", 2, "--views", 1
-    assert _query(out / "field.npz", tmp_path, *asked) == 2  # one of them is too long
+    assert _query(out / "field.safetensors", tmp_path, *asked) == 2  # one of them is too long
     told = capsys.readouterr()
     assert "a phrase of 42 tokens" in told.err
     assert "'red mug': seen in 2 of 2 frames" in told.out
@@ -64,7 +64,7 @@ def test_query_selects_what_a_phrase_names_in_the_frames(room_run, painted, mode
 
 
 def test_a_frame_without_masks_has_its_say(room_run):
-    field = load_field(room_run[1] / "field.npz")
+    field = load_field(room_run[1] / "field.safetensors")
     height, width = field.cameras.height, field.cameras.width
     large = np.zeros((2, 2 * height, 2 * width), bool)
     large[0, 60:150, 80:200] = large[1, 90:200, 100:240] = True
@@ -78,7 +78,7 @@ def test_a_frame_without_masks_has_its_say(room_run):
 
 
 def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room, tmp_path):
-    field = load_field(room_run[1] / "field.npz")
+    field = load_field(room_run[1] / "field.safetensors")
     assert capture_of(field, room_run[1]) == Path(room)
     frames = frames_of(field, room, 3)
     assert list(frames) == [0, 4, 7]
@@ -112,5 +112,5 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
 )
 def test_phrases_that_cannot_be_asked(room_run, model, tmp_path, capsys, options, says):
     options = [model if option == "MODEL" else option for option in options]
-    assert _query(room_run[1] / "field.npz", tmp_path, *options) == 2
+    assert _query(room_run[1] / "field.safetensors", tmp_path, *options) == 2
     assert says in capsys.readouterr().err

@@ -62,7 +62,7 @@ def _again(run, out, **changes):
 
 def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
     run, out = room_run
-    field = load_field(out / "field.npz")
+    field = load_field(out / "field.safetensors")
     assert field.gaussians.count == run.field.gaussians.count > 100
     assert field.names == run.capture.names
     assert field.codes.shape == (field.gaussians.count, field.region_codes.shape[1])
@@ -76,11 +76,11 @@ def test_a_run_ends_in_a_field_that_can_be_read_and_asked(room_run):
 
 def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_path):
     run, out = room_run
-    before = (out / "field.npz").read_bytes()
+    before = (out / "field.safetensors").read_bytes()
     again, listener = _again(run, out)
     assert {name: fresh for name, fresh in listener.fresh.items() if name != "field"} == dict.fromkeys(STAGES, False)
     assert all(listener.planned[name].status == "cached" for name in STAGES)
-    assert (out / "field.npz").read_bytes() == before
+    assert (out / "field.safetensors").read_bytes() == before
     assert again.seconds["gaussians"] == run.seconds["gaussians"]
     assert again.left_out == run.left_out
 
@@ -105,12 +105,12 @@ def test_a_changed_option_reruns_only_what_depends_on_it(room_run, tmp_path, mon
 def test_a_damaged_stage_is_said_and_computed_again_to_the_same_field(room_run, tmp_path):
     run, out = room_run
     shutil.copytree(out, tmp_path / "out")
-    path = next((tmp_path / "out" / "cache").glob("votes-*.npz"))
+    path = next((tmp_path / "out" / "cache").glob("votes-*.safetensors"))
     path.write_bytes(path.read_bytes()[:1000])
     _, listener = _again(run, tmp_path / "out")
     assert {name for name, fresh in listener.fresh.items() if fresh} == {"votes", "field"}
     assert any("votes is computed again" in note for note in listener.notes)
-    assert (tmp_path / "out" / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
+    assert (tmp_path / "out" / "field.safetensors").read_bytes() == (out / "field.safetensors").read_bytes()
 
 
 def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_field(room_run, tmp_path, monkeypatch):
@@ -122,8 +122,8 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
     monkeypatch.setattr(cache, "MAPPED", 1000)  # what is kept of them is mapped, as were it larger
     _, listener = _again(run, tmp_path / "out", reduce="mean")  # so that codes are made of them too
     assert any("votes are cast in blocks: " in note for note in listener.notes)
-    assert sorted(path.suffix for path in (tmp_path / "out" / "cache").iterdir()) == [".TAG"] + 9 * [".npz"]
-    blocks, memory = (load_field(folder / "field.npz").votes for folder in (tmp_path / "out", out))
+    assert sorted(path.suffix for path in (tmp_path / "out" / "cache").iterdir()) == [".TAG"] + 9 * [".safetensors"]
+    blocks, memory = (load_field(folder / "field.safetensors").votes for folder in (tmp_path / "out", out))
     np.testing.assert_allclose(blocks.weights, memory.weights, rtol=1e-4, atol=0.02)
     for name in ("weights", "total", "shown", "overlap"):
         own, other = (np.asarray(getattr(votes, name), np.float64) for votes in (blocks, memory))
@@ -179,12 +179,12 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     np.testing.assert_allclose(there.psnr, given.psnr, atol=0.1)
     text = next(iter(json.loads((room / "scene.json").read_text())["objects"].values()))
     place = jsecon.locate(given.field, text)
-    assert command_line.main(["query", str(out / "field.npz"), text, "--out", str(out), "--views", "1"]) == 0
+    assert command_line.main(["query", str(out / "field.safetensors"), text, "--out", str(out), "--views", "1"]) == 0
     answer = json.loads(next(out.glob("*.json")).read_text())
     chosen = jsecon.load_gaussians(out / answer["ply"], similarity=np.linalg.inv(to_source))
     assert chosen.count == answer["count"] == len(place.points)
     np.testing.assert_allclose(chosen.means, place.points, atol=1e-4)
-    found = jsecon.locate(jsecon.load_field(out / "field.npz"), text)
+    found = jsecon.locate(jsecon.load_field(out / "field.safetensors"), text)
     np.testing.assert_allclose(found.centroid / scale - shift, place.centroid, atol=1e-3)
     box = answer["place"]["bounding_box"]
     np.testing.assert_allclose(np.array(box["min"]) / scale - shift, place.points.min(0), atol=1e-3)
@@ -216,7 +216,7 @@ def test_parts_of_the_scene_are_a_stage_of_their_own(room_run, tmp_path):
     shutil.copytree(out, tmp_path / "out")
     _, listener = _again(run, tmp_path / "out", parts=True)
     assert {name for name, fresh in listener.fresh.items() if fresh} == {"parts", "field"}
-    field = load_field(tmp_path / "out" / "field.npz")
+    field = load_field(tmp_path / "out" / "field.safetensors")
     part, units = np.asarray(field.parts.part), np.asarray(field.parts.embeddings)
     assert part.shape == (field.gaussians.count,)
     assert part.max() + 1 == len(units) > field.regions.count
@@ -315,27 +315,26 @@ class Killed(Exception):
 
 
 def writer_that_stops(stop, victim, nth=1):
-    """np.savez, but that of the nth file of a stage, or of its checkpoints, only a part reaches the disk before `stop`
+    """`write_arrays`, but of the nth file of a stage, or of its checkpoints, only a part reaches the disk before `stop`
     is called."""
-    savez, seen = np.savez, 0
+    seen = 0
 
-    def savez_or_stop(file, **arrays):
+    def write_or_stop(path, arrays, description):
         nonlocal seen
-        name = Path(file.name).name  # .<stage>-<key>[.checkpoint].<random>.partial.npz
+        name = Path(path).name  # .<stage>-<key>[.checkpoint].<random>.partial.safetensors
         if name.startswith("." + victim.split()[0]) and ("checkpoint" in victim) == (".checkpoint." in name):
             seen += 1
             if seen == nth:
-                savez(file, **dict(list(arrays.items())[:1]))
-                file.flush()
+                write_arrays(path, dict(list(arrays.items())[:1]), description)
                 stop()
-        savez(file, **arrays)
+        write_arrays(path, arrays, description)
 
-    return savez_or_stop
+    return write_or_stop
 
 
-def field_writer_that_stops(file, arrays):
+def field_writer_that_stops(path, arrays, description):
     """`write_arrays`, but only a part reaches the disk."""
-    write_arrays(file, dict(list(arrays.items())[:3]))
+    write_arrays(path, dict(list(arrays.items())[:3]), description)
     raise Killed
 
 
@@ -351,7 +350,7 @@ import test_pipeline as test
 compiling.install()
 room, out, victim, nth = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 test.stages.CHECKPOINT_SECONDS = 0.0
-test.np.savez = test.writer_that_stops(test.kill, victim, nth)
+test.cache.write_arrays = test.writer_that_stops(test.kill, victim, nth)
 test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, steps=150), out)
 """
 
@@ -369,7 +368,7 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
     def stop_by_error(victim):
         with monkeypatch.context() as patch:
             patch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
-            patch.setattr(np, "savez", writer_that_stops(raise_killed, victim))
+            patch.setattr(cache, "write_arrays", writer_that_stops(raise_killed, victim))
             patch.setattr(field_file, "write_arrays", field_writer_that_stops)
             with pytest.raises(Killed):
                 pipeline.run(run.options, out)
@@ -387,14 +386,14 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
             stop_by_signal(victim, 1)
         else:
             stop_by_error(victim)
-        for path in (out / "cache").glob("[!.]*.npz"):  # whatever has its final name is whole
+        for path in (out / "cache").glob("[!.]*.safetensors"):  # whatever has its final name is whole
             cache.load(path)
-        assert not (out / "field.npz").exists()
+        assert not (out / "field.safetensors").exists()
     listener = Recorder()
     pipeline.run(run.options, out, listener=listener)
     assert {name for name, fresh in listener.fresh.items() if fresh} == {"field"}
-    assert (out / "field.npz").read_bytes() == (straight / "field.npz").read_bytes()
-    assert not list(out.rglob("*.checkpoint.npz"))
+    assert (out / "field.safetensors").read_bytes() == (straight / "field.safetensors").read_bytes()
+    assert not list(out.rglob("*.checkpoint.safetensors"))
 
 
 @pytest.fixture(scope="module")
@@ -492,7 +491,7 @@ threading.settrace(listen)  # it returns no function for the lines within
 sys.settrace(listen)
 pipeline.run(Options(Path(sys.argv[1]), holdout=4, steps=20), Path(sys.argv[2]) / "out")
 on_the_way += ran_since() + [file for told in ran.values() for file in told["ran"]]
-field = load_field(Path(sys.argv[2]) / "out/field.npz")
+field = load_field(Path(sys.argv[2]) / "out/field.safetensors")
 answer = question.ask_text(field, ColourEmbedder(), "red")
 assert answer.mask.any()
 answers.write_answer(field, answer, Path(sys.argv[2]), answers.masks_of(field, answer, 1))

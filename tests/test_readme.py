@@ -24,7 +24,7 @@ def _blocks(language, text=README):
 def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, monkeypatch):
     _, out = room_run
     (tmp_path / "jsecon-demo").mkdir()
-    shutil.copy(out / "field.npz", tmp_path / "jsecon-demo")
+    shutil.copy(out / "field.safetensors", tmp_path / "jsecon-demo")
     (tmp_path / "jsecon-demo" / "capture").symlink_to(room)
     monkeypatch.chdir(tmp_path)
     blocks, names, told = _blocks("python"), {}, io.StringIO()

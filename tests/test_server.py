@@ -243,22 +243,22 @@ def test_a_token_is_asked_for_where_one_is_set(scenes, tmp_path):
     assert guarded.get("/healthz", headers={"Authorization": "Bearer wrong"}).status_code == 401
     assert guarded.get("/healthz", headers={"Authorization": "Bearer secret"}).status_code == 200
     with pytest.raises(InputError, match="a token that clients must have"):
-        ready([tmp_path / "none.npz"], host="0.0.0.0", port=0, token="", embedder=None)
+        ready([tmp_path / "none.safetensors"], host="0.0.0.0", port=0, token="", embedder=None)
 
 
 def test_its_address_is_told_and_a_port_in_use_is_refused(scenes, tmp_path):
     field = dataclasses.replace(scenes["desk"].field, embedder=ColourEmbedder().name)
-    save_field(tmp_path / "field.npz", field)
+    save_field(tmp_path / "field.safetensors", field)
     given = {"host": "127.0.0.1", "token": "", "embedder": None}
-    told, _ = ready([tmp_path / "field.npz"], port=0, **given)
+    told, _ = ready([tmp_path / "field.safetensors"], port=0, **given)
     port = int(told["address"].removeprefix("http://127.0.0.1:"))
     assert port > 0
     assert [scene["name"] for scene in told["fields"]] == [tmp_path.name]
     if has_ipv6():
-        six, _run = ready([tmp_path / "field.npz"], port=0, **given | {"host": "::1"})
+        six, _run = ready([tmp_path / "field.safetensors"], port=0, **given | {"host": "::1"})
         assert six["address"].startswith("http://[::1]:")
     with pytest.raises(InputError, match="in use"):
-        ready([tmp_path / "field.npz"], port=port, **given)
+        ready([tmp_path / "field.safetensors"], port=port, **given)
 
 
 def has_ipv6() -> bool:
@@ -338,7 +338,7 @@ def test_fields_are_opened_by_their_folders_names(scene, cameras, tmp_path):
     from dataclasses import replace
 
     field = replace(field, embedder=ColourEmbedder().name)
-    files = [tmp_path / name / "field.npz" for name in ("a", "b")]
+    files = [tmp_path / name / "field.safetensors" for name in ("a", "b")]
     for file in files:
         file.parent.mkdir()
         save_field(file, field)

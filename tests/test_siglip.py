@@ -287,12 +287,12 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     silent = ask_text(field, Told(texts, None), "mug")
     assert silent.there is None
 
-    save_field(tmp_path / "field.npz", dataclasses.replace(field, embedder="told"))
+    save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))
     told = {}
     for name, known in (("with", embedder), ("without", Told(texts, None))):
         monkeypatch.setattr(networks, "embedder_of_field", lambda *a, known=known, **k: known)
         out = tmp_path / name
-        assert command_line.main(["query", str(tmp_path / "field.npz"), "mug", "ghost", "--out", str(out)]) == 0
+        assert command_line.main(["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--out", str(out)]) == 0
         told[name] = [json.loads((out / f"{text}.json").read_text()) for text in ("mug", "ghost")]
     assert set(told["with"][0]["probability"]) == {"there", "mean", "tenth"}
     assert list(told["with"][1]["probability"]) == ["there"]

@@ -34,8 +34,8 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
     hints = folders_told(Options(tmp_path / "capture", embedder=model), out)
     assert hints == {"capture": "../../capture", "embedder": "../../models/clip"}
     own = told(field, folders=hints, embedder=CLIP)
-    save_field(out / "field.npz", own)
-    for found in (sources_of(load_field(out / "field.npz")), sources_of(own, out)):
+    save_field(out / "field.safetensors", own)
+    for found in (sources_of(load_field(out / "field.safetensors")), sources_of(own, out)):
         assert found == (CLIP, model, tmp_path / "capture")
     assert sources_of(own) == (CLIP, None, None)  # of a field that no file was read of
 
@@ -52,9 +52,9 @@ def test_a_model_of_another_name_is_not_opened(field, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "visual.onnx").write_bytes(b"no graph")
     own = dataclasses.replace(told(field, folders={"embedder": "model"}, embedder=CLIP), embedder=CLIP)
-    save_field(tmp_path / "field.npz", own)
+    save_field(tmp_path / "field.safetensors", own)
     with pytest.raises(InputError, match="--embedder DIR"):
-        embedder_of_field(load_field(tmp_path / "field.npz"))
+        embedder_of_field(load_field(tmp_path / "field.safetensors"))
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_a_malformed_provenance_is_refused_in_words(field, tmp_path, provenance,
     with pytest.raises(InputError, match="provenance is not what jsecon run writes"):
         embedder_of_field(own)
     if provenance.startswith('{"'):  # others load_field refuses
-        save_field(tmp_path / "field.npz", own)
-        assert main(["query", str(tmp_path / "field.npz"), "red", "--out", str(tmp_path / "a")]) == 2
+        save_field(tmp_path / "field.safetensors", own)
+        assert main(["query", str(tmp_path / "field.safetensors"), "red", "--out", str(tmp_path / "a")]) == 2
         assert "provenance" in capsys.readouterr().err
         assert not np.any([file.name.startswith("red") for file in (tmp_path / "a").iterdir()])

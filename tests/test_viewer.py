@@ -176,7 +176,7 @@ QUIET = ".mantine-Notifications-root { display: none }"
 
 
 def test_the_command_says_where_it_listens(viewer, tmp_path):
-    file, port = tmp_path / "run" / "field.npz", free_port()
+    file, port = tmp_path / "run" / "field.safetensors", free_port()
     file.parent.mkdir()
     save_field(file, viewer.field)
     command = [sys.executable, "-m", "jsecon", "view", str(file), "red", "--port", str(port)]
@@ -191,8 +191,8 @@ def test_the_command_says_where_it_listens(viewer, tmp_path):
 
 
 def test_bad_arguments_end_in_one_message(viewer, tmp_path, capsys):
-    save_field(tmp_path / "field.npz", viewer.field)
-    asked = ["view", str(tmp_path / "field.npz"), "--port", str(viewer.server.get_port())]
+    save_field(tmp_path / "field.safetensors", viewer.field)
+    asked = ["view", str(tmp_path / "field.safetensors"), "--port", str(viewer.server.get_port())]
     for more, wanted in ((["--link", "what"], "link: 'what'"), ([], "--port: ")):
         assert main([*asked, *more]) == 2
         assert wanted in capsys.readouterr().err

@@ -102,9 +102,9 @@ class Sight:
 
 def demo_scene(folder: Path, seed: int) -> Scene:
     """The demo room of `seed`, as `demo` with PLAIN leaves it in FOLDER; made where it is missing."""
-    if not (folder / "field.npz").exists():
+    if not (folder / "field.safetensors").exists():
         demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
-    field = load_field(folder / "field.npz")
+    field = load_field(folder / "field.safetensors")
     told = json.loads((folder / "capture" / "scene.json").read_text())
     voting = np.array([name not in told["held_out"] for name in field.names])
 

@@ -16,7 +16,7 @@ from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import member
 
-_RUN_FILES = ("field.npz", "report.html", "metrics.json")
+_RUN_FILES = ("field.safetensors", "report.html", "metrics.json")
 
 
 def _demo(verb: Demo, console: Console) -> VerbResult:
@@ -65,7 +65,7 @@ def _fit(verb: Fit, console: Console) -> VerbResult:
 
 def _query(verb: Query, console: Console) -> VerbResult:
     if not (verb.texts or verb.at or verb.mask or verb.box):
-        remedy = 'For example: jsecon query field.npz "red mug" --out answers'
+        remedy = 'For example: jsecon query field.safetensors "red mug" --out answers'
         raise InputError("query", "nothing to find", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
     pixels = [(frame, *_whole("--at", x, y)) for frame, x, y in verb.at]
     boxes = [(frame, *_whole("--box", *ends)) for frame, *ends in verb.box]
@@ -113,7 +113,7 @@ def _check_phrases(verb: Query) -> None:
                 raise InputError(name, problem, remedy="Give --phrases DIR, a SAM 3 model folder.")
         return
     if not verb.texts:
-        remedy = 'For example: jsecon query field.npz "red mug" --phrases sam3 --out answers'
+        remedy = 'For example: jsecon query field.safetensors "red mug" --phrases sam3 --out answers'
         raise InputError("--phrases", "no text is given, which is the phrase", remedy=remedy)
     unused = {"by": verb.by != "votes", "all": verb.all, "even": verb.even}
     unused |= {"template": bool(verb.template), "embedder": verb.embedder is not None}

@@ -28,16 +28,17 @@ ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, o
 
 examples
   jsecon demo                                           a made-up room, from frames to answers and a report
-  jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.npz
+  jsecon run my_capture --out my_field                  COLMAP or nerfstudio folder -> my_field/field.safetensors
   jsecon run my_photos --out my_field                   photographs or a video: finds their poses first (extra sfm)
   jsecon run my_capture --out my_field --gaussians point_cloud.ply
                                                         the same on a scene that is already splatted
   jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
-  jsecon query my_field/field.npz "red mug" "dark green bottle" --out answers
-  jsecon query my_field/field.npz --at frame_00012 310 145 --out answers
-  jsecon export my_field/field.npz --out scene.glb      the whole scene for other programs, codes included
-  jsecon view my_field/field.npz "red mug"              in a browser; --export page.html writes a page
-  jsecon eval my_field/field.npz --labels my_capture/label --out evaluation
+  jsecon query my_field/field.safetensors "red mug" "dark green bottle" --out answers
+  jsecon query my_field/field.safetensors --at frame_00012 310 145 --out answers
+  jsecon export my_field/field.safetensors --out scene.glb
+                                                        the whole scene for other programs, codes included
+  jsecon view my_field/field.safetensors "red mug"      in a browser; --export page.html writes a page
+  jsecon eval my_field/field.safetensors --labels my_capture/label --out evaluation
   jsecon run my_capture --out my_field --segmenter sam --embedder clip
                                                         with SAM and CLIP from model folders
   jsecon models check clip                              what a model folder holds and lacks

@@ -128,7 +128,7 @@ def open_scenes(files: list[Path], embedder: Path | None) -> dict[str, Scene]:
     """Loads fields, and asks each once so that its programs are compiled.
 
     Args:
-      files: Paths of field.npz files. A field is named like its folder.
+      files: Paths of field.safetensors files. A field is named like its folder.
       embedder: Folder of the CLIP model of the fields; None where the runs had it.
 
     Returns:

@@ -34,7 +34,7 @@ def ready(
     """Loads fields and listens.
 
     Args:
-      files: Paths of field.npz files.
+      files: Paths of field.safetensors files.
       host: Address to listen on.
       port: Port to listen on; 0 takes a free one.
       token: Token that clients must send; "" is that of the environment, if any.

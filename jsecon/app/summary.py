@@ -51,8 +51,9 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
         f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
     )
+    file = out / "field.safetensors"
     listener.say(
-        f"field   {out / 'field.npz'}\nreport  {out / 'report.html'}\nask it  jsecon query {out / 'field.npz'} "
+        f"field   {file}\nreport  {out / 'report.html'}\nask it  jsecon query {file} "
         f'"dark green bottle" --out {out / "answers"}'
     )
     return metrics

@@ -53,8 +53,8 @@ class Demo(Verb):
 
     The room is procedural, with named, coloured objects. It is written to disk as an ordinary COLMAP capture, and
     `jsecon run`, `query` and `eval` then use nothing of the ground truth but frames, poses and sparse points. The demo
-    writes report.html, metrics.json, field.npz, a short film and a .ply for each query, in one to two minutes on two
-    cores. On a capture of your own, use `jsecon run` and `jsecon query`.
+    writes report.html, metrics.json, field.safetensors, a short film and a .ply for each query, in one to two minutes
+    on two cores. On a capture of your own, use `jsecon run` and `jsecon query`.
 
     Attributes:
       seed: Seed of the room.
@@ -72,7 +72,7 @@ class Run(Verb, InputOptions):
     """Builds the language field of a capture.
 
     Its stages find poses if the capture has none, fit Gaussians or read them, find masklets or read masks, embed each
-    region, and distil codes into the Gaussians. It lists the stages first, and writes field.npz, report.html,
+    region, and distil codes into the Gaussians. It lists the stages first, and writes field.safetensors, report.html,
     metrics.json and cache to the output folder.
 
     Attributes:
@@ -134,7 +134,7 @@ class FieldVerb(Verb):
     """Options of the verbs that read a field and understand texts.
 
     Attributes:
-      field: Path of field.npz, written by jsecon run.
+      field: Path of field.safetensors, written by jsecon run.
       embedder: Folder of the CLIP model that the field was made with. By default it is where the run had it.
       template: Phrase for the texts, such as "a photo of a {}.", with CLIP. Several phrases are averaged. By default
         the bare text is used.
@@ -210,7 +210,7 @@ class Export(Verb):
     Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
 
     Attributes:
-      field: Path of field.npz, written by jsecon run.
+      field: Path of field.safetensors, written by jsecon run.
       out: The .ply (INRIA's layout), .spz or .glb to write.
     """
 
@@ -271,7 +271,7 @@ class Serve(Verb):
     (extra serve).
 
     Attributes:
-      fields: Paths of field.npz files. Each field is known by the name of its folder.
+      fields: Paths of field.safetensors files. Each field is known by the name of its folder.
       host: Address to listen on. Beyond loopback a token is required.
       port: Port to listen on.
       token: Token that clients must send as "Authorization: Bearer TOKEN". By default it is JSECON_TOKEN of the

@@ -34,8 +34,8 @@ PLAIN: dict[str, int] = {"crowded": False}
 def demo(
     out: Path, *, seed: int = 0, steps: int, listener: Listener, room: dict[str, int] | None = None
 ) -> dict[str, Any]:
-    """Writes OUT/{capture, field.npz, true_masks/field.npz, queries, metrics.json, report.html, demo.jpg, demo.webp};
-    returns the metrics.
+    """Writes OUT/{capture, field.safetensors, true_masks/field.safetensors, queries, metrics.json, report.html,
+    demo.jpg, demo.webp}; returns the metrics.
 
     `room` holds options of `write_room` (views, width, height, crowded, ...), for other rooms than the default.
     """
@@ -75,9 +75,10 @@ def demo(
 
 def say_files(out: Path, text: str, listener: Listener) -> None:
     """Where it all is, and how to look at it."""
-    listener.say(f"field   {out / 'field.npz'}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
+    field = out / "field.safetensors"
+    listener.say(f"field   {field}\nanswers {out / 'queries'}\nreport  {out / 'report.html'}")
     asked = f' "{text}"' if text else ""
-    listener.say(f"view it jsecon view {out / 'field.npz'}{asked}  (extra viewer; or --export {out / 'view.html'})")
+    listener.say(f"view it jsecon view {field}{asked}  (extra viewer; or --export {out / 'view.html'})")
 
 
 def _capture(folder: Path, seed: int, room: dict[str, int], listener: Listener) -> Path:

@@ -1,14 +1,13 @@
-"""The language field as one file: a zip of .npy arrays with a JSON header that says what they are. No pickle.
+"""The language field as one safetensors file. No pickle.
 
-The header, member `header.npy` (UTF-8 bytes), holds {"format", "version", "field"}; "field" is the field's tree as
-`jsecon.files.packed` describes it, records by their bare names, each array with its type and shape. Still a zip: it
-knows each column's place and CRC-32, and stored without compression a column can be mapped where it lies. Fields of a
-record that this version does not know are passed over; what would change the meaning of the others raises `version`.
+Its arrays are named by their place, such as "gaussians.means". The description that `jsecon.files.write_arrays` keeps
+beside them is {"format", "version", "field"}; "field" is the tree as `jsecon.files.packed` describes it, records by
+their class names, each array with its type and shape. A reader ignores fields of a record that it does not know. A
+change of the meaning of known ones needs another `version`.
 """
 
 import dataclasses
 import functools
-import json
 import os
 import sys
 import zipfile
@@ -21,7 +20,16 @@ from jaxtyping import Int
 
 from jsecon.data.images import MOST_PIXELS
 from jsecon.errors import InputError, require, why
-from jsecon.files import UNREADABLE, packed, parsed_json, read_arrays, unpacked, write_arrays, written_whole
+from jsecon.files import (
+    UNREADABLE,
+    ForeignFileError,
+    packed,
+    parsed_json,
+    read_arrays,
+    unpacked,
+    write_arrays,
+    written_whole,
+)
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
 from jsecon.language.shares import votes_of_rows
@@ -29,7 +37,9 @@ from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import BANDS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
-FORMAT, VERSION = "jsecon-field", 1
+FORMAT = "jsecon-field"
+VERSION = 2
+"""1 was a zip archive"""
 _RECORDS = {
     cls.__name__: cls
     for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
@@ -81,10 +91,8 @@ def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     problem, arrays = _disagreement(field) or _oddity(field), {}
     require(problem is None, "save_field", problem, "what load_field reads", "Build the field from one run.")
     tree = packed(field, "", arrays, lambda kind: kind.__name__ if kind in _RECORDS.values() else None)
-    header = {"format": FORMAT, "version": VERSION, "field": tree}
-    text = np.frombuffer(json.dumps(header).encode(), np.uint8)
     with written_whole(path) as temporary:
-        write_arrays(temporary, {"header": text} | arrays)
+        write_arrays(temporary, arrays, {"format": FORMAT, "version": VERSION, "field": tree})
 
 
 def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageField:
@@ -122,16 +130,13 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     if not path.is_file():
         raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
-    if not zipfile.is_zipfile(path):
-        found = f"{path.stat().st_size} bytes that are no complete zip archive"
-        raise InputError(path, found, "a field file", changed)
+    if zipfile.is_zipfile(path):
+        found = "it is a field of an earlier version of jsecon"
+        raise InputError(path, found, remedy="Run `jsecon run` again, which writes field.safetensors.")
     try:
-        members = read_arrays(path, mapped=mapped, checked=checked)
-        if "header" not in members:
-            raise InputError(path, "a zip archive without a jsecon header", "a field file", _REMEDY)
-        header = parsed_json(members["header"].tobytes())
+        header, members = read_arrays(path, mapped=mapped, checked=checked)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise InputError(path, "another program's header", f"format {FORMAT!r}", _REMEDY)
+            raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
         if (version := header.get("version")) != VERSION:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
             raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
@@ -141,6 +146,8 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         field = jax.tree.map(_on_device, field)
     except InputError:
         raise
+    except ForeignFileError as error:
+        raise InputError(path, str(error), "a field file", _REMEDY) from error
     except UNREADABLE as error:
         found = f"the field file is damaged ({why(error)})"
         raise InputError(path, found, "a whole one", changed) from error

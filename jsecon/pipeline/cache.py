@@ -1,6 +1,6 @@
 """The cache of a run: one file per stage, named by a digest of all that its content depends on.
 
-    OUT/cache/<stage>-<key>.npz
+    OUT/cache/<stage>-<key>.safetensors
 
 The key covers the stage's options, its input files, the installed source that computes it, and the keys of the stages
 that it reads. So a stopped run resumes, a changed option reruns only what depends on it, and a stale result is never
@@ -28,9 +28,9 @@ from jsecon.files import (
     UNREADABLE,
     files_beneath,
     packed,
-    parsed_json,
     read_arrays,
     unpacked,
+    write_arrays,
     write_text,
     written_whole,
 )
@@ -38,7 +38,6 @@ from jsecon.files import (
 PACKAGE = Path(jsecon.__file__).parent
 ROOMS = ("splat", "vision", "data", "fit", "networks", "language", "association")
 """subpackages that stages compute with, in import order: each imports only those before it"""
-_TREE = "__tree__"
 MAPPED = 1 << 30
 """bytes; larger arrays are memory-mapped"""
 STALE_SECONDS = 600.0
@@ -133,12 +132,12 @@ def source_digest(room: str) -> str:
 
 def path_of(folder: Path, stage: str, key: str) -> Path:
     """Returns the file of a stage's result."""
-    return folder / f"{stage}-{key}.npz"
+    return folder / f"{stage}-{key}.safetensors"
 
 
 def record_path_of(path: Path) -> Path:
     """Returns the file of the checkpoint that a stage writes while it computes the result at `path`."""
-    return path.with_suffix(".checkpoint.npz")
+    return path.with_suffix(".checkpoint.safetensors")
 
 
 def prepare(folder: Path) -> None:
@@ -146,7 +145,7 @@ def prepare(folder: Path) -> None:
     tag = folder / "CACHEDIR.TAG"
     if not tag.exists():
         write_text(tag, "Signature: 8a477f597d28d172789f06886806bc55\n# Made by jsecon; see bford.info/cachedir\n")
-    for partial in folder.glob(".*.partial.npz"):
+    for partial in folder.glob(".*.partial.safetensors"):
         age = time.time() - partial.stat().st_mtime
         if abs(age) > STALE_SECONDS:  # of the time to come where the clock was set back
             partial.unlink(missing_ok=True)
@@ -211,17 +210,15 @@ def load(path: Path) -> Any:
 
 
 def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float) -> None:
-    description = np.frombuffer(json.dumps({"tree": tree, "seconds": seconds}).encode(), np.uint8)
-    with written_whole(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, allow_pickle=False, **{_TREE: description}, **arrays)
-        file.flush()
-        os.fsync(file.fileno())  # a rename may reach the disk before the content does
+    with written_whole(path) as temporary:
+        write_arrays(temporary, arrays, {"tree": tree, "seconds": seconds})
+        with open(temporary, "r+b") as file:
+            os.fsync(file.fileno())  # a rename may reach the disk before the content does
 
 
 def _read(path: Path) -> tuple[Any, float]:
     try:
-        arrays = read_arrays(path, mapped=MAPPED)
-        description = parsed_json(arrays.pop(_TREE).tobytes())
+        description, arrays = read_arrays(path, mapped=MAPPED)
         return unpack(description["tree"], arrays), float(description["seconds"])
     except UNREADABLE as error:
         raise CorruptCacheError(why(error)) from error

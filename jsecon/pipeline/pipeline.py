@@ -49,7 +49,7 @@ from jsecon.process import programs_built
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
 
-FIELD_FILE = "field.npz"
+FIELD_FILE = "field.safetensors"
 SMALLER = "Take smaller frames (--long-side), fewer (--frames), or fewer Gaussians (--gaussians-at-most)."
 """what helps where memory ends"""
 
@@ -189,7 +189,7 @@ def run(
     cache_folder: Path | None = None,
     first: First | None = None,
 ) -> Run:
-    """Builds the field of a capture, keeps each stage under `cache_folder` (default OUT/cache), writes OUT/field.npz.
+    """Builds the field of a capture, keeps each stage under `cache_folder` (default OUT/cache), writes FIELD_FILE.
     `first` calls the other processes of the run (`assist`), where there are any.
 
     A run that was stopped goes on where it stopped, to the same result. `load` takes the loader's place for data whose

@@ -1,12 +1,12 @@
 """Embeddings kept on disk by content: the same mask of the same frame is embedded once by the same model.
 
-    FOLDER/<digest of model and frame>.npz      keys (M, 16) uint8 of its masks, vectors (M, E) float32
+    FOLDER/<digest of model and frame>.safetensors      keys (M, 16) uint8 of its masks, vectors (M, E) float32
 
 So a run that was stopped embeds only what is missing, and so does one whose masks have changed in part.
 
 A segmenter whose masks are kept on disk by content: a frame is cut once by the same model with the same settings.
 
-    FOLDER/<digest of model, settings and frame>.npz      bits (M, ceil(H W / 8)) uint8, shape (3,)
+    FOLDER/<digest of model, settings and frame>.safetensors      bits (M, ceil(H W / 8)) uint8, shape (3,)
 
 SAM takes minutes per frame on a CPU; a run that is stopped in the middle of its frames goes on where it stopped.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.files import UNREADABLE, read_arrays, written_whole
+from jsecon.files import UNREADABLE, read_arrays, write_arrays, written_whole
 from jsecon.vision.protocols import NamedSegmenter
 
 
@@ -33,7 +33,7 @@ class EmbeddingStore:
     def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
         """Mask key -> vector (E,) float32 of a frame. A file that cannot be read holds nothing: it only saves time."""
         try:
-            stored = read_arrays(self._path(frame))
+            _, stored = read_arrays(self._path(frame))
             pairs = zip(stored["keys"], stored["vectors"], strict=True)
             return {key.tobytes(): vector for key, vector in pairs if np.isfinite(vector).all()}
         except UNREADABLE:
@@ -47,12 +47,12 @@ class EmbeddingStore:
         _write(self._path(frame), keys=keys, vectors=np.stack(list(vectors.values())))
 
     def _path(self, frame: np.ndarray) -> Path:
-        return self.folder / f"{frame_digest(self.model, frame)}.npz"
+        return self.folder / f"{frame_digest(self.model, frame)}.safetensors"
 
 
 def _write(path: Path, **arrays: np.ndarray) -> None:
-    with written_whole(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    with written_whole(path) as temporary:
+        write_arrays(temporary, arrays)
 
 
 def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
@@ -94,9 +94,9 @@ class StoredSegmenter:
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
         """frame (H, W, 3) uint8 -> masks (M, H, W) bool, as the segmenter gave them."""
-        path = self._folder / f"{frame_digest(self.name, frame)}.npz"
+        path = self._folder / f"{frame_digest(self.name, frame)}.safetensors"
         try:
-            bits, pixels = read_arrays(path)["bits"], frame.shape[0] * frame.shape[1]
+            bits, pixels = read_arrays(path)[1]["bits"], frame.shape[0] * frame.shape[1]
             if bits.shape[1] != -(-pixels // 8):
                 raise ValueError(f"{bits.shape[1]} bytes a mask")
             return np.unpackbits(bits, axis=1, count=pixels).reshape(-1, *frame.shape[:2]).astype(bool)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.files import UNREADABLE, read_arrays
+from jsecon.files import UNREADABLE
 from jsecon.networks.onnx_graph import Graph, Tensor, content_digest, graph_files
 
 STRIDE = 16
@@ -153,11 +153,11 @@ def sam2_digest(folder: Path, *, extra: str = "") -> str:
 
 def _read_constants(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            constants = {name: array.astype(np.float32) for name, array in read_arrays(path).items()}
+        with np.errstate(over="ignore", invalid="ignore"), np.load(path, allow_pickle=False) as file:
+            constants = {name: file[name].astype(np.float32) for name in file.files}
         if not all(np.isfinite(array).all() and array.size for array in constants.values()):
             raise ValueError("arrays without numbers, or numbers that are not finite")
-    except UNREADABLE as error:
+    except (*UNREADABLE, MemoryError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else f"it cannot be read ({error})"
         raise _bad(path, found, f"the arrays {', '.join(CONSTANTS)}") from error
     return constants
