@@ -35,8 +35,6 @@ LONGEST_NAME = 80
 """characters of a name that a message quotes"""
 _WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 """what the system says of a file system that has no locks"""
-MOST_DEFLATED = 1032
-"""bytes that one byte of a deflated stream can stand for"""
 _HEADER = (
     rb"['\"]descr['\"] *: *['\"]([<>|=]?[biuf]\d+)['\"]",
     rb"['\"]fortran_order['\"] *: *(True|False)",

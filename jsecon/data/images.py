@@ -1,7 +1,10 @@
-"""Image files, read whole or not at all: RGB frames, integer label images, depth maps.
+"""Image files: RGB frames, integer label images, depth maps.
+
+Pillow reads them, and refuses files that are cut short. OpenCV reads TIFF, of which Pillow warns and libtiff writes to
+the standard error; and writes all: after `import pycolmap`, Pillow ends the process where it saves a PNG.
 
 Images come upright, as their EXIF orientation asks. Poses may belong to the stored pixels instead: the readers of
-captures decide that (jsecon.data.frames), and ask for those with `upright=False`.
+captures decide that (jsecon.data.frames), and read those with `upright=False`.
 """
 
 import io
@@ -10,37 +13,40 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from PIL import Image
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
+from PIL.WebPImagePlugin import WebPImageFile
 
 from jsecon.errors import InputError, why
-from jsecon.files import MOST_DEFLATED, UNREADABLE, map_array, written_whole
+from jsecon.files import UNREADABLE, map_array, written_whole
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
 IMAGE_ENDINGS = (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))
 """endings tried, in this order, where a capture names an image without one"""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_START_OF_SCAN = 0xDA
-_APP1 = 0xE1
 _TIFF = (b"II*\0", b"MM\0*")
 _HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
-_READ_AGAIN = "Copy or export the file again."
+_EXIF = b"Exif\0\0"
+_HIDDEN = b"unread"
+"""in place of _EXIF: Pillow warns of damaged EXIF when it opens a JPEG"""
 ID_REMEDY = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
 _PIXELS = (b"IDAT", b"IHDR", b"PLTE", b"tRNS")
-"""the chunks of a PNG that make its pixels"""
-_MODES = {"1": "L", "L": "L", "I;16": "I;16", "RGB": "RGB", "RGBA": "RGBA", "P": "RGB", "PA": "RGBA", "LA": "RGBA"}
-"""Pillow's mode of a file -> that of its pixels here"""
+"""the chunks of a PNG that make its pixels; Pillow refuses a file for a long text or a damaged colour profile"""
+_MODES = {"1": "L", "L": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
+"""Pillow's mode of a file -> that of its pixels here; others become RGB"""
+_NUMBERS = ("I;16", "I;16B", "I", "F")
+"""modes of more than 8 bits, which are kept"""
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """of a PNG, by its colour type"""
-_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-"""first column, first row and steps of each pass of an interlaced PNG"""
 MOST_PIXELS = 1 << 27
 """of an image: 134 million"""
 _SHRINKS = (1, 2, 4, 8)
@@ -52,7 +58,7 @@ TRANSPOSED = (5, 6, 7, 8)
 
 
 def _unreadable(path: Path, problem: str) -> InputError:
-    return InputError(path, problem, "a whole image", _READ_AGAIN)
+    return InputError(path, problem, "a whole image", "Copy or export the file again.")
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -72,7 +78,7 @@ def _png(chunks: Iterable[tuple[bytes, bytes]]) -> bytes:
 
 
 def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """(type, body) of each chunk, checked: OpenCV shows a PNG that was cut short as if its rest were black."""
+    """(type, body) of each chunk, checked: Pillow does not compare the checksums of pixels."""
     offset = len(_PNG)
     while True:
         kind = data[offset + 4 : offset + 8]
@@ -89,59 +95,63 @@ def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
         offset = end + 4
 
 
-def _png_header(path: Path, data: bytes) -> tuple[int, int, int, int]:
-    """Width, height, bits and colour type; raises where no PNG of so many bytes can have as many pixels."""
-    header = next(_png_chunks(path, data))[1]
-    if len(header) != 13 or header[9] not in _CHANNELS or header[10:12] != b"\0\0":
-        raise _unreadable(path, "the PNG has no header")
-    width, height, bits, colour_type = struct.unpack_from(">IIBB", header)
-    _check_pixels(path, data, width, height, bits * _CHANNELS[colour_type])
-    return width, height, bits, colour_type
+def _opened(path: Path, data: bytes) -> tuple[Image.Image, int]:
+    """The image of a file's bytes, of which only the header is read (but of a TIFF), and its EXIF orientation, 1 to 8.
 
-
-def _check_pixels(path: Path, data: bytes, width: int, height: int, bits: int = 8) -> None:
-    """Raises InputError where an image is too large to be read, or its bytes are too few for its pixels."""
+    A HEIC has 1: its decoder applies the file's own rotation, and EXIF's does not count there.
+    """
+    block = b""
+    try:
+        if data.startswith(_PNG):
+            chunks = list(_png_chunks(path, data))
+            image = PngImageFile(io.BytesIO(_png(chunk for chunk in chunks if chunk[0] in _PIXELS)))
+            block = next((body for kind, body in chunks if kind == b"eXIf"), b"")
+        elif data.startswith(_JPEG):
+            image = JpegImageFile(io.BytesIO(data.replace(_EXIF, _HIDDEN)))
+            block = next((body for _, body in image.applist if body.startswith(_HIDDEN)), b"").removeprefix(_HIDDEN)
+        elif data[4:12] in _HEIC:
+            image = _heic_class(path)(io.BytesIO(data))
+        elif data.startswith(b"RIFF"):
+            image = WebPImageFile(io.BytesIO(data))
+            block = image.info.get("exif", b"").removeprefix(_EXIF)
+        elif data.startswith(b"BM"):
+            image = BmpImageFile(io.BytesIO(data))
+        else:
+            image = _tiff(data)
+            block = data[: 1 << 16]
+    except InputError:
+        raise
+    except Exception as error:  # Pillow's own kinds have no common base but this
+        raise _unreadable(path, f"its {len(data)} bytes are no image ({why(error)})") from error
+    shrink = _shrink(*image.size) if isinstance(image, JpegImageFile) else 1
+    width, height = (-(-side // shrink) for side in image.size)
     if width * height > MOST_PIXELS:
         problem = f"the image has {width}x{height} pixels ({width * height / 1e6:.0f} million)"
         remedy = "Shrink it, for instance to half its width and height."
         raise InputError(path, problem, f"at most {MOST_PIXELS // 10**6} million", remedy)
-    if not 0 < width * height * bits <= len(data) * MOST_DEFLATED * 8:
-        raise _unreadable(path, f"the header announces {width}x{height} pixels, but the file has {len(data)} bytes")
+    return image, _orientation(block)
 
 
-def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """(marker, first byte of its body, length of its body) of each segment of a JPEG's header up to the pixels."""
-    offset = 2
-    while offset + 4 <= len(data) and data[offset] == 0xFF:
-        marker = data[offset + 1]
-        if marker == 0xFF:  # fill byte
-            offset += 1
-            continue
-        (length,) = struct.unpack_from(">H", data, offset + 2)
-        yield marker, offset + 4, length - 2
-        if marker == _START_OF_SCAN:
-            return
-        offset += 2 + length
+def _tiff(data: bytes) -> Image.Image:
+    """A TIFF, upright."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if data[:4] not in _TIFF or pixels is None:
+        raise ValueError("it is of another kind, or damaged")
+    if pixels.ndim == 2:
+        return Image.fromarray(pixels)
+    if pixels.dtype == np.uint16:
+        pixels = cv2.convertScaleAbs(pixels, alpha=255 / 65535)
+    return Image.fromarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 
-def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Width and height as it is read, at most MOST_PIXELS; raises where the end marker is missing (OpenCV fills the
-    rest of such a file with grey)."""
-    size, scan = None, 0
-    for marker, start, _ in _jpeg_segments(data):
-        if marker in _FRAME_MARKERS and start + 5 <= len(data):
-            height, width = struct.unpack_from(">HH", data, start + 1)
-            size = width, height
-        scan = start if marker == _START_OF_SCAN else 0
-    if not scan:
-        raise _unreadable(path, f"the JPEG breaks off in its header, after {len(data)} bytes")
-    # A thumbnail within the header has an end marker too: look behind the start of the scan only.
-    if size is None or data.rfind(b"\xff\xd9") < scan - 4:
-        raise _unreadable(path, f"the JPEG breaks off after {len(data)} bytes")
-    shrink = _shrink(*size)
-    width, height = (-(-side // shrink) for side in size)
-    _check_pixels(path, data, width, height)
-    return width, height
+def _heic_class(path: Path) -> type[ImageFile]:
+    try:
+        from pillow_heif import HeifImageFile
+    except ImportError as error:
+        remedy = "Run: pip install 'jsecon[formats]' (or export the photographs as JPEG)."
+        found = "a HEIC photograph cannot be read without pillow-heif"
+        raise InputError(path, found, "it installed", remedy) from error
+    return HeifImageFile
 
 
 def _shrink(width: int, height: int) -> int:
@@ -149,12 +159,8 @@ def _shrink(width: int, height: int) -> int:
     return next((n for n in _SHRINKS if -(-width // n) * -(-height // n) <= MOST_PIXELS), 1)
 
 
-def exif_orientation(data: bytes) -> int:
-    """The EXIF orientation, 1 to 8, of an image file's bytes: JPEG, PNG (eXIf), WebP or TIFF; 1 where it has none.
-
-    HEIC has 1: its decoder applies the file's own rotation, and EXIF's does not count there.
-    """
-    block = _exif_block(data)
+def _orientation(block: bytes) -> int:
+    """The orientation, 1 to 8, of an EXIF block, which is a TIFF; 1 where it has none."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
     if order is None or len(block) < 8:
         return 1
@@ -165,28 +171,6 @@ def exif_orientation(data: bytes) -> int:
         if (tag, kind, values) == (_ORIENTATION, 3, 1):  # one 16-bit integer
             return value if 1 <= value <= 8 else 1
     return 1
-
-
-def _exif_block(data: bytes) -> bytes:
-    """EXIF's records, a TIFF of their own, within an image file; empty where there are none."""
-    if data.startswith(_JPEG):
-        bodies = (data[a : a + size] for marker, a, size in _jpeg_segments(data) if marker == _APP1)
-        return next((body[6:] for body in bodies if body.startswith(b"Exif\0\0")), b"")
-    if data.startswith(_PNG):
-        return next((body for kind, body in _chunks(data, len(_PNG), ">I4s", 12, 1) if kind == b"eXIf"), b"")
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        found = next((body for kind, body in _chunks(data, 12, "<4sI", 8, 2) if kind == b"EXIF"), b"")
-        return found.removeprefix(b"Exif\0\0")
-    return data[: 1 << 16] if data[:4] in _TIFF else b""
-
-
-def _chunks(data: bytes, offset: int, head: str, extra: int, align: int) -> Iterator[tuple[bytes, bytes]]:
-    """(type, body) of the chunks of a PNG or WebP, unchecked; `extra` bytes of each are not its body."""
-    while offset + 8 <= len(data):
-        fields = struct.unpack_from(head, data, offset)
-        kind, size = fields if isinstance(fields[0], bytes) else fields[::-1]
-        yield kind, data[offset + 8 : offset + 8 + size]
-        offset += extra + size + size % align
 
 
 def turned(image: np.ndarray, orientation: int) -> np.ndarray:
@@ -200,83 +184,22 @@ def turned(image: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(image)
 
 
-def _decode(path: Path, data: bytes) -> np.ndarray:
-    """Pixels as stored, grey, RGB or RGBA; of TIFF and HEIC upright, by the decoders themselves.
+def _decoded(path: Path, image: Image.Image, *, native: bool = False) -> np.ndarray:
+    """Pixels: grey, RGB or RGBA, of TIFF and HEIC upright. Of 16 bits of colour, Pillow has the upper 8.
 
-    PNG and JPEG by Pillow: the same pixels as OpenCV's, as fast, and it writes nothing to stderr. For 16 bits of colour
-    and CMYK it has no mode: those are read once more by OpenCV.
+    `native`: the indices of a palette, and colours that are declared transparent.
     """
-    if data[4:12] in _HEIC:
-        return _decode_heic(path, data)
-    kind = PngImageFile if data.startswith(_PNG) else JpegImageFile if data.startswith(_JPEG) else None
     try:
-        deep = kind is PngImageFile and data[24] == 16 and data[25] > 0
-        if deep:
-            _check_deep(list(_png_chunks(path, data)))
-        if kind is not None:
-            with kind(io.BytesIO(data)) as image:
-                if kind is JpegImageFile and (shrink := _shrink(*image.size)) > 1:
-                    image.draft(None, (image.width // shrink, image.height // shrink))
-                mode = "RGBA" if "transparency" in image.info else _MODES.get(image.mode, "RGB")
-                pixels = np.asarray(image if mode == image.mode else image.convert(mode))
-            if image.mode in _MODES and not deep:
-                return pixels
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise ValueError(f"its {len(data)} bytes are no image")
-        order = {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-        return image if image.ndim == 2 else cv2.cvtColor(image, order[image.shape[2]])
-    except Exception as error:  # Pillow's and OpenCV's own kinds have no common base but this
+        if isinstance(image, JpegImageFile) and (shrink := _shrink(*image.size)) > 1:
+            image.draft(None, (image.width // shrink, image.height // shrink))
+        image.load()
+        mode = image.mode if native or image.mode in _NUMBERS else _MODES.get(image.mode, "RGB")
+        if mode in ("L", "RGB") and "transparency" in image.info and not native:
+            mode = "RGBA"
+        pixels = np.asarray(image if mode == image.mode else image.convert(mode))
+        return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    except Exception as error:  # Pillow's own kinds have no common base but this
         raise _unreadable(path, f"the image cannot be decoded ({why(error)})") from error
-
-
-def _check_deep(chunks: list[tuple[bytes, bytes]]) -> None:
-    """Raises where libpng, by which OpenCV reads 16 bits of colour, would say on stderr what is wrong."""
-    kinds = [kind for kind, _ in chunks]
-    first, behind = kinds[: kinds.index(b"IDAT")], kinds[kinds.index(b"IDAT") :]
-    for kind, size in ((b"tRNS", {6}), (b"PLTE", range(3, 769, 3))):
-        if kind in behind or first.count(kind) > 1 or any(len(b) not in size for k, b in chunks if k == kind):
-            raise ValueError(f"its chunk {kind.decode()} is out of place")
-    width, height, bits, colour_type, _, _, woven = struct.unpack(">IIBBBBB", chunks[0][1])
-    passes = _ADAM7 if woven else ((0, 0, 1, 1),)
-    sizes = [(-((x - width) // across), -((y - height) // down)) for x, y, across, down in passes]
-    needed = sum(rows * (1 + columns * _CHANNELS[colour_type] * bits // 8) for columns, rows in sizes if columns > 0)
-    found = len(zlib.decompress(b"".join(body for kind, body in chunks if kind == b"IDAT")))
-    if found != needed:
-        raise ValueError(f"it has {found} bytes of pixels, {width}x{height} of {bits} bits need {needed}")
-
-
-def _open_heic(path: Path, data: bytes) -> Any:
-    try:
-        import pillow_heif
-    except ImportError as error:
-        remedy = "Run: pip install 'jsecon[formats]' (or export the photographs as JPEG)."
-        raise InputError(
-            path, "a HEIC photograph cannot be read without pillow-heif", "it installed", remedy
-        ) from error
-    try:
-        return pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True)
-    except (ValueError, OSError, EOFError, SyntaxError) as error:
-        raise _unreadable(path, f"the HEIC cannot be decoded: {error}") from error
-
-
-def _decode_heic(path: Path, data: bytes) -> np.ndarray:
-    image = _open_heic(path, data)
-    try:
-        return np.ascontiguousarray(np.asarray(image)[..., :3])
-    except (ValueError, OSError, EOFError, SyntaxError) as error:
-        raise _unreadable(path, f"the HEIC cannot be decoded: {error}") from error
-
-
-def _checked_bytes(path: Path, data: bytes) -> bytes:
-    """The bytes that a decoder is given: checked to be whole, without what doesn't bear on the pixels."""
-    if data.startswith(_PNG):
-        _png_header(path, data)
-        return _png(own for own in _png_chunks(path, data) if own[0] in _PIXELS)
-    if data.startswith(_JPEG):
-        _jpeg_size(path, data)
-        return data.replace(b"Exif\0\0", b"unread")  # of which Pillow would warn
-    return data
 
 
 def existing_image(folder: Path, name: str) -> Path | None:
@@ -317,19 +240,22 @@ class ImageHeader(NamedTuple):
 
 
 def image_header(path: str | Path) -> ImageHeader:
-    """Size and orientation of an image file. Raises InputError where it is missing, empty or cut short."""
+    """Reads the size and the orientation of an image file, not its pixels.
+
+    Args:
+      path: An image file.
+
+    Raises:
+      InputError: The file is missing, empty, too large, or no image.
+    """
     path = Path(path)
     data = _read_bytes(path)
-    orientation = exif_orientation(data)
-    if data.startswith(_PNG):
-        return ImageHeader(_png_header(path, data)[:2], orientation)
-    if data.startswith(_JPEG):
-        return ImageHeader(_jpeg_size(path, data), orientation)
-    if data[4:12] in _HEIC:
-        return ImageHeader(_open_heic(path, data).size, orientation)
-    height, width = _decode(path, data).shape[:2]
-    turned_already = data[:4] in _TIFF and orientation in TRANSPOSED
-    return ImageHeader((height, width) if turned_already else (width, height), orientation)
+    image, orientation = _opened(path, data)
+    width, height = image.size
+    if data[:4] in _TIFF and orientation in TRANSPOSED:
+        width, height = height, width
+    shrink = _shrink(width, height) if isinstance(image, JpegImageFile) else 1
+    return ImageHeader((-(-width // shrink), -(-height // shrink)), orientation)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -338,14 +264,24 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def read_stored(path: Path, *, upright: bool = True) -> np.ndarray:
-    """The values of an image file as they are stored: grey (H, W), RGB or RGBA (H, W, C), upright or not. Raises
-    InputError where it is damaged."""
+    """Reads the values of an image file as they are stored.
+
+    Args:
+      path: An image file.
+      upright: Apply the EXIF orientation; False has the stored pixels.
+
+    Returns:
+      Grey (H, W), RGB or RGBA (H, W, C).
+
+    Raises:
+      InputError: The file is missing, damaged, too large, or no image.
+    """
     data = _read_bytes(path)
-    orientation = exif_orientation(data)
-    image = _decode(path, _checked_bytes(path, data))
+    image, orientation = _opened(path, data)
+    pixels = _decoded(path, image)
     if orientation == 1 or (data[:4] in _TIFF) == upright:
-        return image
-    return turned(image, orientation if upright else {6: 8, 8: 6}.get(orientation, orientation))
+        return pixels
+    return turned(pixels, orientation if upright else {6: 8, 8: 6}.get(orientation, orientation))
 
 
 def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
@@ -407,25 +343,23 @@ def read_ids(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
     expected = "ids as grey values (8 or 16 bits), palette indices or 8 bit colours"
     if not data.startswith(_PNG):
         raise InputError(path, "the mask is no PNG", expected, ID_REMEDY)
-    _, _, bits, colour_type = _png_header(path, data)
-    (kind, header), *others = _png_chunks(path, data)
-    if colour_type == 3:  # as grey, whose values are the indices
-        header, colour_type = header[:9] + b"\0" + header[10:], 0
-    image = _decode(path, _png([(kind, header), *(own for own in others if own[0] == b"IDAT")]))
-    image = turned(image, exif_orientation(data))
-    if colour_type == 0 and image.ndim == 2:
+    opened, orientation = _opened(path, data)
+    bits, colour_type = data[24], data[25]
+    image = turned(_decoded(path, opened, native=True), orientation)
+    if colour_type in (0, 3):
         ids = image.astype(np.int32)
-        return ids if bits >= 8 else ids // (255 // (2**bits - 1)), False  # fewer than 8 come stretched to 0..255
+        return ids // (255 // (2**bits - 1)) if opened.mode == "L" else ids, False  # Pillow stretches 2 and 4 bits
     if bits > 8 or image.ndim != 3:
         raise InputError(
             path, f"the mask has {bits} bits in each of {_CHANNELS[colour_type]} channels", expected, ID_REMEDY
         )
-    red, green, blue = (image[..., channel].astype(np.int32) for channel in range(3))
     grey = colour_type == 4
-    ids = red if grey else red * 65536 + green * 256 + blue
-    if image.shape[2] == 4:
-        opaque = image[..., 3] == 255
-        if not (opaque | (image[..., 3] == 0)).all():
+    colours = image.astype(np.int32)
+    ids = colours[..., 0] if grey else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
+    if image.shape[2] in (2, 4):
+        alpha = image[..., -1]
+        opaque = alpha == 255
+        if not (opaque | (alpha == 0)).all():
             raise InputError(path, "the mask has pixels that are half transparent (4 channels)", expected, ID_REMEDY)
         ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
     return ids, not grey

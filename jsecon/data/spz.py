@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from jsecon.data.ply import sound, usable_blocks
 from jsecon.errors import InputError, why
-from jsecon.files import MOST_DEFLATED, written_whole
+from jsecon.files import written_whole
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.transform import transform_axes
 from jsecon.types import Array, Gaussians
@@ -43,6 +43,8 @@ _LEAST_OPACITY = 1e-6
 """that the bytes 0 and 255 are read as, and its distance from 1"""
 _LEVEL = 6
 """of gzip: more takes longer and gains little"""
+_MOST_DEFLATED = 1032
+"""bytes that one byte of a deflated stream can stand for"""
 _ANTIALIASED, _RECORDS = 1, 2
 """flags of a file"""
 _ORBIT, _COORDINATES = 0xADBE0002, 0xADBE0003
@@ -226,7 +228,7 @@ def _unzipped(path: Path, data: bytes) -> tuple[_Head, list[np.ndarray], bytes]:
     if head.version > 3:
         raise InputError(path, f"it is of version {head.version} in gzip", "version 1 to 3", _AGAIN)
     size = head.count * sum(head.widths)
-    if size > MOST_DEFLATED * len(data):
+    if size > _MOST_DEFLATED * len(data):
         raise EOFError
     body = stream.decompress(stream.unconsumed_tail, size) if size else b""
     if len(body) < size:
