@@ -90,6 +90,10 @@ class Options(Sources):
     cache: str = str(results.HOME / "results" / "real_words" / "run")
     """folder of what takes long: scenes, votes and the labeller's scores"""
     out: str = str(results.HOME / "results" / "real_words")
+    scenes: str = "replica_apartment_0 apc_bin bonsai"
+    """scenes to measure, blanks between them"""
+    only_kept: str = "no"
+    """"yes" prints what is measured already, and measures nothing"""
 
 
 Kept = Callable[[str, Callable[[], Any]], Any]
