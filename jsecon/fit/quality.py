@@ -65,7 +65,7 @@ def quality(
             frame = resized_frame(np.asarray(capture.frames[t]), cameras)
             counted = np.ones(frame.shape[:2], bool)
             if capture.ignored is not None:
-                counted = ~resized_mask(capture.ignored[t], cameras)
+                counted = ~resized_mask(np.asarray(capture.ignored[t]), cameras)
             yield [float(value) for value in _compare(image, frame, counted)]
 
     values = dealt_out(len(chosen), rows, progress)

@@ -67,7 +67,7 @@ class Views:
             depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
             depth = depth if depth.shape == to[::-1] else _smaller_depth(depth, to)
         if capture.ignored is not None:
-            ignored = resized_mask(capture.ignored[t], self.cameras)
+            ignored = resized_mask(np.asarray(capture.ignored[t]), self.cameras)
         frame = resized_frame(np.asarray(capture.frames[t]), self.cameras)
         return View(self.cameras[index], frame, depth, ignored)
 
