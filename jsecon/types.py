@@ -273,6 +273,9 @@ class LanguageField(_Shown):
     """JSON: version, options, inputs' digests."""
     parts: Parts | None = None
     """what single masks say of small parts of the scene, where the run was asked for it."""
+    reference: Array | None = None
+    """(W, E) embeddings of words that have nothing to do with the scene, W may be 0: what a text's similarity is
+    measured against (jsecon.query.retrieval). None: a field of an earlier version."""
 
 
 @record
@@ -287,3 +290,6 @@ class Selection(_Shown):
     """() int32 region that anchored the query; -1 = none (nothing retrieved, or a query without anchor)."""
     score: Array
     """() float: similarity of the text to that region; for queries without anchor the best similarity."""
+    quantile: Array | None = None
+    """() float: share of unrelated words that are less similar to the scene than the text is; NaN or None where that is
+    not known."""

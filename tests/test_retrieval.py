@@ -11,8 +11,11 @@ from small_field import field_of, make_field, unit_rows
 
 from jsecon.query.anchored import query_anchored
 from jsecon.query.direct import similarities
+from jsecon.query.classes import query_classes
 from jsecon.query.retrieval import (
     CONTRAST_THRESHOLD,
+    QUANTILE,
+    RELATED,
     RETRIEVAL_THRESHOLD,
     contrasts as plain_contrasts,
     evidence,
@@ -224,3 +227,113 @@ def test_a_thing_that_fills_a_third_of_all_views_is_found_before_slivers_of_its_
     assert everything[0]
     assert everything[3:].any()
     assert not everything[1:3].any()
+
+
+def exact_quantile(embeddings, text, words):
+    """The share of words, without the tenth that is nearest to the text, that are less similar to their best region."""
+    rows, words, text = (unit(np.asarray(a, np.float64)) for a in (embeddings, words, text))
+    mean = words.mean(0)
+    order = np.argsort(-(unit(words - mean) @ unit(text - mean)), kind="stable")[int(RELATED * len(words)) :]
+    scores = (unit(words - mean) @ rows.T).max(1)[order]
+    return np.mean(scores < (rows @ unit(text - mean)).max())
+
+
+@pytest.fixture
+def worded(scene, cameras):
+    """A field of five regions with 61 unrelated words, and texts."""
+    rng = np.random.default_rng(3)
+    field, _ = make_field(scene, cameras)
+    return dataclasses.replace(field, reference=unit_rows(rng, 61, SIZE)), unit_rows(rng, 200, SIZE)
+
+
+def test_a_text_is_refused_by_its_quantile_among_unrelated_words(worded):
+    field, texts = worded
+    ask = lambda text: query_anchored(field, text)
+    together = jax.jit(jax.vmap(ask))(texts[:40])
+    for k, text in enumerate(texts[:40]):
+        expected = exact_quantile(field.regions.embeddings, text, field.reference)
+        found = ask(text)
+        assert float(found.quantile) == pytest.approx(expected, abs=1e-6)
+        assert (int(found.region) >= 0) == (expected >= QUANTILE)
+        assert bool(found.mask.any()) <= (expected >= QUANTILE)
+        assert float(together.quantile[k]) == pytest.approx(expected, abs=1e-6)
+        np.testing.assert_array_equal(together.mask[k], found.mask)
+        loose, strict = (query_anchored(field, text, quantile=q) for q in (expected - 1e-3, expected + 1e-3))
+        assert int(loose.region) >= 0 > int(strict.region)
+        assert float(query_several(field, text[None]).quantile) == pytest.approx(expected, abs=1e-6)
+    assert int(query_anchored(field, texts[0], quantile=0.0).region) >= 0
+    by_threshold = query_anchored(field, texts[0], retrieval_threshold=-1.0, quantile=1.0)
+    assert int(by_threshold.region) >= 0  # a threshold that is given decides
+
+
+def test_of_unrelated_texts_about_one_minus_the_quantile_is_answered(worded):
+    field, texts = worded
+    shares = np.asarray(jax.vmap(lambda text: query_anchored(field, text).quantile)(texts))
+    for q in (0.5, 0.8, 0.9):
+        assert np.mean(shares >= q) == pytest.approx(1 - q, abs=0.1)
+
+
+def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back(worded):
+    field, texts = worded
+    tied = dataclasses.replace(field, reference=np.repeat(field.reference[:1], 9, 0))
+    itself = query_anchored(tied, field.reference[0])  # of equal words none is less similar, and the text is no text
+    assert float(itself.quantile) == 1 or np.isnan(float(itself.quantile))
+    empty = dataclasses.replace(field, reference=field.reference[:0])
+    old = dataclasses.replace(field, reference=None)
+    for text in texts[:8]:
+        contrast = query_anchored(field, text, retrieval="contrast", retrieval_threshold=CONTRAST_THRESHOLD)
+        for bare in (empty, old):
+            found = query_anchored(bare, text)
+            assert np.isnan(float(found.quantile))
+            assert float(found.score) == float(contrast.score)
+            np.testing.assert_array_equal(found.mask, contrast.mask)
+    nan = query_anchored(field, np.full(SIZE, np.nan, np.float32))
+    assert int(nan.region) == -1
+    assert np.isnan(float(nan.quantile))
+    known = field.reference[7]
+    assert float(query_anchored(field, known).quantile) == pytest.approx(
+        exact_quantile(field.regions.embeddings, known, field.reference), abs=1e-6
+    )
+    one = dataclasses.replace(
+        field_of(
+            Votes(
+                regions=np.zeros((4, 1), np.int32),
+                weights=np.ones((4, 1), np.float32),
+                labelled=np.ones(4, np.float32),
+                total=np.ones(4, np.float32),
+                peak=np.ones(4, np.float32),
+                views=np.full(4, 3, np.int32),
+                overflow=np.zeros((), np.int32),
+                num_regions=1,
+            ),
+            Regions(field.reference[:1] * 0.5, np.full((1, 1), 900)),
+        ),
+        canonical=np.zeros((0, SIZE), np.float32),
+        reference=field.reference,
+    )
+    assert float(query_anchored(one, field.reference[0]).quantile) == 1  # nothing is nearer to it than itself
+    none = dataclasses.replace(one, regions=Regions(np.zeros((0, SIZE), np.float32), np.zeros((0, 1), np.int32)))
+    assert int(query_anchored(none, texts[0]).region) == -1
+
+
+def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
+    field, texts = worded
+    hub = unit(unit(np.asarray(field.regions.embeddings)).sum(0)).astype(np.float32)  # a little like every region
+    names = np.stack([hub, *np.asarray(field.regions.embeddings)[:2]])
+    words = np.asarray(field.reference, np.float64).mean(0)
+    similar = unit(np.asarray(field.regions.embeddings, np.float64)) @ unit(names - words).T
+    weight = np.asarray(evidence(field.regions.pixels), np.float64)[:, None]
+    weight = weight / weight.sum()
+    mean = (weight * similar).sum(0)
+    table = (similar - mean) / np.sqrt((weight * (similar - mean) ** 2).sum(0))
+    label, likeness = query_classes(field, names, quantile=0.0)
+    shares = np.zeros((len(label), len(table)))
+    votes = field.votes
+    rows = np.repeat(np.arange(len(label)), votes.regions.shape[1])
+    np.add.at(shares, (rows, np.asarray(votes.regions).ravel()), np.asarray(votes.weights).ravel())
+    seen = shares.sum(1) > 0
+    expected = shares[seen] @ table / shares[seen].sum(1, keepdims=True)
+    np.testing.assert_allclose(np.asarray(likeness)[seen], expected, atol=1e-4)
+    assert query_classes(field, names, quantile=1.0)[0].max() >= -1
+    nothing = query_classes(field, np.zeros((2, SIZE), np.float32))
+    assert (np.asarray(nothing[0]) == -1).all()

@@ -29,7 +29,7 @@ def field(scene, cameras):
 
 def test_all_of_a_kind_are_found_and_no_others(field):
     rows = field.regions.embeddings
-    chosen = regions_of_text(rows, rows @ rows[0], np.ones(5, bool), retrieval_threshold=0.2)
+    chosen = regions_of_text(rows, rows @ rows[0], np.ones(5, bool))
     assert np.asarray(chosen).tolist() == [True, True, False, False, False]  # from 0.3 + 0.75 (1 - 0.3) = 0.825 on
     for retrieval in ("contrast", "cosine"):
         got = query_several(field, rows[:1], retrieval=retrieval)
@@ -47,7 +47,7 @@ def test_the_rule_is_the_stated_one(field):
         for nearness in (0.3, 0.8):
             expected = ((similarity >= middle + nearness * (best - middle)) | alike) & known & (best >= 0.2)
             given = rows, similarity.astype(np.float32), known
-            got = regions_of_text(*given, nearness=nearness, retrieval_threshold=0.2)
+            got = regions_of_text(*given, nearness=nearness, accepted=best >= 0.2)
             np.testing.assert_array_equal(got, expected)
 
 

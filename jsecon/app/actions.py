@@ -73,6 +73,9 @@ def _query(verb: Query, console: Console) -> VerbResult:
         if len(pairs) % 2:
             remedy = "For example: --mask frame_00012 mug.png"
             raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", remedy)
+    if not 0 <= verb.quantile <= 1:
+        remedy = f"{Query.quantile:g} is the default; 0 refuses no text."
+        raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
     _check_phrases(verb)
     require_writable(verb.out)
     with console.progress("field"):
@@ -88,10 +91,10 @@ def _query(verb: Query, console: Console) -> VerbResult:
             check_field(verb.field)
         field = load_field(verb.field, mapped=large)
         texts = verb.texts if verb.phrases is None else []
-        embedder = _embedder(field, verb) if texts else None
+        embedder = _embedder(field, verb, console) if texts else None
     by_phrase, unread = ([], []) if verb.phrases is None else _phrases(field, verb, console)
     options: dict[str, Any] = {"texts": texts, "pixels": pixels, "several": verb.all, "by": verb.by}
-    options |= {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
+    options |= {"threshold": verb.threshold, "quantile": verb.quantile, "outliers": not verb.keep_outliers}
     with console.progress("answers"):
         if large:
             answers, refused = asking.answered_in_blocks(field, embedder, **options)
@@ -116,6 +119,7 @@ def _check_phrases(verb: Query) -> None:
         remedy = 'For example: jsecon query field.safetensors "red mug" --phrases sam3 --out answers'
         raise InputError("--phrases", "no text is given, which is the phrase", remedy=remedy)
     unused = {"by": verb.by != "votes", "all": verb.all, "even": verb.even}
+    unused["quantile"] = verb.quantile != Query.quantile
     unused |= {"template": bool(verb.template), "embedder": verb.embedder is not None}
     if any(unused.values()):
         flags = " ".join(f"--{name}" for name, used in unused.items() if used)
@@ -159,7 +163,7 @@ def _view(verb: View, console: Console) -> VerbResult:
     if verb.export is None:
         from jsecon.app.viewer import view
 
-        return view(verb, _embedder, console.say)
+        return view(verb, lambda field, verb: _embedder(field, verb, console), console.say)
     if verb.export.suffix != ".html":
         raise InputError("--export", f"{verb.export} does not end in .html", remedy="For example: --export page.html")
     require_writable(verb.export.parent)
@@ -169,7 +173,7 @@ def _view(verb: View, console: Console) -> VerbResult:
         from jsecon.language.field import load_field
 
         field = load_field(verb.field)
-        embedder = _embedder(field, verb) if verb.texts else None
+        embedder = _embedder(field, verb, console) if verb.texts else None
         answers, refused = asking.asked_each(asking.questions_of(field, embedder, texts=verb.texts))
         size = write_page(field, answers, verb.export, title=verb.field.resolve().parent.name)
     console.say(
@@ -186,7 +190,7 @@ def _eval(verb: Eval, console: Console) -> VerbResult:
         from jsecon.app.summary import write_evaluation
         from jsecon.language.field import load_field
 
-        embedder = _embedder(field := load_field(verb.field), verb)
+        embedder = _embedder(field := load_field(verb.field), verb, console)
     return write_evaluation(field, embedder, verb.labels, out, console)
 
 
@@ -199,6 +203,8 @@ def _serve(verb: Serve, console: Console) -> VerbResult:
         result, serve = server.ready(verb.fields, embedder=verb.embedder, **access)
     for scene in result["fields"]:
         console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
+        if scene["unrelated_words"] is None:
+            console.note(f"{scene['name']}: {_OLD_FIELD}")
     console.say(result["address"])
     return result | {"then": serve}
 
@@ -222,9 +228,17 @@ def _doctor(verb: Doctor, console: Console) -> VerbResult:
     return {"checks": checks, "refused": wrong(checks)}
 
 
-def _embedder(field: Any, verb: FieldVerb) -> Any:
+_OLD_FIELD = (
+    "an earlier version made this field, without the unrelated words that texts are compared with. Fixed thresholds "
+    "decide which texts are answered. Make it again with `jsecon run`."
+)
+
+
+def _embedder(field: Any, verb: FieldVerb, console: Console) -> Any:
     from jsecon.pipeline import networks
 
+    if field.reference is None:
+        console.note(_OLD_FIELD)
     return networks.embedder_of_field(field, verb.embedder, templates=verb.template or ("{}",))
 
 

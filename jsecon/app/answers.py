@@ -88,6 +88,7 @@ def _figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "count": len(means),
         "of": field.gaussians.count,
         "score": round(float(answer.selection.score), 6),
+        "quantile": answer.quantile,
         "region": region if region >= 0 else None,
         "probability": sure,
         "outliers_dropped": answer.dropped,

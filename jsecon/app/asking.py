@@ -34,6 +34,7 @@ from jsecon.query.blocks import Chosen, chosen_in_blocks
 from jsecon.query.lift import box_mask
 from jsecon.query.neighbours import nearest
 from jsecon.query.parts import InParts, query_parts
+from jsecon.query.retrieval import QUANTILE
 from jsecon.types import LanguageField, Selection
 
 _T = TypeVar("_T")
@@ -53,6 +54,7 @@ def questions_of(
     even: bool = False,
     by: str = "votes",
     threshold: float | None = None,
+    quantile: float = QUANTILE,
     outliers: bool = True,
 ) -> list[Callable[[], Answer]]:
     """What the command line asks of a field, each to be called: texts, pixels (frame, column, row), outlines (frame,
@@ -60,7 +62,8 @@ def questions_of(
     shape: dict[str, Any] = {"threshold": threshold, "outliers": outliers}
     how = shape | {"by": by, "near": nearest(field.gaussians.means) if even else None}
     found: list[Callable[[], Answer]] = []
-    found += [functools.partial(ask_text, field, embedder, text, several=several, **how) for text in texts]
+    text_how = how | {"several": several, "quantile": quantile}
+    found += [functools.partial(ask_text, field, embedder, text, **text_how) for text in texts]
     found += [functools.partial(ask_pixel, field, *pixel, **how) for pixel in pixels]
 
     def require_outline(name: str) -> None:
@@ -151,13 +154,14 @@ def answered_in_blocks(
     several: bool = False,
     by: str = "votes",
     threshold: float | None = None,
+    quantile: float = QUANTILE,
     outliers: bool = True,
 ) -> tuple[list[Answer], list[InputError]]:
     """What `asked_each` of `questions_of` would return of a mapped field, by votes or code, in one pass over its
     columns. The answers hold what is selected, and no number for any other Gaussian (`Answer.rows`)."""
 
     def of_text(text: str) -> _Asked:
-        asked = sought(field, embedder, text, by=by, several=several)
+        asked = sought(field, embedder, text, by=by, several=several, quantile=quantile)
         return _Asked(text, by, asked.found, asked)
 
     def at_pixel(*pixel: Any) -> _Asked:
@@ -183,7 +187,9 @@ def _answered(
     rows, similarity = np.zeros(size, np.int64), np.zeros(size, np.float32)
     rows[:count], similarity[:count] = chosen.gaussians, chosen.similarity
     own, mask = field_of_rows(field, rows), np.arange(size) < count
-    selection = Selection(mask, similarity, np.asarray(chosen.region, np.int32), np.asarray(chosen.score, np.float32))
+    told = asked.found.quantile if instead is None else instead.selection.quantile
+    best = np.asarray(chosen.region, np.int32), np.asarray(chosen.score, np.float32)
+    selection = Selection(mask, similarity, *best, np.asarray(told))
     if asked.text is None:
         answer = answer_of(own, asked.name, asked.by, selection, outliers, POINTED, key=asked.name)
         return dataclasses.replace(answer, rows=rows)

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.app.pictures import Renderer
+from jsecon.app.question import with_phrases
 from jsecon.app.splat_page import regions_of
 from jsecon.query.direct import similarities
 from jsecon.query.masks import HIDDEN_LOGIT
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
-from jsecon.query.retrieval import apart_from_scene, contrasts, evidence
+from jsecon.query.retrieval import RETRIEVALS, answers, apart_from_scene, evidence, words_of
 from jsecon.query.several import ROUNDING, parts_of_question
 from jsecon.types import Camera, LanguageField
 
@@ -46,10 +47,11 @@ def candidates(field: LanguageField, embedder: Any, thing: str | int, count: int
         return []
     table, pixels = jnp.asarray(field.regions.embeddings), jnp.asarray(field.regions.pixels)
     if isinstance(thing, str):
-        canonical = jnp.asarray(field.canonical if len(field.canonical) else embedder.canonical)
+        field = with_phrases(field, embedder)
+        words, retrieval = words_of(field, RETRIEVALS[0])
         wanted, unwanted = parts_of_question(thing)
         texts = jnp.asarray(embedder.embed_text(wanted + unwanted))
-        each = [_contrasts(table, text, canonical, pixels) for text in texts]
+        each = [_answers(table, text, jnp.asarray(field.canonical), words, pixels, retrieval) for text in texts]
         near, known = np.stack([found for found, _ in each]), np.array(each[0][1])
         score = near[: len(wanted)].max(0)
         known &= score > near[len(wanted) :].max(0, initial=-np.inf) + ROUNDING
@@ -62,7 +64,7 @@ def candidates(field: LanguageField, embedder: Any, thing: str | int, count: int
     return [Candidate(int(r), float(score[r]), int(frames[r])) for r in order]
 
 
-_contrasts, _evidence = jax.jit(contrasts), jax.jit(evidence)
+_answers, _evidence = jax.jit(answers, static_argnames="retrieval"), jax.jit(evidence)
 
 
 @jax.jit

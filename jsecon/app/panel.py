@@ -11,11 +11,11 @@ import numpy as np
 
 from jsecon.app import viewing
 from jsecon.app.candidates import Candidate
-from jsecon.app.question import Answer
+from jsecon.app.question import Answer, quantile_message
 from jsecon.app.viewing import PAINTS, ViewState, tints
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD
+from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, QUANTILE
 from jsecon.types import LanguageField
 
 THUMBNAIL = 88
@@ -177,9 +177,12 @@ def told(field: LanguageField, state: ViewState, answers: Sequence[Answer | Inpu
             continue
         score, count = float(found.selection.score), int(found.mask.sum())
         if int(found.selection.region) < 0 and not np.asarray(found.selection.mask).any():
-            best, least = f"the best score is {score:.2f}", CONTRAST_THRESHOLD
-            if found.there is not None:
+            if found.quantile is not None:
+                best, least = quantile_message(found.quantile), f"{100 * QUANTILE:.0f} %"
+            elif found.there is not None:
                 best, least = f"it is there with a probability of {found.there:.2g}", PRESENCE_THRESHOLD
+            else:
+                best, least = f"the best score is {score:.2f}", CONTRAST_THRESHOLD
             why = f"nothing here answers it: {best}, and {least} is the least"
             lines.append(_box(f"{head}: {why}. Below is what comes nearest."))
         elif not count:

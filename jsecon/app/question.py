@@ -29,7 +29,7 @@ from jsecon.query.neighbours import evened
 from jsecon.query.outliers import clean
 from jsecon.query.parts import InParts, parts_instead, query_parts
 from jsecon.query.pixel import region_at
-from jsecon.query.retrieval import PIECE_NEARNESS, best_presence
+from jsecon.query.retrieval import PIECE_NEARNESS, QUANTILE, Refusal, best_presence
 from jsecon.query.several import found_of_several, parts_of_question
 from jsecon.query.silhouette import OUTLINES, silhouette_members
 from jsecon.types import Array, LanguageField, Selection
@@ -72,9 +72,20 @@ class Answer:
     """clusters that DBSCAN kept and dropped; (0, 0) where it was not needed or found none."""
 
     @property
+    def quantile(self) -> float | None:
+        """Share of unrelated words that are less similar to the scene than the text is; None where it is not known."""
+        share = self.selection.quantile
+        return None if share is None or np.isnan(share) else round(float(share), 4)
+
+    @property
     def dropped(self) -> int:
         """Gaussians dropped as outliers."""
         return int(np.asarray(self.selection.mask).sum() - self.mask.sum())
+
+
+def quantile_message(quantile: float) -> str:
+    """What a quantile among unrelated words means, in whole percent, rounded down."""
+    return f"more similar than {int(100 * quantile + 1e-6)} % of unrelated words"
 
 
 def ask_text(
@@ -88,10 +99,12 @@ def ask_text(
     several: bool = False,
     near: Int[np.ndarray, "n k"] | None = None,
     piece_nearness: float = PIECE_NEARNESS,
+    quantile: float = QUANTILE,
 ) -> Answer:
     """The Gaussians that a text names; with `several`, of all regions that answer it (`query_several` has the rule).
     With `near` (N, K), the `nearest` of each Gaussian, shares of votes are evened out over them before they are cut.
-    `piece_nearness`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`).
+    `piece_nearness`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`). `quantile`: a
+    text selects nothing unless it is more similar to the scene than this share of unrelated words (`query_anchored`).
 
     A text may be composite: `"red mug" or "bowl" but not "handle"`. Of a field with parts, those answer a plain text
     that no region does (`parts_instead`). Raises InputError where the embedder has no words for a part, and for several
@@ -101,7 +114,8 @@ def ask_text(
     wanted, unwanted = parts_of_question(text)
     if by in BY_CODES and not several and len(wanted + unwanted) == 1:
         return answer_of(field, text, by, _compared(field, embedder, wanted[0], by, threshold), outliers, {})
-    asked = sought(field, embedder, text, by=by, several=several, piece_nearness=piece_nearness)
+    given: dict[str, Any] = {"piece_nearness": piece_nearness, "quantile": quantile}
+    asked = sought(field, embedder, text, by=by, several=several, **given)
     if (found := unheld(asked, by, threshold)) is not None:
         selection, asked, left = found.selection, asked._replace(there=found.there), UNHELD
     else:
@@ -125,7 +139,7 @@ class Sought(NamedTuple):
     """of the selection's clusters: "largest", or "all" where there may be several things."""
     there: float | None
     """as in `Answer`."""
-    logits: Any = None
+    refused_by: Refusal
 
 
 UNHELD = {"regions": "none holds what the text names: the parts that answer it were taken"}
@@ -135,8 +149,10 @@ def unheld(asked: Sought, by: str, threshold: float | None) -> InParts | None:
     """`parts_instead` for a plain text by votes; None of other questions, and where the field has no parts."""
     if asked.field.parts is None or asked.keep != "largest" or by not in BY_VOTES:
         return None
-    how: dict[str, Any] = {"similarity_threshold": threshold, "logits": asked.logits}
-    return parts_instead(asked.field, asked.wanted[0], asked.found.score, **how)
+    how: dict[str, Any] = {"similarity_threshold": threshold, "logits": asked.refused_by.logits}
+    how["quantile"] = asked.refused_by.quantile
+    region = found_of(asked.field, asked.wanted[0], quantile=0.0, retrieval="contrast")  # as parts are measured
+    return parts_instead(asked.field, asked.wanted[0], region.score, **how)
 
 
 def sought(
@@ -147,12 +163,14 @@ def sought(
     by: str = "votes",
     several: bool = False,
     piece_nearness: float = PIECE_NEARNESS,
+    quantile: float = QUANTILE,
 ) -> Sought:
     """The regions that a text names; options and errors as for `ask_text`."""
     field = with_phrases(field, embedder)
     wanted, unwanted = parts_of_question(text)
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
-    how: dict[str, Any] = {"piece_nearness": piece_nearness, "logits": getattr(embedder, "logits", None)}
+    logits = getattr(embedder, "logits", None)
+    how: dict[str, Any] = {"piece_nearness": piece_nearness, "logits": logits, "quantile": quantile}
     keep = "largest"
     if several or unwanted or len(wanted) > 1:
         if by not in BY_VOTES:
@@ -164,8 +182,8 @@ def sought(
     else:
         texts = jax.device_put(embedder.embed_text(wanted))
         found = found_of(field, texts[0], **how)
-    there = best_presence(field.regions, texts, found.region, how["logits"])
-    return Sought(field, texts, found, keep, there, how["logits"])
+    there = best_presence(field.regions, texts, found.region, logits)
+    return Sought(field, texts, found, keep, there, Refusal(None, quantile, logits))
 
 
 def _compared(field: LanguageField, embedder: Any, text: str, by: str, threshold: float | None) -> Selection:
@@ -180,10 +198,15 @@ def _compared(field: LanguageField, embedder: Any, text: str, by: str, threshold
 
 
 def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
-    """The field with canonical phrases: those of who reads the text, where its embeddings came from files without."""
-    if len(field.canonical):
+    """The field with canonical phrases and unrelated words: those of who reads the text, where its embeddings came from
+    files without; and such words in the templates that texts are put into, where those are the reader's own."""
+    reference = None if field.reference is None else getattr(embedder, "reference", None)
+    plain = getattr(embedder, "templates", ("{}",)) == ("{}",)
+    if len(field.canonical) and (plain or reference is None):
         return field
-    return dataclasses.replace(field, canonical=np.asarray(embedder.canonical, np.float32))
+    own: dict[str, Any] = {} if len(field.canonical) else {"canonical": np.asarray(embedder.canonical, np.float32)}
+    own |= {} if reference is None else {"reference": np.asarray(reference, np.float16)}
+    return dataclasses.replace(field, **own)
 
 
 def ask_pixel(

@@ -128,6 +128,7 @@ def write_answers(
             else:
                 place = "nothing selected"
             count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
+            score += "" if item.quantile is None else f", {question.quantile_message(item.quantile)}"
             unheld = "regions" in told["left_out"]
             where = "its parts, as no region holds it" if unheld else f"region {told['region']}"
             listener.say(f"{item.question!r}: {count}, {score}, {where}, {place}")

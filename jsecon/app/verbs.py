@@ -168,6 +168,8 @@ class Query(FieldVerb):
         With one_step and canonical, each Gaussian's code is compared with the text.
       threshold: Threshold of the measure of --by. By default it is 0.5 for votes, silhouettes and canonical, 0.9 for
         code, and 0.8 for one_step, which is too high for CLIP.
+      quantile: A text selects nothing unless it is more similar to the scene than this share of unrelated words. Of
+        texts that name nothing in the scene, about 1 - quantile are answered. With 0 every text is answered.
       all: Selects every region that answers a text, such as all the chairs, and not only the best one: those whose
         similarity has come 0.75 of the way from the middle region's to the best one's (by votes or a silhouette).
       even: Smooths the votes over the ten neighbours of each Gaussian before the threshold. Rims become sharper if the
@@ -192,6 +194,7 @@ class Query(FieldVerb):
     out: Option[Path]
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
+    quantile: Option[float] = 0.83
     all: Option[bool] = False
     even: Option[bool] = False
     keep_outliers: Option[bool] = False

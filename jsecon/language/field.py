@@ -58,6 +58,7 @@ _LETTERS = {
     "k": ("votes.regions", -1),
     "c": ("canonical", 0),
     "p": ("parts.weight", 0),
+    "w": ("reference", 0),
     "b": ("gaussians.sh", 1),
 }
 """where a field's sizes are read off: array and axis"""
@@ -76,9 +77,10 @@ _SHAPES = {
     (): "votes.overflow",
     ("c", "e"): "canonical",
     ("p", "e"): "parts.embeddings",
+    ("w", "e"): "reference",
     (4, 4): "to_source",
 }
-_OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings")
+_OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings", "reference")
 
 
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:

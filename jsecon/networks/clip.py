@@ -20,6 +20,7 @@ from jsecon.networks.onnx_graph import Graph, Tensor, batches, describe
 from jsecon.networks.sigmoid import fitted_logits, read_logits
 from jsecon.networks.tokenizer import CONTEXT_LENGTH, ClipTokenizer, load_tokenizer
 from jsecon.vision.protocols import CANONICAL, Logits
+from jsecon.vision.reference_words import REFERENCE_WORDS
 from jsecon.vision.stores import EmbeddingStore, known_vectors, mask_key
 
 
@@ -96,6 +97,19 @@ class ClipEmbedder:
     def canonical(self) -> Float32[np.ndarray, "c e"]:
         """(C, E) float32 unit: the bare texts of CANONICAL, without templates."""
         return self._embedded(list(CANONICAL))
+
+    @functools.cached_property
+    def reference(self) -> Float32[np.ndarray, "w e"]:
+        """(W, E) float32 unit: REFERENCE_WORDS, in the templates, as texts are; kept in the store."""
+        words = "\0".join([*self.templates, *REFERENCE_WORDS]).encode()
+        content, key = np.frombuffer(words, np.uint8), b"reference words"
+        known = {} if self._store is None else self._store.read(content)
+        if known.get(key, np.zeros(0)).size == len(REFERENCE_WORDS) * self.dim:
+            return known[key].reshape(-1, self.dim)
+        rows = self.embed_text(list(REFERENCE_WORDS))
+        if self._store is not None:
+            self._store.write(content, {key: rows.reshape(-1)})
+        return rows
 
     @functools.cached_property
     def logits(self) -> Logits | None:

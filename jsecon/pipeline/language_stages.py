@@ -215,4 +215,5 @@ def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:
         embedder=embedder.name,
         provenance=provenance,
         parts=results.get("parts"),
+        reference=np.asarray(embedder.reference, np.float16),
     )

@@ -25,7 +25,7 @@ class GivenSpace:
 
     def __init__(self, dim: int):
         self.dim, self.name = dim, f"{_NAME}{dim}"
-        self.canonical = np.zeros((0, dim), np.float32)
+        self.canonical = self.reference = np.zeros((0, dim), np.float32)
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> NoReturn:
         """Raises InputError."""

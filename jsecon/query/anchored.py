@@ -19,14 +19,16 @@ from jsecon.language.shares import SHARE_THRESHOLD, share_of, vote_blocks
 from jsecon.query.direct import Number, UnitCodes, as_codes, similarities
 from jsecon.query.retrieval import (
     PIECE_NEARNESS,
-    anchor_of,
-    answers,
-    evidence,
+    QUANTILE,
+    RETRIEVALS,
+    Refusal,
     is_alike,
     is_piece,
-    presence,
+    measured,
     regions_of_text,
-    threshold_of,
+    require_retrieval,
+    unrelated_similarities,
+    words_of,
 )
 from jsecon.types import Array, LanguageField, Selection
 from jsecon.vision.protocols import Logits
@@ -43,6 +45,8 @@ class Found(NamedTuple):
     """the best of them, -1 where there is none."""
     score: Float[Array, ""]
     """similarity of the best region, chosen or not; 0 where nothing is known."""
+    quantile: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
+    """share of unrelated words that are less similar to their best region; NaN where there are no such words."""
 
 
 NOTHING = Found(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
@@ -53,10 +57,11 @@ def query_anchored(
     field: LanguageField,
     text_embedding: Float[Array, " e"],
     *,
+    quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
     similarity_threshold: Number | None = None,
     by: str = "votes",
-    retrieval: str = "contrast",
+    retrieval: str = RETRIEVALS[0],
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     piece_nearness: Number | None = PIECE_NEARNESS,
     codes: UnitCodes | None = None,
@@ -64,12 +69,16 @@ def query_anchored(
 ) -> Selection:
     """The Gaussians of the region that answers a text's embedding (E,) best.
 
-    Retrieval: the region with the largest similarity, `retrieval`: "contrast", what sets the text apart from the
-    canonical phrases against what sets the region apart from the scene (`contrasts` has the formula), times what stands
-    behind the region's embedding (`evidence`), or "cosine", the plain one (the paper). Where that region's similarity
-    is below `retrieval_threshold` (default 0.12 for contrast, 0.2 for cosine) nothing is selected, and Selection.region
-    is -1; Selection.score is how much it was. With the embedder's `logits` the threshold is on the probability that the
-    text is true of that region (`presence`; default 0.01). Membership, `by`:
+    Retrieval: the region with the largest similarity, times what stands behind its embedding (`evidence`).
+    `retrieval`: "apart", the cosine with what sets the text apart from the unrelated words `field.reference`
+    (`direction`); "contrast", what sets the text apart from the canonical phrases against what sets the region apart
+    from the scene (`contrasts`), as "apart" is of a field without such words; "cosine", the plain one, without evidence
+    (the paper). Selection.score is how much it is, Selection.quantile the share of unrelated words that are less
+    similar to the scene (`quantile_among`). Nothing is selected, and Selection.region is -1, where that is below
+    `quantile`: of texts that name nothing in the scene about 1 - quantile are answered. `retrieval_threshold` is a
+    threshold on the similarity in its place (the paper's; with the embedder's `logits` on the probability that the text
+    is true of that region, `presence`), and of a field without such words the only one: 0.12 for contrast, 0.2 for
+    cosine, 0.01 for a probability. Membership, `by`:
     "votes": the share of the region and of those that are the same thing as the text sees it, an estimate of the
         probability that a pixel of the Gaussian belongs to them (`share_of`); default threshold 0.5. The same thing
         are regions alike, by `alike_threshold`, and pieces, by `piece_nearness` where the votes know which regions
@@ -82,9 +91,10 @@ def query_anchored(
     another size.
     """
     require_one_of("query_anchored", by, THRESHOLDS, "'votes' is the default.")
-    threshold_of(retrieval, retrieval_threshold, "query_anchored", logits)
+    require_retrieval("query_anchored", retrieval)
     how = {"alike_threshold": alike_threshold, "piece_nearness": piece_nearness, "logits": logits}
-    found = found_of(field, text_embedding, retrieval_threshold=retrieval_threshold, retrieval=retrieval, **how)
+    how |= {"quantile": quantile, "retrieval_threshold": retrieval_threshold}
+    found = found_of(field, text_embedding, retrieval=retrieval, **how)
     return members(field, found, similarity_threshold, by=by, codes=codes)
 
 
@@ -92,8 +102,9 @@ def found_of(
     field: LanguageField,
     text_embedding: Float[Array, " e"],
     *,
+    quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
-    retrieval: str = "contrast",
+    retrieval: str = RETRIEVALS[0],
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     piece_nearness: Number | None = PIECE_NEARNESS,
     logits: Logits | None = None,
@@ -103,11 +114,13 @@ def found_of(
     size = field.regions.embeddings.shape[1]
     remedy = f"Embed the text with the field's embedder{f', {field.embedder}' if field.embedder else ''}."
     require_shape("text_embedding", text_embedding, (size,), remedy)
-    least = threshold_of(retrieval, retrieval_threshold, "found_of", logits)
+    require_retrieval("found_of", retrieval)
     if field.regions.count == 0:
         return NOTHING
     given = field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels, field.votes.overlap
-    return _retrieve(*jax.tree.map(jnp.asarray, given), least, alike_threshold, piece_nearness, logits, retrieval)
+    refusal = Refusal(retrieval_threshold, quantile, logits)
+    words, retrieval = words_of(field, retrieval)
+    return _retrieve(*jax.tree.map(jnp.asarray, given), words, refusal, alike_threshold, piece_nearness, retrieval)
 
 
 def query_region(
@@ -155,7 +168,7 @@ def members(
     if isinstance(field.votes.regions, np.memmap) and codes is None:
         parts = [jax.tree.map(np.asarray, part) for part in members_by_block(field, [found], threshold, by=by)]
         mask, similarity = (np.concatenate([getattr(p[0], name) for p in parts]) for name in ("mask", "similarity"))
-        return Selection(mask, similarity, found.region.astype(jnp.int32), found.score)
+        return Selection(mask, similarity, found.region.astype(jnp.int32), found.score, jnp.asarray(found.quantile))
     if by == "votes":
         return _by_share(jax.tree.map(jnp.asarray, field.votes), found, threshold)
     seen, table = jnp.asarray(field.votes.views) > 0, jnp.asarray(field.region_codes)
@@ -185,14 +198,15 @@ def _nothing(field: LanguageField) -> Selection:
 
 
 # Apart from the members, so that fields of any number of Gaussians share the one, and a text and a pixel the other.
-def _retrieve_body(embeddings, text, canonical, pixels, overlap, least, alike, nearness, logits, retrieval) -> Found:
-    similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
-    standing = None if retrieval == "cosine" else evidence(pixels).astype(similarity.dtype)
-    rule = {"retrieval_threshold": least, "alike_threshold": alike, "piece_nearness": nearness, "standing": standing}
-    there = None if logits is None else presence(embeddings, text, logits)
-    chosen = regions_of_text(embeddings, similarity, known, overlap, several=False, there=there, **rule)
-    best = anchor_of(similarity, known, standing)
-    return Found(chosen, jnp.where(chosen[best], best, -1), jnp.where(known[best], similarity[best], 0.0))
+def _retrieve_body(embeddings, text, canonical, pixels, overlap, words, refusal, alike, nearness, retrieval) -> Found:
+    similar = None if words is None else unrelated_similarities(embeddings, words, canonical, pixels, retrieval)
+    found = measured(embeddings, text, canonical, pixels, words, similar, refusal, retrieval)
+    rule = {"standing": found.standing, "accepted": found.accepted}
+    rule |= {"alike_threshold": alike, "piece_nearness": nearness}
+    chosen = regions_of_text(embeddings, found.similarity, found.known, overlap, several=False, **rule)
+    best, known = found.anchor, found.known[found.anchor]
+    score, quantile = jnp.where(known, found.similarity[best], 0.0), jnp.where(known, found.quantile, jnp.nan)
+    return Found(chosen, jnp.where(chosen[best], best, -1), score, quantile)
 
 
 _retrieve = jax.jit(_retrieve_body, static_argnames="retrieval")
@@ -216,7 +230,7 @@ def _found_region(
 def _by_share(votes, found: Found, threshold: Number) -> Selection:
     share, known = share_of(votes, found.chosen)
     mask = known & (share >= threshold) & (found.region >= 0)
-    return Selection(mask, share, found.region.astype(jnp.int32), found.score)
+    return Selection(mask, share, found.region.astype(jnp.int32), found.score, found.quantile)
 
 
 @jax.jit
@@ -224,4 +238,5 @@ def _by_code(codes, region_codes, seen, found: Found, threshold: Number) -> Sele
     similarity, known = similarities(codes, region_codes[jnp.maximum(found.region, 0)])
     known &= seen & (found.region >= 0)
     mask = known & (similarity >= threshold)
-    return Selection(mask, jnp.where(known, similarity, 0.0), found.region.astype(jnp.int32), found.score)
+    similarity = jnp.where(known, similarity, 0.0)
+    return Selection(mask, similarity, found.region.astype(jnp.int32), found.score, found.quantile)

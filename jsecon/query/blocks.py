@@ -11,7 +11,7 @@ from jsecon.errors import require_one_of, require_shape
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.query.anchored import THRESHOLDS, Found, found_of, members_by_block
 from jsecon.query.direct import Number
-from jsecon.query.retrieval import PIECE_NEARNESS
+from jsecon.query.retrieval import PIECE_NEARNESS, QUANTILE, RETRIEVALS
 from jsecon.types import Array, LanguageField
 from jsecon.vision.protocols import Logits
 
@@ -33,10 +33,11 @@ def query_in_blocks(
     field: LanguageField,
     text_embeddings: Float[Array, "q e"],
     *,
+    quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
     similarity_threshold: Number | None = None,
     by: str = "votes",
-    retrieval: str = "contrast",
+    retrieval: str = RETRIEVALS[0],
     alike_threshold: Number | None = ALIKE_THRESHOLD,
     piece_nearness: Number | None = PIECE_NEARNESS,
     logits: Logits | None = None,
@@ -50,7 +51,7 @@ def query_in_blocks(
         "query_in_blocks", text_embeddings, ("Q", field.regions.embeddings.shape[1]), "Give a row for a text."
     )
     require_one_of("query_in_blocks", by, THRESHOLDS, "'votes' is the default.")
-    how = {"retrieval_threshold": retrieval_threshold, "retrieval": retrieval}
+    how = {"quantile": quantile, "retrieval_threshold": retrieval_threshold, "retrieval": retrieval}
     how |= {"alike_threshold": alike_threshold, "piece_nearness": piece_nearness, "logits": logits}
     found = [found_of(field, jnp.asarray(text), **how) for text in text_embeddings]
     return chosen_in_blocks(field, found, similarity_threshold, by=by)

@@ -19,8 +19,20 @@ from jaxtyping import Bool, Float
 from jsecon.errors import require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.numerics import normalize
+from jsecon.query.direct import Number
 from jsecon.query.outliers import MIN_SAMPLES, dbscan, default_eps
-from jsecon.query.retrieval import NEARNESS, PIECE_NEARNESS, contrasts, presence, threshold_of
+from jsecon.query.retrieval import (
+    NEARNESS,
+    PIECE_NEARNESS,
+    QUANTILE,
+    Refusal,
+    contrasts,
+    fixed_threshold,
+    presence,
+    quantile_among,
+    unrelated_similarities,
+    words_of,
+)
 from jsecon.types import Array, LanguageField, Parts, Selection
 from jsecon.vision.protocols import Logits
 
@@ -80,6 +92,7 @@ def parts_instead(
     text: Float[Array, " e"],
     score: Float[Array, ""] | float,
     *,
+    quantile: Number = QUANTILE,
     similarity_threshold: float | None = None,
     logits: Logits | None = None,
 ) -> InParts | None:
@@ -91,7 +104,8 @@ def parts_instead(
 
         unit(sum_p w_p n_p(S) / n_p e_p),
 
-    has s < HELD c, and reaches the threshold on it (with `logits` on its probability) that a region must reach.
+    has s < HELD c, and is refused by neither `quantile`, against the parts that answer unrelated words best, nor, of a
+    field without such words, by the threshold that a region must reach.
     Selection.region is then -1, its score c, its similarity z on a scale that is 0.5 at THING, on which
     `similarity_threshold` (default 0.5) cuts in its place; of what is as near and not in S, NOT_OF_IT at most. Host
     code around compiled parts. Raises ValueError where the field has no parts.
@@ -109,11 +123,23 @@ def parts_instead(
     inside = count(part[mask]) / np.maximum(count(part), 1.0)
     embedding, contrast = _pooled(parts.embeddings, parts.weight, inside, text, field.canonical)
     there = None if logits is None else float(presence(embedding[None], jnp.asarray(text), logits)[0])
-    reached = contrast if there is None else there
-    if not mask.any() or score >= HELD * contrast or reached < threshold_of("contrast", None, "parts_instead", logits):
+    if (words := words_of(field, "contrast")[0]) is None:
+        told, on = jnp.asarray(jnp.nan), contrast if there is None else there
+        accepted = on >= fixed_threshold(Refusal(logits=logits), "contrast")
+    else:
+        told = _quantile(parts.embeddings, parts.weight, contrast, jnp.asarray(text), words, field.canonical)
+        accepted = told >= quantile
+    if not mask.any() or score >= HELD * contrast or not accepted:
         return None
     region, contrast = jnp.asarray(-1, jnp.int32), jnp.asarray(contrast, jnp.float32)
-    return InParts(Selection(jnp.asarray(mask), jnp.asarray(similarity), region, contrast), there)
+    return InParts(Selection(jnp.asarray(mask), jnp.asarray(similarity), region, contrast, told), there)
+
+
+@jax.jit
+def _quantile(embeddings: Array, weight: Array, contrast: Array, text: Array, words: Array, canonical: Array) -> Array:
+    """The share of unrelated words (W, E) whose best of P parts has less than a text's contrast."""
+    similar = unrelated_similarities(embeddings, words, canonical, weight[:, None], "contrast")
+    return quantile_among(contrast, text, words, similar)
 
 
 @jax.jit

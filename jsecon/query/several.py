@@ -10,7 +10,18 @@ from jsecon.errors import InputError, require
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.anchored import NOTHING, Found, members
 from jsecon.query.direct import Number
-from jsecon.query.retrieval import NEARNESS, PIECE_NEARNESS, answers, evidence, presence, regions_of_text, threshold_of
+from jsecon.query.retrieval import (
+    NEARNESS,
+    PIECE_NEARNESS,
+    QUANTILE,
+    RETRIEVALS,
+    Refusal,
+    measured,
+    regions_of_text,
+    require_retrieval,
+    unrelated_similarities,
+    words_of,
+)
 from jsecon.types import Array, LanguageField, Selection
 from jsecon.vision.protocols import Logits
 
@@ -31,22 +42,24 @@ def query_several(
     several: bool = True,
     nearness: Number = NEARNESS,
     piece_nearness: Number = PIECE_NEARNESS,
-    retrieval: str = "contrast",
+    retrieval: str = RETRIEVALS[0],
+    quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
     similarity_threshold: Number = SHARE_THRESHOLD,
     logits: Logits | None = None,
 ) -> Selection:
     """The Gaussians of all regions that answer any of the wanted texts (Q, E) and none of the unwanted (U, E).
 
-    A region answers a text by the rule of `regions_of_text`, on the similarities that `retrieval` names, with `logits`
-    as in `query_anchored`. One that answers a wanted and an unwanted text belongs to the one that it is more similar
-    to, so that "mug but not handle" keeps the mug where the handle was never told apart. Membership is by votes, as in
-    `query_anchored`: the share of the chosen regions is at least `similarity_threshold`. Selection.region is the best
-    of the chosen, -1 where there is none; Selection.score its similarity. Pure: jit it or vmap it over texts. Raises
-    ValueError on texts of another size.
+    A region answers a text by the rule of `regions_of_text`, on the similarities that `retrieval` names; `quantile`,
+    `retrieval_threshold` and `logits` refuse a text as in `query_anchored`. One that answers a wanted and an unwanted
+    text belongs to the one that it is more similar to, so that "mug but not handle" keeps the mug where the handle was
+    never told apart. Membership is by votes, as in `query_anchored`: the share of the chosen regions is at least
+    `similarity_threshold`. Selection.region is the best of the chosen, -1 where there is none; Selection.score its
+    similarity. Pure: jit it or vmap it over texts. Raises ValueError on texts of another size.
     """
     how = {"nearness": nearness, "piece_nearness": piece_nearness, "retrieval": retrieval, "logits": logits}
-    found = found_of_several(field, wanted, unwanted, several=several, retrieval_threshold=retrieval_threshold, **how)
+    how |= {"quantile": quantile, "retrieval_threshold": retrieval_threshold}
+    found = found_of_several(field, wanted, unwanted, several=several, **how)
     return members(field, found, similarity_threshold)
 
 
@@ -58,7 +71,8 @@ def found_of_several(
     several: bool = True,
     nearness: Number = NEARNESS,
     piece_nearness: Number = PIECE_NEARNESS,
-    retrieval: str = "contrast",
+    retrieval: str = RETRIEVALS[0],
+    quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
     logits: Logits | None = None,
 ) -> Found:
@@ -69,35 +83,37 @@ def found_of_several(
     fit = wanted.shape[1] == size and unwanted.shape[1] == size and wanted.shape[0] >= 1
     found, expected = f"wanted {wanted.shape}, unwanted {unwanted.shape}", f"(Q >= 1, {size}) and (U, {size})"
     require(fit, "query_several", found, expected, "Embed the texts with the field's embedder.")
-    least = threshold_of(retrieval, retrieval_threshold, "query_several", logits)
+    require_retrieval("query_several", retrieval)
     if field.regions.count == 0:
         return NOTHING
     known = field.regions.embeddings, field.canonical, field.regions.pixels, field.votes.overlap
     given = jax.tree.map(jnp.asarray, (*known, wanted, unwanted))
-    return _retrieve(*given, nearness, piece_nearness, least, logits, several, retrieval)
+    refusal, (words, retrieval) = Refusal(retrieval_threshold, quantile, logits), words_of(field, retrieval)
+    return _retrieve(*given, words, refusal, nearness, piece_nearness, several, retrieval)
 
 
 def _retrieve_body(
-    embeddings, canonical, pixels, overlap, wanted, unwanted, nearness, pieces, least, logits, several, retrieval
+    embeddings, canonical, pixels, overlap, wanted, unwanted, words, refusal, nearness, pieces, several, retrieval
 ) -> Found:
-    count = embeddings.shape[0]
-    standing = None if retrieval == "cosine" else evidence(pixels).astype(embeddings.dtype)
+    count, dtype = embeddings.shape[0], embeddings.dtype
+    similar = None if words is None else unrelated_similarities(embeddings, words, canonical, pixels, retrieval)
 
     def answering(texts):
-        chosen, closeness = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, embeddings.dtype)
+        chosen, closeness, quantile = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, dtype), jnp.asarray(jnp.nan)
         for text in texts:
-            similarity, known = answers(embeddings, text, canonical, pixels, retrieval)
-            rule = {"retrieval_threshold": least, "several": several, "nearness": nearness, "standing": standing}
-            rule["there"] = None if logits is None else presence(embeddings, text, logits)
-            own = regions_of_text(embeddings, similarity, known, overlap, piece_nearness=pieces, **rule)
-            chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, similarity, -jnp.inf))
-        return chosen, closeness
+            found = measured(embeddings, text, canonical, pixels, words, similar, refusal, retrieval)
+            rule = {"several": several, "nearness": nearness, "piece_nearness": pieces}
+            rule |= {"standing": found.standing, "accepted": found.accepted}
+            own = regions_of_text(embeddings, found.similarity, found.known, overlap, **rule)
+            chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, found.similarity, -jnp.inf))
+            quantile = jnp.fmax(quantile, found.quantile)
+        return chosen, closeness, quantile
 
-    chosen, closeness = answering(wanted)
-    refused, against = answering(unwanted)
+    chosen, closeness, quantile = answering(wanted)
+    refused, against, _ = answering(unwanted)
     chosen &= ~(refused & (against >= closeness - ROUNDING))
     best, found = jnp.argmax(jnp.where(chosen, closeness, -jnp.inf)), jnp.any(chosen)
-    return Found(chosen, jnp.where(found, best, -1), jnp.where(found, closeness[best], 0.0))
+    return Found(chosen, jnp.where(found, best, -1), jnp.where(found, closeness[best], 0.0), quantile)
 
 
 _retrieve = jax.jit(_retrieve_body, static_argnames=("several", "retrieval"))

@@ -4,6 +4,7 @@ Both sides become a distribution over points of CIELAB, and by a smooth kernel a
 whose names are the basic colour terms (Berlin & Kay 1969) and the common mixed ones.
 """
 
+import itertools
 import re
 from concurrent.futures import ThreadPoolExecutor
 
@@ -100,6 +101,9 @@ class ColourEmbedder:
 
     `canonical` holds what a colour query must beat in LERF's relevancy, in the role of object / things / stuff /
     texture: the palette's mean (any colour), mid grey, and a pale and a dark neutral (walls, shadow).
+
+    `reference` are things of two colours, of each pair of basic terms and their shades. Most colours are somewhere in
+    most rooms, and few pairs are on one thing: a region that has one of the two says how similar half of a text is.
     """
 
     name = "colours-1"
@@ -119,6 +123,8 @@ class ColourEmbedder:
         neutral = lab_of(np.asarray([(128, 128, 128), (190, 182, 170), (64, 62, 60)]))
         colours = [self._mean(self._points), *(self._mean(point[None]) for point in neutral)]
         self.canonical = np.stack([_joined(c, angle) for c, angle in zip(colours, (0.25, 0.25, 0.5, 0.25))])
+        basic = [name for name in self.names if name.split()[-1] in BASIC]
+        self.reference = self.embed_text([f"{one} and {other}" for one, other in itertools.combinations(basic, 2)])
 
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]

@@ -70,6 +70,8 @@ class Embedder(Protocol):
     """E"""
     canonical: np.ndarray
     """(C, E) float32 unit: what a query must beat, such as `CANONICAL`"""
+    reference: np.ndarray
+    """(W, E) float32 unit: texts that have nothing to do with a scene, such as `REFERENCE_WORDS`; W may be 0"""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
