@@ -1,6 +1,7 @@
 """Which region answers a text: contrasts against NumPy in float64, and what they are for."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from small_field import field_of, make_field, unit_rows
 
+from jsecon.app import command_line
+from jsecon.app.question import ask_text
+from jsecon.language.field import load_field, save_field
+from jsecon.pipeline import networks
 from jsecon.query.anchored import query_anchored
-from jsecon.query.direct import similarities
 from jsecon.query.classes import query_classes
+from jsecon.query.direct import similarities
 from jsecon.query.retrieval import (
     CONTRAST_THRESHOLD,
     QUANTILE,
@@ -317,7 +322,7 @@ def test_unrelated_words_that_tell_nothing_refuse_nothing_and_no_words_fall_back
 
 
 def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
-    field, texts = worded
+    field = worded[0]
     hub = unit(unit(np.asarray(field.regions.embeddings)).sum(0)).astype(np.float32)  # a little like every region
     names = np.stack([hub, *np.asarray(field.regions.embeddings)[:2]])
     words = np.asarray(field.reference, np.float64).mean(0)
@@ -337,3 +342,49 @@ def test_a_list_of_classes_is_compared_in_deviations_of_each_text(worded):
     assert query_classes(field, names, quantile=1.0)[0].max() >= -1
     nothing = query_classes(field, np.zeros((2, SIZE), np.float32))
     assert (np.asarray(nothing[0]) == -1).all()
+
+
+def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, tmp_path, monkeypatch, capsys):
+    field, texts = worded
+    shares = [exact_quantile(field.regions.embeddings, text, field.reference) for text in texts]
+    rows = {"seen": texts[int(np.argmax(shares))], "unseen": texts[int(np.argmin(shares))]}
+
+    class Words:
+        canonical = field.canonical
+        embed_text = staticmethod(lambda asked: np.stack([rows[text] for text in asked]))
+
+    monkeypatch.setattr(networks, "embedder_of_field", lambda *a, **k: Words())
+
+    def asked(name, *options):
+        assert (
+            command_line.main(["query", str(tmp_path / name), "seen", "unseen", "--out", str(tmp_path), *options]) == 0
+        )
+        told = [json.loads((tmp_path / f"{text}.json").read_text()) for text in ("seen", "unseen")]
+        return told, capsys.readouterr().out
+
+    save_field(tmp_path / "new.npz", dataclasses.replace(field, reference=field.reference.astype(np.float16)))
+    assert np.asarray(load_field(tmp_path / "new.npz").reference).dtype == np.float16
+    (seen, unseen), out = asked("new.npz")
+    assert seen["quantile"] == pytest.approx(max(shares), abs=0.02)  # of words in float16
+    assert unseen["quantile"] == pytest.approx(min(shares), abs=0.02)
+    assert seen["region"] is not None
+    assert unseen["region"] is None
+    assert f"more similar than {int(100 * seen['quantile'])} % of unrelated words" in out
+    assert "earlier version" not in out
+    assert asked("new.npz", "--quantile", "0")[0][1]["region"] is not None
+    beyond = ["query", str(tmp_path / "new.npz"), "seen", "--out", str(tmp_path), "--quantile", "1.5"]
+    assert command_line.main(beyond) == 2
+    assert "--quantile" in capsys.readouterr().err
+
+    save_field(tmp_path / "old.npz", dataclasses.replace(field, reference=None))
+    (seen, unseen), out = asked("old.npz")
+    assert seen["quantile"] is unseen["quantile"] is None
+    assert out.count("earlier version") == 1
+    contrast = query_anchored(dataclasses.replace(field, reference=None), rows["seen"])
+    assert seen["score"] == pytest.approx(float(contrast.score), abs=1e-5)
+
+    class Templated(Words):
+        templates = ("a photo of a {}.",)
+        reference = -np.asarray(field.reference)
+
+    assert ask_text(field, Templated(), "seen").quantile != ask_text(field, Words(), "seen").quantile

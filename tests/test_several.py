@@ -43,11 +43,13 @@ def test_the_rule_is_the_stated_one(field):
         similarity = rows.astype(np.float64) @ text
         known = rng.random(9) < 0.8
         best, middle = similarity[known].max(), np.median(similarity[known])
-        alike = rows @ rows[np.where(known, similarity, -2).argmax()] >= 0.95
+        apart = rows - rows.sum(0, dtype=np.float64) / 10  # nine regions
+        apart /= np.linalg.norm(apart, axis=1, keepdims=True)
+        alike = apart @ apart[np.where(known, similarity, -2).argmax()] >= 0.9
         for nearness in (0.3, 0.8):
             expected = ((similarity >= middle + nearness * (best - middle)) | alike) & known & (best >= 0.2)
             given = rows, similarity.astype(np.float32), known
-            got = regions_of_text(*given, nearness=nearness, accepted=best >= 0.2)
+            got = regions_of_text(*given, nearness=nearness, accepted=bool(best >= 0.2))
             np.testing.assert_array_equal(got, expected)
 
 

@@ -13,11 +13,14 @@ from scipy import sparse
 from experiments.ideas import scenes
 from jsecon.association.atoms import Sparse
 from jsecon.association.consensus import group_by_consensus
-from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.query.retrieval import contrasts
 
 ROUNDS = 10
 """most rounds of `agree`; with a fifth of the masks wrong two or three suffice"""
+
+
+ALIKE_COSINE = 0.95
+"""of two regions' embeddings: above it they are one thing seen twice"""
 
 
 class State:
@@ -49,7 +52,7 @@ class State:
         """(K,) the region most similar to each text."""
         return self.similarities(texts, canonical).argmax(1)
 
-    def joined(self, anchors: np.ndarray, alike: float = ALIKE_THRESHOLD) -> list[np.ndarray]:
+    def joined(self, anchors: np.ndarray, alike: float = ALIKE_COSINE) -> list[np.ndarray]:
         """For each anchor the regions that are alike."""
         gram = self.embeddings @ self.embeddings.T
         return [np.flatnonzero(gram[a] >= alike) for a in anchors]

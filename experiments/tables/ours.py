@@ -188,7 +188,7 @@ def ask_field(
     if way not in ("votes", "all", "parts"):
         return by_selection(setting, ask, field.codes)
     texts = jnp.asarray(setting.texts)
-    classes = lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, every=True)[0])
+    classes = lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, standardise=False, every=True)[0])
     return Answers(ask, classes, features=field.codes)
 
 

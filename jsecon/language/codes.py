@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import require
 from jsecon.language.autoencoder import require_finite, train_autoencoder
-from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.numerics import WHOLE, cosine_matrix, normalize
 from jsecon.types import Array, Key
 
@@ -24,6 +23,8 @@ MAX_COSINE_LOSS = 1e-4
 CODE_THRESHOLD = 0.9
 """on the cosine of codes: from it on a query takes one for the other. Codes distilled from one region lie within a few
 degrees (0.9 is 26)"""
+DISTINCT_COSINE = 0.95
+"""of two regions' embeddings: below it their codes are to be kept apart"""
 LATENTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """sizes of code that "auto" tries"""
 SHARPNESS = 40.0
@@ -99,7 +100,7 @@ def region_codes(
     E <= latent: the unit embeddings, coder None; regions whose span has at most `latent` dimensions: coordinates in it,
     a `Rotation`, no cosine moved by more than 1e-4; else the codes of an `Autoencoder` trained on them.
     latent="auto": the smallest of `LATENTS`, and of a `Rotation` and `Spread` codes the first, that keeps every pair of
-    distinct regions (embeddings' cosine below `ALIKE_THRESHOLD`) apart at a query's threshold (codes' cosine below
+    distinct regions (embeddings' cosine below `DISTINCT_COSINE`) apart at a query's threshold (codes' cosine below
     `CODE_THRESHOLD`); None where no code shorter than the embeddings does.
     Raises ValueError for numbers that are not finite.
     """
@@ -146,10 +147,10 @@ def _spread_out(units: Array, latent: int) -> tuple[Array, Spread]:
 
 
 def distinct_pairs(units: Float[Array, "r e"]) -> Bool[np.ndarray, "r r"]:
-    """(R, R) where two regions with an embedding are two things: their cosine is below `ALIKE_THRESHOLD`."""
+    """(R, R) where two regions with an embedding are two things: their cosine is below `DISTINCT_COSINE`."""
     exact = np.asarray(units, np.float64)
     known = np.any(exact != 0, axis=1)
-    return (exact @ exact.T < ALIKE_THRESHOLD) & known[:, None] & known[None]
+    return (exact @ exact.T < DISTINCT_COSINE) & known[:, None] & known[None]
 
 
 def confused_pairs(units: Float[Array, "r e"], codes: Float[Array, "r d"]) -> int:

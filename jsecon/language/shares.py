@@ -23,7 +23,7 @@ from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.language.regions import ALIKE_THRESHOLD
+from jsecon.language.regions import ALIKE_THRESHOLD, apart_from_mean
 from jsecon.numerics import WHOLE, cosine_matrix
 from jsecon.types import Array, Regions, Votes
 
@@ -66,8 +66,8 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
     """`votes` with `shown` (N, K), for each vote the weight with which the views that show its region see the Gaussian,
     and without `by_view`, of which it is made.
 
-    Regions whose embeddings have a cosine of at least `alike_threshold` are shown together, as queries join them. The
-    share that follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
+    Regions that are alike, by `alike_threshold`, are shown together, as queries join them (`is_alike`). The share that
+    follows is the object posterior of B3-Seg: weight inside over inside and outside, over the views that
     contain the object. Pure; `by_view` that is mapped is read in blocks. Raises ValueError where the votes were cast
     without `by_view`, or over other views than `regions` knows.
     """
@@ -91,8 +91,8 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
 
 def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
     """(R, T) which views show a region, or one alike to it."""
-    known = jnp.any(regions.embeddings != 0, axis=1)
-    alike = cosine_matrix(regions.embeddings, regions.embeddings) >= alike_threshold
+    apart, known = apart_from_mean(jnp.asarray(regions.embeddings))
+    alike = cosine_matrix(apart, apart) >= alike_threshold
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
     return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0
 

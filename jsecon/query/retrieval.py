@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.errors import require_one_of
-from jsecon.language.regions import ALIKE_THRESHOLD
+from jsecon.language.regions import ALIKE_THRESHOLD, apart_from_mean
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.query.direct import Number, similarities
 from jsecon.types import Array, LanguageField, Regions
@@ -296,10 +296,11 @@ def regions_of_text(
 
         s_r >= m + nearness (s_b - m)              with `several`: of the same kind (`is_near`)
         s_r >= m + piece_nearness (s_b - m), o_rc >= PIECE_OVERLAP     with c = a or of its kind: a piece (`is_piece`)
-        cos(e_r, e_a) >= alike_threshold           the same thing seen twice (`is_alike`)
+        cos(d_r, d_a) >= alike_threshold           the same thing seen twice (`is_alike`)
 
-    with m the median of the known s, o the soft IoU of two regions' Gaussians, `overlap` (R, R), and e the embeddings
-    (R, E). No pieces where `overlap` or `piece_nearness` is None, none alike where `alike_threshold` is.
+    with m the median of the known s, o the soft IoU of two regions' Gaussians, `overlap` (R, R), and d what sets an
+    embedding (R, E) apart from the others. No pieces where `overlap` or `piece_nearness` is None, none alike where
+    `alike_threshold` is.
     """
     anchor = anchor_of(similarity, known, standing)
     chosen = jnp.arange(embeddings.shape[0]) == anchor
@@ -323,9 +324,11 @@ def anchor_of(
 def is_alike(
     embeddings: Float[Array, "r e"], region: Int[Array, ""], threshold: Number = ALIKE_THRESHOLD
 ) -> Bool[Array, " r"]:
-    """Which of R regions have an embedding whose cosine with that of `region` is at least `threshold`."""
-    cosines, known = similarities(embeddings, embeddings[region])
-    return known & (cosines >= threshold)
+    """Which of R regions differ from the others as `region` does: what sets both apart (`apart_from_mean`) has a cosine
+    of at least `threshold`."""
+    apart, known = apart_from_mean(embeddings)
+    cosines, measured = similarities(apart, apart[region])
+    return known & measured & (cosines >= threshold)
 
 
 def is_near(similarity: Float[Array, " r"], known: Bool[Array, " r"], nearness: Number) -> Bool[Array, " r"]:
