@@ -119,6 +119,7 @@ class Scene:
             "name": self.name,
             "gaussians": self.field.gaussians.count,
             "regions": self.field.regions.count,
+            "unrelated_words": None if self.field.reference is None else len(self.field.reference),
             "frames": list(self.field.names),
             "size": [self.field.cameras.width, self.field.cameras.height],
         }
