@@ -100,16 +100,8 @@ class ClipEmbedder:
 
     @functools.cached_property
     def reference(self) -> Float32[np.ndarray, "w e"]:
-        """(W, E) float32 unit: REFERENCE_WORDS, in the templates, as texts are; kept in the store."""
-        words = "\0".join([*self.templates, *REFERENCE_WORDS]).encode()
-        content, key = np.frombuffer(words, np.uint8), b"reference words"
-        known = {} if self._store is None else self._store.read(content)
-        if known.get(key, np.zeros(0)).size == len(REFERENCE_WORDS) * self.dim:
-            return known[key].reshape(-1, self.dim)
-        rows = self.embed_text(list(REFERENCE_WORDS))
-        if self._store is not None:
-            self._store.write(content, {key: rows.reshape(-1)})
-        return rows
+        """(W, E) float32 unit: REFERENCE_WORDS, in the templates, as texts are."""
+        return self.embed_text(list(REFERENCE_WORDS))
 
     @functools.cached_property
     def logits(self) -> Logits | None:
