@@ -57,6 +57,7 @@ def make_field(scene, cameras, *, dim=12, latent=8):
         names=tuple(f"frame_{t}" for t in range(len(labels))),
         embedder="random",
         provenance='{"made by": "a test"}',
+        reference=np.zeros((0, dim), np.float32),
     )
     return field, labels
 
