@@ -1,6 +1,7 @@
 """The field's file: what goes in comes out, and every broken file is told apart with one clear message."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -132,16 +133,27 @@ def test_a_file_with_bytes_changed(path):
     assert told >= 20
 
 
-def test_another_programs_file_and_a_field_of_before(tmp_path):
+def test_another_programs_file(tmp_path):
     save_file({"a": np.ones(3)}, tmp_path / "other.safetensors")
     fails(tmp_path / "other.safetensors", "another program")
     for description in ({"format": "something"}, [1, 2], None):
         write_arrays(tmp_path / "foreign.safetensors", {"a": np.ones(3)}, description)
         fails(tmp_path / "foreign.safetensors", "no field")
-    np.savez(tmp_path / "field.npz", header=np.zeros(3, np.uint8))
-    fails(
-        tmp_path / "field.npz", r"earlier version of jsecon\. Run `jsecon run` again, which writes field\.safetensors"
-    )
+    np.savez(tmp_path / "foreign.npz", header=np.zeros(3, np.uint8), a=np.ones(3))
+    fails(tmp_path / "foreign.npz", "jsecon run")
+
+
+def test_a_field_of_the_first_version_is_read_and_its_damage_is_noticed(field, tmp_path):
+    """field.npz: the same arrays in a zip archive, their description among them."""
+    save_field(tmp_path / "field.safetensors", field)
+    header, arrays = read_arrays(tmp_path / "field.safetensors")
+    text = np.frombuffer(json.dumps(header | {"version": 1}).encode(), np.uint8)
+    np.savez(tmp_path / "field.npz", header=text, **arrays)
+    assert_same(load_field(tmp_path / "field.npz"), field)
+    content = bytearray((tmp_path / "field.npz").read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (tmp_path / "field.npz").write_bytes(content)
+    fails(tmp_path / "field.npz", "jsecon run")
 
 
 def rewritten(path, change):
@@ -202,7 +214,7 @@ def test_mapped_columns_are_not_read_until_they_are_asked_for(field, path, monke
     monkeypatch.setattr(module, "MAPPED", 0)
     back = load_field(path, mapped=True)
     for x, y in zip(jax.tree.leaves(back), jax.tree.leaves(field), strict=True):
-        assert isinstance(x, np.memmap)
+        assert isinstance(x, np.memmap) or x.size == 0
         assert not x.flags.writeable
         assert x.ctypes.data % x.itemsize == 0
         np.testing.assert_array_equal(x, y)

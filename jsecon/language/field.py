@@ -26,6 +26,7 @@ from jsecon.files import (
     packed,
     parsed_json,
     read_arrays,
+    read_zip,
     unpacked,
     write_arrays,
     written_whole,
@@ -39,7 +40,8 @@ from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT = "jsecon-field"
 VERSION = 2
-"""1 was a zip archive"""
+_ZIP_VERSION = 1
+"""of field.npz, a zip archive of NumPy's arrays"""
 _RECORDS = {
     cls.__name__: cls
     for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
@@ -132,16 +134,19 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     if not path.is_file():
         raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
-    if zipfile.is_zipfile(path):
-        found = "it is a field of an earlier version of jsecon"
-        raise InputError(path, found, remedy="Run `jsecon run` again, which writes field.safetensors.")
+    is_zip = zipfile.is_zipfile(path)
     try:
-        header, members = read_arrays(path, mapped=mapped, checked=checked)
+        if is_zip:  # field.npz, as it was written before field.safetensors
+            members = read_zip(path)
+            header = parsed_json(members.pop("header", np.zeros(0, np.uint8)).tobytes() or b"null")
+        else:
+            header, members = read_arrays(path, mapped=mapped, checked=checked)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
-        if (version := header.get("version")) != VERSION:
+        expected = _ZIP_VERSION if is_zip else VERSION
+        if (version := header.get("version")) != expected:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
-            raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
+            raise InputError(path, f"version {version}", f"version {expected}", remedy)
         field = unpacked(_known(header["field"]), members, _RECORDS.__getitem__)
         whole = isinstance(field, LanguageField)
         problem = _disagreement(field) or _oddity(field, checked) if whole else "no field at its root"
