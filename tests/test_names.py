@@ -159,7 +159,9 @@ def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):
 
     for by in ("votes", "one_step"):
         heard: list[str] = []
-        plain, quoted = (ask_text(field, Heard(), text, by=by) for text in (word, f'"{word}"'))
+        embedder = Heard()
+        heard.clear()
+        plain, quoted = (ask_text(field, embedder, text, by=by) for text in (word, f'"{word}"'))
         np.testing.assert_array_equal(plain.mask, quoted.mask)
         assert set(heard) == {word}
 

@@ -28,6 +28,7 @@ from jsecon.pipeline.masklet_stages import masklets
 from jsecon.pipeline.networks import GivenSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians, load
+from jsecon.query.retrieval import evidence
 from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.stores import StoredSegmenter
 
@@ -147,16 +148,17 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
 def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp_path, capsys):
     _, folder, _ = seen
     field = folder / "field.safetensors"
-    assert (
-        command_line.main(
-            ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
-        )
-        == 0
-    )
+    query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
+    assert command_line.main([*query, "--quantile", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
     text = networks.embedder_of_field(found, templates=("a {} thing",)).embed_text(["red"])[0]
-    assert answer["region"] == int((np.asarray(found.regions.embeddings) @ text).argmax())
-    assert answer["score"] > 0.9
+    words = networks.embedder_of_field(found, templates=("a {} thing",)).reference
+    similar = (
+        np.asarray(found.regions.embeddings) @ (text - words.mean(axis=0)) / np.linalg.norm(text - words.mean(axis=0))
+    )
+    standing = np.asarray(evidence(found.regions.pixels))
+    assert answer["region"] == int(np.where(similar > 0, similar * standing, similar).argmax())
+    assert answer["score"] == pytest.approx(float(similar[answer["region"]]), abs=2e-3)
     other = write_clip(tmp_path / "other", "immich")
     assert command_line.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--embedder", str(other)]) == 2
     assert "model that the field was made with" in capsys.readouterr().err

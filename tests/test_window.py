@@ -123,7 +123,7 @@ def test_several(field):
 
 def test_classes_of_all(field, count):
     sets = unit_rows(np.random.default_rng(2), 10, of_classes.SIZE).reshape(2, 5, -1)
-    ask = {"retrieval": "cosine", "retrieval_threshold": -1.0, "every": True}
+    ask = {"retrieval": "cosine", "retrieval_threshold": -1.0, "standardise": False, "every": True}
     labels, found = compiled(lambda texts, field: query_classes(field, texts, **ask), sets, field)
     rows = np.unique(np.linspace(0, count - 1, 2_000).astype(int))
     few = dataclasses.replace(

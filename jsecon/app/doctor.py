@@ -30,6 +30,7 @@ PACKAGES = (
     "flax",
     "onnxruntime",
     "tokenizers",
+    "safetensors",
     "ftfy",
     "tqdm",
     "tyro",

@@ -196,6 +196,7 @@ def distil(work: Work) -> Stage:
 def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:
     """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
     from jsecon.language.shares import finish_votes
+    from jsecon.vision.reference_words import reference_of
 
     capture, found = results["load"], results["regions"]
     pixels = np.zeros((found.count, len(capture.names)), np.int32)
@@ -215,5 +216,5 @@ def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:
         embedder=embedder.name,
         provenance=provenance,
         parts=results.get("parts"),
-        reference=np.asarray(embedder.reference, np.float16),
+        reference=reference_of(embedder).astype(np.float16),
     )

@@ -62,7 +62,11 @@ class NamedTracker(Tracker, Network, Protocol):
 
 @runtime_checkable
 class Embedder(Protocol):
-    """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity."""
+    """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity.
+
+    An embedder may also have `reference`, (W, E) float32 unit: texts that have nothing to do with a scene. Without it
+    `REFERENCE_WORDS` are embedded (`reference_words.reference_of`).
+    """
 
     name: str
     """identifies the space: fields and texts must come from the same"""
@@ -70,8 +74,6 @@ class Embedder(Protocol):
     """E"""
     canonical: np.ndarray
     """(C, E) float32 unit: what a query must beat, such as `CANONICAL`"""
-    reference: np.ndarray
-    """(W, E) float32 unit: texts that have nothing to do with a scene, such as `REFERENCE_WORDS`; W may be 0"""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""

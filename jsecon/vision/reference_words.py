@@ -4,6 +4,12 @@ Few of them are in any one scene. So their best regions say how similar a text i
 it names (jsecon.query.retrieval). The list was written before anything was measured with it.
 """
 
+import numpy as np
+from jaxtyping import Float32
+
+from jsecon.errors import InputError
+from jsecon.vision.protocols import Embedder
+
 _WORDS = """
 apple, banana, orange, lemon, grape, strawberry, cherry, melon, pineapple, coconut, tomato, potato, carrot, onion,
 cabbage, mushroom, corn, bean, rice, bread, cheese, butter, egg, sausage, soup, salad, pizza, sandwich, noodle, cake,
@@ -37,3 +43,21 @@ sword, shield, cannon, bomb, coffin, mask, feather, horn, wing, nest, cage, aqua
 basket, jar, paper, brick, wool, leather, diamond
 """
 REFERENCE_WORDS: tuple[str, ...] = tuple(word.strip() for word in _WORDS.split(","))
+
+
+def reference_of(embedder: Embedder) -> Float32[np.ndarray, "w e"]:
+    """Embeds texts that have nothing to do with a scene.
+
+    Args:
+      embedder: Space of images and texts. Where it has `reference`, that is taken.
+
+    Returns:
+      (W, E) unit rows; W is 0 where the embedder has no words for REFERENCE_WORDS.
+    """
+    rows = getattr(embedder, "reference", None)
+    if rows is None:
+        try:
+            rows = embedder.embed_text(list(REFERENCE_WORDS))
+        except InputError:
+            rows = np.zeros((0, embedder.dim))
+    return np.asarray(rows, np.float32)
