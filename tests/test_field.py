@@ -214,7 +214,9 @@ def test_mapped_columns_are_not_read_until_they_are_asked_for(field, path, monke
     monkeypatch.setattr(module, "MAPPED", 0)
     back = load_field(path, mapped=True)
     for x, y in zip(jax.tree.leaves(back), jax.tree.leaves(field), strict=True):
-        assert isinstance(x, np.memmap) or x.size == 0
+        if y.size == 0:
+            continue
+        assert isinstance(x, np.memmap)
         assert not x.flags.writeable
         assert x.ctypes.data % x.itemsize == 0
         np.testing.assert_array_equal(x, y)
