@@ -35,9 +35,9 @@ QUANTILE = 0.83
 texts that name nothing in it, one in six selects something all the same. The least by which simulated CLIP at medium
 noise refuses 0.8 of the texts of what is not there. Refused of these, and kept of the others: 0.81 and 0.93 there, 0.81
 and 0.86 at high noise, 0.80 and 0.48 with errors that views share; on real words (ConSE, 15 classes of
-replica_apartment_0) 0.96 and 0.93; on colours of three rooms all and all. The contrast at its own 0.83 quantile keeps
-more in the simulation (0.96, 0.95, 0.85), whose gap between texts and images is a constant that it subtracts, and 0.60
-on real words"""
+replica_apartment_0; at 0.82) 0.96 and 0.93; on colours of three rooms all and all. The contrast
+keeps more in the simulation, whose gap between texts and images is a constant that it subtracts, and 0.60 on real
+words"""
 RELATED = 0.1
 """of the unrelated words, the nearest to a text are left out: what is like a thing of the scene is often there too"""
 PRESENCE_THRESHOLD = 0.01
