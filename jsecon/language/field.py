@@ -142,7 +142,8 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         else:
             header, members = read_arrays(path, mapped=mapped, checked=checked)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
+            problem = "it is an archive of another program" if is_zip else "it is a file of jsecon, but no field"
+            raise InputError(path, problem, "a field file", _REMEDY)
         expected = _ZIP_VERSION if is_zip else VERSION
         if (version := header.get("version")) != expected:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
