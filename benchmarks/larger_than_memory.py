@@ -29,7 +29,7 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.app.answers import save_scene
+from jsecon.app.outputs import save_scene
 from jsecon.files import map_array, write_column
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
@@ -102,7 +102,7 @@ class Labels:
         return np.where(inside, square @ [1, SQUARES], -1).astype(np.int32)
 
 
-def regions_of(labels: Labels) -> Regions:
+def main_regions(labels: Labels) -> Regions:
     """Random embeddings, true pixels."""
     pixels = [np.bincount(image[image >= 0], minlength=REGIONS) for image in (labels[t] for t in range(len(labels)))]
     embeddings = np.random.default_rng(0).normal(size=(REGIONS, EMBEDDING)).astype(np.float32)
@@ -134,7 +134,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
     """Votes, overlap, codes; and all in one field file."""
     cameras, told = ring(views, width, height), {}
     labels, gaussians = Labels(cameras), mapped(folder / "scene")
-    regions = timed(told, "labels' pixels, s", lambda: regions_of(labels))
+    regions = timed(told, "labels' pixels, s", lambda: main_regions(labels))
     how = {"folder": folder / "votes", "regions": regions}
     steps, worked = [], []
     votes = timed(
@@ -191,7 +191,7 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     part = jax.tree.map(lambda a: np.array(a[first : first + PART]), whole)
     cameras = ring(views, width, height)
     labels = Labels(cameras)
-    regions, images = regions_of(labels), np.stack([labels[t] for t in range(views)])
+    regions, images = main_regions(labels), np.stack([labels[t] for t in range(views)])
     how = {"folder": folder / "part", "regions": regions}
     blocks = timed(told, "in blocks, s", lambda: jsecon.region_votes_in_blocks(part, cameras, labels, REGIONS, **how))
     memory = timed(
@@ -298,7 +298,7 @@ def query_growth(base: Path, largest: int) -> None:
     """A query by votes along N."""
     print("| N | one query, s | s of CPU | 100 queries, s | s of CPU |\n|---|---|---|---|---|", flush=True)
     cameras, rows = ring(1, 64, 36), []
-    regions = regions_of(Labels(cameras))
+    regions = main_regions(Labels(cameras))
     texts = texts_near(regions)
     for count in (100_000, 1_000_000, 4_000_000, 20_000_000):
         if count <= largest:

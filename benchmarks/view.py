@@ -27,8 +27,8 @@ import numpy as np
 from browser import Page, opened, until
 from serve import SHADES, WORDS, copied, free_port
 
-from jsecon.app.viewer import Viewer, open_viewer
-from jsecon.app.viewing import ViewState
+from jsecon.app.viewer.view_state import ViewState
+from jsecon.app.viewer.window import Viewer, open_viewer
 from jsecon.language.field import load_field, save_field
 from jsecon.pipeline.networks import embedder_of_field
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results
-from jsecon.app.question import ask_text
+from jsecon.app.ask import ask_text
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import iou
 from jsecon.pipeline import pipeline

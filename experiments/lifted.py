@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments import results
 from experiments.places import Options as Places, asked_for, fields_of, room_of
-from jsecon.app.question import ask_outline, ask_text
+from jsecon.app.ask import ask_outline, ask_text
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.demo.raycast import trace
 from jsecon.demo.room import Room

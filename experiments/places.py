@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import results
-from jsecon.app.place import locate
+from jsecon.app.locate import locate
 from jsecon.app.verbs import Demo
 from jsecon.demo.crowd import crowded_room
 from jsecon.demo.demo import PLAIN, demo

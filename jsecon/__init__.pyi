@@ -1,7 +1,7 @@
 """Public names of `jsecon`, and the module of each."""
 
+from .app.locate import Place as Place, locate as locate
 from .app.notebook import show as show, to_html as to_html, to_png as to_png
-from .app.place import Place as Place, locate as locate
 from .association.algorithm1 import masklets as masklets
 from .backend import check_backend as check_backend
 from .data.capture import load_capture as load_capture

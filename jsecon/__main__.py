@@ -66,7 +66,7 @@ def main() -> int:
     stop_by_signals()
     code = 1
     try:
-        from jsecon.app.command_line import main as run
+        from jsecon.app.cli import main as run
 
         code = run(sys.argv[1:])
     except KeyboardInterrupt:  # amid the imports: nothing has begun

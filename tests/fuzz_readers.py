@@ -22,7 +22,7 @@ from test_proposal_files import records
 from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
-from jsecon.app import asking
+from jsecon.app import ask
 from jsecon.data import images, mask_files, motion, proposal_files, video
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
@@ -345,7 +345,7 @@ def masks(folder: Path) -> Iterator[Case]:
 
     for kind in ("grey", "colour", "bits"):
         file = folder / kind / "a.png"
-        yield Case([file], lambda file=file: asking.read_mask(file, field), whole_outline)
+        yield Case([file], lambda file=file: ask.read_mask(file, field), whole_outline)
 
 
 def langsplat(folder: Path) -> Iterator[Case]:

@@ -7,8 +7,8 @@ import pytest
 from small_field import REGIONS, make_field
 from test_gltf import read_glb
 
-from jsecon.app import command_line
-from jsecon.app.splat_page import NOWHERE, regions_of
+from jsecon.app import cli
+from jsecon.app.viewer.static_page import NOWHERE, main_regions
 from jsecon.data.gaussian_files import load_gaussians
 from jsecon.language.field import save_field
 
@@ -27,7 +27,7 @@ def saved(scene, cameras, tmp_path_factory):
 
 
 def run(*arguments) -> int:
-    return command_line.main([str(argument) for argument in arguments])
+    return cli.main([str(argument) for argument in arguments])
 
 
 def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
@@ -42,7 +42,7 @@ def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
     np.testing.assert_allclose(found["POSITION"], means * [-1, -1, 1], atol=1e-6)
     codes = np.concatenate([found[name] for name in found if name.startswith("_CODE")], axis=1)
     np.testing.assert_array_equal(codes, field.codes)
-    regions = regions_of(field)
+    regions = main_regions(field)
     np.testing.assert_array_equal(found["_REGION"][:, 0], np.where(regions == NOWHERE, -1, regions))
     assert set(range(REGIONS)) <= set(found["_REGION"][:, 0].astype(int))
 

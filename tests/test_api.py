@@ -61,7 +61,7 @@ def test_importing_the_package_starts_nothing_and_changes_no_environment():
     code = (
         "import os, sys; before = dict(os.environ); import jsecon; "
         "assert 'jax' not in sys.modules and 'numpy' not in sys.modules; "
-        "import jsecon.app.command_line; assert dict(os.environ) == before"
+        "import jsecon.app.cli; assert dict(os.environ) == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
 
@@ -152,4 +152,4 @@ def test_help_runs_as_a_program():
     )
     for verb in ("demo", "run", "query", "eval"):
         assert verb in text.stdout
-    importlib.import_module("jsecon.app.command_line")
+    importlib.import_module("jsecon.app.cli")

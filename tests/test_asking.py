@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from jsecon.app import asking, command_line
+from jsecon.app import ask, cli
 from jsecon.language import field as field_file, shares
 from jsecon.language.field import field_of_rows, load_field, save_field
 from jsecon.query import pixel
@@ -26,7 +26,7 @@ def forced(monkeypatch):
 
 
 def _query(field, out, *more):
-    return command_line.main([str(word) for word in ("query", field, *more, "--out", out, "--views", 1)])
+    return cli.main([str(word) for word in ("query", field, *more, "--out", out, "--views", 1)])
 
 
 @pytest.mark.parametrize("more", [(), ("--by", "code", "--format", "glb")])
@@ -63,8 +63,8 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     assert isinstance(mapped.parts.part, np.memmap)
     for threshold in (None, 2.0):
         how["threshold"] = threshold
-        answers, _ = asking.asked_each(asking.questions_of(field, ColourEmbedder(), **how))
-        blocks, _ = asking.answered_in_blocks(mapped, ColourEmbedder(), **how)
+        answers, _ = ask.answer_each(ask.queries_of(field, ColourEmbedder(), **how))
+        blocks, _ = ask.answer_in_blocks(mapped, ColourEmbedder(), **how)
         for memory, own in zip(answers, blocks, strict=True):
             np.testing.assert_array_equal(own.rows[own.mask], np.flatnonzero(memory.mask))
             np.testing.assert_array_equal(own.selection.similarity[own.mask], memory.selection.similarity[memory.mask])

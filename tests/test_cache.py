@@ -214,7 +214,7 @@ def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path,
         (package / file).write_bytes(text)
         return rooms
 
-    assert changed("app/viewer.py") == changed("query/anchored.py") == changed("evaluate/lerf.py") == set()
+    assert changed("app/viewer/window.py") == changed("query/anchored.py") == changed("evaluate/lerf.py") == set()
     assert changed("association/consensus.py") == {"association"}
     assert changed("language/votes.py") == {"language", "association"}
     assert changed("networks/sam2/bank.py") == {"networks", "language", "association"}

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.candidates import Pictures, candidates, region_along
-from jsecon.app.question import ask_text
-from jsecon.app.splat_page import regions_of
+from jsecon.app.ask import ask_text
+from jsecon.app.viewer.candidates import Pictures, candidates, region_along
+from jsecon.app.viewer.static_page import main_regions
 from jsecon.errors import InputError
 from jsecon.query.pixel import region_at
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -99,7 +99,7 @@ def test_a_ray_passes_what_is_hidden(field):
     everything = np.ones(64, bool)
     first = region_along(field, centre, ahead, focal=45.0, seen=everything)
     assert first >= 0
-    behind = region_along(field, centre, ahead, focal=45.0, seen=regions_of(field) != first)
+    behind = region_along(field, centre, ahead, focal=45.0, seen=main_regions(field) != first)
     assert behind != first
     assert region_along(field, centre, ahead, focal=45.0, seen=~everything) == -1
     assert region_along(field, centre, -ahead, focal=45.0, seen=everything) == -1

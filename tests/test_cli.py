@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.app import command_line, verbs
-from jsecon.app.question import BY_VOTES, METHODS
+from jsecon.app import cli, verbs
+from jsecon.app.ask import BY_VOTES, METHODS
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.pipeline import pipeline, progress
 from jsecon.pipeline.options import Options
@@ -22,7 +22,7 @@ from jsecon.splat.transform import transform_gaussians
 
 
 def _run(*arguments):
-    return command_line.main([str(argument) for argument in arguments])
+    return cli.main([str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -236,15 +236,13 @@ def test_options_of_a_run_are_grouped(capsys):
 
 
 def test_what_is_not_given_has_the_default_of_the_dataclass():
-    run = command_line.parse(["run", "room", "--out", "out"])
+    run = cli.parse(["run", "room", "--out", "out"])
     assert run.options == Options(Path("room"))
     changed = ["--latent", "auto", "--sh-degree", "2", "--masks", "m", "--downscale", "2", "--weighting", "uniform"]
-    options = command_line.parse(["run", "room", "--out=out", *changed]).options
+    options = cli.parse(["run", "room", "--out=out", *changed]).options
     found = options.latent, options.sh_degree, options.masks, options.downscale, options.weighting
     assert found == ("auto", 2, Path("m"), 2, "uniform")
-    assert command_line.parse(["fit", "room", "--out", "a.ply", "--steps", "7"]).options == Options(
-        Path("room"), steps=7
-    )
+    assert cli.parse(["fit", "room", "--out", "a.ply", "--steps", "7"]).options == Options(Path("room"), steps=7)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +258,7 @@ def test_what_is_not_given_has_the_default_of_the_dataclass():
     ],
 )
 def test_options_of_a_query_are_read(line, options):
-    query = command_line.parse(["query", *line.split()])
+    query = cli.parse(["query", *line.split()])
     assert (query.field, query.out) == (Path("f"), Path("o"))
     assert {name: getattr(query, name) for name in options} == options
 

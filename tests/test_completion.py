@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from jsecon.app.command_line import completion_script
+from jsecon.app.cli import completion_script
 
 TRY = """
 source {script}

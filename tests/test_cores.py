@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.question import ask_text
+from jsecon.app.ask import ask_text
 from jsecon.language.field import save_field
 from jsecon.vision.colours import ColourEmbedder
 
@@ -30,7 +30,7 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
     from conftest import look_at
 
     import jsecon
-    from jsecon.app.command_line import main
+    from jsecon.app.cli import main
     from jsecon.fit.optimise import fit_gaussians
     from jsecon.fit.schedule import Schedule
 
@@ -143,7 +143,7 @@ home = pathlib.Path(jsecon.__file__).parent
 for path in sorted(home.rglob("*.py")):
     if path.stem != "__main__":
         importlib.import_module(".".join(path.relative_to(home.parent).with_suffix("").parts).removesuffix(".__init__"))
-from jsecon.app.command_line import main
+from jsecon.app.cli import main
 code = main(["query", sys.argv[1], sys.argv[2], "--out", sys.argv[3]])
 assert memory_budget() > 1 << 20 and peak_memory_mib() >= 0
 assert not set({HIDDEN}) & set(sys.modules), set({HIDDEN}) & set(sys.modules)

@@ -10,14 +10,14 @@ import pytest
 from clip_files import write_clip
 
 from jsecon import backend, process
-from jsecon.app import command_line, doctor
+from jsecon.app import cli, doctor
 from jsecon.errors import InputError
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parent.parent / "pyproject.toml").read_text())["project"]
 
 
 def _lines(capsys, *options):
-    code = command_line.main(["doctor", *map(str, options)])
+    code = cli.main(["doctor", *map(str, options)])
     out = capsys.readouterr().out
     return code, {line[9:19].strip(): (line[:8].strip(), line[20:]) for line in out.splitlines()}
 
@@ -45,13 +45,13 @@ def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
         raise RuntimeError("cosines are off")
 
     monkeypatch.setattr(backend, "check_backend", wrong)
-    assert command_line.main(["doctor", "--json"]) == 2
+    assert cli.main(["doctor", "--json"]) == 2
     told = json.loads(capsys.readouterr().out)
     assert {check["name"]: check["status"] for check in told["checks"]}["backend"] == "wrong"
     assert [error["name"] for error in told["refused"]] == ["backend", "memory"]
     assert told["refused"][0]["remedy"] == backend.REMEDY
     with pytest.raises(InputError, match="no such folder"):
-        doctor.checks_of(Path("nowhere"))
+        doctor.run_checks(Path("nowhere"))
 
 
 def test_a_package_that_cannot_be_imported(monkeypatch):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.data.capture import capture_extent, load_capture
 from jsecon.data.frames import Extent
 from jsecon.data.video import size_of
@@ -17,7 +17,7 @@ STAGES = ["load", "gaussians", "masklets", "regions", "codes", "votes", "distil"
 
 
 def _dry(capsys, *arguments):
-    assert command_line.main([*map(str, arguments), "--dry-run", "--json"]) == 0
+    assert cli.main([*map(str, arguments), "--dry-run", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     return told, {stage["name"]: stage for stage in told["stages"]}
 
@@ -37,7 +37,7 @@ def test_a_dry_run_prints_the_lines_that_the_run_begins_with(room, room_run, tmp
     shutil.copytree(room_run[1] / "cache", tmp_path / "out" / "cache")
     line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", "--holdout", 4, "--steps", 150]
     for more in (["--dry-run"], []):
-        assert command_line.main([*map(str, line), *more]) == 0
+        assert cli.main([*map(str, line), *more]) == 0
     told = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     end = told.index("Nothing was written.")
     assert told[1:end] == told[end + 2 :][: end - 1]
@@ -47,7 +47,7 @@ def test_a_dry_run_prints_the_lines_that_the_run_begins_with(room, room_run, tmp
 
 def test_bad_options_are_refused_as_in_a_run(room, tmp_path, capsys):
     line = ["run", str(room), "--out", str(tmp_path / "out"), "--steps", "0", "--dry-run", "--json"]
-    assert command_line.main(line) == 2
+    assert cli.main(line) == 2
     assert json.loads(capsys.readouterr().out)["error"]["name"] == "--steps"
 
 
@@ -116,7 +116,7 @@ def test_a_dry_run_refuses_what_a_run_would_refuse_at_once(room, tmp_path, capsy
     shutil.copytree(room, tmp_path / "capture")
     options = make(room, tmp_path)
     line = ["run", tmp_path / "capture", "--out", tmp_path / "out", *options]
-    assert command_line.main([*map(str, line), "--dry-run"]) == 2
+    assert cli.main([*map(str, line), "--dry-run"]) == 2
     told = capsys.readouterr().err
     assert says in told
     assert "Traceback" not in told
@@ -127,14 +127,11 @@ def test_a_dry_run_on_photographs_needs_what_finds_their_poses(room, tmp_path, c
     shutil.copytree(room / "images", tmp_path / "photos")
     line = ["run", tmp_path / "photos", "--out", tmp_path / "out"]
     _dry(capsys, *line, "--masks", room / "masks")
-    assert (
-        command_line.main([*map(str, line), "--dry-run", *_wrong_masks(room, tmp_path)[:1], str(tmp_path / "wrong")])
-        == 2
-    )
+    assert cli.main([*map(str, line), "--dry-run", *_wrong_masks(room, tmp_path)[:1], str(tmp_path / "wrong")]) == 2
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert command_line.main([*map(str, line), "--dry-run"]) == 2
+    assert cli.main([*map(str, line), "--dry-run"]) == 2
     assert "jsecon[sfm]" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "photos")
     (tmp_path / "photos").mkdir()
-    assert command_line.main([*map(str, line), "--dry-run"]) == 2
+    assert cli.main([*map(str, line), "--dry-run"]) == 2
     assert "empty folder" in capsys.readouterr().err

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jsecon.app import command_line, verbs
-from jsecon.app.ending import finish
+from jsecon.app import cli, verbs
+from jsecon.app.cli import finish
 from jsecon.app.verbs import Output
 from jsecon.errors import InputError, why
 
@@ -42,7 +42,7 @@ def test_what_was_refused_is_told_beside_what_was_not(capsys):
     "line", [["run", "--json"], ["fly", "--json"], ["query", "f", "x", "--threshold", "a", "--json"]]
 )
 def test_wrong_usage_is_an_error_object_too(capsys, line):
-    assert command_line.main(line) == 2
+    assert cli.main(line) == 2
     out, err = capsys.readouterr()
     assert "--help lists the" in json.loads(out)["error"]["remedy"]
     assert err == ""
@@ -51,16 +51,16 @@ def test_wrong_usage_is_an_error_object_too(capsys, line):
 def test_debug_shows_where_an_error_came_from(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("JAX_TRACEBACK_FILTERING", "auto")  # what the user has set stays
     line = ["eval", str(tmp_path / "none.safetensors"), "--labels", str(tmp_path), "--out", str(tmp_path)]
-    assert command_line.main(line) == 2
+    assert cli.main(line) == 2
     assert "Traceback" not in capsys.readouterr().err
-    assert command_line.main([*line, "--debug"]) == 2
+    assert cli.main([*line, "--debug"]) == 2
     err = capsys.readouterr().err
     assert "Traceback" in err
     assert "in load_field" in err
     assert err.splitlines()[-1].startswith("jsecon: ")
     assert os.environ["JAX_TRACEBACK_FILTERING"] == "auto"
     monkeypatch.delenv("JAX_TRACEBACK_FILTERING")
-    assert command_line.main([*line, "--debug"]) == 2
+    assert cli.main([*line, "--debug"]) == 2
     assert os.environ["JAX_TRACEBACK_FILTERING"] == "off"
 
 
@@ -69,8 +69,8 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monke
         def act(asked, console):
             raise error
 
-        monkeypatch.setitem(command_line._VERBS, "models", (act, verbs.Models))
-        return command_line.main(["models", "check", str(tmp_path), "--json"])
+        monkeypatch.setitem(cli._VERBS, "models", (act, verbs.Models))
+        return cli.main(["models", "check", str(tmp_path), "--json"])
 
     def within(stop):  # as a library that tidies up after a stop, and fails in that
         error = InputError("a file", "half of it", "all of it", "Fetch it again.")

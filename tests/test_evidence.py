@@ -10,7 +10,7 @@ from conftest import look_at
 from small_field import field_of
 
 import jsecon
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.language.field import save_field
 from jsecon.language.shares import finish_votes
 from jsecon.types import Camera, Gaussians, Regions, Votes
@@ -72,7 +72,7 @@ def test_what_a_wall_hides_is_not_part_of_what_stands_before_it(two_rooms, masks
 def ask(file, out, *options):
     """The figures of the one answer of a query at the middle of the first frame."""
     asked = ["query", file, "--at", "#0", 25, 19, "--views", 0, "--out", out, *options]
-    assert command_line.main([str(word) for word in asked]) == 0
+    assert cli.main([str(word) for word in asked]) == 0
     return json.loads(next(out.glob("*.json")).read_text())
 
 

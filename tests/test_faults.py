@@ -156,7 +156,7 @@ def test_a_stop_is_exit_code_130_wherever_it_falls(tmp_path):
         "atexit.register(lambda: print('taken apart', file=sys.stderr))\n"
         "class Import:\n"
         "    def find_spec(self, name, *_):\n"
-        "        if name == 'jsecon.app.command_line':\n"
+        "        if name == 'jsecon.app.cli':\n"
         "            exec('os.kill(os.getpid(), signal.SIGTERM)')\n"
         "sys.meta_path.insert(0, Import())"
     )

@@ -7,7 +7,7 @@ from conftest import look_at
 from PIL import Image
 from small_field import make_field, true_regions
 
-from jsecon.app.question import Answer
+from jsecon.app.ask import Answer
 from jsecon.demo import film
 from jsecon.types import Camera, Selection
 

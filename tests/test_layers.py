@@ -9,7 +9,7 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 import viser
 from small_field import make_field
 
-from jsecon.app.layers import LARGEST, Layers
+from jsecon.app.viewer.scene import LARGEST, Layers
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from sam2_files import write_sam2
 from sam3_files import write_sam3
 from sam_files import write_sam
 
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.errors import InputError
 from jsecon.pipeline.models import examine, report_lines, unusable
 
@@ -45,7 +45,7 @@ def test_what_a_folder_is_good_for(folders, model, words):
 
 
 def test_every_graph_is_told_with_its_tensors(folders, capsys):
-    assert command_line.main(["models", "check", str(folders["CLIP"])]) == 0
+    assert cli.main(["models", "check", str(folders["CLIP"])]) == 0
     told = capsys.readouterr().out
     for line in (
         "  textual/model.onnx",
@@ -65,12 +65,12 @@ def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):
     folder = write_clip(tmp_path / "clip", "immich")
     graph = folder / "visual" / "model.onnx"
     graph.write_bytes(graph.read_bytes()[:100])
-    assert command_line.main(["models", "check", str(folder)]) == 2
+    assert cli.main(["models", "check", str(folder)]) == 2
     told = capsys.readouterr()
     assert "cannot be opened: ONNX Runtime" in told.out
     assert "nothing that can be used" in told.err
     (tmp_path / "empty").mkdir()
-    assert command_line.main(["models", "check", str(tmp_path / "empty")]) == 2
+    assert cli.main(["models", "check", str(tmp_path / "empty")]) == 2
     assert "0 graphs" in capsys.readouterr().out
     with pytest.raises(InputError, match="no such folder"):
         examine(tmp_path / "nowhere")

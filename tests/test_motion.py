@@ -17,7 +17,7 @@ from capture_files import refused
 from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.data import motion, motion_steps
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_image
@@ -169,7 +169,7 @@ def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monk
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with refused("pip install 'jsecon[sfm]'", "walk"):
         find_poses(photographs(photos[0]), tmp_path, where=photos[0])
-    assert command_line.main(["run", str(photos[0]), "--out", str(tmp_path / "out")]) == 2
+    assert cli.main(["run", str(photos[0]), "--out", str(tmp_path / "out")]) == 2
     told = capsys.readouterr()
     assert "poses            run       found by structure from motion (pycolmap) for 8 photographs" in told.out
     assert "pip install 'jsecon[sfm]'" in told.err

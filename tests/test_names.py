@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.answers import stem_of, write_answer
-from jsecon.app.command_line import main
-from jsecon.app.question import Answer, ask_pixel, ask_region, ask_text
+from jsecon.app.ask import Answer, ask_pixel, ask_region, ask_text
+from jsecon.app.cli import main
+from jsecon.app.outputs import file_stem, write_answer
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
 from jsecon.data.ply import load_ply
@@ -56,23 +56,23 @@ TEXTS = [
 
 
 def test_texts_have_names_of_their_own_also_without_case(field):
-    names = {text: stem_of(answer(field, text)) for text in TEXTS}
+    names = {text: file_stem(answer(field, text)) for text in TEXTS}
     assert (names["red mug"], names["c"], names["café"]) == ("red-mug", "c", "café")
     assert len({name.casefold() for name in names.values()}) == len(TEXTS)
     for name in names.values():
         assert len(f".{name}-{'x' * 92}.12345678.partial.png".encode()) <= 255
         assert not set('/\\:*?"<>| .\0') & set(name)
         assert name not in ("con", "nul", "com1")
-    assert names == {text: stem_of(answer(field, text)) for text in TEXTS}
+    assert names == {text: file_stem(answer(field, text)) for text in TEXTS}
 
 
 def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field):
     at = "at frame_1 24 20"
     pixel, region = ask_pixel(field, 1, 24, 20), ask_region(field, 1)
     assert pixel.question == at
-    assert stem_of(pixel) != stem_of(answer(field, at))
-    assert stem_of(region) != stem_of(answer(field, "region 1"))
-    assert stem_of(pixel) == stem_of(ask_pixel(field, "frame_1", 24, 20)) != stem_of(ask_pixel(field, 1, 24, 21))
+    assert file_stem(pixel) != file_stem(answer(field, at))
+    assert file_stem(region) != file_stem(answer(field, "region 1"))
+    assert file_stem(pixel) == file_stem(ask_pixel(field, "frame_1", 24, 20)) != file_stem(ask_pixel(field, 1, 24, 21))
 
 
 def test_frames_of_hostile_names_are_written_beneath_the_folder(field, tmp_path):
@@ -179,7 +179,7 @@ def test_a_pixel_and_an_outline_are_refused_by_what_compares_texts(field, word, 
 
 def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
     """Of the .json, of `locate` and of the server: the mean of the centres, to less than a millimetre at 5e6 m."""
-    from jsecon.app.place import place_of
+    from jsecon.app.locate import locate_answer
 
     moved = np.eye(4)
     moved[:3, 3] = [500_000.125, 5_400_000.25, 120.5]
@@ -189,7 +189,7 @@ def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):
     told = write_answer(own, found, tmp_path, {})
     np.testing.assert_allclose(told["place"]["centroid"], means.mean(0), atol=1e-5)
     np.testing.assert_allclose(told["place"]["bounding_box"]["max"], means.max(0), atol=1e-5)
-    assert place_of(own, found).as_dict()["centroid"] == pytest.approx(told["place"]["centroid"], abs=1e-5)
+    assert locate_answer(own, found).as_dict()["centroid"] == pytest.approx(told["place"]["centroid"], abs=1e-5)
     small = np.diag([1e-6, 1e-6, 1e-6, 1.0])
     told = write_answer(dataclasses.replace(field, to_source=small), found, tmp_path, {})
     np.testing.assert_allclose(told["place"]["centroid"], 1e-6 * (means - moved[:3, 3]).mean(0), rtol=1e-4, atol=1e-11)

@@ -14,7 +14,7 @@ from sam_files import write_sam
 from test_pipeline import Recorder
 
 from experiments.datasets.feature_files import write_features
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.data.capture import load_capture
 from jsecon.data.ply import load_ply, save_ply
 from jsecon.errors import InputError
@@ -149,7 +149,7 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     _, folder, _ = seen
     field = folder / "field.safetensors"
     query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
-    assert command_line.main([*query, "--quantile", "0"]) == 0
+    assert cli.main([*query, "--quantile", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
     text = networks.embedder_of_field(found, templates=("a {} thing",)).embed_text(["red"])[0]
     words = networks.embedder_of_field(found, templates=("a {} thing",)).reference
@@ -160,9 +160,9 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     assert answer["region"] == int(np.where(similar > 0, similar * standing, similar).argmax())
     assert answer["score"] == pytest.approx(float(similar[answer["region"]]), abs=2e-3)
     other = write_clip(tmp_path / "other", "immich")
-    assert command_line.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--embedder", str(other)]) == 2
+    assert cli.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--embedder", str(other)]) == 2
     assert "model that the field was made with" in capsys.readouterr().err
-    assert command_line.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--template", "a thing"]) == 2
+    assert cli.main(["query", str(field), "red", "--out", str(tmp_path / "b"), "--template", "a thing"]) == 2
     assert "a phrase that holds {}" in capsys.readouterr().err
     lost = dataclasses.replace(load_field(field), provenance=json.dumps({"options": {"embedder": "/nowhere"}}))
     with pytest.raises(InputError, match=r"--embedder DIR"):
@@ -207,13 +207,11 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     given = dataclasses.replace(known, embedder="given-3", canonical=np.zeros((0, 3), np.float32), provenance="{}")
     save_field(tmp_path / "field.safetensors", given)
     ask = ["query", str(tmp_path / "field.safetensors"), "red", "--views", "0", "--out", str(tmp_path / "answers")]
-    assert command_line.main(ask) == 2
+    assert cli.main(ask) == 2
     assert "came from files, 3 numbers each" in capsys.readouterr().err
     with pytest.raises(InputError, match="--embedder DIR"):
         GivenSpace(3).embed_text(["red"])
-    assert (
-        command_line.main([*ask, "--embedder", str(models[1]), "--by", "canonical"]) == 0
-    )  # the phrases, too, are the model's
+    assert cli.main([*ask, "--embedder", str(models[1]), "--by", "canonical"]) == 0  # the phrases, too, are the model's
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
         networks.embedder_named("given-5", folder=models[1])

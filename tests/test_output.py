@@ -12,8 +12,8 @@ import pytest
 from small_field import make_field
 
 from jsecon.__main__ import UNREAD, Output
-from jsecon.app.command_line import main
-from jsecon.app.question import ask_text
+from jsecon.app.ask import ask_text
+from jsecon.app.cli import main
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.vision.colours import ColourEmbedder

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.candidates import Candidate
-from jsecon.app.panel import sheet, told
-from jsecon.app.question import ask_region, ask_text
-from jsecon.app.viewing import ViewState
+from jsecon.app.ask import ask_region, ask_text
+from jsecon.app.viewer.candidates import Candidate
+from jsecon.app.viewer.panel import sheet, told
+from jsecon.app.viewer.view_state import ViewState
 from jsecon.errors import InputError
 from jsecon.vision.colours import ColourEmbedder
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from small_field import field_of, make_field, unit_rows
 
-from jsecon.app.asking import answered_in_blocks
-from jsecon.app.question import ask_text
+from jsecon.app.ask import answer_in_blocks, ask_text
 from jsecon.query.anchored import query_anchored
 from jsecon.query.parts import HELD, THING, answering_parts, part_nearness, parts_instead, query_parts
 from jsecon.types import Parts, Regions, Votes
@@ -218,7 +217,7 @@ def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blo
     assert "regions" not in plain.left_out
     alone = ask_text(dataclasses.replace(field, parts=None), embedder, "fifth")  # the region that it went to, whole
     np.testing.assert_array_equal(alone.mask, thing >= 3)
-    (found, first), refused = answered_in_blocks(field, embedder, texts=["fifth", "first"])
+    (found, first), refused = answer_in_blocks(field, embedder, texts=["fifth", "first"])
     assert not refused
     np.testing.assert_array_equal(np.sort(found.rows[found.mask]), np.flatnonzero(thing == 4))
     assert found.left_out == answer.left_out

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.data import capture as captures
 from jsecon.data.motion import photographs
 from jsecon.data.ply import load_ply, save_ply
@@ -24,7 +24,7 @@ PLACE = "Büro für Köln 日本 #1 %20 'é'"
 
 
 def _run(*arguments):
-    return command_line.main([str(argument) for argument in arguments])
+    return cli.main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

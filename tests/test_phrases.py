@@ -11,7 +11,7 @@ import pytest
 from clip_files import COLOURS
 from sam3_files import write_sam3
 
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.app.phrases import capture_of, frames_of, lifted
 from jsecon.data.ply import load_ply
 from jsecon.errors import InputError
@@ -39,7 +39,7 @@ def painted(room, tmp_path_factory):
 
 
 def _query(field, out, *options):
-    return command_line.main(["query", str(field), *map(str, options), "--out", str(out)])
+    return cli.main(["query", str(field), *map(str, options), "--out", str(out)])
 
 
 def test_query_selects_what_a_phrase_names_in_the_frames(room_run, painted, model, tmp_path, capsys):

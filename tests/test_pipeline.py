@@ -17,7 +17,7 @@ from capture_files import transforms
 from test_api import jsecon_imports
 
 import jsecon
-from jsecon.app import command_line, question
+from jsecon.app import ask, cli
 from jsecon.association.algorithm1 import iou_matrix
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
@@ -179,7 +179,7 @@ def test_the_same_scene_far_away_in_another_world_and_unit_gives_the_same_answer
     np.testing.assert_allclose(there.psnr, given.psnr, atol=0.1)
     text = next(iter(json.loads((room / "scene.json").read_text())["objects"].values()))
     place = jsecon.locate(given.field, text)
-    assert command_line.main(["query", str(out / "field.safetensors"), text, "--out", str(out), "--views", "1"]) == 0
+    assert cli.main(["query", str(out / "field.safetensors"), text, "--out", str(out), "--views", "1"]) == 0
     answer = json.loads(next(out.glob("*.json")).read_text())
     chosen = jsecon.load_gaussians(out / answer["ply"], similarity=np.linalg.inv(to_source))
     assert chosen.count == answer["count"] == len(place.points)
@@ -418,7 +418,7 @@ def test_each_stage_executes_nothing_that_its_key_does_not_cover(watched):
         assert set(told["ran"]) <= set(told["covered"]), stage
 
 
-@pytest.mark.parametrize(("module", "most"), [(pipeline, 26), (question, 12)], ids=["run", "query"])
+@pytest.mark.parametrize(("module", "most"), [(pipeline, 26), (ask, 12)], ids=["run", "query"])
 def test_the_files_to_read_are_those_that_run(watched, module, most):
     """Each file that a docstring lists runs on the way, and one that runs without being listed is the ground's, the
     engine's, or imported by its own room's listed ones."""
@@ -446,7 +446,7 @@ WATCHER = """
 import inspect, json, sys, threading
 from pathlib import Path
 import jsecon
-from jsecon.app import answers, question
+from jsecon.app import ask, outputs
 from jsecon.pipeline import cache, pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import Stage
@@ -492,9 +492,9 @@ sys.settrace(listen)
 pipeline.run(Options(Path(sys.argv[1]), holdout=4, steps=20), Path(sys.argv[2]) / "out")
 on_the_way += ran_since() + [file for told in ran.values() for file in told["ran"]]
 field = load_field(Path(sys.argv[2]) / "out/field.safetensors")
-answer = question.ask_text(field, ColourEmbedder(), "red")
+answer = ask.ask_text(field, ColourEmbedder(), "red")
 assert answer.mask.any()
-answers.write_answer(field, answer, Path(sys.argv[2]), answers.masks_of(field, answer, 1))
+outputs.write_answer(field, answer, Path(sys.argv[2]), outputs.answer_masks(field, answer, 1))
 told = {"stages": ran, "run": on_the_way, "query": ran_since()}
 (Path(sys.argv[2]) / "ran.json").write_text(json.dumps(told))
 """

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from small_field import make_field
 
 from experiments.places import box_iou
-from jsecon.app.place import place_of
-from jsecon.app.question import Answer
+from jsecon.app.ask import Answer
+from jsecon.app.locate import locate_answer
 from jsecon.errors import InputError
 from jsecon.types import Selection
 
@@ -36,7 +36,7 @@ def answer(scene, cameras):
 
 def test_the_oriented_box_is_that_of_the_brick(answer):
     field, asked, turn, means = answer
-    place = place_of(field, asked)
+    place = locate_answer(field, asked)
     np.testing.assert_allclose(place.centroid, [1, 2, 3], atol=0.02)
     np.testing.assert_allclose(place.extent, SIZE, rtol=0.25)
     np.testing.assert_allclose(place.axes.T @ place.axes, np.eye(3), atol=1e-6)
@@ -53,10 +53,10 @@ def test_the_oriented_box_is_that_of_the_brick(answer):
 
 def test_it_is_in_the_world_of_the_capture(answer):
     field, asked, *_ = answer
-    here = place_of(field, asked)
+    here = locate_answer(field, asked)
     to_source = np.diag([2.0, 2.0, 2.0, 1.0])
     to_source[:3, 3] = [5, 0, 0]
-    there = place_of(dataclasses.replace(field, to_source=to_source), asked)
+    there = locate_answer(dataclasses.replace(field, to_source=to_source), asked)
     np.testing.assert_allclose(there.centroid, 2 * here.centroid + [5, 0, 0], rtol=1e-4)
     np.testing.assert_allclose(there.extent, 2 * here.extent, rtol=1e-3)
 
@@ -64,7 +64,7 @@ def test_it_is_in_the_world_of_the_capture(answer):
 def test_what_selects_nothing_has_no_place(answer):
     field, asked, *_ = answer
     with pytest.raises(InputError, match="nothing selected"):
-        place_of(field, dataclasses.replace(asked, mask=np.zeros(64, bool)))
+        locate_answer(field, dataclasses.replace(asked, mask=np.zeros(64, bool)))
 
 
 def test_boxes_overlap_as_they_should():

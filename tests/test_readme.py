@@ -11,7 +11,7 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-from jsecon.app import command_line
+from jsecon.app import cli
 
 HOME = Path(__file__).resolve().parent.parent
 README = (HOME / "README.md").read_text()
@@ -42,12 +42,10 @@ def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, mon
 
 def test_every_command_line_is_one_that_the_program_takes():
     lines = [line for block in _blocks("bash") for line in block.splitlines() if line.startswith("jsecon")]
-    lines += [
-        line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", command_line.ABOUT, re.MULTILINE)
-    ]
+    lines += [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", cli.ABOUT, re.MULTILINE)]
     assert len(lines) >= 10
     for line in lines:
-        command_line.parse(shlex.split(line)[1:])
+        cli.parse(shlex.split(line)[1:])
 
 
 def test_the_first_two_commands_do_everything():

@@ -15,7 +15,7 @@ from test_corrections import (
     truth as truth,
 )
 
-from jsecon.app import command_line
+from jsecon.app import cli
 from jsecon.fit import settle
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.pipeline import _computed
@@ -102,7 +102,7 @@ def test_a_dry_run_lists_the_refinement(capture, tmp_path, capsys):
 
     def load_stage(*options):
         line = ["fit", str(folder), "--out", str(tmp_path / "out.ply"), *options, "--dry-run", "--json"]
-        assert command_line.main(line) == 0
+        assert cli.main(line) == 0
         return next(stage for stage in json.loads(capsys.readouterr().out)["stages"] if stage["name"] == "load")
 
     assert "--refine auto" in load_stage()["why"]

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from small_field import field_of, make_field, unit_rows
 
-from jsecon.app import command_line
-from jsecon.app.question import ask_text
+from jsecon.app import cli
+from jsecon.app.ask import ask_text
 from jsecon.language.field import load_field, save_field
 from jsecon.pipeline import networks
 from jsecon.query.anchored import query_anchored
@@ -356,9 +356,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     monkeypatch.setattr(networks, "embedder_of_field", lambda *a, **k: Words())
 
     def asked(name, *options):
-        assert (
-            command_line.main(["query", str(tmp_path / name), "seen", "unseen", "--out", str(tmp_path), *options]) == 0
-        )
+        assert cli.main(["query", str(tmp_path / name), "seen", "unseen", "--out", str(tmp_path), *options]) == 0
         told = [json.loads((tmp_path / f"{text}.json").read_text()) for text in ("seen", "unseen")]
         return told, capsys.readouterr().out
 
@@ -373,7 +371,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert "earlier version" not in out
     assert asked("new.npz", "--quantile", "0")[0][1]["region"] is not None
     beyond = ["query", str(tmp_path / "new.npz"), "seen", "--out", str(tmp_path), "--quantile", "1.5"]
-    assert command_line.main(beyond) == 2
+    assert cli.main(beyond) == 2
     assert "--quantile" in capsys.readouterr().err
 
     save_field(tmp_path / "old.npz", dataclasses.replace(field, reference=None))

@@ -16,10 +16,10 @@ pytest.importorskip("fastapi", reason="the extra serve is not installed")
 from small_field import make_field
 from starlette.testclient import TestClient
 
-from jsecon.app.api import application
-from jsecon.app.guard import Busy, Guard, Limits, Workers
-from jsecon.app.scenes import Question, Scene, open_scenes
-from jsecon.app.server import ready
+from jsecon.app.server.api import application
+from jsecon.app.server.guard import Busy, Guard, Limits, Workers
+from jsecon.app.server.scenes import Question, Scene, open_scenes
+from jsecon.app.server.serve import ready
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.process import cores

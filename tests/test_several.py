@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from small_field import make_field, shares, unit_rows
 
-from jsecon.app.answers import write_answer
-from jsecon.app.question import ask_text
+from jsecon.app.ask import ask_text
+from jsecon.app.outputs import write_answer
 from jsecon.errors import InputError
 from jsecon.query.anchored import query_anchored
 from jsecon.query.neighbours import evened, nearest

@@ -14,8 +14,8 @@ from siglip_files import BIAS, LENGTH, SCALE, embedded, write_joint, write_json,
 from small_field import make_field, unit_rows
 
 from experiments.export.vocabulary import write_vocabulary
-from jsecon.app import command_line
-from jsecon.app.question import ask_text
+from jsecon.app import cli
+from jsecon.app.ask import ask_text
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.networks.clip import ClipEmbedder
@@ -292,7 +292,7 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     for name, known in (("with", embedder), ("without", Told(texts, None))):
         monkeypatch.setattr(networks, "embedder_of_field", lambda *a, known=known, **k: known)
         out = tmp_path / name
-        assert command_line.main(["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--out", str(out)]) == 0
+        assert cli.main(["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--out", str(out)]) == 0
         told[name] = [json.loads((out / f"{text}.json").read_text()) for text in ("mug", "ghost")]
     assert set(told["with"][0]["probability"]) == {"there", "mean", "tenth"}
     assert list(told["with"][1]["probability"]) == ["there"]

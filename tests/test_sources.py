@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.command_line import main
+from jsecon.app.cli import main
 from jsecon.errors import InputError
 from jsecon.language.field import load_field, save_field
 from jsecon.pipeline.networks import embedder_of_field

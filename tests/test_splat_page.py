@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from small_field import make_field
 
-from jsecon.app.question import Answer
-from jsecon.app.splat_page import NOWHERE, page, regions_of
+from jsecon.app.ask import Answer
+from jsecon.app.viewer.static_page import NOWHERE, main_regions, page
 from jsecon.language.shares import vote_shares
 from jsecon.splat.sh import C0
 from jsecon.types import Selection
@@ -23,7 +23,7 @@ BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil
 @pytest.fixture(scope="module")
 def made(scene, cameras):
     field, labels = make_field(scene, cameras)
-    mask, none = regions_of(field) == 1, np.zeros(64, bool)
+    mask, none = main_regions(field) == 1, np.zeros(64, bool)
     share = mask.astype(np.float32)
     answers = [
         Answer("the second </script>", "votes", Selection(mask, share, np.int32(1), np.float32(0.75)), mask, {}),
@@ -60,7 +60,7 @@ def test_a_page_holds_the_field_within_its_digits(made):
     np.testing.assert_allclose(columns["turns"] / 127, turns, atol=0.01)
     colours = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh)[:, 0], 0, 1)
     np.testing.assert_allclose(columns["colours"] / 255, colours, atol=0.003)
-    np.testing.assert_array_equal(columns["regions"][:, 0], regions_of(field))
+    np.testing.assert_array_equal(columns["regions"][:, 0], main_regions(field))
     for answer, kept in zip(answers, told["texts"], strict=True):
         bits = np.unpackbits(np.frombuffer(base64.b64decode(kept["mask"]), np.uint8), bitorder="little")[:64]
         np.testing.assert_array_equal(bits, answer.mask)
@@ -68,7 +68,7 @@ def test_a_page_holds_the_field_within_its_digits(made):
 
 def test_a_region_has_at_least_half_of_what_is_its(made):
     field = made[0]
-    found, share = regions_of(field), np.asarray(vote_shares(field.votes))
+    found, share = main_regions(field), np.asarray(vote_shares(field.votes))
     regions = np.asarray(field.votes.regions)
     for n, region in enumerate(found):
         own = share[n, regions[n] == region]

@@ -15,7 +15,7 @@ from test_gltf import NAME, rewritten
 from test_ply import columns, write
 
 import jsecon
-from jsecon.app import command_line
+from jsecon.app import cli
 
 SCENE = scene(300, 4)
 SYSTEMS = ("LDB RDB LUB RUB LDF RDF LUF RUF", "LFD RFD LFU RFU LBD RBD LBU RBU")
@@ -374,7 +374,7 @@ def test_any_file_of_gaussians_has_a_dry_run(room, tmp_path, capsys):
         (tmp_path / name).write_bytes(data)
     for name in made:
         line = ["run", room, "--out", tmp_path / "out", "--gaussians", tmp_path / name, "--dry-run"]
-        assert command_line.main(list(map(str, line))) == 0, name
+        assert cli.main(list(map(str, line))) == 0, name
         assert "gaussians" in capsys.readouterr().out
 
 
@@ -399,7 +399,7 @@ def test_a_file_of_no_gaussians_is_told_as_such(room, tmp_path, capsys, how):
         assert jsecon.load_gaussians(tmp_path / name).count == 0
     for name in ("a.splat", "c.ply"):
         line = ["run", room, "--out", tmp_path / "out", "--gaussians", tmp_path / name, *how]
-        assert command_line.main(list(map(str, line))) == 2, name
+        assert cli.main(list(map(str, line))) == 2, name
         said = capsys.readouterr().err
         assert name in said
         assert "holds no Gaussians" in said

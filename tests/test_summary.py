@@ -5,8 +5,8 @@ import json
 import numpy as np
 from small_field import make_field
 
-from jsecon.app.question import Answer
-from jsecon.app.summary import write_answers
+from jsecon.app.ask import Answer
+from jsecon.app.outputs import write_answers
 from jsecon.pipeline.progress import Listener
 from jsecon.query.anchored import query_region
 

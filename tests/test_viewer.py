@@ -18,11 +18,11 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from browser import CHROMIUM, opened, until
 from small_field import make_field
 
-from jsecon.app import viewing
-from jsecon.app.command_line import main
-from jsecon.app.question import Answer
-from jsecon.app.viewer import Viewer, open_viewer
-from jsecon.app.viewing import ViewState
+from jsecon.app.ask import Answer
+from jsecon.app.cli import main
+from jsecon.app.viewer import view_state
+from jsecon.app.viewer.view_state import ViewState
+from jsecon.app.viewer.window import Viewer, open_viewer
 from jsecon.data.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
@@ -43,7 +43,7 @@ def free_port() -> int:
 def viewer(scene, cameras):
     field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
     field = dataclasses.replace(field, votes=with_overlap(field.votes), embedder=ColourEmbedder.name)
-    port, state = free_port(), viewing.asked(ViewState(), START)
+    port, state = free_port(), view_state.asked(ViewState(), START)
     viewer = open_viewer(field, ColourEmbedder(), host="127.0.0.1", port=port, name="<desk>", state=state)
     yield viewer
     viewer.stop()
@@ -67,7 +67,7 @@ def settled(viewer: Viewer, act) -> ViewState:
 
 def word_of(viewer: Viewer) -> str:
     """A colour that selects a part of the scene."""
-    masks = {word: viewer.answer(viewing.Ask(word)).mask.sum() for word in BASIC}
+    masks = {word: viewer.answer(view_state.Ask(word)).mask.sum() for word in BASIC}
     return next(word for word, count in masks.items() if 3 < count < 30)
 
 
@@ -83,12 +83,12 @@ def colours(viewer: Viewer) -> np.ndarray:
 def test_a_text_lights_up(viewer):
     base, word = colours(viewer), word_of(viewer)
     before = [handle.buffer.copy() for _, handle in viewer.layers._groups]
-    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, word)))
-    mask = viewer.answer(viewing.Ask(word)).mask
+    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, word)))
+    mask = viewer.answer(view_state.Ask(word)).mask
     lit = colours(viewer)
     assert (lit[~mask, :3].astype(int) <= base[~mask, :3]).all()
     np.testing.assert_array_equal(lit[:, 3], base[:, 3])
-    tint = 0.45 * base[mask, :3] + 0.55 * viewing.tints(1)[0]
+    tint = 0.45 * base[mask, :3] + 0.55 * view_state.tints(1)[0]
     np.testing.assert_allclose(lit[mask, :3], tint, atol=1)
     for (_, handle), was in zip(viewer.layers._groups, before, strict=True):
         np.testing.assert_array_equal(handle.buffer[:, :7], was[:, :7])
@@ -96,29 +96,29 @@ def test_a_text_lights_up(viewer):
 
 def test_show_only_hide_and_undo(viewer):
     word, opacity = word_of(viewer), colours(viewer)[:, 3]
-    mask = viewer.answer(viewing.Ask(word)).mask
-    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, word)))
-    settled(viewer, lambda: viewer.then(viewing.shown_only))
+    mask = viewer.answer(view_state.Ask(word)).mask
+    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, word)))
+    settled(viewer, lambda: viewer.then(view_state.shown_only))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, opacity, 0))
     settled(viewer, viewer.undo)
     np.testing.assert_array_equal(colours(viewer)[:, 3], opacity)
-    settled(viewer, lambda: viewer.then(viewing.hidden))
+    settled(viewer, lambda: viewer.then(view_state.hidden))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, 0, opacity))
-    assert settled(viewer, lambda: viewer.then(viewing.all_shown)) == ViewState()
+    assert settled(viewer, lambda: viewer.then(view_state.all_shown)) == ViewState()
 
 
-@pytest.mark.parametrize("paint", viewing.PAINTS)
+@pytest.mark.parametrize("paint", view_state.PAINTS)
 def test_every_paint(viewer, paint):
-    settled(viewer, lambda: viewer.then(lambda s: viewing.moved(s, paint=paint)))
+    settled(viewer, lambda: viewer.then(lambda s: view_state.moved(s, paint=paint)))
     told = colours(viewer)
     kinds = len(np.unique(told[:, :3], axis=0))
     assert kinds == 1 if paint == "score" else kinds > 2
-    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, word_of(viewer))))
+    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, word_of(viewer))))
     assert (colours(viewer)[:, :3] != told[:, :3]).any()
 
 
 def test_part_or_whole_changes_what_a_region_takes(viewer):
-    part, whole = (viewer.answer(viewing.Ask(2, whole=w)).mask for w in (0.0, 1.0))
+    part, whole = (viewer.answer(view_state.Ask(2, whole=w)).mask for w in (0.0, 1.0))
     overlap = np.asarray(viewer.field.votes.overlap)[2]
     assert (np.delete(overlap, 2) >= 0.1).any(), "a field whose regions overlap"
     assert whole.sum() > part.sum() > 0
@@ -126,7 +126,7 @@ def test_part_or_whole_changes_what_a_region_takes(viewer):
 
 
 def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
-    state = settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, "the meaning of life; black or ''")))
+    state = settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, "the meaning of life; black or ''")))
     assert len(state.things) == 2
     told = viewer.panel._told.content
     assert "no colour word" in told
@@ -137,9 +137,9 @@ def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
     assert "Copy the whole line" in viewer.panel._notice.content
     assert viewer.history.state == state
     np.testing.assert_array_equal(colours(viewer), before)
-    settled(viewer, lambda: viewer.then(lambda s: viewing.asked(s, "<script>alert(1)</script> red")))
+    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, "<script>alert(1)</script> red")))
     assert "<script>" not in viewer.panel._told.content
-    settled(viewer, lambda: viewer.then(lambda s: viewing.clicked(s, 4000)))
+    settled(viewer, lambda: viewer.then(lambda s: view_state.clicked(s, 4000)))
     assert "nothing here answers it" in viewer.panel._told.content
 
 
@@ -147,11 +147,11 @@ def test_an_error_inside_is_told_and_the_viewer_goes_on(viewer, capsys):
     settled(viewer, lambda: viewer.then(lambda s: 1 / 0))
     assert "the terminal has it" in viewer.panel._notice.content
     assert "ZeroDivisionError" in capsys.readouterr().err
-    assert settled(viewer, lambda: viewer.then(lambda s: viewing.clicked(s, 1))).things == (1,)
+    assert settled(viewer, lambda: viewer.then(lambda s: view_state.clicked(s, 1))).things == (1,)
 
 
 def test_files_of_the_answers(viewer, tmp_path):
-    answer = viewer.answer(viewing.Ask(1))
+    answer = viewer.answer(view_state.Ask(1))
     assert isinstance(answer, Answer)
     with zipfile.ZipFile(io.BytesIO(viewer.packed([answer]))) as archive:
         names = archive.namelist()
@@ -234,7 +234,7 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         page.type(input_of("find"), word)
         until(lambda: viewer.history.state.things == (word,), "the text arrives")
         after_change(page, first)
-        count = int(viewer.answer(viewing.Ask(word)).mask.sum())
+        count = int(viewer.answer(view_state.Ask(word)).mask.sum())
         page.until(f"document.body.innerText.includes('{word}: {count} Gaussians')")
         page.until("document.querySelectorAll('figure img').length >= 3")
 

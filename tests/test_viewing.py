@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from jsecon.app.viewing import (
+from jsecon.app.viewer.view_state import (
     MOST,
     PAINTS,
     Ask,

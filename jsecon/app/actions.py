@@ -9,8 +9,7 @@ import re
 import sys
 from typing import Any
 
-from jsecon.app.ending import VerbResult
-from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, View
+from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, VerbResult, View
 from jsecon.errors import InputError
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
@@ -29,7 +28,7 @@ def _demo(verb: Demo, console: Console) -> VerbResult:
 
 def _run(verb: Run, console: Console) -> VerbResult:
     with console.progress("start"):
-        from jsecon.app.summary import write_run
+        from jsecon.app.run_report import write_run
         from jsecon.pipeline import pipeline, processes
 
     options = verb.options
@@ -52,7 +51,7 @@ def _run(verb: Run, console: Console) -> VerbResult:
 
 def _fit(verb: Fit, console: Console) -> VerbResult:
     with console.progress("start"):
-        from jsecon.app.summary import write_scene
+        from jsecon.app.run_report import write_scene
         from jsecon.data.gaussian_files import require_written
         from jsecon.pipeline import pipeline
     require_written(verb.out)
@@ -79,15 +78,15 @@ def _query(verb: Query, console: Console) -> VerbResult:
     _check_phrases(verb)
     require_writable(verb.out)
     with console.progress("field"):
-        from jsecon.app import asking
-        from jsecon.app.summary import write_answers
+        from jsecon.app import ask
+        from jsecon.app.outputs import write_answers
         from jsecon.data.gaussian_files import require_written
         from jsecon.language.field import check_field, load_field
 
         require_written(verb.out / f"answer.{verb.format}")
-        if large := asking.larger_than_memory(verb.field):
+        if large := ask.larger_than_memory(verb.field):
             outlined = bool(verb.mask or boxes or verb.phrases)
-            asking.require_blocks(verb.field, by=verb.by, even=verb.even, outlined=outlined)
+            ask.require_blocks(verb.field, by=verb.by, even=verb.even, outlined=outlined)
             check_field(verb.field)
         field = load_field(verb.field, mapped=large)
         texts = verb.texts if verb.phrases is None else []
@@ -97,10 +96,10 @@ def _query(verb: Query, console: Console) -> VerbResult:
     options |= {"threshold": verb.threshold, "quantile": verb.quantile, "outliers": not verb.keep_outliers}
     with console.progress("answers"):
         if large:
-            answers, refused = asking.answered_in_blocks(field, embedder, **options)
+            answers, refused = ask.answer_in_blocks(field, embedder, **options)
         else:
             options |= {"masks": verb.mask, "boxes": boxes, "even": verb.even}
-            answers, refused = asking.asked_each(asking.questions_of(field, embedder, **options))
+            answers, refused = ask.answer_each(ask.queries_of(field, embedder, **options))
     answers, refused = by_phrase + answers, unread + refused
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
@@ -146,7 +145,7 @@ def _phrases(field: Any, verb: Query, console: Console) -> tuple[list[Any], list
 
 def _export(verb: Export, console: Console) -> VerbResult:
     with console.progress("field"):
-        from jsecon.app.answers import save_scene
+        from jsecon.app.outputs import save_scene
         from jsecon.data.gaussian_files import require_written
         from jsecon.language.field import check_field, load_field
 
@@ -161,20 +160,20 @@ def _export(verb: Export, console: Console) -> VerbResult:
 
 def _view(verb: View, console: Console) -> VerbResult:
     if verb.export is None:
-        from jsecon.app.viewer import view
+        from jsecon.app.viewer.window import view
 
         return view(verb, lambda field, verb: _embedder(field, verb, console), console.say)
     if verb.export.suffix != ".html":
         raise InputError("--export", f"{verb.export} does not end in .html", remedy="For example: --export page.html")
     require_writable(verb.export.parent)
     with console.progress("page"):
-        from jsecon.app import asking
-        from jsecon.app.splat_page import write_page
+        from jsecon.app import ask
+        from jsecon.app.viewer.static_page import write_page
         from jsecon.language.field import load_field
 
         field = load_field(verb.field)
         embedder = _embedder(field, verb, console) if verb.texts else None
-        answers, refused = asking.asked_each(asking.questions_of(field, embedder, texts=verb.texts))
+        answers, refused = ask.answer_each(ask.queries_of(field, embedder, texts=verb.texts))
         size = write_page(field, answers, verb.export, title=verb.field.resolve().parent.name)
     console.say(
         f"{(count := field.gaussians.count)} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {verb.export}"
@@ -187,7 +186,7 @@ def _eval(verb: Eval, console: Console) -> VerbResult:
     out = verb.out or verb.field.parent
     require_writable(out)
     with console.progress("field"):
-        from jsecon.app.summary import write_evaluation
+        from jsecon.app.evaluation import write_evaluation
         from jsecon.language.field import load_field
 
         embedder = _embedder(field := load_field(verb.field), verb, console)
@@ -196,11 +195,11 @@ def _eval(verb: Eval, console: Console) -> VerbResult:
 
 def _serve(verb: Serve, console: Console) -> VerbResult:
     with console.progress("start"):
-        from jsecon.app import server
+        from jsecon.app.server.serve import ready
 
     access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
-        result, serve = server.ready(verb.fields, embedder=verb.embedder, **access)
+        result, serve = ready(verb.fields, embedder=verb.embedder, **access)
     for scene in result["fields"]:
         console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
         if scene["unrelated_words"] is None:
@@ -221,9 +220,9 @@ def _models(verb: Models, console: Console) -> VerbResult:
 
 def _doctor(verb: Doctor, console: Console) -> VerbResult:
     with console.progress("looking"):
-        from jsecon.app.doctor import checks_of, wrong
+        from jsecon.app.doctor import run_checks, wrong
 
-        checks = checks_of(verb.models)
+        checks = run_checks(verb.models)
     console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.told}" for check in checks))
     return {"checks": checks, "refused": wrong(checks)}
 

@@ -60,7 +60,7 @@ class Check:
     """what mends it, where every run needs it."""
 
 
-def checks_of(models: Path | None = None) -> list[Check]:
+def run_checks(models: Path | None = None) -> list[Check]:
     """All lines; `models`: a folder to look for models in. Raises InputError where there is no such folder."""
     checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), _packages()]
     checks += [*_backend(), _cores(), _memory(), _disk(), _programs(), *_models(models), *map(_extra, EXTRAS)]

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jsecon.app import pictures, report
-from jsecon.app.answers import masks_of
-from jsecon.app.question import ask_text
+from jsecon.app.ask import ask_text
+from jsecon.app.outputs import answer_masks
 from jsecon.errors import InputError
 from jsecon.fit.schedule import resized, resized_frame
 from jsecon.pipeline import networks
@@ -80,7 +80,7 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
     """The `views` frames that show best what a text selects, rendered, and with the selection: a figure of matplotlib,
     whose axes (2, views) are returned.
 
-    `embedder`: the field's own, opened where it is not given; `how` as for `jsecon.app.question.ask_text`. Raises
+    `embedder`: the field's own, opened where it is not given; `how` as for `jsecon.app.ask.ask_text`. Raises
     InputError where matplotlib is missing, and where the embedder has no words for the text.
     """
     try:
@@ -89,7 +89,7 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
         remedy = "Run: pip install 'jsecon[figures]'"
         raise InputError("jsecon.show", "the package matplotlib is missing", remedy=remedy) from error
     answer = ask_text(field, embedder or networks.embedder_of_field(field), text, **how)
-    masks = masks_of(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
+    masks = answer_masks(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
     renderer = pictures.Renderer(field.gaussians, field.cameras)
     size = 3.2 * len(masks), 4.8
     figure, axes = plt.subplots(2, len(masks), squeeze=False, figsize=size, layout="constrained")

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jsecon.app.question import Answer, answer_of
+from jsecon.app.ask import Answer, answer_of
 from jsecon.data.frames import Progress, spread
 from jsecon.errors import InputError
 from jsecon.language.shares import SHARE_THRESHOLD

@@ -6,7 +6,7 @@ attributes are the help texts of the options.
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -24,6 +24,10 @@ T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
 """an option that may be given several times"""
 By = Literal["votes", "silhouette", "strict_silhouette", "lenient_silhouette", "code", "one_step", "canonical"]
+
+VerbResult: TypeAlias = dict[str, Any]
+"""files and figures of a verb: plain values, paths and records; under "refused" the InputErrors of what it could not do
+besides"""
 
 
 @dataclasses.dataclass(frozen=True)

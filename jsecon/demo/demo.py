@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jsecon.app import asking, pictures, question, report, summary
-from jsecon.app.answers import masks_of, write_answer
+from jsecon.app import ask, evaluation, pictures, report, run_report
+from jsecon.app.outputs import answer_masks, write_answer
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.demo import write_room
 from jsecon.demo.film import write_film
@@ -49,8 +49,8 @@ def demo(
     labels = load_lerf_labels(capture / "label")
     embedder = networks.embedder_of_field(found.field)
     listener.say("measured on the held-out views")
-    results = summary.evaluate(found.field, embedder, labels, listener)
-    with_true = summary.evaluate(given.field, embedder, labels, listener, ("anchored", "one_step"))
+    results = evaluation.evaluate(found.field, embedder, labels, listener)
+    with_true = evaluation.evaluate(given.field, embedder, labels, listener, ("anchored", "one_step"))
     results["true_masks"], results["true_masks_one_step"] = with_true["anchored"], with_true["one_step"]
     metrics = _metrics(results, found, given)
     with listener.progress("report"):
@@ -64,7 +64,7 @@ def demo(
     metrics["left_out"]["DBSCAN"] = f"{single} of {len(queries)} selections are one component"
     metrics["peak_memory_mib"] = round(peak_memory_mib(), 1)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
-    summary.say_table(results, listener)
+    evaluation.print_table(results, listener)
     listener.say(
         f"held-out PSNR {metrics['held_out_psnr']:.2f} dB, {metrics['seconds_in_all']:.0f} s of work, "
         f"peak memory {metrics['peak_memory_mib']:.0f} MiB"
@@ -110,15 +110,15 @@ def _metrics(results: dict[str, tuple[list[Row], dict[str, Any]]], found: Run, g
     }
 
 
-def answers_to(field: LanguageField, embedder: Any, texts: Sequence[str]) -> dict[str, question.Answer]:
+def answers_to(field: LanguageField, embedder: Any, texts: Sequence[str]) -> dict[str, ask.Answer]:
     """text → its answer, of those that are understood."""
-    questions = asking.questions_of(field, embedder, texts=texts)
-    return {answer.question: answer for answer in asking.asked_each(questions)[0]}
+    questions = ask.queries_of(field, embedder, texts=texts)
+    return {answer.question: answer for answer in ask.answer_each(questions)[0]}
 
 
-def write_queries(field: LanguageField, answers: Mapping[str, question.Answer], out: Path) -> dict[str, dict[str, Any]]:
+def write_queries(field: LanguageField, answers: Mapping[str, ask.Answer], out: Path) -> dict[str, dict[str, Any]]:
     """The files of each answer, and its figures, by text."""
-    return {text: write_answer(field, own, out, masks_of(field, own, views=2)) for text, own in answers.items()}
+    return {text: write_answer(field, own, out, answer_masks(field, own, views=2)) for text, own in answers.items()}
 
 
 def _page(
@@ -162,12 +162,12 @@ def _page(
     parts = [head, pictured, report.section("How well", words, table), _iou_part(results), asked]
     lead = "A made-up room as an ordinary capture: frames, poses and sparse points in, answers to texts out, "
     lead += "on a plain CPU and without any learned weights."
-    parts += [*summary.scene_parts(found), *summary.work_parts(found)]
+    parts += [*run_report.scene_parts(found), *run_report.work_parts(found)]
     return report.page(f"jsecon demo, room {seed}", lead, parts)
 
 
 def write_pictures(
-    out: Path, run: Run, answers: Mapping[str, question.Answer], frame: int, masks: Mapping[str, np.ndarray]
+    out: Path, run: Run, answers: Mapping[str, ask.Answer], frame: int, masks: Mapping[str, np.ndarray]
 ) -> str:
     """OUT/demo.jpg, a frame, the masklets and codes of the nearest that was fitted to, and the `masks` that texts have
     in it; and OUT/demo.webp, the film. Returns its part of the page."""

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from jsecon.app.ask import Answer
 from jsecon.app.pictures import Renderer
-from jsecon.app.question import Answer
 from jsecon.demo.capture import look_at
 from jsecon.files import written_whole
 from jsecon.fit.schedule import resized

@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jsecon.app import viewing
-from jsecon.app.candidates import Candidate
-from jsecon.app.question import Answer, quantile_message
-from jsecon.app.viewing import PAINTS, ViewState, tints
+from jsecon.app.ask import Answer, quantile_message
+from jsecon.app.viewer import view_state
+from jsecon.app.viewer.candidates import Candidate
+from jsecon.app.viewer.view_state import PAINTS, ViewState, tints
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
 from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, QUANTILE
@@ -63,11 +63,11 @@ class Panel:
             self._link = gui.add_text("link", "", hint=hint)
 
         on = lambda handle: handle.on_update
-        asking.on_submit(_later(lambda e: viewer.then(lambda s: viewing.asked(s, self._text.value))))
+        asking.on_submit(_later(lambda e: viewer.then(lambda s: view_state.asked(s, self._text.value))))
         restoring.on_submit(_later(lambda e: viewer.restore(self._link.value)))
         for name in ("every", "threshold", "whole", "paint"):
             on(getattr(self, f"_{name}"))(_later(lambda e, name=name: self._moved(viewer, name, e.target.value)))
-        steps = {"show only": viewing.shown_only, "hide": viewing.hidden, "show all": viewing.all_shown}
+        steps = {"show only": view_state.shown_only, "hide": view_state.hidden, "show all": view_state.all_shown}
         for group in (acts, back):
 
             @group.on_click
@@ -97,7 +97,7 @@ class Panel:
 
     def _moved(self, viewer: Any, name: str, value: Any) -> None:
         if getattr(viewer.history.state, name) != value:
-            viewer.then(lambda state: viewing.moved(state, **{name: value}))
+            viewer.then(lambda state: view_state.moved(state, **{name: value}))
 
     def _chosen(self, viewer: Any, event: Any) -> None:
         if event.client is not None and event.target.value in self._names:
@@ -114,7 +114,7 @@ class Panel:
 
     def show(self, state: ViewState) -> None:
         """Sets the controls as a state has them."""
-        self._text.value = viewing.line_of(state)
+        self._text.value = view_state.line_of(state)
         self._every.value, self._paint.value = state.every, state.paint
         self._threshold.value, self._whole.value = state.threshold, state.whole
 

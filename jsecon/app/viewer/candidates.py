@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from jsecon.app.ask import with_phrases
 from jsecon.app.pictures import Renderer
-from jsecon.app.question import with_phrases
-from jsecon.app.splat_page import regions_of
+from jsecon.app.viewer.static_page import main_regions
 from jsecon.query.direct import similarities
 from jsecon.query.masks import HIDDEN_LOGIT
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
@@ -78,7 +78,7 @@ class Pictures:
     """Pictures of a field's frames and regions, as its Gaussians show them."""
 
     def __init__(self, field: LanguageField):
-        self.renderer, self.regions = Renderer(field.gaussians, field.cameras), regions_of(field)
+        self.renderer, self.regions = Renderer(field.gaussians, field.cameras), main_regions(field)
         self._means = np.asarray(field.gaussians.means)
         self._poses = np.asarray(field.cameras.world_to_camera)
         self._lens = [np.asarray(a) for a in (field.cameras.fx, field.cameras.fy, field.cameras.cx, field.cameras.cy)]

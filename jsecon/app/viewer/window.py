@@ -19,17 +19,17 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from jsecon.app import viewing
 from jsecon.app.access import bracketed, listen, token_for
-from jsecon.app.answers import masks_of, stem_of, write_answer
-from jsecon.app.candidates import Candidate, Pictures, candidates, region_along
-from jsecon.app.layers import Layers
-from jsecon.app.panel import Panel, sheet, told
+from jsecon.app.ask import Answer, ask_region, ask_text
+from jsecon.app.outputs import answer_masks, file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
-from jsecon.app.question import Answer, ask_region, ask_text
-from jsecon.app.splat_page import NOWHERE
-from jsecon.app.viewer_access import guarded_pages
-from jsecon.app.viewing import Ask, History, ViewState
+from jsecon.app.viewer import view_state
+from jsecon.app.viewer.access import guarded_pages
+from jsecon.app.viewer.candidates import Candidate, Pictures, candidates, region_along
+from jsecon.app.viewer.panel import Panel, sheet, told
+from jsecon.app.viewer.scene import Layers
+from jsecon.app.viewer.static_page import NOWHERE
+from jsecon.app.viewer.view_state import Ask, History, ViewState
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import GivenSpace, given_dim
@@ -68,7 +68,7 @@ class Viewer:
         """Draws a first state, and from then on what the page asks for; all that a question needs is compiled."""
         self._go(state, whole=True)
         self._paint(self.history.state)
-        warm = viewing.asked(ViewState(), "red")
+        warm = view_state.asked(ViewState(), "red")
         answers = [self.answer(ask) for ask in warm.asks]
         told(self.field, warm, answers)
         self._sure(warm, answers)
@@ -101,7 +101,7 @@ class Viewer:
 
     def restore(self, link: str) -> None:
         """The state of a link."""
-        self.then(lambda state: viewing.state_of(link), whole=True)
+        self.then(lambda state: view_state.state_of(link), whole=True)
 
     def seen_from(self, camera: Any) -> None:
         """Where a client looks from, in the field's world."""
@@ -118,7 +118,7 @@ class Viewer:
             if region < 0:
                 self.panel.notice("No region is known there: it is background, or no frame shows it.")
                 return state
-            return viewing.clicked(state, region, more=more)
+            return view_state.clicked(state, region, more=more)
 
         self.then(step, whole=True)
 
@@ -127,7 +127,7 @@ class Viewer:
 
         def step(state: ViewState) -> ViewState:
             place, candidate = self._candidates[number]
-            return viewing.instead(state, place, candidate.region)
+            return view_state.instead(state, place, candidate.region)
 
         self.then(step, whole=True)
 
@@ -151,7 +151,7 @@ class Viewer:
             if not found:
                 self.panel.notice("Nothing is lit up, so there is nothing to export.")
             else:
-                client.send_file_download(f"{stem_of(found[0])}.zip", self.packed(found), save_immediately=True)
+                client.send_file_download(f"{file_stem(found[0])}.zip", self.packed(found), save_immediately=True)
 
         self.do(act)
 
@@ -161,7 +161,7 @@ class Viewer:
         how = {"compression": zipfile.ZIP_DEFLATED, "strict_timestamps": False}  # a clock may stand before 1980
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **how) as archive:
             for answer in answers:
-                write_answer(self.field, answer, Path(folder), masks_of(self.field, answer, VIEWS))
+                write_answer(self.field, answer, Path(folder), answer_masks(self.field, answer, VIEWS))
             for file in sorted(Path(folder).iterdir()):
                 archive.write(file, file.name)
         return packed.getvalue()
@@ -187,14 +187,14 @@ class Viewer:
                 traceback.print_exc()
 
     def _go(self, state: ViewState, *, whole: bool) -> None:
-        self.history = self.history.then(viewing.moved(state, camera=()))
+        self.history = self.history.then(view_state.moved(state, camera=()))
         if whole:
             self.panel.show(state)
         if state.camera:
             self.layers.look(state.camera)
 
     def _link(self) -> None:
-        self.panel.link(viewing.link_of(viewing.moved(self.history.state, camera=self._camera)))
+        self.panel.link(view_state.link_of(view_state.moved(self.history.state, camera=self._camera)))
 
     def _answer(self, ask: Ask) -> Answer | InputError:
         how: dict[str, Any] = {"several": ask.every, "piece_nearness": 1 - ask.whole}
@@ -214,7 +214,7 @@ class Viewer:
 
     def _shown(self, state: ViewState) -> np.ndarray:
         only, hidden = ([self._found(ask)[0] for ask in asks] for asks in (state.only, state.hidden))
-        return viewing.shown(self.field.gaussians.count, only, hidden)
+        return view_state.shown(self.field.gaussians.count, only, hidden)
 
     def _base(self, paint: str) -> np.ndarray:
         """(N, 3) RGB of the Gaussians without an answer."""
@@ -231,9 +231,9 @@ class Viewer:
         found = [self._found(ask) for ask in state.asks]
         masks, similarities = [mask for mask, _ in found], [similarity for _, similarity in found]
         if state.paint == "score":
-            colours = viewing.scored(similarities, self.field.gaussians.count)
+            colours = view_state.scored(similarities, self.field.gaussians.count)
         else:
-            colours = viewing.lit(self.base(state.paint), masks if any(m.any() for m in masks) else [], similarities)
+            colours = view_state.lit(self.base(state.paint), masks if any(m.any() for m in masks) else [], similarities)
         self.layers.paint(colours, self._shown(state))
         self.drawn = state
 
@@ -292,8 +292,8 @@ def open_viewer(
 def view(asked: Any, embedder_of: Callable[..., Any], say: Callable[[str], object]) -> dict[str, Any]:
     """Shows a field as `jsecon view` asks until it is stopped; raises as `open_viewer` does."""
     token = token_for(asked.host, asked.token)
-    state = viewing.state_of(asked.link) if asked.link else ViewState()
-    state = viewing.asked(state, "; ".join(asked.texts)) if asked.texts else state
+    state = view_state.state_of(asked.link) if asked.link else ViewState()
+    state = view_state.asked(state, "; ".join(asked.texts)) if asked.texts else state
     field, name, dim = load_field(asked.field), asked.field.resolve().parent.name, None
     if not asked.texts and asked.embedder is None:
         dim = given_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked

@@ -1,14 +1,14 @@
 """An answer as files: one of the Gaussians, a JSON of figures, a few masks.
 
 Every question has file names of its own, the same in every run: an ordinary text is its own name ("red mug" is
-red-mug), any other name ends in a hash of what it stands for (`stem_of`).
+red-mug), any other name ends in a hash of what it stands for (`file_stem`).
 """
 
 import hashlib
 import json
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,15 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.app.place import digits, points_of, rounded
-from jsecon.app.question import Answer
-from jsecon.app.splat_page import NOWHERE, regions_of
+from jsecon.app import pictures, report
+from jsecon.app.ask import Answer, quantile_message
+from jsecon.app.locate import digits, rounded, selected_centers
+from jsecon.app.viewer.static_page import NOWHERE, main_regions
 from jsecon.data.gaussian_files import save_gaussians
 from jsecon.files import write_text, written_whole
 from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
+from jsecon.pipeline.progress import Listener
 from jsecon.query.masks import selection_mask
 from jsecon.splat.transform import carried
 from jsecon.types import Gaussians, LanguageField
@@ -69,7 +71,7 @@ def _figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
     Under "place", in the capture's own world: "centroid", the mean of the centres of the selected Gaussians, as
     `Place.centroid`, and "bounding_box", the least and the greatest of their coordinates.
     """
-    means = points_of(field, answer.mask)
+    means = selected_centers(field, answer.mask)
     place = sure = None
     if len(means):
         low, high = means.min(0), means.max(0)
@@ -104,7 +106,7 @@ def _figures(field: LanguageField, answer: Answer) -> dict[str, Any]:
     } | ({} if answer.frames is None else {"frames": dict(answer.frames)})
 
 
-def place_told(place: dict[str, Any]) -> str:
+def centroid_text(place: dict[str, Any]) -> str:
     """The centroid of a "place" of `_figures` in words, to a hundredth of the size of the thing."""
     box = place["bounding_box"]
     decimals = digits(float(np.linalg.norm(np.subtract(box["max"], box["min"]))), 0.01)
@@ -120,10 +122,10 @@ def write_answer(
     ending: str = "ply",
 ) -> dict[str, Any]:
     """Writes OUT/<stem>.ply (or .spz, .glb: `ending`), .json, and <stem>-<frame>.png of `masks` (by frame, see
-    `masks_of`); returns the figures. The stem is `stem_of` the answer. An empty selection leaves out the Gaussians and
+    `answer_masks`); returns the figures. An empty selection leaves out the Gaussians and
     the masks.
     """
-    stem, count = stem_of(answer), field.gaussians.count
+    stem, count = file_stem(answer), field.gaussians.count
     field = part_of(field, answer)
     chosen = carried(selected(field.gaussians, answer.mask), field.to_source)
     told = _figures(field, answer) | {"of": count, ending: None, "masks": {}}
@@ -148,11 +150,11 @@ def save_scene(field: LanguageField, file: Path) -> None:
 
 def _regions(field: LanguageField) -> np.ndarray:
     """(N,) as a .glb holds them: -1 = none."""
-    regions = regions_of(field)
+    regions = main_regions(field)
     return np.where(regions == NOWHERE, -1, regions)
 
 
-def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:
+def answer_masks(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool[np.ndarray, "h w"]]:
     """frame -> (H, W) bool of the `views` best frames: where the selected Gaussians alone have an alpha above 0.7."""
     field = part_of(field, answer)
     gaussians, mask = jax.device_put((field.gaussians, answer.mask))
@@ -161,7 +163,7 @@ def masks_of(field: LanguageField, answer: Answer, views: int) -> dict[int, Bool
     return {t: np.asarray(selection_mask(gaussians, cameras[t], mask)) for t in frames}
 
 
-def stem_of(answer: Answer) -> str:
+def file_stem(answer: Answer) -> str:
     """The name of an answer's files without their endings: the same in every run, and no other question's."""
     question, plain = answer.question, _slug(answer.question)
     pointed = _POINTED.fullmatch(question) is not None
@@ -189,3 +191,56 @@ def _hashed(slug: str, key: str) -> str:
     digest = hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:10]
     start = slug.encode("utf-8", "replace")[:_MOST_BYTES].decode("utf-8", "ignore")
     return f"{start}--{digest}"
+
+
+def write_answers(
+    field: LanguageField,
+    answers: Sequence[Answer],
+    out: Path,
+    listener: Listener,
+    *,
+    views: int,
+    ending: str = "ply",
+) -> dict[str, Any]:
+    """The files of each answer, OUT/answers.html, and a line each; returns the files and the figures."""
+    in_blocks = any(item.rows is not None for item in answers)
+    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras, in_blocks=in_blocks), [], []
+    with listener.progress("pictures") as progress:
+        for n, item in enumerate(answers):
+            shown = answer_masks(field, item, max(views, 1))
+            masks = {t: shown[t] for t in list(shown)[:views]}
+            told = write_answer(field, item, out, masks, ending=ending)
+            figures_of.append(told)
+            if told["place"]:
+                place = f"around {centroid_text(told['place'])}"
+            elif told["region"] is None and item.by in ("votes", "code"):
+                place = "nothing selected: no region answers it"
+            else:
+                place = "nothing selected"
+            count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
+            score += "" if item.quantile is None else f", {quantile_message(item.quantile)}"
+            unheld = "regions" in told["left_out"]
+            where = "its parts, as no region holds it" if unheld else f"region {told['region']}"
+            listener.say(f"{item.question!r}: {count}, {score}, {where}, {place}")
+            if dropped := outliers_message(told["outliers"]):
+                listener.note(dropped)
+            else:
+                dropped = "no outliers dropped"
+            words = f"{count} by {item.by}; {score}; {where}; {dropped}; {place}."
+            overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
+            figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
+            parts.append(report.section(item.question, words, report.grid(figures, 3)))
+            progress(n + 1, len(answers))
+    write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
+    listener.say(f"pictures  {out / 'answers.html'}")
+    return {"written": {"folder": out, "pictures": out / "answers.html"}, "answers": figures_of}
+
+
+def outliers_message(outliers: dict[str, Any]) -> str:
+    """What DBSCAN dropped of an answer, and how to keep it; "" where it dropped nothing."""
+    if not outliers["dropped"]:
+        return ""
+    many = outliers["clusters_dropped"]
+    clusters = f", {many} smaller cluster{'s' if many > 1 else ''} among them" if many else ""
+    part = f"{outliers['dropped']} of {outliers['of_selected']} selected Gaussians stand apart and were dropped"
+    return f"{part}{clusters}; --keep-outliers keeps them"

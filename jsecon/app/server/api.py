@@ -18,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, Stri
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 import jsecon
-from jsecon.app.guard import LIMITS, Busy, Guard, Limits, Workers
-from jsecon.app.question import frame_index
-from jsecon.app.scenes import Question, Scene
+from jsecon.app.ask import frame_index
+from jsecon.app.server.guard import LIMITS, Busy, Guard, Limits, Workers
+from jsecon.app.server.scenes import Question, Scene
 from jsecon.app.verbs import By
 from jsecon.errors import InputError
 from jsecon.process import cores

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.app.answers import best_frames, selected
-from jsecon.app.place import place_of
-from jsecon.app.question import Answer, ask_pixel, ask_text
+from jsecon.app.ask import Answer, ask_pixel, ask_text
+from jsecon.app.locate import locate_answer
+from jsecon.app.outputs import best_frames, selected
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -89,7 +89,7 @@ class Scene:
             "count": int(answer.mask.sum()),
             "region": region if region >= 0 else None,
             "score": round(float(answer.selection.score), 6),
-            "place": place_of(self.field, answer).as_dict() if answer.mask.any() else None,
+            "place": locate_answer(self.field, answer).as_dict() if answer.mask.any() else None,
         }
 
     def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:

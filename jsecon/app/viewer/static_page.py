@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jsecon.app.question import Answer
+from jsecon.app.ask import Answer
 from jsecon.files import write_text
 from jsecon.language.shares import SHARE_THRESHOLD, vote_blocks, vote_shares
 from jsecon.numerics import sigmoid
@@ -56,14 +56,14 @@ def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
         "texts": [_told(answer, kept) for answer in answers],
         **_camera(field, means[kept]),
     }
-    splats, ends = _packed(gaussians, regions_of(field), opacity, kept, low, high)
+    splats, ends = _packed(gaussians, main_regions(field), opacity, kept, low, high)
     template = resources.files("jsecon.app").joinpath("splat_page.html").read_text(encoding="utf-8")
     written = json.dumps(told | ends).replace("</", "<\\/")
     filled = template.replace("__TITLE__", html.escape(title)).replace("__TOLD__", written)
     return filled.replace("__SPLATS__", base64.b64encode(splats).decode())
 
 
-def regions_of(field: LanguageField) -> Int[np.ndarray, " n"]:
+def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
     """The region that has most of each Gaussian, and at least half; NOWHERE where none has. Read in blocks."""
     parts = [np.zeros(0, np.int32)]
     for votes in vote_blocks(field.votes):

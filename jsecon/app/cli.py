@@ -5,11 +5,14 @@ is in actions.py.
 """
 
 import contextlib
+import dataclasses
 import difflib
 import inspect
 import io
+import json
 import re
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Union
@@ -18,8 +21,7 @@ import tyro
 
 import jsecon
 from jsecon.app.actions import VERBS
-from jsecon.app.ending import VerbResult, finish
-from jsecon.app.verbs import Completion, Output, Verb
+from jsecon.app.verbs import Completion, Output, Verb, VerbResult
 from jsecon.errors import InputError, why
 from jsecon.pipeline.progress import Console
 from jsecon.process import show_whole_traces
@@ -158,6 +160,39 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
+
+
+def finish(output: Output, result: VerbResult, code: int = 0) -> int:
+    """Prints the errors of a verb, and with --json its result, in which the last error is "error".
+
+    Args:
+      output: Options of the output.
+      result: Result of the verb.
+      code: Exit code if no error is in the result.
+
+    Returns:
+      The exit code: 2 if the result has errors.
+    """
+    refused = result.get("refused", ())
+    for error in refused:
+        if output.debug:
+            traceback.print_exception(error)
+        if not output.json:
+            print(f"jsecon: {error}", file=sys.stderr)
+    if output.json:
+        fields = {name: value for name, value in result.items() if name != "refused" or len(refused) > 1}
+        if refused:
+            fields["error"] = refused[-1]
+        print(json.dumps(fields, default=_plain), flush=True)
+    return 2 if refused else code
+
+
+def _plain(value: Any) -> Any:
+    """Returns what JSON takes of an error, a record, or a path."""
+    if isinstance(value, InputError):
+        parts = {"name": value.where, "found": value.found, "expected": value.expected, "remedy": value.remedy}
+        return {"message": str(value)} | parts
+    return vars(value) if dataclasses.is_dataclass(value) else str(value)
 
 
 def completion_script(shell: str) -> str:

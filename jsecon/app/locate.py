@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jsecon.app.question import Answer, ask_text
+from jsecon.app.ask import Answer, ask_text
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
 from jsecon.splat.transform import carried
@@ -55,7 +55,7 @@ class Place:
 
 
 def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) -> Place:
-    """Where the thing is that a text names; `how` as for `jsecon.app.question.ask_text`.
+    """Where the thing is that a text names; `how` as for `jsecon.app.ask.ask_text`.
 
     `embedder`: that of the field, opened where it is not given. In five rooms of the demo, of whose things that no
     other shares a name with it finds 59 of 60, `center` is off by 6 mm in the median and the box along the
@@ -66,10 +66,10 @@ def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) ->
         from jsecon.pipeline.networks import embedder_of_field
 
         embedder = embedder_of_field(field)
-    return place_of(field, ask_text(field, embedder, text, **how))
+    return locate_answer(field, ask_text(field, embedder, text, **how))
 
 
-def place_of(field: LanguageField, answer: Answer) -> Place:
+def locate_answer(field: LanguageField, answer: Answer) -> Place:
     """Where an answer is. Raises InputError where it selected nothing."""
     if not answer.mask.any():
         found = f"nothing selected (score {float(answer.selection.score):.3f})"
@@ -77,7 +77,7 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # colours have no place
     rows = np.asarray(answer.mask)
     chosen = carried(jax.tree.map(lambda a: np.asarray(a)[rows], plain), field.to_source)
-    points = points_of(field, rows)
+    points = selected_centers(field, rows)
     spread = points - points.mean(0)
     axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -99,7 +99,7 @@ def place_of(field: LanguageField, answer: Answer) -> Place:
     )
 
 
-def points_of(field: LanguageField, mask: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
+def selected_centers(field: LanguageField, mask: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
     """(M, 3) float64 centres of the Gaussians in `mask`, in the capture's own world."""
     to_source = np.asarray(field.to_source, np.float64)
     return np.asarray(field.gaussians.means)[mask].astype(np.float64) @ to_source[:3, :3].T + to_source[:3, 3]

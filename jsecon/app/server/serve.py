@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from jsecon.app.access import bracketed, listen, token_for
-from jsecon.app.scenes import open_scenes
+from jsecon.app.server.scenes import open_scenes
 from jsecon.errors import InputError
 
 REMEDY = 'pip install "jsecon[serve]"'
@@ -51,7 +51,7 @@ def ready(
     try:
         import uvicorn
 
-        from jsecon.app.api import application
+        from jsecon.app.server.api import application
     except ImportError as error:
         found = f"the package {error.name} is missing"
         raise InputError("jsecon serve", found, remedy=f"Run: {REMEDY}") from error

@@ -2,33 +2,20 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jsecon.app import answers as answers_of, pictures, question, report
+from jsecon.app import pictures, report
 from jsecon.data.gaussian_files import save_gaussians
-from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
-from jsecon.errors import InputError
-from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
 from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.stages import WARNING
 from jsecon.process import peak_memory_mib
-from jsecon.types import Capture, Gaussians, LanguageField, Quality, Selection
+from jsecon.types import Capture, Gaussians, Quality
 
-KINDS: dict[str, dict[str, Any]] = {
-    "anchored": {"by": "votes"},
-    "silhouette": {"by": "silhouette"},
-    "all": {"several": True},
-    "anchored_code": {"by": "code"},
-    "one_step": {"by": "one_step"},
-    "canonical": {"by": "canonical"},
-}
-"""kind of query in metrics.json -> how jsecon.app.question asks"""
 FRAMES_SHOWN, FOLLOWED, LARGE = 6, 10, 0.15
 """rows of frames; masklets followed, the largest of those that fill less than a part of a frame; frames of each"""
 
@@ -43,7 +30,7 @@ def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
         parts = [*warnings, report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
         title = f"Language field of {run.options.capture.resolve().name}"
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
-    say_quality(run.held_out, listener)
+    print_quality(run.held_out, listener)
     for note in told:
         listener.say(f"{WARNING}{note}")
     listener.say(
@@ -64,12 +51,12 @@ def write_scene(
 ) -> dict[str, Any]:
     """The file of a fitted scene, in the world of the capture's files; says the figures, and returns them."""
     save_gaussians(out, gaussians, similarity=capture.to_source)
-    say_quality(held_out, listener)
+    print_quality(held_out, listener)
     listener.say(f"{gaussians.count} Gaussians  {out}")
-    return {"written": {"scene": out}, "gaussians": gaussians.count} | quality_told(held_out)
+    return {"written": {"scene": out}, "gaussians": gaussians.count} | quality_metrics(held_out)
 
 
-def quality_told(held_out: Quality) -> dict[str, float | None]:
+def quality_metrics(held_out: Quality) -> dict[str, float | None]:
     """Mean PSNR (dB) and SSIM of the frames held out; None where there are none."""
     some, (psnr, ssim) = len(held_out.frames), (held_out.psnr, held_out.ssim)
     return {
@@ -78,7 +65,7 @@ def quality_told(held_out: Quality) -> dict[str, float | None]:
     }
 
 
-def say_quality(held_out: Quality, listener: Listener) -> None:
+def print_quality(held_out: Quality, listener: Listener) -> None:
     """How well the scene shows the frames held out; nothing where there are none."""
     count = len(held_out.frames)
     if count:
@@ -94,125 +81,13 @@ def run_metrics(run: Run) -> dict[str, Any]:
         "code_size": int(run.field.region_codes.shape[1]),
         "frames": len(run.capture.names),
         "size": [run.capture.cameras.width, run.capture.cameras.height],
-        **quality_told(run.held_out),
+        **quality_metrics(run.held_out),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
         "left_out": run.left_out,
         "notes": list(run.notes),
         "programs_compiled": run.programs,
         "peak_memory_mib": round(peak_memory_mib(), 1),
     }
-
-
-def write_answers(
-    field: LanguageField,
-    answers: Sequence[question.Answer],
-    out: Path,
-    listener: Listener,
-    *,
-    views: int,
-    ending: str = "ply",
-) -> dict[str, Any]:
-    """The files of each answer, OUT/answers.html, and a line each; returns the files and the figures."""
-    in_blocks = any(item.rows is not None for item in answers)
-    renderer, parts, figures_of = pictures.Renderer(field.gaussians, field.cameras, in_blocks=in_blocks), [], []
-    with listener.progress("pictures") as progress:
-        for n, item in enumerate(answers):
-            shown = answers_of.masks_of(field, item, max(views, 1))
-            masks = {t: shown[t] for t in list(shown)[:views]}
-            told = answers_of.write_answer(field, item, out, masks, ending=ending)
-            figures_of.append(told)
-            if told["place"]:
-                place = f"around {answers_of.place_told(told['place'])}"
-            elif told["region"] is None and item.by in ("votes", "code"):
-                place = "nothing selected: no region answers it"
-            else:
-                place = "nothing selected"
-            count, score = f"{told['count']} of {told['of']} Gaussians", f"score {told['score']:.3f}"
-            score += "" if item.quantile is None else f", {question.quantile_message(item.quantile)}"
-            unheld = "regions" in told["left_out"]
-            where = "its parts, as no region holds it" if unheld else f"region {told['region']}"
-            listener.say(f"{item.question!r}: {count}, {score}, {where}, {place}")
-            if dropped := outliers_message(told["outliers"]):
-                listener.note(dropped)
-            else:
-                dropped = "no outliers dropped"
-            words = f"{count} by {item.by}; {score}; {where}; {dropped}; {place}."
-            overlays = {t: pictures.selection_overlay(renderer.photo(t), mask) for t, mask in shown.items()}
-            figures = [report.figure(image, field.names[t]) for t, image in overlays.items()]
-            parts.append(report.section(item.question, words, report.grid(figures, 3)))
-            progress(n + 1, len(answers))
-    write_text(out / "answers.html", report.page("Answers", "The selection's own mask over the rendered scene.", parts))
-    listener.say(f"pictures  {out / 'answers.html'}")
-    return {"written": {"folder": out, "pictures": out / "answers.html"}, "answers": figures_of}
-
-
-def outliers_message(outliers: dict[str, Any]) -> str:
-    """What DBSCAN dropped of an answer, and how to keep it; "" where it dropped nothing."""
-    if not outliers["dropped"]:
-        return ""
-    many = outliers["clusters_dropped"]
-    clusters = f", {many} smaller cluster{'s' if many > 1 else ''} among them" if many else ""
-    part = f"{outliers['dropped']} of {outliers['of_selected']} selected Gaussians stand apart and were dropped"
-    return f"{part}{clusters}; --keep-outliers keeps them"
-
-
-def evaluate(
-    field: LanguageField,
-    embedder: Any,
-    labels: Sequence[LabelledFrame],
-    listener: Listener,
-    kinds: Sequence[str] = tuple(KINDS),
-) -> dict[str, tuple[list[Row], dict[str, Any]]]:
-    """Rows and summary of each kind of query under the point-level rendered protocol."""
-    cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
-    found = {}
-    for kind in kinds:
-
-        def select(text: str, how: dict[str, Any] = KINDS[kind]) -> Selection | None:
-            try:
-                asked = question.ask_text(field, embedder, text, **how)
-            except InputError:  # no words for it: no answer, which counts as 0
-                return None
-            return dataclasses.replace(asked.selection, mask=asked.mask)
-
-        with listener.progress(f"evaluate {kind}") as progress:
-            found[kind] = evaluate_point_level_rendered(field.gaussians, cameras, labels, select, progress=progress)
-    return found
-
-
-def write_evaluation(
-    field: LanguageField, embedder: Any, folder: Path, out: Path, listener: Listener
-) -> dict[str, Any]:
-    """Prints the table and writes OUT/evaluation.json, with every pair; returns the table's figures."""
-    found = evaluate(field, embedder, load_lerf_labels(folder), listener)
-    say_table(found, listener)
-    told = {kind: summary | {"rows": [pair(row) for row in rows]} for kind, (rows, summary) in found.items()}
-    write_text(out / "evaluation.json", json.dumps(told, indent=2) + "\n")
-    listener.say(f"all pairs  {out / 'evaluation.json'}")
-    return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in found.items()}
-
-
-def pair(row: Row) -> dict[str, Any]:
-    """A row without its mask, as plain values."""
-    return {
-        "frame": row.frame,
-        "query": row.query,
-        "iou": round(row.iou, 4),
-        "located": row.located,
-        "selected": row.selected,
-        "region": row.region,
-        "score": round(row.score, 4),
-    }
-
-
-def say_table(found: dict[str, tuple[list[Row], dict[str, Any]]], listener: Listener) -> None:
-    """mIoU, mAcc@0.25 and localisation of each kind, with the protocol they were measured under."""
-    told = next(iter(found.values()))[1]
-    listener.say(f"{told['protocol']}\n{told['pairs']} pairs of {told['queries']} queries in {told['frames']} frames")
-    listener.say(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
-    for kind, (_, told) in found.items():
-        shares = f"{told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f}"
-        listener.say(f"  {kind:<14} {shares} {told['missing']:>8}")
 
 
 def _tiles(metrics: dict[str, Any]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from jsecon.app.splat_page import regions_of
+from jsecon.app.viewer.static_page import main_regions
 from jsecon.numerics import sigmoid
 from jsecon.splat.project import usable
 from jsecon.splat.sh import C0
@@ -45,7 +45,7 @@ class Layers:
         halves = (turns * np.minimum(sizes * self.scale, LARGEST)[:, None]).astype(np.float32)
         spread, centres = halves @ halves.transpose(0, 2, 1), finite(gaussians.means) * np.float32(self.scale)
         self._groups = []
-        order = np.argsort(regions_of(field), kind="stable")
+        order = np.argsort(main_regions(field), kind="stable")
         for k, rows in enumerate(np.array_split(order, max(min(GROUPS, len(order)), 1))):
             own = {"centers": centres[rows], "covariances": spread[rows], "rgbs": self.photo[rows]}
             handle = server.scene.add_gaussian_splats(f"/field/{k}", opacities=self._opacity[rows, None], **own)

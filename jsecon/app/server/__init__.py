@@ -1,0 +1,1 @@
+"""The server: fields behind HTTP."""

@@ -1,0 +1,1 @@
+"""The viewer: a field in a browser, and as one HTML file."""
