@@ -30,7 +30,7 @@ from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import Current, Steps, Way, on_devices
 from jsecon.fit.view import Views
-from jsecon.parallel import MESH_OPTIONS, host_mesh, over_rows
+from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import colours_from_sh
@@ -55,7 +55,7 @@ def main() -> None:
     room = default_capacity(gaussians.count, cameras.width, cameras.height, strips=strips)
 
     def absolute(gaussians, camera, frame):
-        colours = over_rows(colours_from_sh, gaussians, camera, mesh)
+        colours = map_rows(colours_from_sh, gaussians, camera, mesh)
         image = render(gaussians, camera, colours, capacity=room, mesh=mesh).features
         return l1(image, frame.astype(jnp.float32) / 255)
 

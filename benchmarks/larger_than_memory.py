@@ -30,7 +30,7 @@ import numpy as np
 
 import jsecon
 from jsecon.app.outputs import save_scene
-from jsecon.files import map_array, write_column
+from jsecon.files import map_npy, write_npy
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
 SIDE, ACROSS, SQUARES, PART = 100.0, 64, 10, 2_000_000
@@ -58,11 +58,11 @@ def write_landscape(folder: Path, count: int) -> None:
     firsts = range(0, count, 1 << 20)
     for name, rest in SHAPES.items():
         blocks = (getattr(landscape(count, first, min(1 << 20, count - first)), name) for first in firsts)
-        write_column(folder / f"{name}.npy", (count, *rest), np.float32, blocks)
+        write_npy(folder / f"{name}.npy", (count, *rest), np.float32, blocks)
 
 
 def mapped(folder: Path) -> Gaussians:
-    return Gaussians(*(map_array(folder / f"{name}.npy") for name in SHAPES))
+    return Gaussians(*(map_npy(folder / f"{name}.npy") for name in SHAPES))
 
 
 def ring(views: int, width: int, height: int) -> Camera:
@@ -289,8 +289,8 @@ def random_votes(folder: Path, count: int) -> Votes:
         rng = np.random.default_rng(len(name))
         sizes = ((min(1 << 20, count - first), *rest) for first in range(0, count, 1 << 20))
         draw = (lambda shape: rng.integers(1, REGIONS, shape)) if dtype is np.int32 else rng.random  # noqa: B023
-        write_column(folder / f"{name}.npy", (count, *rest), dtype, map(draw, sizes))
-    columns = {name: map_array(folder / f"{name}.npy") for name in kinds}
+        write_npy(folder / f"{name}.npy", (count, *rest), dtype, map(draw, sizes))
+    columns = {name: map_npy(folder / f"{name}.npy") for name in kinds}
     return Votes(**columns, overflow=np.zeros((), np.int32), num_regions=REGIONS)
 
 

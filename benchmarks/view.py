@@ -30,7 +30,7 @@ from serve import SHADES, WORDS, copied, free_port
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
 from jsecon.language.field import load_field, save_field
-from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.networks import field_embedder
 
 HOOK = """(undrawn => {
   const now = () => performance.timeOrigin + performance.now();
@@ -142,7 +142,7 @@ def main() -> None:
         save_field(file, field)
         for name in ("first", "warm", "warm"):
             print(f"opened after {opening(file):.1f} s, {name}", flush=True)
-        embedder = embedder_of_field(field)
+        embedder = field_embedder(field)
         viewer = open_viewer(field, embedder, host="127.0.0.1", port=free_port(), name="field", state=ViewState())
         address = f"http://127.0.0.1:{viewer.server.get_port()}/"
         same = {"deviceScaleFactor": 1, "mobile": False}

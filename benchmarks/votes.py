@@ -23,7 +23,7 @@ from metrics import Metric, interleaved, show
 
 import jsecon
 from jsecon.errors import InputError
-from jsecon.parallel import spread_over_devices
+from jsecon.parallel import accumulate_over_views
 from jsecon.types import Camera, Gaussians
 
 
@@ -33,7 +33,7 @@ def voting_views(run: Path, width: int) -> tuple[Gaussians, Camera, np.ndarray, 
     found = {kind: sorted((run / "cache").glob(f"{kind}-*.safetensors"), key=lambda file: file.stat().st_mtime)
              for kind in ("masklets", "load")}  # fmt: skip
     if not all(found.values()):
-        raise InputError(run, found="no cache of masklets", expected="the folder of a whole run", remedy="jsecon run")
+        raise InputError(run, problem="no cache of masklets", expected="the folder of a whole run", remedy="jsecon run")
     labels = np.load(found["masklets"][-1])["root.value"]
     voting = ~np.load(found["load"][-1])["root.value.held_out"]
     scale = width / field.cameras.width
@@ -60,7 +60,7 @@ def measure(run: Path, width: int, size: int, repeats: int) -> list[Metric]:
         return jsecon.region_votes(gaussians, cameras, labels, regions, capacity=capacity, by_view=by_view)
 
     calls = {
-        "rendered": lambda: spread_over_devices(add, jnp.float32(0), jnp.add, (gaussians, features), cameras)[0],
+        "rendered": lambda: accumulate_over_views(add, jnp.float32(0), jnp.add, (gaussians, features), cameras)[0],
         "votes": lambda: votes(False).weights,
         "votes by view": lambda: votes(True).weights,
     }

@@ -39,10 +39,10 @@ from jsecon.data.capture import load_capture
 from jsecon.demo.demo import PLAIN, demo
 from jsecon.language.field import load_field
 from jsecon.pipeline import cache
-from jsecon.pipeline.masklet_stages import associated, proposals_of
+from jsecon.pipeline.masklet_stages import associate_masks, frame_proposals
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.stages import Work, training_frames
+from jsecon.pipeline.stages import RunContext, training_frames
 from jsecon.types import Capture, Gaussians
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -137,14 +137,14 @@ def measure(options: RunOptions, capture: Capture, gaussians: Gaussians, way: st
     train = training_frames(capture)
     frames = np.asarray(capture.frames)[train]
     options = dataclasses.replace(options, association="consensus" if way == CONSENSUS else "tracking")
-    work = Work(options, Networks(ColourEmbedder()), Path())
+    work = RunContext(options, Networks(ColourEmbedder()), Path())
     start = time.perf_counter()
     if way in (ALONE, FLOW):
-        labels = alone(frames, proposals_of(work, capture, gaussians)[0])
+        labels = alone(frames, frame_proposals(work, capture, gaussians)[0])
         labels = by_flow(frames, labels) if way == FLOW else labels
     else:
-        proposals, _ = proposals_of(work, capture, gaussians)
-        labels = associated(work, capture, gaussians, proposals, lambda done, total: None)
+        proposals, _ = frame_proposals(work, capture, gaussians)
+        labels = associate_masks(work, capture, gaussians, proposals, lambda done, total: None)
     return labels, time.perf_counter() - start
 
 

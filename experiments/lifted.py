@@ -25,7 +25,7 @@ from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.demo.raycast import trace
 from jsecon.demo.room import Room
 from jsecon.evaluate.metrics import iou
-from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.networks import field_embedder
 from jsecon.query.masks import selection_mask
 from jsecon.splat.render import render
 from jsecon.types import Camera, Gaussians, LanguageField
@@ -107,7 +107,7 @@ def main(options: Places) -> str:
     columns = [(way, reading) for reading in READINGS for way in WAYS]
     for seed, folder, field in fields_of(options):
         labels = load_lerf_labels(folder / "capture" / "label")
-        embedder = embedder_of_field(field)
+        embedder = field_embedder(field)
         names = sorted({name for frame in labels for name in frame.objects})
         answers = {name: ask_text(field, embedder, name).mask for name in names}
         found = judged(field, room_of(seed, options), labels, answers)

@@ -24,7 +24,7 @@ from jsecon.demo.raycast import trace
 from jsecon.demo.room import Room, make_room
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
-from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.networks import field_embedder
 from jsecon.pipeline.progress import Listener
 from jsecon.types import Camera, LanguageField
 
@@ -93,7 +93,7 @@ def main(options: Options) -> str:
     """The table, written."""
     rows = []
     for seed, _, field in fields_of(options):
-        embedder = embedder_of_field(field)
+        embedder = field_embedder(field)
         for name, box in true_boxes(room_of(seed, options), field.cameras).items():
             try:
                 place = locate(field, name, embedder)

@@ -116,7 +116,7 @@ def kept_in(file: Path, *, only: bool = False) -> Kept:
     return kept
 
 
-def sources_of(options: Options) -> Sources:
+def locate_sources(options: Options) -> Sources:
     """The options' data alone."""
     return Sources(*(getattr(options, own.name) for own in dataclasses.fields(Sources)))
 
@@ -143,7 +143,7 @@ def embedder_of(options: Options, crop: Crop | None = None, weights: str = "prob
 
 def case_of(options: Options, scene: WordScene, embedder: Conse) -> Case:
     """A scene with the embeddings of `embedder`, as a field that jsecon's queries take."""
-    found = class_weights(scores_of(options.cache, scene, embedder, sources_of(options)), embedder.weights)
+    found = class_weights(scores_of(options.cache, scene, embedder, locate_sources(options)), embedder.weights)
     crops = conse(found, embedder.class_vectors, top=embedder.top)
     regions = scene.regions(crops)
     count, regions_count = scene.gaussians.count, regions.count
@@ -326,8 +326,8 @@ def compare_crops(options: Options, kept: Kept) -> list[dict]:
 def _outlined(options: Options, name: str) -> tuple[tuple[str, ...], tuple]:
     """The texts of a scene that chooses, and its outlined things as `crop_quality` takes them."""
     masks = dict(CHOOSING[::-1])[name]
-    scene = load_scene(options.cache, name, masks, sources_of(options))
-    frames, things, names = things_of(options.cache, name, masks, sources_of(options))
+    scene = load_scene(options.cache, name, masks, locate_sources(options))
+    frames, things, names = things_of(options.cache, name, masks, locate_sources(options))
     place = np.full(len(scene.names) + 2, -1)
     place[scene.asked] = np.arange(len(scene.asked))
     return scene.texts, (frames, things, place[names])
@@ -380,7 +380,7 @@ def _mean(values: Any) -> str:
 def measured(options: Options, name: str, masks: str, variant: str) -> dict:
     """All figures of a scene with its masks, by a variant of the embedder."""
     embedder = variants_of(options)[variant]
-    scene = load_scene(options.cache, name, masks, sources_of(options))
+    scene = load_scene(options.cache, name, masks, locate_sources(options))
     case = case_of(options, scene, embedder)
     selected = {row: choose(case) for row, choose in ROWS.items()}
     return {
@@ -394,9 +394,9 @@ def measured(options: Options, name: str, masks: str, variant: str) -> dict:
 
 def measured_alone(options: Options, name: str, masks: str, variant: str, method: str) -> dict[str, list[float]]:
     """IoUs of a scene's texts by each reading of a method of RIVALS."""
-    scene = load_scene(options.cache, name, masks, sources_of(options))
+    scene = load_scene(options.cache, name, masks, locate_sources(options))
     case = case_of(options, scene, variants_of(options)[variant])
-    cast = rival_weights(options.cache, scene, method, sources_of(options))
+    cast = rival_weights(options.cache, scene, method, locate_sources(options))
     return {reading: own.tolist() for reading, own in alone(case, cast).items()}
 
 
@@ -451,7 +451,7 @@ def main(options: Options = Options(), tell: Callable[[str], None] = print) -> d
     for k, (name, masks) in told.items():
 
         def parts(name: str = name, masks: str = masks) -> list[dict]:
-            return lifting_and_rendering(load_scene(options.cache, name, masks, sources_of(options)))
+            return lifting_and_rendering(load_scene(options.cache, name, masks, locate_sources(options)))
 
         found = kept(f"{k}, parts", parts)
         if found is not None:

@@ -28,9 +28,9 @@ from experiments.cells import append_cell, read_cells
 from experiments.default_vision import LEAST, connected_parts
 from experiments.replica_apartment_0 import load_replica
 from jsecon.pipeline import pipeline
-from jsecon.pipeline.masklet_stages import proposals_of
+from jsecon.pipeline.masklet_stages import frame_proposals
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.stages import RunContext
 from jsecon.types import Capture
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -95,7 +95,7 @@ def measured(way: str, options: Options, capture: Capture, every: dict, tell: Ca
     how: Any = {"granularity": granularity, "agreement": float(agreement), "steps": options.steps}
     given = RunOptions(Path(options.capture), **how)
     run = pipeline.run(given, Path(options.out) / "run", load=lambda: capture)
-    masks, _ = proposals_of(Work(given, Networks(ColourEmbedder()), Path()), capture, run.field.gaussians)
+    masks, _ = frame_proposals(RunContext(given, Networks(ColourEmbedder()), Path()), capture, run.field.gaussians)
     asked, kept = Asked(run.field, capture), {}
     for k, truth in every.items():
         first, mask = next(iter(truth.items()))

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 
 HOME = Path(__file__).resolve().parent
 CAPTURES = HOME.parent.parent / "shared" / "captures"
@@ -21,7 +21,7 @@ def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = No
     write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     write_text(folder / "table.md", table + "\n")
     if figure is not None:
-        with written_whole(folder / "figure.png") as temporary:
+        with atomic_write(folder / "figure.png") as temporary:
             figure.savefig(temporary, dpi=110, bbox_inches="tight")
 
 
@@ -66,5 +66,5 @@ def bars(labels: list[str], series: dict[str, list[float]], ylabel: str):
 
 def save_picture(folder: Path, name: str, figure: Any) -> None:
     """A picture that shows a capture's own pixels, points or labels: into folder/pictures, which git ignores."""
-    with written_whole(folder / "pictures" / name) as temporary:
+    with atomic_write(folder / "pictures" / name) as temporary:
         figure.savefig(temporary, dpi=110, bbox_inches="tight")

@@ -32,7 +32,7 @@ from experiments.tables.ours import field_of, parts_of
 from experiments.tables.setting import Setting
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.votes import region_votes
-from jsecon.process import forget_programs
+from jsecon.process import clear_programs
 from jsecon.query.anchored import found_of, query_anchored
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import parts_instead, query_parts
@@ -213,7 +213,7 @@ def main(options: Options = Options()) -> dict:
         for where in ((scene, seed, level) for seed in options.seeds for scene in options.scenes):
             key = f"{'-'.join(map(str, where))}-{dict(options.data.size)}"
             if key not in read_cells(file):
-                forget_programs()
+                clear_programs()
                 append_cell(file, key, measure(options.data, *where))
                 print(*where, "measured", flush=True)
             found[where] = read_cells(file)[key]

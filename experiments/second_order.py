@@ -30,7 +30,7 @@ from jsecon.fit.schedule import LearningRates, rates_at
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.view import Views, view_loss
 from jsecon.parallel import MESH_OPTIONS, host_mesh
-from jsecon.process import forget_programs
+from jsecon.process import clear_programs
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
@@ -149,7 +149,7 @@ def main(options: Options) -> None:
     cells = []
     for way in WAYS:
         cells += fitted(capture, start, way, options)
-        forget_programs()
+        clear_programs()
     marks = sorted({cell["steps"] for cell in cells})
     rows = []
     for way in WAYS:

@@ -21,7 +21,7 @@ from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.quality import quality
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import Start, starting_gaussians
-from jsecon.process import cores, forget_programs
+from jsecon.process import clear_programs, cores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +149,7 @@ def main() -> None:
             cell = next((cell for cell in cells if key.items() <= cell.items()), None)
             if cell is None:
                 cell = key | {"cores": cores()} | fit(load(), WAYS[way], minutes)
-                forget_programs()
+                clear_programs()
                 with place.open("a") as file:
                     file.write(json.dumps(cell) + "\n")
                 cells.append(cell)

@@ -7,7 +7,7 @@ import sys
 import traceback
 from typing import Any
 
-from jsecon.process import member, prepare_member, prepare_process, stop_by_signals
+from jsecon.process import prepare_process, prepare_worker, stop_by_signals, worker_info
 
 STOPPED = 130
 """exit code of a program that the user stopped"""
@@ -54,9 +54,9 @@ class Output:
 
 def main() -> int:
     """Entry point: returns the exit code."""
-    several = member() is not None
+    several = worker_info() is not None
     if several:
-        prepare_member()
+        prepare_worker()
     prepare_process()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

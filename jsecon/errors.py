@@ -10,29 +10,29 @@ LONGEST = 600
 class InputError(ValueError):
     """Bad input from outside: a file, an option, a capture. The command line prints it and exits with code 2.
 
-    It prints as "WHERE: FOUND, expected EXPECTED. REMEDY", for example "images.txt: line 7 has 9 fields, expected 10.
-    Export the model again."; without `expected` as "WHERE: FOUND. REMEDY". `why` has a Python exception's words for it.
+    It prints as "WHERE: PROBLEM, expected EXPECTED. REMEDY", for example "images.txt: line 7 has 9 fields, expected 10.
+    Export the model again."; without `expected` as "WHERE: PROBLEM. REMEDY".
 
     Args:
-      where: The file or argument; empty where `found` names it.
-      found: What is wrong there: a clause without a full stop, or what is there in place of `expected`.
+      where: The file or argument; empty if `problem` names it.
+      problem: What is wrong there: a clause without a full stop, or what is there in place of `expected`.
       expected: What should be there.
       remedy: What to do about it, a sentence.
     """
 
-    def __init__(self, where: object, found: str, expected: str = "", remedy: str = ""):
+    def __init__(self, where: object, problem: str, expected: str = "", remedy: str = ""):
         half = LONGEST // 2
-        where, found = (t if len(t) <= LONGEST else f"{t[:half]} ... {t[-half:]}" for t in (str(where), found))
-        self.where, self.found, self.expected, self.remedy = where, found, expected, remedy
-        super().__init__(f"{where}: {self.problem} {remedy}".removeprefix(": ").rstrip())
+        where, problem = (t if len(t) <= LONGEST else f"{t[:half]} ... {t[-half:]}" for t in (str(where), problem))
+        self.where, self.problem, self.expected, self.remedy = where, problem, expected, remedy
+        super().__init__(f"{where}: {self.sentence} {remedy}".removeprefix(": ").rstrip())
 
     @property
-    def problem(self) -> str:
+    def sentence(self) -> str:
         """What is wrong, as a sentence, without where and without the remedy."""
-        return f"{self.found.rstrip('.')}{f', expected {self.expected}' if self.expected else ''}."
+        return f"{self.problem.rstrip('.')}{f', expected {self.expected}' if self.expected else ''}."
 
 
-def why(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Why something failed, in words that a user knows: without the name of a Python exception, on one line."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.partition(" (")[0]

@@ -1,7 +1,7 @@
 """Atomic writes, and files of arrays.
 
 A file gets its final name when it is complete. Arrays are kept as safetensors, with a JSON description and checksums;
-`packed` describes a tree of records so. Reading takes no more memory than the file's bytes fill, and runs no code.
+`pack_tree` describes a tree of records so. Reading takes no more memory than the file's bytes fill, and runs no code.
 """
 
 import codecs
@@ -24,9 +24,9 @@ import numpy as np
 from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 
-from jsecon.errors import InputError, require, why
+from jsecon.errors import InputError, describe_error, require
 
-UNREADABLE = (
+READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
     *(ArithmeticError, zipfile.BadZipFile, zlib.error, SafetensorError),
 )
@@ -55,7 +55,7 @@ class ForeignFileError(ValueError):
 
 
 @contextlib.contextmanager
-def written_whole(path: str | os.PathLike) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     """Yields a temporary path beside `path`; on leaving it is renamed to `path`, or removed if the body raised.
 
     The temporary name keeps `path`'s ending, for writers that choose the format by it. Raises InputError where the
@@ -77,12 +77,12 @@ def written_whole(path: str | os.PathLike) -> Iterator[Path]:
 
 def _unwritten(path: Path, error: OSError) -> InputError:
     remedy = "Choose another, mend its permissions, or free some room."
-    found = f"{why(error)} on writing to {path.parent}"
+    found = f"{describe_error(error)} on writing to {path.parent}"
     return InputError(path, found, "a folder that can be written", remedy)
 
 
 @contextlib.contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def exclusive_lock(folder: Path) -> Iterator[None]:
     """While it is open, `folder` is this caller's to write to. Raises InputError where it is another's, or is full."""
     lock = FileLock(folder / ".lock", timeout=0)
     try:
@@ -110,30 +110,30 @@ def path_within(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def made_by_jsecon(folder: Path) -> bool:
+def is_output_folder(folder: Path) -> bool:
     """Whether a folder is the output folder of a run or of a query, and so no input, wherever it lies."""
     return (folder / "cache" / "CACHEDIR.TAG").is_file() or (folder / "answers.html").is_file()
 
 
-def files_beneath(root: Path, *, leave_out: Path | None = None) -> Iterator[Path]:
+def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
     """Yields the files beneath a folder in name order, through links too.
 
-    Hidden files are left out, the folders in it that are output of jsecon, and `leave_out`.
+    Hidden files are left out, the folders in it that are output of jsecon, and `exclude`.
     """
-    own = None if leave_out is None else leave_out.resolve()
+    own = None if exclude is None else exclude.resolve()
     found, visited = [], set()
     for place, folders, names in os.walk(root, followlinks=True):
         folder, home = Path(place), os.path.realpath(place)
         kept = () if home in visited else sorted(name for name in folders if not name.startswith("."))
         visited.add(home)  # a link to a folder above would lead round and round
-        folders[:] = [name for name in kept if not made_by_jsecon(folder / name) and (folder / name).resolve() != own]
+        folders[:] = [name for name in kept if not is_output_folder(folder / name) and (folder / name).resolve() != own]
         found += [folder / name for name in names if not name.startswith(".")]
     yield from (file for file in sorted(found) if file.is_file())
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
     """Writes `text` (UTF-8) to `path`, whole or not at all; bytes of file names that are no UTF-8 as \\udcxx."""
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
@@ -148,7 +148,7 @@ def read_text(path: Path) -> str:
     return data.removeprefix(codecs.BOM_UTF8).decode("utf-8", "surrogateescape")
 
 
-def parsed_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes) -> Any:
     """What a JSON text holds, whole numbers of 300 digits and more as floats. Raises ValueError."""
     try:
         return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 300 else float(digits))
@@ -157,16 +157,16 @@ def parsed_json(text: str | bytes) -> Any:
 
 
 def read_json(path: Path, expected: str, remedy: str) -> Any:
-    """What a JSON file holds, as `parsed_json` has it. Raises InputError where it cannot be read."""
+    """What a JSON file holds, as `parse_json` has it. Raises InputError where it cannot be read."""
     try:
-        return parsed_json(path.read_bytes())
+        return parse_json(path.read_bytes())
     except OSError as error:
-        raise InputError(path, why(error), expected, remedy) from error
+        raise InputError(path, describe_error(error), expected, remedy) from error
     except ValueError as error:
-        raise InputError(path, f"it is not JSON ({why(error)})", expected, remedy) from error
+        raise InputError(path, f"it is not JSON ({describe_error(error)})", expected, remedy) from error
 
 
-def map_array(path: Path) -> np.ndarray:
+def map_npy(path: Path) -> np.ndarray:
     """Memory-maps the array of a .npy file.
 
     The header is parsed here: NumPy's parser warns of damaged ones, and raises errors of Python's tokenizer.
@@ -178,7 +178,7 @@ def map_array(path: Path) -> np.ndarray:
       The array, read-only.
 
     Raises:
-      OSError, ValueError, ...: One of UNREADABLE. The file is missing, is damaged, or holds other values than numbers.
+      OSError, ValueError, ...: One of READ_ERRORS. The file is missing, is damaged, or holds other values than numbers.
     """
     with open(path, "rb") as file:
         magic = file.read(8)
@@ -197,7 +197,7 @@ def map_array(path: Path) -> np.ndarray:
     return np.memmap(path, dtype, "r", start, shape, "F" if order == "True" else "C")
 
 
-def write_column(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:
+def write_npy(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, blocks: Iterable[np.ndarray]) -> None:
     """Writes a .npy block by block. On a full disk a write raises; a memory map would end the process.
 
     Args:
@@ -249,7 +249,7 @@ def read_zip(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """Reads all arrays of a NumPy archive (.npz), whose checksums are compared; none of Python's objects.
 
     Raises:
-      OSError, ValueError, ...: One of UNREADABLE. The file is damaged, or holds objects.
+      OSError, ValueError, ...: One of READ_ERRORS. The file is damaged, or holds objects.
     """
     with np.load(path, allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
@@ -269,20 +269,20 @@ def read_arrays(
       The description, and the arrays by name.
 
     Raises:
-      OSError, ValueError, ...: One of UNREADABLE. The file is missing, is damaged, or was not written by jsecon.
+      OSError, ValueError, ...: One of READ_ERRORS. The file is missing, is damaged, or was not written by jsecon.
     """
     with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, nothing behind the end
         pass
     arrays = {}
     with open(path, "rb") as file:
         length = int.from_bytes(file.read(8), "little")
-        layout = parsed_json(file.read(length))
+        layout = parse_json(file.read(length))
         metadata = layout.pop("__metadata__", {})
         if "jsecon" not in metadata:
             raise ForeignFileError("it is a safetensors file of another program")
         if metadata.get("crc32") != str(zlib.crc32(metadata["jsecon"].encode())):
             raise ValueError("its description does not match its checksum")
-        told = parsed_json(metadata["jsecon"])
+        told = parse_json(metadata["jsecon"])
         for name, entry in layout.items():
             dtype, shape, (begin, end) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
             is_mapped = end - begin > mapped
@@ -301,7 +301,7 @@ def _crc32(array: np.ndarray) -> int:
     return zlib.crc32(array.data if array.size else b"")
 
 
-def packed(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None]) -> dict:
+def pack_tree(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None]) -> dict:
     """JSON that describes a tree of plain values, arrays, dicts, lists, tuples and records; its arrays go to `arrays`,
     by their path. name_of: what a type of record is called, None for any other. Raises ValueError on anything else.
 
@@ -310,7 +310,7 @@ def packed(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callabl
     """
 
     def inner(parts: Any) -> dict:
-        return {name: packed(part, f"{path}.{name}".lstrip("."), arrays, name_of) for name, part in parts}
+        return {name: pack_tree(part, f"{path}.{name}".lstrip("."), arrays, name_of) for name, part in parts}
 
     kind, plain = type(node), (bool, int, float, str, type(None))
     if isinstance(node, plain):
@@ -331,9 +331,9 @@ def packed(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callabl
     return {"array": path, "shape": list(array.shape), "dtype": array.dtype.name}
 
 
-def unpacked(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str], type]) -> Any:
-    """The tree that `packed` described, of NumPy's arrays; kind_of: the type of record of a name. Raises one of
-    UNREADABLE on what `packed` did not write."""
+def unpack_tree(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str], type]) -> Any:
+    """The tree that `pack_tree` described, of NumPy's arrays; kind_of: the type of record of a name. Raises one of
+    READ_ERRORS on what `pack_tree` did not write."""
     if "value" in node:
         return tuple(node["value"]) if isinstance(node["value"], list) else node["value"]
     if "array" in node:
@@ -344,7 +344,7 @@ def unpacked(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str
         return array
     for kind in (list, tuple):
         if kind.__name__ in node:
-            return kind(unpacked(part, arrays, kind_of) for part in node[kind.__name__])
+            return kind(unpack_tree(part, arrays, kind_of) for part in node[kind.__name__])
     parts = node["dict"] if "dict" in node else node["fields"]
-    parts = {name: unpacked(part, arrays, kind_of) for name, part in parts.items()}
+    parts = {name: unpack_tree(part, arrays, kind_of) for name, part in parts.items()}
     return parts if "dict" in node else kind_of(node["record"])(**parts)

@@ -24,22 +24,22 @@ FRUSTUM_MARGIN = 1.3
 """x/z and y/z are clamped to this multiple of the field of view inside the Jacobian only"""
 NEAR = 0.01
 """near plane, world units (0.2 reproduces INRIA)"""
-WHOLE = jax.lax.Precision.HIGHEST
+FULL_PRECISION = jax.lax.Precision.HIGHEST
 """of products of matrices: all of float32. A GPU left to itself keeps 10 bits of each factor (TF32; cosines off by
 5e-4 on an H100). A CPU computes the same digits either way"""
 
 
-MOST = 1e18
+MAX_MAGNITUDE = 1e18
 """of a coordinate, focal length or coefficient in a file: float32 holds its square"""
 
 
 @np.errstate(invalid="ignore")  # a signalling NaN
-def sane(*numbers: Any) -> bool:
-    """Whether all numbers are finite and none is above MOST."""
-    return all(bool((np.abs(np.asarray(own, np.float64)) <= MOST).all()) for own in numbers)
+def is_finite_and_bounded(*numbers: Any) -> bool:
+    """Whether all numbers are finite and none is above MAX_MAGNITUDE."""
+    return all(bool((np.abs(np.asarray(own, np.float64)) <= MAX_MAGNITUDE).all()) for own in numbers)
 
 
-def into_range(size: Array) -> Array:
+def safe_scale(size: Array) -> Array:
     """A power of two that brings numbers of this size to where squares neither overflow nor vanish.
 
     Multiplied, not divided: XLA turns a division by a row's largest number into a product with its reciprocal, and that
@@ -57,7 +57,7 @@ def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
-    factor = into_range(largest)
+    factor = safe_scale(largest)
     scaled = jnp.where(usable, x * factor, 0.0)
     squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
     length = jnp.where(usable, jnp.sqrt(jnp.where(usable, squares, 1.0)) * (1 / factor), largest)
@@ -69,7 +69,7 @@ def normalize(x: Array, axis: int = -1) -> Array:
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
-    scaled = jnp.where(usable, x * into_range(largest), 0.0)
+    scaled = jnp.where(usable, x * safe_scale(largest), 0.0)
     squares = jnp.sum(scaled * scaled, axis=axis, keepdims=True)
     unit = scaled / jnp.sqrt(jnp.where(usable, squares, 1.0))
     return jnp.where(usable, unit, jnp.where(largest == 0, 0.0, jnp.nan))
@@ -92,10 +92,10 @@ def cosine(x: Array, y: Array) -> Array:
 
 def cosine_matrix(x: Array, y: Array) -> Array:
     """(N, d), (M, d) -> (N, M) cosines as one matrix product, the form that jax issue 39103 leaves right."""
-    return jnp.matmul(normalize(x), normalize(y).T, precision=WHOLE)
+    return jnp.matmul(normalize(x), normalize(y).T, precision=FULL_PRECISION)
 
 
-def finite(*arrays: Array) -> Array:
+def all_finite(*arrays: Array) -> Array:
     """() bool: every number in every array is finite."""
     result = jnp.asarray(True)
     for array in arrays:

@@ -3,9 +3,9 @@
 A CPU is one device to jax unless the program says otherwise before jax starts (`process.prepare_process`); the command
 line does. The library only uses what it finds.
 
-One view over all devices, under jit: `render(..., mesh=host_mesh())`. Many views: `spread_over_devices`, one view on
+One view over all devices, under jit: `render(..., mesh=host_mesh())`. Many views: `accumulate_over_views`, one view on
 each device, which needs no exchange and so scales better, and over several processes too. Work that is no program of
-jax, frame by frame: `dealt_out`. Each works with any number of devices, and compiles once for all of them.
+jax, frame by frame: `map_over_processes`. Each works with any number of devices, and compiles once for all of them.
 """
 
 import io
@@ -20,7 +20,7 @@ import numpy as np
 from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from jsecon.files import packed, unpacked
+from jsecon.files import pack_tree, unpack_tree
 from jsecon.types import Array
 
 AXIS = "devices"
@@ -31,14 +31,14 @@ of each device into parts for the threads of all, and such kernels take up to th
 Gaussians 7.4 instead of 2.6 ms. Programs of one device are better off with the parts."""
 
 LANES = 8
-"""of `spread_over_devices`: the sums that views are added up in side by side"""
+"""of `accumulate_over_views`: the sums that views are added up in side by side"""
 _LANES_BYTES = 1 << 30
 """that the sums of all lanes at once may take, where there are more than two"""
 _AHEAD = 2
 """steps that are dispatched before one is done"""
 _TREE = "__tree__"
 _PIECE = 1 << 26
-"""bytes that `exchanged` sends at once"""
+"""bytes that `allgather_bytes` sends at once"""
 
 
 def host_mesh() -> Mesh | None:
@@ -47,7 +47,7 @@ def host_mesh() -> Mesh | None:
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None
 
 
-def over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total: bool = False) -> Any:
+def map_over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total: bool = False) -> Any:
     """`local(index of the device, dealt, common)` on every device of `mesh`, each with its equal part of the arrays
     `dealt` along their leading axes, and the whole of `common`. The results are joined along their leading axes, or
     added up where `total`."""
@@ -62,20 +62,20 @@ def over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total:
     return spread(dealt, common)
 
 
-def over_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
+def map_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
     """`local(rows, common)`, row by row independent in every array of `rows` and of the result, each device taking an
     equal part of them; the last part is filled up with zeros, which `local` must bear."""
     if mesh is None:
         return local(rows, common)
     count = jax.tree.leaves(rows)[0].shape[0]
     fill = lambda a: jnp.pad(a, [(0, -count % mesh.size)] + [(0, 0)] * (a.ndim - 1))
-    out = over_devices(lambda _, rows, common: local(rows, common), jax.tree.map(fill, rows), common, mesh)
+    out = map_over_devices(lambda _, rows, common: local(rows, common), jax.tree.map(fill, rows), common, mesh)
     return jax.tree.map(lambda a: a[:count], out)
 
 
-def lanes_at_once(views: int, state_bytes: int) -> int:
-    """How many lanes of `spread_over_devices` this process works on at a time: no more than there are devices, the same
-    number in every turn, and above two no more than _LANES_BYTES hold, each with a state of `state_bytes`."""
+def concurrent_lanes(views: int, state_bytes: int) -> int:
+    """How many lanes of `accumulate_over_views` this process works on at a time: no more than there are devices, the
+    same number in every turn, and above two no more than _LANES_BYTES hold, each with a state of `state_bytes`."""
     world = jax.process_count()
     own = -(-_lane_count(views) // world)
     devices = min(sum(device.process_index == p for device in jax.devices()) for p in range(world))
@@ -87,7 +87,7 @@ def _lane_count(views: int) -> int:
     return max(1, min(views, max(LANES, jax.process_count())))
 
 
-def spread_over_devices(
+def accumulate_over_views(
     step: Callable,
     start: Any,
     merge: Callable[[Any, Any], Any],
@@ -104,7 +104,7 @@ def spread_over_devices(
 
     View t is added up in lane t mod LANES, and `merge`, whose neutral state is `start`, joins the lanes in their order.
     So the number of devices and of processes (up to LANES) changes no bit of the sum. A device works on one lane at a
-    time (`lanes_at_once`); all run one program, which jax compiles once. `step` is a pure function, traced under
+    time (`concurrent_lanes`); all run one program, which jax compiles once. `step` is a pure function, traced under
     shard_map. Host code; dispatch is asynchronous. `progress(done, total)` is called as views finish.
 
     Over several processes (`jax.distributed.initialize`), each given the same arguments, process p of P takes lanes p,
@@ -114,7 +114,7 @@ def spread_over_devices(
     common, start, views = jax.tree.map(np.asarray, (common, start, views))
     count = jax.tree.leaves(views)[0].shape[0]
     lanes = _lane_count(count)
-    width = lanes_at_once(count, sum(leaf.nbytes for leaf in jax.tree.leaves(start)))
+    width = concurrent_lanes(count, sum(leaf.nbytes for leaf in jax.tree.leaves(start)))
     mesh = Mesh(np.array(jax.local_devices()[:width]), (AXIS,), axis_types=(AxisType.Auto,))
     whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
     # Where half of the cores and more have no lane, XLA cuts the kernels of the others for them.
@@ -189,7 +189,7 @@ def _prepare_lanes(wave: Any, common: Any, prepare: Callable, static: tuple, mes
         prepared = prepare(common, jax.tree.map(lambda a: a[0], wave), *static)
         return jax.tree.map(lambda a: a[None], prepared)
 
-    return over_devices(local, wave, common, mesh)
+    return map_over_devices(local, wave, common, mesh)
 
 
 def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Callable, static: tuple, mesh: Mesh):
@@ -205,7 +205,7 @@ def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Call
             found = jax.lax.cond(there, taken, lambda: (state, blank))
         return jax.tree.map(lambda a: a[None], found)
 
-    return over_devices(local, (states, wave), common, mesh)
+    return map_over_devices(local, (states, wave), common, mesh)
 
 
 # where lanes leave cores idle, and where they do not
@@ -222,7 +222,7 @@ def _of_all(state: Any) -> list[Any]:
     return [jax.tree.map(lambda a, p=p: np.asarray(a[p]), parts) for p in range(jax.process_count())]
 
 
-def dealt_out(
+def map_over_processes(
     count: int,
     rows: Callable[[Sequence[int]], Iterable[Any]],
     progress: Callable[[int, int], None] | None = None,
@@ -240,11 +240,11 @@ def dealt_out(
             progress(min(len(found) * world, count), count)
     if world == 1:
         return found
-    parts = [parcel_read(part) for part in exchanged(parcel(found))]
+    parts = [deserialize_tree(part) for part in allgather_bytes(serialize_tree(found))]
     return [parts[t % world][t // world] for t in range(count)]
 
 
-def keep_own_programs() -> None:
+def cache_worker_programs() -> None:
     """Lets this process, one of several, keep its compiled programs on disk, if it has a folder for them.
 
     jax leaves that to the first (jax/_src/compiler.py, `_cache_write`). But a program is kept for its device, and every
@@ -256,23 +256,23 @@ def keep_own_programs() -> None:
     distributed.global_state.process_id = 0
 
 
-def parcel(tree: Any) -> bytes:
+def serialize_tree(tree: Any) -> bytes:
     """A tree of arrays, plain values, dicts, lists and tuples as one string of bytes, without pickle."""
     arrays: dict[str, np.ndarray] = {}
-    description = json.dumps(packed(tree, "root", arrays, lambda kind: None)).encode()
+    description = json.dumps(pack_tree(tree, "root", arrays, lambda kind: None)).encode()
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **{_TREE: np.frombuffer(description, np.uint8)}, **arrays)
     return stream.getvalue()
 
 
-def parcel_read(held: bytes) -> Any:
-    """The tree of a `parcel`."""
+def deserialize_tree(held: bytes) -> Any:
+    """The tree of a `serialize_tree`."""
     with np.load(io.BytesIO(held)) as file:
         arrays = {name: file[name] for name in file.files}
-    return unpacked(json.loads(arrays.pop(_TREE).tobytes()), arrays, lambda name: dict)
+    return unpack_tree(json.loads(arrays.pop(_TREE).tobytes()), arrays, lambda name: dict)
 
 
-def exchanged(own: bytes) -> list[bytes]:
+def allgather_bytes(own: bytes) -> list[bytes]:
     """Of each process the bytes that it gave; all processes call it. They may come minutes apart.
 
     By all_gather, in pieces of at most `_PIECE` bytes, whose lengths are powers of two: jax compiles for each length.

@@ -7,7 +7,7 @@ both cores and the speed of benchmarks/results.md does the same:
     prepare_process()
     import jsecon
 
-From time to time, where it lives long and sees many scenes: `forget_programs()`.
+From time to time, where it lives long and sees many scenes: `clear_programs()`.
 """
 
 import _thread
@@ -32,8 +32,8 @@ from jsecon.errors import InputError
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
 _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
 """what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
-MEMBER = "JSECON_MEMBER"
-"""environment variable of a process that is one of several (pipeline/processes.py), see `member`"""
+WORKER = "JSECON_WORKER"
+"""environment variable of a process that is one of several (pipeline/processes.py), see `worker_info`"""
 MEMORY = "JSECON_MEMORY"
 """environment variable: GiB that a scene's columns may take, in place of half of the memory that is free"""
 AGAIN_SECONDS = 0.05
@@ -79,17 +79,17 @@ def _remove_damaged_programs(folder: Path) -> None:
     warnings.filterwarnings("always", _UNKEPT)  # of each, also where two are called alike
 
 
-def member() -> tuple[int, int, str] | None:
+def worker_info() -> tuple[int, int, str] | None:
     """(index, count, HOST:PORT of the first) where this is one of the processes of a run, else None."""
-    told = os.environ.get(MEMBER, "").split()
+    told = os.environ.get(WORKER, "").split()
     return (int(told[0]), int(told[1]), told[2]) if told else None
 
 
-def prepare_member() -> None:
-    """A member keeps to the cores that MEMBER names last ("0,2"); what C++ writes to the terminal is dropped: pages,
+def prepare_worker() -> None:
+    """A member keeps to the cores that WORKER names last ("0,2"); what C++ writes to the terminal is dropped: pages,
     where another process of the run dies. What Python writes stays. Before `prepare_process`."""
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {int(core) for core in os.environ[MEMBER].split()[3].split(",")})
+        os.sched_setaffinity(0, {int(core) for core in os.environ[WORKER].split()[3].split(",")})
     for number, name in ((1, "stdout"), (2, "stderr")):
         getattr(sys, name).flush()
         kept = os.dup(number)
@@ -126,7 +126,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def memory() -> tuple[int | None, int | None]:
+def available_memory() -> tuple[int | None, int | None]:
     """Bytes that are free, and the limit of this process's cgroup, which what is free counts in; None where the system
     does not tell, or sets none."""
     try:
@@ -135,10 +135,10 @@ def memory() -> tuple[int | None, int | None]:
         free = psutil.virtual_memory().available
     except (ImportError, OSError):
         return None, None
-    limit = cgroup_words("memory.max", "memory/memory.limit_in_bytes")
+    limit = read_cgroup("memory.max", "memory/memory.limit_in_bytes")
     if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
         return free, None
-    used = cgroup_words("memory.current", "memory/memory.usage_in_bytes") or ["0"]
+    used = read_cgroup("memory.current", "memory/memory.usage_in_bytes") or ["0"]
     return min(free, int(limit[0]) - int(used[0])), int(limit[0])
 
 
@@ -161,14 +161,14 @@ def memory_budget() -> float:
     takes twice what it reads, or what MEMORY says. Raises InputError where that is no number."""
     told = os.environ.get(MEMORY)
     if told is None:
-        return float("inf") if (free := memory()[0]) is None else free / 2
+        return float("inf") if (free := available_memory()[0]) is None else free / 2
     try:
         return float(told) * 2**30
     except ValueError:
         raise InputError(MEMORY, repr(told), "GiB, a number", f"For example: export {MEMORY}=4") from None
 
 
-def cgroup_words(new: str, old: str) -> list[str]:
+def read_cgroup(new: str, old: str) -> list[str]:
     """The words of a file of this process's cgroup, of version 2 or else 1; none where there is none."""
     try:
         own = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
@@ -181,7 +181,7 @@ def cgroup_words(new: str, old: str) -> list[str]:
     return next((path.read_text().split() for path in places if path.is_file()), [])
 
 
-def programs_built() -> dict[str, int]:
+def compilation_counts() -> dict[str, int]:
     """How many programs jax has built since this was first called: all of them, and those read from disk."""
     import jax
 
@@ -198,12 +198,12 @@ def programs_built() -> dict[str, int]:
     return dict(_built)
 
 
-def show_whole_traces() -> None:
+def show_full_tracebacks() -> None:
     """Errors keep jax's own frames; call it before jax is imported."""
     os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")
 
 
-def forget_programs(*, above: int = 25_000) -> bool:
+def clear_programs(*, above: int = 25_000) -> bool:
     """Forgets jax's compiled programs where the process holds more than `above` memory maps; whether it did.
 
     Linux grants a process 65,530 of them and XLA takes several a program: one that sees scene after scene, each with

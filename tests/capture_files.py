@@ -20,7 +20,7 @@ def refused(*parts):
         yield
     for part in parts:
         assert str(part) in str(info.value)
-    assert info.value.found
+    assert info.value.problem
     assert info.value.expected
     assert info.value.remedy
 

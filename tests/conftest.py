@@ -55,7 +55,7 @@ if os.environ.get("CI"):
 
 import numpy as np  # noqa: E402
 
-from jsecon.process import forget_programs, programs_built  # noqa: E402
+from jsecon.process import clear_programs, compilation_counts  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
 # Tracing makes many objects and few cycles: looking for those ten times less often saves a tenth of a test's time.
@@ -107,18 +107,18 @@ def pytest_runtest_protocol(item, nextitem):
     compiling.choose(shipped=marked["as_shipped"], loops=not marked["few_steps"])
     done = yield
     if nextitem is None or nextitem.path != item.path:
-        forget_programs()
+        clear_programs()
     return done
 
 
 def pytest_sessionstart(session):
     session.config.programs = Counter()
-    programs_built()
+    compilation_counts()
 
 
 def pytest_sessionfinish(session):
     """What a worker of xdist built is added up in the process that prints it."""
-    session.config.programs.update(programs_built())
+    session.config.programs.update(compilation_counts())
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["programs"] = dict(session.config.programs)
 

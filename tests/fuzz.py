@@ -79,7 +79,7 @@ def _outcome(case: Any) -> tuple[str, str]:
         case.whole(case.read())
     except InputError as error:
         text = str(error)
-        if not (error.found and error.expected and error.remedy) or len(text) > LONGEST_MESSAGE:
+        if not (error.problem and error.expected and error.remedy) or len(text) > LONGEST_MESSAGE:
             return "an unreadable message", f"{len(text)} characters: {text[:200]}"
         out_of_memory = re.search("nsufficient memory|bad.alloc|MemoryError|nable to allocate", text)
         return ("memory", text[:200]) if out_of_memory else ("refused", "")

@@ -537,7 +537,7 @@ def kept(folder: Path) -> Iterator[Case]:
     def read():
         return cache.fetch(folder / "stage-0.safetensors", lambda: value)
 
-    def whole(found: cache.Kept) -> None:
+    def whole(found: cache.CachedResult) -> None:
         if found.fresh:
             raise InputError("cache", "computed again", "-", "-")
         assert isinstance(found.seconds, float)

@@ -9,7 +9,7 @@ from jax.extend.core import jaxprs_in_params
 import jsecon
 import jsecon.backend as backend
 from jsecon.language.codes import Rotation
-from jsecon.numerics import WHOLE, cosine_matrix
+from jsecon.numerics import FULL_PRECISION, cosine_matrix
 from jsecon.query.direct import similarities, unit_codes
 
 pytestmark = pytest.mark.as_shipped
@@ -57,4 +57,4 @@ def test_no_product_of_matrices_is_left_to_the_device(scene, cameras):
     for name, program in programs.items():
         found = list(products(jax.make_jaxpr(program)(scene, cameras, labels).jaxpr))
         assert found, name
-        assert set(found) == {(WHOLE, WHOLE)}, (name, found)
+        assert set(found) == {(FULL_PRECISION, FULL_PRECISION)}, (name, found)

@@ -13,7 +13,7 @@ from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
 from jsecon.pipeline import cache
-from jsecon.pipeline.stages import Outcome
+from jsecon.pipeline.stages import StageResult
 
 
 def _tree(scene, cameras):
@@ -26,7 +26,7 @@ def _tree(scene, cameras):
         "rotation": Rotation(np.eye(3, 2, dtype=np.float32)),
         "nan": float("nan"),
         "empty": np.zeros((0, 3)),
-        "outcome": Outcome(np.ones(2, bool), {"part": "why"}, ("a note",)),
+        "outcome": StageResult(np.ones(2, bool), {"part": "why"}, ("a note",)),
     }
 
 
@@ -101,7 +101,7 @@ def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
 
 def test_a_failed_computation_leaves_nothing_behind(tmp_path):
     def fail():
-        raise InputError("x", found="a", expected="b", remedy="c")
+        raise InputError("x", problem="a", expected="b", remedy="c")
 
     with pytest.raises(InputError):
         cache.fetch(cache.path_of(tmp_path, "stage", "k"), fail)
@@ -162,11 +162,11 @@ def test_files_digest_passes_over_what_goes_while_it_looks(tmp_path, monkeypatch
 
 def test_files_digest_leaves_out_the_output_and_hidden_files(tmp_path):
     (tmp_path / "a.png").write_bytes(b"one")
-    before = cache.files_digest([tmp_path], leave_out=tmp_path / "out")
+    before = cache.files_digest([tmp_path], exclude=tmp_path / "out")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "field.safetensors").write_bytes(b"result")
     (tmp_path / ".DS_Store").write_bytes(b"x")
-    assert cache.files_digest([tmp_path], leave_out=tmp_path / "out") == before
+    assert cache.files_digest([tmp_path], exclude=tmp_path / "out") == before
 
 
 def test_files_digest_of_names_that_are_no_utf8_and_of_linked_folders(tmp_path):
@@ -187,10 +187,10 @@ def test_files_digest_counts_a_capture_that_lies_in_the_output_folder(tmp_path):
     capture = tmp_path / "out" / "capture"
     capture.mkdir(parents=True)
     (capture / "a.png").write_bytes(b"one")
-    before = cache.files_digest([capture], leave_out=tmp_path / "out")
-    assert before == cache.files_digest([capture], leave_out=tmp_path / "elsewhere")
+    before = cache.files_digest([capture], exclude=tmp_path / "out")
+    assert before == cache.files_digest([capture], exclude=tmp_path / "elsewhere")
     (capture / "a.png").write_bytes(b"other")
-    assert cache.files_digest([capture], leave_out=tmp_path / "out") != before
+    assert cache.files_digest([capture], exclude=tmp_path / "out") != before
 
 
 def test_a_key_follows_the_source_that_a_stage_can_import_and_no_other(tmp_path, monkeypatch, request):

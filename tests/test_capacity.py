@@ -10,7 +10,7 @@ import pytest
 from jsecon.language.distill import distill_l1
 from jsecon.language.votes import region_votes
 from jsecon.parallel import host_mesh
-from jsecon.process import programs_built
+from jsecon.process import compilation_counts
 from jsecon.query.masks import selection_mask
 from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
 from jsecon.splat.plan import plan_view, plan_views, render_plan
@@ -124,13 +124,13 @@ def test_one_program_serves_all_views_and_selections_of_a_size(scene, cameras):
         selection_mask(some, cameras[t], np.arange(some.count) % (t + 2) == 0)
         region_votes(some, cameras[t : t + 1], np.full((1, 40, 48), t % 2, np.int32), 2)
 
-    programs_built()
+    compilation_counts()
     look(0)
-    before = programs_built()["all"]
+    before = compilation_counts()["all"]
     assert before > 0
     for t in range(1, 4):
         look(t)
-    assert programs_built()["all"] == before
+    assert compilation_counts()["all"] == before
 
 
 def test_it_follows_the_sizes_alone():

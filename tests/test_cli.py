@@ -183,7 +183,7 @@ def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, 
     field, fitted = out / "field.safetensors", ["--holdout", 4, "--steps", 150]
     line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", *fitted]
     told, _ = _object(capsys, *line, "--dry-run")
-    assert {stage["status"] for stage in told["stages"]} == {"cached", "left out"}
+    assert {stage["status"] for stage in told["stages"]} == {"cached", "skipped"}
     assert not (tmp_path / "out" / "field.safetensors").exists()
     told, err = _object(capsys, *line)
     assert told["gaussians"] == run.field.gaussians.count

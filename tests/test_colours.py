@@ -119,7 +119,7 @@ def test_a_text_without_colour_is_refused_plainly(embedder, text):
     with pytest.raises(InputError) as error:
         embedder.embed_text(["red cup", text])
     assert repr(text) in str(error.value)
-    assert "colour" in error.value.found
+    assert "colour" in error.value.problem
     for remedy in ("teal", "--at", "CLIP"):
         assert remedy in error.value.remedy
 

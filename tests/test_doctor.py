@@ -76,7 +76,7 @@ def test_it_knows_the_packages_and_extras_of_the_project():
 def test_limits_of_a_cgroup_are_told(monkeypatch):
     files = {"memory.max": ["1073741824"], "memory.current": ["1000"], "cpu.max": ["50000", "100000"]}
     for module in (doctor, process):
-        monkeypatch.setattr(module, "cgroup_words", lambda new, old: files.get(new, []))
+        monkeypatch.setattr(module, "read_cgroup", lambda new, old: files.get(new, []))
     memory, cores = doctor._memory(), doctor._cores()
     assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.told) == ("wrong", True)
     assert "the time of only 0.5 (cgroup)" in cores.told

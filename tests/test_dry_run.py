@@ -29,7 +29,7 @@ def test_a_dry_run_lists_every_stage_and_writes_nothing(room, tmp_path, capsys):
     _, stages = _dry(capsys, "fit", room, "--out", tmp_path / "scene.ply", "--minutes", 3, "--growth", "none")
     assert [name for name, stage in stages.items() if stage["status"] == "run"] == ["load", "gaussians", "held_out"]
     assert "3 minutes" in stages["gaussians"]["why"]
-    assert stages["densification"]["status"] == "left out"
+    assert stages["densification"]["status"] == "skipped"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -42,7 +42,7 @@ def test_a_dry_run_prints_the_lines_that_the_run_begins_with(room, room_run, tmp
     end = told.index("Nothing was written.")
     assert told[1:end] == told[end + 2 :][: end - 1]
     assert any("cached" in line for line in told[:end])
-    assert any("left out" in line for line in told[:end])
+    assert any("skipped" in line for line in told[:end])
 
 
 def test_bad_options_are_refused_as_in_a_run(room, tmp_path, capsys):

@@ -9,7 +9,7 @@ import pytest
 from jsecon.app import cli, verbs
 from jsecon.app.cli import finish
 from jsecon.app.verbs import Output
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 
 PARTS = {"name": "mug.png", "found": "text", "expected": "a picture", "remedy": "Draw one."}
 ERROR = PARTS | {"message": "mug.png: text, expected a picture. Draw one."}
@@ -119,4 +119,4 @@ def test_an_error_reads_as_sentences(error, message):
     ],
 )
 def test_the_reason_of_a_failure_is_in_words(error, words):
-    assert why(error) == words
+    assert describe_error(error) == words

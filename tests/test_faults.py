@@ -16,13 +16,13 @@ from fuzz_readers import _field
 from jsecon.data import frames
 from jsecon.data.images import write_image
 from jsecon.data.ply import save_ply
-from jsecon.files import alone, write_text
+from jsecon.files import exclusive_lock, write_text
 from jsecon.language.field import save_field
 from jsecon.pipeline import cache, pipeline
-from jsecon.pipeline.processes import First
+from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import loaded
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.scene_stages import capture_stages
+from jsecon.pipeline.stages import RunContext
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -101,12 +101,12 @@ class Meddler(Listener):
 
 
 def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(capture, tmp_path):
-    work = Work(pipeline.Options(capture), Networks(ColourEmbedder()), tmp_path / "out")
+    work = RunContext(pipeline.Options(capture), Networks(ColourEmbedder()), tmp_path / "out")
     (tmp_path / "out").mkdir()
 
     def loaded_by(listener):
-        stages = loaded(work)
-        pipeline._computed(work, stages, tmp_path / "out" / "cache", listener, First(several=False))
+        stages = capture_stages(work)
+        pipeline._computed(work, stages, tmp_path / "out" / "cache", listener, Coordinator(several=False))
         return listener.fresh["load"]
 
     with refused(capture, "files that changed while stage load read them", "same command again"):
@@ -118,12 +118,12 @@ def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(
 
 def test_two_runs_in_one_folder_are_told_apart(capture, tmp_path):
     (tmp_path / "out").mkdir()
-    with alone(tmp_path / "out"), refused(tmp_path / "out", "another run"):
+    with exclusive_lock(tmp_path / "out"), refused(tmp_path / "out", "another run"):
         pipeline.run(pipeline.Options(capture), tmp_path / "out")
-    with alone(tmp_path / "out"):
+    with exclusive_lock(tmp_path / "out"):
         pass
     (tmp_path / "file").touch()
-    with refused(".lock", "on writing to", "free some room"), alone(tmp_path / "file"):
+    with refused(".lock", "on writing to", "free some room"), exclusive_lock(tmp_path / "file"):
         pass
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from jsecon.files import UNREADABLE, map_array, parsed_json, read_arrays, write_arrays
+from jsecon.files import READ_ERRORS, map_npy, parse_json, read_arrays, write_arrays
 
 ARRAYS = {
     "table": np.arange(12, dtype=">f4").reshape(3, 4),
@@ -21,7 +21,7 @@ ARRAYS = {
 @pytest.mark.parametrize("mapped", [0, 1 << 30])
 def test_arrays_and_their_description_come_back(tmp_path, mapped):
     write_arrays(tmp_path / "a.safetensors", ARRAYS, {"of": ["what", 1, None, "\udcff"]})
-    description, arrays = read_arrays(tmp_path / "a.safetensors", mapped=mapped)
+    description, arrays = read_arrays(tmp_path / "a.safetensors", memory_map_above=mapped)
     assert description == {"of": ["what", 1, None, "\udcff"]}
     others = load_file(tmp_path / "a.safetensors")  # by the format's own library
     assert arrays.keys() == others.keys() == ARRAYS.keys()
@@ -46,7 +46,7 @@ def test_every_byte_counts(tmp_path):
     content = path.read_bytes()
     for place in range(len(content)):
         path.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-        with pytest.raises(UNREADABLE):
+        with pytest.raises(READ_ERRORS):
             read_arrays(path)
 
 
@@ -54,7 +54,7 @@ def test_headers_of_other_writers_are_read(tmp_path):
     header = b"{'shape':(2L, 3L),\"descr\":\"<i2\", 'fortran_order' : False}\n"
     body = b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + np.arange(6, dtype="<i2").tobytes()
     (tmp_path / "a.npy").write_bytes(body)
-    np.testing.assert_array_equal(map_array(tmp_path / "a.npy"), [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(map_npy(tmp_path / "a.npy"), [[0, 1, 2], [3, 4, 5]])
 
 
 def saved(array):
@@ -79,13 +79,13 @@ def saved(array):
 )
 def test_what_the_bytes_do_not_hold_is_refused(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(UNREADABLE):
-        map_array(tmp_path / "a.npy")
+    with pytest.raises(READ_ERRORS):
+        map_npy(tmp_path / "a.npy")
 
 
 def test_json_without_end_or_bounds():
-    assert parsed_json('{"a": [12345678901234567890123, "b"]}') == {"a": [12345678901234567890123, "b"]}
-    assert parsed_json("\ufeff[1]".encode()) == [1]
-    assert parsed_json("9" * 400) == float("inf")
+    assert parse_json('{"a": [12345678901234567890123, "b"]}') == {"a": [12345678901234567890123, "b"]}
+    assert parse_json("\ufeff[1]".encode()) == [1]
+    assert parse_json("9" * 400) == float("inf")
     with pytest.raises(ValueError, match="too deeply"):
-        parsed_json("[" * 100_000)
+        parse_json("[" * 100_000)

@@ -8,7 +8,7 @@ from sam_files import write_sam
 
 from jsecon.app import cli
 from jsecon.errors import InputError
-from jsecon.pipeline.models import examine, report_lines, unusable
+from jsecon.pipeline.models import inspect_models, report_lines, unusable
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def folders(tmp_path_factory):
     ],
 )
 def test_what_a_folder_is_good_for(folders, model, words):
-    findings = examine(folders[model])
+    findings = inspect_models(folders[model])
     told = {use.model: use for use in findings.uses}
     assert {name for name, use in told.items() if use.usable} == {model}
     for word in words:
@@ -56,7 +56,7 @@ def test_every_graph_is_told_with_its_tensors(folders, capsys):
         "SAM: not usable",
     ):
         assert line in told.splitlines()
-    findings = examine(folders["SAM"])
+    findings = inspect_models(folders["SAM"])
     assert len(findings.graphs) == 2
     assert any("input_points float32[1, batch, points, 2]" in line for line in report_lines(findings))
 
@@ -73,4 +73,4 @@ def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):
     assert cli.main(["models", "check", str(tmp_path / "empty")]) == 2
     assert "0 graphs" in capsys.readouterr().out
     with pytest.raises(InputError, match="no such folder"):
-        examine(tmp_path / "nowhere")
+        inspect_models(tmp_path / "nowhere")

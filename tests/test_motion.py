@@ -25,8 +25,8 @@ from jsecon.data.motion import find_poses, photographs
 from jsecon.pipeline import pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import loaded
-from jsecon.pipeline.stages import KEY_FILE, Record, Work
+from jsecon.pipeline.scene_stages import capture_stages
+from jsecon.pipeline.stages import KEY_FILE, Checkpoint, RunContext
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -233,8 +233,8 @@ def test_an_output_folder_among_the_photographs_is_no_input(photos, tmp_path):
     folder = shutil.copytree(photos[0], tmp_path / "walk")
 
     def stage(out):
-        work = Work(Options(folder), Networks(ColourEmbedder()), out)
-        return loaded(work)[0], work
+        work = RunContext(Options(folder), Networks(ColourEmbedder()), out)
+        return capture_stages(work)[0], work
 
     (one, work), (other, other_work) = stage(folder / "f"), stage(folder / "g")
     before = one.files_digest(work)
@@ -328,8 +328,8 @@ def test_a_run_finds_the_poses_first_and_keeps_them(photos, at_once, tmp_path):
 
 def test_only_captures_without_poses_have_the_stage(photos, room, found, tmp_path):
     def names(capture, load=None):
-        work = Work(Options(capture), Networks(ColourEmbedder()), tmp_path, load)
-        return [stage.name for stage in loaded(work)]
+        work = RunContext(Options(capture), Networks(ColourEmbedder()), tmp_path, load)
+        return [stage.name for stage in capture_stages(work)]
 
     assert names(photos[0]) == ["poses", "load"]
     for capture in (room, found[1], tmp_path):
@@ -355,7 +355,7 @@ def test_colmap_is_given_a_png_for_a_heic(photos, tmp_path):
 
 
 def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):
-    record = Record(tmp_path / "poses-12.checkpoint.safetensors")
+    record = Checkpoint(tmp_path / "poses-12.checkpoint.safetensors")
     (record.folder / "half").mkdir(parents=True)
     assert record.folder == tmp_path / "poses-12.checkpoint"
     record.remove()

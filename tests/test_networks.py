@@ -25,7 +25,7 @@ from jsecon.networks.sam2.tracker import Sam2Tracker
 from jsecon.pipeline import networks, pipeline, stages
 from jsecon.pipeline.language_stages import parts, regions
 from jsecon.pipeline.masklet_stages import masklets
-from jsecon.pipeline.networks import GivenSpace
+from jsecon.pipeline.networks import ExternalSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians, load
 from jsecon.query.retrieval import evidence
@@ -65,7 +65,7 @@ def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     assert field.embedder.startswith("clip-")
     assert field.regions.embeddings.shape[1] == 3
     assert field.regions.count >= 4
-    texts = networks.embedder_of_field(field).embed_text([f"a {name} thing" for name in COLOURS])
+    texts = networks.field_embedder(field).embed_text([f"a {name} thing" for name in COLOURS])
     frames = np.asarray(run.capture.frames)[~run.capture.held_out]
     for text, (name, colour) in zip(texts, COLOURS.items()):
         best = int((np.asarray(field.regions.embeddings) @ text).argmax())
@@ -128,9 +128,9 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
 
     def tracked(folder):
         called.clear()
-        work, results = stages.Work(options, networks.networks_of(options, folder), folder), {}
+        work, results = stages.RunContext(options, networks.open_networks(options, folder), folder), {}
         for stage in (load(work), gaussians(work), masklets(work)):
-            record = stages.Record(folder / f"{stage.name}.safetensors")
+            record = stages.Checkpoint(folder / f"{stage.name}.safetensors")
             results[stage.name] = stage.compute(results, lambda done, total: None, record).value
         return results["masklets"]
 
@@ -151,8 +151,8 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     query = ["query", str(field), "red", "--out", str(tmp_path / "a"), "--template", "a {} thing", "--views", "0"]
     assert cli.main([*query, "--quantile", "0"]) == 0
     answer, found = json.loads((tmp_path / "a" / "red.json").read_text()), load_field(field)
-    text = networks.embedder_of_field(found, templates=("a {} thing",)).embed_text(["red"])[0]
-    words = networks.embedder_of_field(found, templates=("a {} thing",)).reference
+    text = networks.field_embedder(found, templates=("a {} thing",)).embed_text(["red"])[0]
+    words = networks.field_embedder(found, templates=("a {} thing",)).reference
     similar = (
         np.asarray(found.regions.embeddings) @ (text - words.mean(axis=0)) / np.linalg.norm(text - words.mean(axis=0))
     )
@@ -166,8 +166,8 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     assert "a phrase that holds {}" in capsys.readouterr().err
     lost = dataclasses.replace(load_field(field), provenance=json.dumps({"options": {"embedder": "/nowhere"}}))
     with pytest.raises(InputError, match=r"--embedder DIR"):
-        networks.embedder_of_field(lost)
-    assert networks.embedder_of_field(lost, models[1]).name == lost.embedder
+        networks.field_embedder(lost)
+    assert networks.field_embedder(lost, models[1]).name == lost.embedder
 
 
 def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, models, tmp_path):
@@ -179,11 +179,11 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
         rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
     options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
-    work = stages.Work(options, networks.networks_of(options, tmp_path), tmp_path)
+    work = stages.RunContext(options, networks.open_networks(options, tmp_path), tmp_path)
     assert work.networks.embedder.name == "given-3"
-    stage, none = regions(work), (lambda done, total: None, stages.Record(tmp_path / "none.safetensors"))
+    stage, none = regions(work), (lambda done, total: None, stages.Checkpoint(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how
-    assert "embedder" in stage.left_out
+    assert "embedder" in stage.skipped
     results = {"load": capture}
     results["masklets"] = masklets(work).compute(results, *none).value
     found = stage.compute(results, *none)
@@ -198,7 +198,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
     with pytest.raises(InputError, match="no mask of level l"):
         stage.compute(results, *none)
-    with_clip = networks.networks_of(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
+    with_clip = networks.open_networks(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
     assert with_clip.name.startswith("clip-")
 
 
@@ -210,16 +210,16 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert cli.main(ask) == 2
     assert "came from files, 3 numbers each" in capsys.readouterr().err
     with pytest.raises(InputError, match="--embedder DIR"):
-        GivenSpace(3).embed_text(["red"])
+        ExternalSpace(3).embed_text(["red"])
     assert cli.main([*ask, "--embedder", str(models[1]), "--by", "canonical"]) == 0  # the phrases, too, are the model's
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
-        networks.embedder_named("given-5", folder=models[1])
+        networks.open_embedder("given-5", folder=models[1])
 
 
 def test_templates_are_for_clip():
     with pytest.raises(InputError, match="--template"):
-        networks.embedder_named(templates=("a photo of a {}.",))
+        networks.open_embedder(templates=("a photo of a {}.",))
 
 
 def test_two_sources_of_masks_are_refused(room, models, tmp_path):

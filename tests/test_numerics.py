@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from jsecon.numerics import cosine, cosine_matrix, finite, normalize, safe_norm, sigmoid
+from jsecon.numerics import all_finite, cosine, cosine_matrix, normalize, safe_norm, sigmoid
 
 pytestmark = pytest.mark.as_shipped
 
@@ -45,8 +45,8 @@ def test_infinite_and_nan_are_not_hidden():
     assert bool(jnp.isnan(normalize(jnp.asarray([jnp.nan, 1.0]))).all())
     assert bool(jnp.isnan(normalize(jnp.asarray([jnp.inf, 1.0]))).all())
     assert float(safe_norm(jnp.asarray([jnp.inf, 1.0]))) == np.inf
-    assert not bool(finite(jnp.ones(3), jnp.asarray([jnp.nan])))
-    assert bool(finite(jnp.ones(3)))
+    assert not bool(all_finite(jnp.ones(3), jnp.asarray([jnp.nan])))
+    assert bool(all_finite(jnp.ones(3)))
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])

@@ -12,16 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.parallel import LANES, dealt_out, exchanged, lanes_at_once, parcel, parcel_read, spread_over_devices
+from jsecon.parallel import (
+    LANES,
+    accumulate_over_views,
+    allgather_bytes,
+    concurrent_lanes,
+    deserialize_tree,
+    map_over_processes,
+    serialize_tree,
+)
 
 PROGRAM = """
 import sys
 import jax
 rank, world, port, count = map(int, sys.argv[1:])
 jax.distributed.initialize(f"127.0.0.1:{port}", world, rank)
-from jsecon.parallel import keep_own_programs
+from jsecon.parallel import cache_worker_programs
 from test_parallel import rows, summed
-keep_own_programs()
+cache_worker_programs()
 jax.jit(lambda x: jax.numpy.stack([x, x]))(rank)
 state, outs = summed(count)
 print(*map(int, state), "|", *map(int, outs), "|", *rows(count))
@@ -33,28 +41,28 @@ def summed(count: int, progress=None):
     step = lambda state, factor, view: (state + jnp.stack([view, 1]), factor * view)
     merge = lambda a, b: a + b
     views = 10 * jnp.arange(count)
-    return spread_over_devices(step, jnp.zeros(2, int), merge, jnp.int32(2), views, progress=progress)
+    return accumulate_over_views(step, jnp.zeros(2, int), merge, jnp.int32(2), views, progress=progress)
 
 
 def rows(count: int) -> list[str]:
     """Rows of several lengths, as words."""
-    found = dealt_out(count, lambda own: ((np.arange(t), {"t": t}) for t in own))
+    found = map_over_processes(count, lambda own: ((np.arange(t), {"t": t}) for t in own))
     return [f"{row.sum()}of{told['t']}" for row, told in found]
 
 
 def test_a_parcel_holds_trees_of_arrays_and_plain_values():
     tree = {"a": [np.arange(3, dtype=np.int32), np.zeros((0, 2), bool)], "b": (1.5, "two", None), "c": np.float32(4)}
-    back = parcel_read(parcel(tree))
+    back = deserialize_tree(serialize_tree(tree))
     np.testing.assert_array_equal(back["a"][0], tree["a"][0])
     assert (back["a"][0].dtype, back["a"][1].shape) == (np.int32, (0, 2))
     assert (back["b"], back["c"]) == (tree["b"], 4)
-    assert exchanged(b"alone") == [b"alone"]
+    assert allgather_bytes(b"alone") == [b"alone"]
 
 
 def test_views_are_added_up_in_lanes_that_are_joined_in_their_order():
     values = np.asarray(np.random.default_rng(0).normal(size=101) * 10.0 ** np.arange(-50, 51).clip(-6, 6), np.float32)
     step = lambda state, _, view: (state + view, None)
-    got, _ = spread_over_devices(step, np.float32(0), lambda a, b: a + b, np.float32(0), values)
+    got, _ = accumulate_over_views(step, np.float32(0), lambda a, b: a + b, np.float32(0), values)
     lanes = np.zeros(LANES, np.float32)
     for t, value in enumerate(values):
         lanes[t % LANES] += value
@@ -67,9 +75,9 @@ def test_views_are_added_up_in_lanes_that_are_joined_in_their_order():
 def test_no_turn_has_more_lanes_than_devices_and_none_many_fewer(monkeypatch, devices, at_once):
     local = [jax.local_devices()[0]] * devices
     monkeypatch.setattr(jax, "devices", lambda: local)
-    assert lanes_at_once(100, 1 << 20) == at_once
-    assert lanes_at_once(3, 1 << 20) == min(devices, 3)  # a lane a view
-    assert lanes_at_once(100, 1 << 30) == min(devices, 2)  # memory
+    assert concurrent_lanes(100, 1 << 20) == at_once
+    assert concurrent_lanes(3, 1 << 20) == min(devices, 3)  # a lane a view
+    assert concurrent_lanes(100, 1 << 30) == min(devices, 2)  # memory
 
 
 def test_one_process_counts_every_view_once():

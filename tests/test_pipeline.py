@@ -27,7 +27,7 @@ from jsecon.language.field import load_field
 from jsecon.pipeline import cache, networks, pipeline, stages
 from jsecon.pipeline.progress import Listener
 from jsecon.pipeline.scene_stages import gaussians
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.stages import RunContext
 from jsecon.process import peak_memory_mib
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -82,7 +82,7 @@ def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_
     assert all(listener.planned[name].status == "cached" for name in STAGES)
     assert (out / "field.safetensors").read_bytes() == before
     assert again.seconds["gaussians"] == run.seconds["gaussians"]
-    assert again.left_out == run.left_out
+    assert again.skipped == run.skipped
 
 
 @pytest.mark.parametrize(
@@ -143,13 +143,13 @@ def on_given_gaussians(room_run, tmp_path_factory):
 def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tmp_path):
     run, _ = room_run
     given, listener = on_given_gaussians
-    assert {"segmenter", "association"} <= set(run.left_out)
+    assert {"segmenter", "association"} <= set(run.skipped)
     flat = dataclasses.replace(run.options, sh_degree=0, growth="none")
-    work, bare = (Work(options, Networks(ColourEmbedder()), tmp_path) for options in (run.options, flat))
-    left = set(gaussians(bare).left_out) - set(gaussians(work).left_out)
+    work, bare = (RunContext(options, Networks(ColourEmbedder()), tmp_path) for options in (run.options, flat))
+    left = set(gaussians(bare).skipped) - set(gaussians(work).skipped)
     assert left == {"view-dependent colour", "densification"}
-    assert "scene.ply" in given.left_out["photometric fit"]
-    assert listener.planned["photometric fit"].status == "left out"
+    assert "scene.ply" in given.skipped["photometric fit"]
+    assert listener.planned["photometric fit"].status == "skipped"
     assert listener.planned["gaussians"].status == "run"
     np.testing.assert_array_equal(given.field.gaussians.means, run.field.gaussians.means)
     np.testing.assert_array_equal(given.field.codes, run.field.codes)
@@ -251,7 +251,7 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     found = pipeline.run(dataclasses.replace(run.options, masks=None), tmp_path, listener=listener)
     assert not listener.fresh["gaussians"]
     assert listener.fresh["masklets"]
-    assert "segmenter" not in found.left_out
+    assert "segmenter" not in found.skipped
     overlap = iou_matrix(
         *(labels.ravel() == np.arange(labels.max() + 1)[:, None] for labels in (run.labels, found.labels))
     )
@@ -307,7 +307,7 @@ def test_peak_memory_is_in_mebibytes():
 
 def test_embedders_of_other_versions_are_refused():
     with pytest.raises(InputError, match="Run the capture again"):
-        networks.embedder_named("colours-of-the-future")
+        networks.open_embedder("colours-of-the-future")
 
 
 class Killed(Exception):

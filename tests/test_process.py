@@ -14,7 +14,7 @@ import pytest
 
 from jsecon import process
 from jsecon.errors import InputError
-from jsecon.process import forget_programs, settings
+from jsecon.process import clear_programs, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -59,11 +59,11 @@ def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
 def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_a_word(tmp_path):
     """As a full disk leaves it, or a stop while jax writes it."""
     program = (
-        "from jsecon.process import prepare_process, programs_built\n"
+        "from jsecon.process import prepare_process, compilation_counts\n"
         "prepare_process()\n"
-        "programs_built()\n"
+        "compilation_counts()\n"
         "import jax, warnings\n"
-        "print(jax.jit(lambda x: 3 * x)(7), programs_built())\n"
+        "print(jax.jit(lambda x: 3 * x)(7), compilation_counts())\n"
         "warnings.warn('of another kind')"
     )
     environ = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
@@ -87,18 +87,18 @@ def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_
 def test_programs_are_forgotten_where_there_are_too_many_maps_and_work_again():
     twice = jax.jit(lambda x: 2 * x)
     assert twice(jnp.float32(3)) == 6
-    assert not forget_programs(above=10**9)
+    assert not clear_programs(above=10**9)
     assert twice._cache_size() == 1
-    assert forget_programs(above=0)
+    assert clear_programs(above=0)
     assert twice._cache_size() == 0
     assert twice(jnp.float32(4)) == 8
 
 
 def test_room_for_columns_is_half_of_what_is_free_or_what_the_user_says(monkeypatch):
     monkeypatch.delenv("JSECON_MEMORY", raising=False)
-    monkeypatch.setattr(process, "memory", lambda: (6 << 30, None))
+    monkeypatch.setattr(process, "available_memory", lambda: (6 << 30, None))
     assert process.memory_budget() == 3 << 30
-    monkeypatch.setattr(process, "memory", lambda: (None, None))
+    monkeypatch.setattr(process, "available_memory", lambda: (None, None))
     assert process.memory_budget() == float("inf")
     monkeypatch.setenv("JSECON_MEMORY", "0.5")
     assert process.memory_budget() == 1 << 29

@@ -12,8 +12,8 @@ import pytest
 from safetensors.numpy import load_file
 
 from jsecon.errors import InputError
-from jsecon.pipeline.processes import launched
-from jsecon.process import MEMBER
+from jsecon.pipeline.processes import launch
+from jsecon.process import WORKER
 
 COMMAND = [sys.executable, "-m", "jsecon"]
 
@@ -26,7 +26,7 @@ def members(out: Path) -> dict[int, int]:
             environ, line = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
         except OSError:
             continue
-        if (told := environ.partition(f"{MEMBER}=".encode())[2]) and os.fsencode(out) in line:
+        if (told := environ.partition(f"{WORKER}=".encode())[2]) and os.fsencode(out) in line:
             found[int(told.split(b" ")[0])] = int(place.name)
     return found
 
@@ -92,5 +92,5 @@ def test_what_is_wrong_with_the_input_is_said_once(tmp_path):
 )
 def test_numbers_that_do_not_fit_are_refused(count, coordinator, index, where):
     with pytest.raises(InputError) as caught:
-        launched([], count, coordinator, index)
+        launch([], count, coordinator, index)
     assert caught.value.where == where

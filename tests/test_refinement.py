@@ -19,10 +19,10 @@ from jsecon.app import cli
 from jsecon.fit import settle
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.pipeline import _computed
-from jsecon.pipeline.processes import First
+from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import loaded
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.scene_stages import capture_stages
+from jsecon.pipeline.stages import RunContext
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -43,8 +43,8 @@ def write(capture, folder, *, depth=True):
 def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
     given = Options(capture=folder, holdout=6, steps=2000, **options)
-    work = Work(given, Networks(ColourEmbedder()), out)
-    done = _computed(work, loaded(work), out / "cache", Listener(), First(several=False))
+    work = RunContext(given, Networks(ColourEmbedder()), out)
+    done = _computed(work, capture_stages(work), out / "cache", Listener(), Coordinator(several=False))
     return done.results["load"], " ".join(done.notes), done.steps[0].status
 
 
@@ -85,14 +85,14 @@ def test_by_default_an_exact_capture_stays_as_its_files_say(capture, tmp_path):
 
 def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
     def how(folder, **options):
-        return loaded(Work(Options(folder, **options), Networks(ColourEmbedder()), tmp_path / "out"))[-1]
+        return capture_stages(RunContext(Options(folder, **options), Networks(ColourEmbedder()), tmp_path / "out"))[-1]
 
     plain = write(capture, tmp_path / "plain", depth=False)
     deep = write(capture, tmp_path / "deep")
     for one, other in ((how(plain), how(plain, refine="none")), (how(deep, gaussians=plain), how(deep, refine="none"))):
         assert one.how == other.how
-        assert one.given == other.given
-    assert how(deep).given != how(deep, steps=300).given
+        assert one.key_options == other.key_options
+    assert how(deep).key_options != how(deep, steps=300).key_options
     _, notes, _ = load(plain, tmp_path / "none")
     assert "stay as they are" not in notes
 

@@ -50,7 +50,7 @@ def page():
             report.section(
                 "Frames", "words", report.grid([report.figure(_image(), "<b>x</b>", strong="IoU 0.5", sharp=True)], 2)
             ),
-            report.section("Plan", "", report.steps([Step("photometric fit", "left out", "a .ply is given")])),
+            report.section("Plan", "", report.steps([Step("photometric fit", "skipped", "a .ply is given")])),
             report.section("Seconds", "", report.bars({"load": 1.0, "fit": 3.0}, {"fit": "12 <b>programs</b>"})),
             report.section(
                 "Answers", "", report.grid([report.pair(_image(), _image(1), "mask", strong="<i>mug</i>")], 1)

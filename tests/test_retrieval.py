@@ -353,7 +353,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
         canonical = field.canonical
         embed_text = staticmethod(lambda asked: np.stack([rows[text] for text in asked]))
 
-    monkeypatch.setattr(networks, "embedder_of_field", lambda *a, **k: Words())
+    monkeypatch.setattr(networks, "field_embedder", lambda *a, **k: Words())
 
     def asked(name, *options):
         assert cli.main(["query", str(tmp_path / name), "seen", "unseen", "--out", str(tmp_path), *options]) == 0

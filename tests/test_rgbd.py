@@ -15,8 +15,8 @@ from jsecon.data.images import read_depth
 from jsecon.data.lens import Lens, seen_through
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import loaded
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.scene_stages import capture_stages
+from jsecon.pipeline.stages import RunContext
 from jsecon.types import Capture
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -147,8 +147,8 @@ def test_the_capture_comes_back(tmp_path, name):
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_run_looks_for_no_poses(tmp_path, name):
     FORMATS[name](tmp_path / name)
-    work = Work(Options(tmp_path / name), Networks(ColourEmbedder()), tmp_path / "out")
-    assert [stage.name for stage in loaded(work)] == ["load"]
+    work = RunContext(Options(tmp_path / name), Networks(ColourEmbedder()), tmp_path / "out")
+    assert [stage.name for stage in capture_stages(work)] == ["load"]
 
 
 def test_names_stay_those_of_the_files(tmp_path):

@@ -15,7 +15,7 @@ from jsecon.data.gaussian_files import load_gaussians, save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians as stage_of
-from jsecon.pipeline.stages import Record, Work
+from jsecon.pipeline.stages import Checkpoint, RunContext
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import carried, transform_gaussians
 from jsecon.vision.colours import ColourEmbedder
@@ -28,9 +28,9 @@ TRAINED = np.diag([0.4, 0.4, 0.4, 1]) @ TURN
 
 def read(capture, file):
     """The outcome of the stage that reads `file`, and the stage."""
-    work = Work(Options(capture=file.parent, gaussians=file), Networks(ColourEmbedder()), file.parent / "out")
+    work = RunContext(Options(capture=file.parent, gaussians=file), Networks(ColourEmbedder()), file.parent / "out")
     stage = stage_of(work)
-    return stage.compute({"load": capture}, lambda done, total: None, Record(work.out)), stage
+    return stage.compute({"load": capture}, lambda done, total: None, Checkpoint(work.out)), stage
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_a_scene_that_nerfstudio_trained_is_carried_back(tmp_path, near, name):
     np.testing.assert_allclose(found.value.means, near.means, atol=1e-4)
     np.testing.assert_allclose(found.value.log_scales, near.log_scales, atol=0.04)
     assert "dataparser_transforms.json" in found.notes[0]
-    assert before.given != after.given
+    assert before.key_options != after.key_options
 
 
 @pytest.mark.parametrize("world", ["files", "poses", "gsplat", "nerfstudio"])

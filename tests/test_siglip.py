@@ -22,7 +22,7 @@ from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.clip_folder import find_clip, read_preprocessing
 from jsecon.networks.file_tokenizer import FileTokenizer, TextRules
 from jsecon.pipeline import networks
-from jsecon.pipeline.models import examine
+from jsecon.pipeline.models import inspect_models
 from jsecon.query.anchored import query_anchored
 from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, best_presence, contrasts, presence
 from jsecon.query.several import query_several
@@ -204,7 +204,7 @@ def test_a_joint_graph_of_another_kind_is_refused(tmp_path):
 
 
 def _told(folder) -> str:
-    use = next(use for use in examine(folder).uses if use.model == "CLIP")
+    use = next(use for use in inspect_models(folder).uses if use.model == "CLIP")
     assert use.usable, use.told
     return use.told
 
@@ -290,7 +290,7 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))
     told = {}
     for name, known in (("with", embedder), ("without", Told(texts, None))):
-        monkeypatch.setattr(networks, "embedder_of_field", lambda *a, known=known, **k: known)
+        monkeypatch.setattr(networks, "field_embedder", lambda *a, known=known, **k: known)
         out = tmp_path / name
         assert cli.main(["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--out", str(out)]) == 0
         told[name] = [json.loads((out / f"{text}.json").read_text()) for text in ("mug", "ghost")]

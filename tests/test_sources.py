@@ -10,9 +10,9 @@ from small_field import make_field
 from jsecon.app.cli import main
 from jsecon.errors import InputError
 from jsecon.language.field import load_field, save_field
-from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.networks import field_embedder
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import folders_told, sources_of
+from jsecon.pipeline.sources import locate_sources, relative_folders
 from jsecon.vision.colours import ColourEmbedder
 
 CLIP = "clip-0123456789abcdef"
@@ -31,13 +31,13 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
     out, model = tmp_path / "runs" / "a", tmp_path / "models" / "clip"
     for folder in (out, model, tmp_path / "capture"):
         folder.mkdir(parents=True)
-    hints = folders_told(Options(tmp_path / "capture", embedder=model), out)
+    hints = relative_folders(Options(tmp_path / "capture", embedder=model), out)
     assert hints == {"capture": "../../capture", "embedder": "../../models/clip"}
     own = told(field, folders=hints, embedder=CLIP)
     save_field(out / "field.safetensors", own)
-    for found in (sources_of(load_field(out / "field.safetensors")), sources_of(own, out)):
+    for found in (locate_sources(load_field(out / "field.safetensors")), locate_sources(own, out)):
         assert found == (CLIP, model, tmp_path / "capture")
-    assert sources_of(own) == (CLIP, None, None)  # of a field that no file was read of
+    assert locate_sources(own) == (CLIP, None, None)  # of a field that no file was read of
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
 )
 def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path, hint):
     own = told(field, folders={"capture": hint, "embedder": hint}, embedder=CLIP, options={"embedder": hint})
-    assert sources_of(own, tmp_path) == (CLIP, None, None)
+    assert locate_sources(own, tmp_path) == (CLIP, None, None)
 
 
 def test_a_model_of_another_name_is_not_opened(field, tmp_path):
@@ -54,7 +54,7 @@ def test_a_model_of_another_name_is_not_opened(field, tmp_path):
     own = dataclasses.replace(told(field, folders={"embedder": "model"}, embedder=CLIP), embedder=CLIP)
     save_field(tmp_path / "field.safetensors", own)
     with pytest.raises(InputError, match="--embedder DIR"):
-        embedder_of_field(load_field(tmp_path / "field.safetensors"))
+        field_embedder(load_field(tmp_path / "field.safetensors"))
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_model_of_another_name_is_not_opened(field, tmp_path):
 def test_a_malformed_provenance_is_refused_in_words(field, tmp_path, provenance, capsys):
     own = dataclasses.replace(field, provenance=provenance, embedder=ColourEmbedder().name)
     with pytest.raises(InputError, match="provenance is not what jsecon run writes"):
-        embedder_of_field(own)
+        field_embedder(own)
     if provenance.startswith('{"'):  # others load_field refuses
         save_field(tmp_path / "field.safetensors", own)
         assert main(["query", str(tmp_path / "field.safetensors"), "red", "--out", str(tmp_path / "a")]) == 2

@@ -7,8 +7,8 @@ from capture_files import refused
 
 from jsecon.data.video import is_video, sharpest, write_frames
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import loaded
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.scene_stages import capture_stages
+from jsecon.pipeline.stages import RunContext
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -60,8 +60,8 @@ def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
     assert not is_video(tmp_path)
     keys = []
     for frames in (None, 20, 30):
-        work = Work(Options(video, frames=frames), Networks(ColourEmbedder()), tmp_path)
-        poses, load = loaded(work)
+        work = RunContext(Options(video, frames=frames), Networks(ColourEmbedder()), tmp_path)
+        poses, load = capture_stages(work)
         assert f"the {frames or 150} sharpest frames of walk.avi" in poses.how
         assert load.after == ("poses",)
         keys.append(poses.key(work, {}, poses.files_digest(work)))

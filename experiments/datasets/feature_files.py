@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from jsecon.data.mask_files import LEVELS
 from jsecon.errors import InputError
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.vision.protocols import CANONICAL
 
 
@@ -20,7 +20,7 @@ def write_features(
     or the same for all."""
     levels = np.broadcast_to(labels, (len(LEVELS), *labels.shape[-2:])).astype(np.float32)
     for ending, array in (("_s", levels), ("_f", embeddings.astype(np.float32))):
-        with written_whole(folder / f"{name}{ending}.npy") as temporary:
+        with atomic_write(folder / f"{name}{ending}.npy") as temporary:
             np.save(temporary, array)
 
 

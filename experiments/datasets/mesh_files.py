@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jsecon.data.ply_file import ORDERS, bad_ply, opened
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 
 
 def read_faces(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -72,5 +72,5 @@ def write_mesh(
         for name, values in properties.items():
             table[name] = values
         body.append(table.tobytes())
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes("\n".join([*header, "end_header\n"]).encode() + b"".join(body))

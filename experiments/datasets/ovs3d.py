@@ -21,7 +21,7 @@ from jsecon.data.images import IMAGE_ENDINGS, image_size, read_image, write_imag
 from jsecon.data.lens import Lens
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.types import Capture
 
 OVS3D_PAIRS = {"bed": 30, "bench": 35, "lawn": 30, "room": 30, "sofa": 30}
@@ -175,7 +175,7 @@ def write_poses_bounds(
     centre = -np.einsum("nji,nj->ni", rotation, poses[:, :3, 3])
     columns = [rotation[:, 1], rotation[:, 0], -rotation[:, 2], centre, sizes]
     table = np.concatenate([np.stack(columns, axis=2).reshape(-1, 15), bounds], axis=1)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         np.save(temporary.with_suffix(".npy"), table)
 
 

@@ -28,7 +28,7 @@ from jsecon.data.images import write_image
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.capture import captured, labelled, look_at, room_cameras, write_ids
 from jsecon.demo.room import TABLE_WOOD, Part, Room, linear, make_room
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
 
 FURNISHINGS = (5, 3, 8, 11, 10, 14, 12, 24, 34, 33, 36, 16)
@@ -278,7 +278,7 @@ def _finish(
 
 
 def _write_png16(path: Path, values: np.ndarray) -> None:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", values.astype(np.uint16))[1].tobytes())
 
 

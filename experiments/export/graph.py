@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 from jsecon.networks.onnx_graph import Graph
 
 OPSET = 17
@@ -78,7 +78,7 @@ def write_graph(
     """
     module.eval().requires_grad_(False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with torch.inference_mode(), warnings.catch_warnings(), written_whole(path) as temporary:
+    with torch.inference_mode(), warnings.catch_warnings(), atomic_write(path) as temporary:
         warnings.simplefilter("ignore")  # of the tracer: sizes are fixed but where `free` says so
         torch.onnx.export(
             module,

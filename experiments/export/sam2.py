@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 
 QUERIES = 1024
 """rows of an attention matrix at a time: 4,096 at once would take 0.5 GiB a layer with a full bank"""
@@ -170,7 +170,7 @@ def _write_constants(model: torch.nn.Module, path: Path) -> None:
     }
     if model.no_obj_embed_spatial is not None:
         arrays["no_obj_embed_spatial"] = model.no_obj_embed_spatial
-    with written_whole(path) as temporary, open(temporary, "wb") as stream:
+    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **{name: tensor.detach().numpy() for name, tensor in arrays.items()})
 
 

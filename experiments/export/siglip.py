@@ -13,7 +13,7 @@ from experiments.export.clip import Image, Text
 from experiments.export.embedder import FRAMES, TEXTS, agreements, told
 from experiments.export.graph import OPSET, Agreement, declare_missing_operators, shake, write_graph
 from experiments.export.vocabulary import write_vocabulary
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.networks.clip import ClipEmbedder
 from jsecon.networks.sigmoid import LOGITS
 
@@ -124,7 +124,7 @@ def _write_joint(path: Path, model: torch.nn.Module, ids: torch.Tensor, images: 
     outputs = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
     free = {"input_ids": {0: "texts"}, "pixel_values": {0: "images"}}
     free |= {"text_embeds": {0: "texts"}, "image_embeds": {0: "images"}}
-    with torch.inference_mode(), written_whole(path) as temporary:
+    with torch.inference_mode(), atomic_write(path) as temporary:
         torch.onnx.export(
             Joint(model),
             (ids, images),

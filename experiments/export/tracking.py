@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import torch
 
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 from jsecon.networks.sam2.graphs import open_sam2
 from jsecon.networks.sam2.heads import Prompt
 from jsecon.networks.sam2.tracker import at_size, follow
@@ -95,7 +95,7 @@ def officially_once(model: torch.nn.Module, clip: Clip, path: Path) -> tuple[np.
     started = time.process_time()
     logits, scores = officially(model, clip)
     seconds = time.process_time() - started
-    with written_whole(path) as temporary, open(temporary, "wb") as stream:
+    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(stream, key=digest.hexdigest(), logits=logits, scores=scores, seconds=seconds)
     return logits, scores, seconds
 

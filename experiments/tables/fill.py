@@ -18,7 +18,7 @@ from experiments.tables import twins
 from experiments.tables.answers import Answers, Method, Steps
 from experiments.tables.setting import Fitted, Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
-from jsecon.process import cores, forget_programs, peak_memory_mib
+from jsecon.process import clear_programs, cores, peak_memory_mib
 
 DIGITS = 4
 """of the IoU of single texts and frames"""
@@ -117,7 +117,7 @@ def _complete(plan: Plan, methods: Mapping[str, Method], where: tuple, keys: dic
         missing = [name for name, key in keys.items() if key not in known]
         if not missing:
             return
-        forget_programs()
+        clear_programs()
         setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps, fitted=plan.fitted)
         for name in missing:
             began = time.perf_counter()

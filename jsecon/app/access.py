@@ -12,7 +12,7 @@ import socket
 from collections.abc import Collection
 from urllib.parse import urlsplit
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 
 TOKEN = "JSECON_TOKEN"
 """environment variable with the token, used without --token"""
@@ -103,7 +103,7 @@ def listen(host: str, port: int) -> socket.socket:
         family, _, _, _, address = min(addresses, key=lambda info: info[0] != socket.AF_INET)
         return socket.create_server((address[0], port, *address[2:]), family=family)
     except (OSError, OverflowError, ValueError) as error:
-        reason = why(error) if isinstance(error, OSError) else "it is not an address"
+        reason = describe_error(error) if isinstance(error, OSError) else "it is not an address"
         remedy = "Take another --port, or 0 to have one chosen. --host must be an address of this machine."
         raise InputError("--port", f"cannot listen on {bracketed(host)}:{port} ({reason})", remedy=remedy) from error
 

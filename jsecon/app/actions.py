@@ -13,7 +13,7 @@ from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models,
 from jsecon.errors import InputError
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.process import member
+from jsecon.process import worker_info
 
 _RUN_FILES = ("field.safetensors", "report.html", "metrics.json")
 
@@ -34,18 +34,18 @@ def _run(verb: Run, console: Console) -> VerbResult:
     options = verb.options
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, listener=console)
-    place = member()
+    place = worker_info()
     if place is None and (verb.processes, verb.coordinator, verb.process) != (1, None, None):
-        raise SystemExit(processes.launched(sys.argv[1:], verb.processes, verb.coordinator, verb.process))
+        raise SystemExit(processes.launch(sys.argv[1:], verb.processes, verb.coordinator, verb.process))
     with processes.lost_touch():
         if place is not None:
             processes.join(options, *place)
             if place[0] > 0:
-                pipeline.assist(options, verb.out)
+                pipeline.run_worker(options, verb.out)
                 return {}
-        first = processes.First(several=place is not None)
+        first = processes.Coordinator(several=place is not None)
         run = pipeline.run(options, verb.out, listener=console, first=first)
-        first.dismiss()
+        first.shutdown()
     return {"written": [verb.out / name for name in _RUN_FILES]} | write_run(run, verb.out, console)
 
 
@@ -210,9 +210,9 @@ def _serve(verb: Serve, console: Console) -> VerbResult:
 
 def _models(verb: Models, console: Console) -> VerbResult:
     with console.progress("graphs"):
-        from jsecon.pipeline.models import examine, report_lines, unusable
+        from jsecon.pipeline.models import inspect_models, report_lines, unusable
 
-        findings = examine(verb.folder)
+        findings = inspect_models(verb.folder)
     for line in report_lines(findings):
         console.say(line)
     return dataclasses.asdict(findings) | {"refused": unusable(findings)}
@@ -238,7 +238,7 @@ def _embedder(field: Any, verb: FieldVerb, console: Console) -> Any:
 
     if field.reference is None:
         console.note(_OLD_FIELD)
-    return networks.embedder_of_field(field, verb.embedder, templates=verb.template or ("{}",))
+    return networks.field_embedder(field, verb.embedder, templates=verb.template or ("{}",))
 
 
 _EXAMPLES = {"--at": "For example: --at frame_00012 310 145", "--box": "For example: --box frame_00012 280 120 340 190"}

@@ -22,9 +22,9 @@ import tyro
 import jsecon
 from jsecon.app.actions import VERBS
 from jsecon.app.verbs import Completion, Output, Verb, VerbResult
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
-from jsecon.process import show_whole_traces
+from jsecon.process import show_full_tracebacks
 
 ABOUT = """Finds things in 3D Gaussian scenes by text, at the level of points, on a plain CPU.
 
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb = parse(argv)
         output = verb.output
         if output.debug:
-            show_whole_traces()
+            show_full_tracebacks()
         act, _ = _VERBS[argv[0]]
         console = Console(sys.stderr if output.json else None)
         result = act(verb, console)
@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return finish(output, {"refused": [error]})
         # a bug, whose trace the interpreter prints
         remedy = "Report it with the trace on standard error."
-        finish(output, {"error": InputError("jsecon", f"internal error: {why(error)}", remedy=remedy)})
+        finish(output, {"error": InputError("jsecon", f"internal error: {describe_error(error)}", remedy=remedy)})
         raise
     then = result.pop("then", lambda: None)
     code = finish(output, result)

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from jsecon.errors import InputError, why
-from jsecon.process import cgroup_words, cores, memory
+from jsecon.errors import InputError, describe_error
+from jsecon.process import available_memory, cores, read_cgroup
 
 LEAST_MEMORY, LEAST_DISK = 2 << 30, 200 << 20
 """bytes that `jsecon demo` takes, rounded up"""
@@ -97,7 +97,7 @@ def _backend() -> list[Check]:
         kinds = [device.platform for device in jax.devices()]
         devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     except Exception as error:  # whatever a driver or a wheel raises
-        told = str(error) or why(error)
+        told = str(error) or describe_error(error)
         return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.13"')]
     found = [Check("jax", "ok", f"{jax.__version__}, devices: {devices}")]
     try:
@@ -111,8 +111,8 @@ def _backend() -> list[Check]:
 
 
 def _cores() -> Check:
-    quota = cgroup_words("cpu.max", "cpu/cpu.cfs_quota_us")
-    period = (quota[1:] or cgroup_words("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
+    quota = read_cgroup("cpu.max", "cpu/cpu.cfs_quota_us")
+    period = (quota[1:] or read_cgroup("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
     told = f"{cores()} of {os.cpu_count()} may be used"
     if quota and quota[0].isdecimal() and int(quota[0]) < cores() * int(period):
         told += f", but the time of only {int(quota[0]) / int(period):.3g} (cgroup)"
@@ -120,7 +120,7 @@ def _cores() -> Check:
 
 
 def _memory() -> Check:
-    free, limit = memory()
+    free, limit = available_memory()
     if free is None:
         return Check("memory", "ok", "this system does not tell how much is free")
     told = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
@@ -150,9 +150,9 @@ def _programs() -> Check:
 def _models(folder: Path | None) -> list[Check]:
     if folder is None:
         return [Check("models", "missing", "no folder given (--models DIR): without CLIP, texts name colours")]
-    from jsecon.pipeline.models import examine
+    from jsecon.pipeline.models import inspect_models
 
-    found = [examine(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
+    found = [inspect_models(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
     usable = {use.model: use.told for findings in reversed(found) for use in findings.uses if use.usable}
     missing = "none in {}: jsecon models check says what is missing"
     return [

@@ -63,9 +63,9 @@ def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) ->
     the text.
     """
     if embedder is None:
-        from jsecon.pipeline.networks import embedder_of_field
+        from jsecon.pipeline.networks import field_embedder
 
-        embedder = embedder_of_field(field)
+        embedder = field_embedder(field)
     return locate_answer(field, ask_text(field, embedder, text, **how))
 
 

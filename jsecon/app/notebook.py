@@ -88,7 +88,7 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
     except ImportError as error:
         remedy = "Run: pip install 'jsecon[figures]'"
         raise InputError("jsecon.show", "the package matplotlib is missing", remedy=remedy) from error
-    answer = ask_text(field, embedder or networks.embedder_of_field(field), text, **how)
+    answer = ask_text(field, embedder or networks.field_embedder(field), text, **how)
     masks = answer_masks(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
     renderer = pictures.Renderer(field.gaussians, field.cameras)
     size = 3.2 * len(masks), 4.8

@@ -22,7 +22,7 @@ from jsecon.app.ask import Answer, quantile_message
 from jsecon.app.locate import digits, rounded, selected_centers
 from jsecon.app.viewer.static_page import NOWHERE, main_regions
 from jsecon.data.gaussian_files import save_gaussians
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
 from jsecon.pipeline.progress import Listener
@@ -135,7 +135,7 @@ def write_answer(
         save_gaussians(out / told[ending], chosen, **{name: table[answer.mask] for name, table in own.items()})
         for t, mask in masks.items():
             told["masks"][field.names[t]] = file = f"{stem}-{_frame_stem(field, t)}.png"
-            with written_whole(out / file) as temporary:
+            with atomic_write(out / file) as temporary:
                 temporary.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
     write_text(out / f"{stem}.json", json.dumps(told, indent=2) + "\n")
     return told

@@ -16,7 +16,7 @@ from jsecon.data.frames import Progress, spread
 from jsecon.errors import InputError
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
-from jsecon.pipeline.sources import sources_of
+from jsecon.pipeline.sources import locate_sources
 from jsecon.query.anchored import query_region
 from jsecon.query.lift import lift
 from jsecon.types import LanguageField
@@ -47,7 +47,7 @@ def capture_of(field: LanguageField, beside: Path) -> Path:
     the run was given. Raises InputError where neither is there."""
     if (poses := beside / "poses").exists():
         return poses
-    if (capture := sources_of(field, beside).capture) is not None:
+    if (capture := locate_sources(field, beside).capture) is not None:
         return capture
     raise InputError("--phrases", "the capture that the field was made from is not found", remedy="Give --images DIR.")
 

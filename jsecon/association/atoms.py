@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy import sparse
 
 from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import WHOLE
+from jsecon.numerics import FULL_PRECISION
 from jsecon.splat.fusion import stored
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
@@ -133,7 +133,7 @@ def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: floa
             weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-            own = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype), precision=WHOLE)
+            own = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype), precision=FULL_PRECISION)
             return transmittance, cast.at[chunk.places].set(own, mode="drop")
 
         return walk(table, lists, batches, ids_of_tiles, body, cast)[0], None

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from jsecon.association.atoms import SMALLEST, Sparse, cast_on_atoms, coverage, image_atoms
 from jsecon.errors import require
-from jsecon.parallel import dealt_out
+from jsecon.parallel import map_over_processes
 from jsecon.process import cores
 from jsecon.types import Camera, Gaussians
 
@@ -107,7 +107,7 @@ class SceneViews:
         if not self._views:
             views = [
                 View(atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32))
-                for atoms, seen, votes, shape, within in dealt_out(
+                for atoms, seen, votes, shape, within in map_over_processes(
                     len(frames), lambda own: self._said(frames, own), progress
                 )
             ]

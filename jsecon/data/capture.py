@@ -13,7 +13,7 @@ from jsecon.data.motion import photographs
 from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.data.rgbd import find_rgbd
 from jsecon.errors import InputError
-from jsecon.files import made_by_jsecon
+from jsecon.files import is_output_folder
 from jsecon.types import Camera, Capture
 
 POINTS_AT_ONCE = 65536
@@ -91,7 +91,7 @@ def bare_photographs(path: Path) -> list[Path]:
 
 def _inner_captures(path: Path) -> list[Path]:
     folders = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
-    return [child for child in folders if not made_by_jsecon(child) and has_poses(child)]
+    return [child for child in folders if not is_output_folder(child) and has_poses(child)]
 
 
 def _no_capture(path: Path) -> InputError:

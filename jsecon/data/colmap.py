@@ -26,7 +26,7 @@ from jsecon.data.frames import Posed, Shot
 from jsecon.data.images import existing_image, write_image
 from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
-from jsecon.files import path_within, written_whole
+from jsecon.files import atomic_write, path_within
 from jsecon.splat.transform import quaternion_of
 from jsecon.types import Capture
 
@@ -144,5 +144,5 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
         "points3D": struct.pack("<Q", len(points)) + points.tobytes(),
     }
     for kind, content in contents.items():
-        with written_whole(path / "sparse" / "0" / f"{kind}.bin") as temporary:
+        with atomic_write(path / "sparse" / "0" / f"{kind}.bin") as temporary:
             temporary.write_bytes(content)

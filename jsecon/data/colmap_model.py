@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from jsecon.data.lens import PROJECTIONS, Lens
 from jsecon.errors import InputError
 from jsecon.files import read_text
-from jsecon.numerics import sane
+from jsecon.numerics import is_finite_and_bounded
 
 # name -> (number in the binary format, count of parameters)
 MODELS = {
@@ -141,7 +141,7 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
     focals = 1 if model in _ONE_FOCAL else 2
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy, *distortion = parameters[focals:]
-    if not (sane(parameters) and fx > 0 and fy > 0 and 0 < width < 1 << 31 and 0 < height < 1 << 31):
+    if not (is_finite_and_bounded(parameters) and fx > 0 and fy > 0 and 0 < width < 1 << 31 and 0 < height < 1 << 31):
         found = f"a camera of {width}x{height} px with parameters {parameters}"
         raise bad_model(file, found, "positive size and focal length", "Estimate the cameras again.")
     own = model if model in PROJECTIONS else None
@@ -171,7 +171,7 @@ def read_cameras(model: Path) -> dict[int, Lens]:
 def _pose(file: Path, name: str, numbers: tuple[float, ...]) -> np.ndarray:
     """(4, 4) world-to-camera from qw qx qy qz tx ty tz."""
     quaternion = np.array(numbers[:4], np.float64)
-    length = np.linalg.norm(quaternion) if sane(numbers) else 0.0
+    length = np.linalg.norm(quaternion) if is_finite_and_bounded(numbers) else 0.0
     if not length > 1e-6:
         found = f"a pose of {name} with NaN, infinite or absurd numbers, or without rotation: {numbers}"
         raise bad_model(file, found, "finite poses", "Estimate the poses again, or delete this image from the model.")
@@ -223,7 +223,7 @@ def read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray
         points, colours = rows[:, :3], rows[:, 3:].astype(np.uint8)
     else:
         points, colours = _read_binary_points(file)
-    if not sane(points):
+    if not is_finite_and_bounded(points):
         found = "points with NaN, infinite or absurd coordinates"
         raise bad_model(file, found, "finite points", "Estimate the model again.")
     return points, colours

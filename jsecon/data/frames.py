@@ -23,7 +23,7 @@ from jsecon.data.lens import Lens, distort, seen_through, undistorted, undistort
 from jsecon.data.poses import camera_jumps, rigid
 from jsecon.data.worlds import moved_poses, ordinary_world
 from jsecon.errors import InputError
-from jsecon.numerics import sane
+from jsecon.numerics import is_finite_and_bounded
 from jsecon.types import Camera, Capture, ImageFile
 
 Progress = Callable[[int, int], None] | None
@@ -204,7 +204,10 @@ def _colour_error(shot: Shot, points: np.ndarray, colours: np.ndarray, *, uprigh
 def _true_lens(shot: Shot, width: int, height: int) -> Lens:
     """The lens of a shot at the size that its image is read at."""
     lens = shot.lens
-    if not sane((lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)) or min(lens.fx, lens.fy) < LEAST_FOCAL:
+    if (
+        not is_finite_and_bounded((lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion))
+        or min(lens.fx, lens.fy) < LEAST_FOCAL
+    ):
         problem = f"its camera has focal lengths {lens.fx:g}, {lens.fy:g}, centre {lens.cx:g}, {lens.cy:g}"
         problem += f" and distortion {lens.distortion}"
         raise InputError(shot.image, problem, "finite pixels", "Estimate the cameras again.")

@@ -17,8 +17,8 @@ from jsecon.data.gltf import read_glb, save_glb
 from jsecon.data.ply import SH_DC, in_float32, read_ply, save_ply, sound
 from jsecon.data.ply_file import header_of, is_compressed
 from jsecon.data.spz import load_spz, save_spz
-from jsecon.errors import InputError, why
-from jsecon.files import parsed_json
+from jsecon.errors import InputError, describe_error
+from jsecon.files import parse_json
 from jsecon.types import Array, Gaussians
 
 WRITTEN = (".ply", ".spz", ".glb")
@@ -138,7 +138,7 @@ def _read_sog(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
 
     try:
         # gsply looks up a codebook's number that is not there without an error
-        told = parsed_json(zipfile.ZipFile(path).read("meta.json"))
+        told = parse_json(zipfile.ZipFile(path).read("meta.json"))
         if any(len(part.get("codebook", [0] * 256)) < 256 for part in told.values() if isinstance(part, dict)):
             raise ValueError("a codebook of fewer than 256 numbers")
         with np.errstate(invalid="ignore", over="ignore"):
@@ -148,7 +148,7 @@ def _read_sog(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
             raise ValueError(f"{rest} harmonics above the constant")
     except Exception as error:  # whatever a decoder says of damaged bytes
         remedy = f"Export it again, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
-        raise InputError(path, f"gsply cannot read it ({why(error)})", "a whole .sog", remedy) from error
+        raise InputError(path, f"gsply cannot read it ({describe_error(error)})", "a whole .sog", remedy) from error
     sh = [np.asarray(data.sh0)[:, None], *([] if data.shN is None else [data.shN])]
     given = {"means": data.means, "log_scales": data.scales, "quaternions": data.quats}
     notes = _trained_antialiased(path) if told.get("antialias") is True else ()

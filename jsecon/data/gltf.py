@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jsecon.data.ply import in_float32, needs_float64, sound, usable_blocks
-from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, parsed_json, written_whole
+from jsecon.errors import InputError, describe_error
+from jsecon.files import READ_ERRORS, atomic_write, parse_json
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.sh import BANDS, C0
 from jsecon.splat.transform import carried, transformed_blocks
@@ -116,7 +116,7 @@ def save_glb(
     if (length := 12 + 8 + len(text) + 8 + offset) > _MOST:
         found, remedy = f"{count} Gaussians of {length / 2**30:.3g} GiB", "Write a .ply, or without harmonics or codes."
         raise InputError(path, found, "at most 4 GiB in a .glb", remedy)
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, length))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", offset, b"BIN\0"))
         body = file.tell()
@@ -186,8 +186,8 @@ def read_glb(path: Path) -> Gaussians:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(path, why(error), _WANTED, "Check the path.") from error
-    except (*UNREADABLE, struct.error) as error:
+        raise InputError(path, describe_error(error), _WANTED, "Check the path.") from error
+    except (*READ_ERRORS, struct.error) as error:
         raise InputError(path, "its description (JSON) is damaged or incomplete", _WANTED, _REMEDY) from error
     if not found:
         raise InputError(path, "no primitive of its scene holds Gaussians", _WANTED, _REMEDY)
@@ -210,7 +210,7 @@ def _container(path: Path, file: BinaryIO, size: int) -> tuple[Any, int, int]:
     text, kind = struct.unpack("<I4s", file.read(8))
     if kind != b"JSON" or text > size - 20:
         raise InputError(path, "it does not begin with its description (JSON)", _WANTED, _REMEDY)
-    told, start, length = parsed_json(file.read(text)), 28 + text, 0
+    told, start, length = parse_json(file.read(text)), 28 + text, 0
     if start <= size:
         length, kind = struct.unpack("<I4s", file.read(8))
         if kind != b"BIN\0" or start + length > size:

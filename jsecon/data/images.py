@@ -25,8 +25,8 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, map_array, written_whole
+from jsecon.errors import InputError, describe_error
+from jsecon.files import READ_ERRORS, atomic_write, map_npy
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
 IMAGE_ENDINGS = (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))
@@ -122,7 +122,7 @@ def _opened(path: Path, data: bytes) -> tuple[Image.Image, int]:
     except InputError:
         raise
     except Exception as error:  # Pillow's own kinds have no common base but this
-        raise _unreadable(path, f"its {len(data)} bytes are no image ({why(error)})") from error
+        raise _unreadable(path, f"its {len(data)} bytes are no image ({describe_error(error)})") from error
     shrink = _shrink(*image.size) if isinstance(image, JpegImageFile) else 1
     width, height = (-(-side // shrink) for side in image.size)
     if width * height > MOST_PIXELS:
@@ -199,7 +199,7 @@ def _decoded(path: Path, image: Image.Image, *, native: bool = False) -> np.ndar
         pixels = np.asarray(image if mode == image.mode else image.convert(mode))
         return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     except Exception as error:  # Pillow's own kinds have no common base but this
-        raise _unreadable(path, f"the image cannot be decoded ({why(error)})") from error
+        raise _unreadable(path, f"the image cannot be decoded ({describe_error(error)})") from error
 
 
 def existing_image(folder: Path, name: str) -> Path | None:
@@ -322,7 +322,7 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
         done = False
     if not done:
         raise InputError(path, f"no image format has the ending {path.suffix!r}", ".png or .jpg", "Choose another.")
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
 
 
@@ -369,9 +369,11 @@ def _read_id_array(path: Path) -> np.ndarray:
     """The ids (H, W) int64 of a .npy."""
     expected = "whole numbers of shape (H, W)"
     try:
-        image = map_array(path)
-    except UNREADABLE as error:
-        raise InputError(path, f"the array cannot be read: {why(error)}", expected, "Write the mask again.") from error
+        image = map_npy(path)
+    except READ_ERRORS as error:
+        raise InputError(
+            path, f"the array cannot be read: {describe_error(error)}", expected, "Write the mask again."
+        ) from error
     image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
     if image.ndim == 3:
         remedy = "Give such stacks with --proposals, or write one image of ids for each frame."
@@ -396,9 +398,11 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
     remedy = "Write the depth in millimetres as a 16 bit PNG."
     if path.suffix.lower() == ".npy":
         try:
-            depth = map_array(path)
-        except UNREADABLE as error:
-            raise InputError(path, f"the depth map cannot be read: {why(error)}", expected, remedy) from error
+            depth = map_npy(path)
+        except READ_ERRORS as error:
+            raise InputError(
+                path, f"the depth map cannot be read: {describe_error(error)}", expected, remedy
+            ) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         if depth.ndim != 2 or not depth.size:
             raise InputError(path, f"the depth map has shape {depth.shape}", expected, remedy)

@@ -15,9 +15,9 @@ import numpy as np
 
 from jsecon.data.mask_files import Fit, compact, read_level
 from jsecon.data.mask_names import find_masks
-from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, map_array
-from jsecon.numerics import sane
+from jsecon.errors import InputError, describe_error
+from jsecon.files import READ_ERRORS, map_npy
+from jsecon.numerics import is_finite_and_bounded
 from jsecon.types import ImageFile
 
 
@@ -66,7 +66,7 @@ def load_features(
             raise InputError(file, problem, wanted, "Write all frames' files with the same model.")
         ids, indices = compact(masks, read_level(masks, level))
         last = max(ids.tolist(), default=-1)
-        if table.ndim != 2 or not sane(table) or last >= len(table):
+        if table.ndim != 2 or not is_finite_and_bounded(table) or last >= len(table):
             wanted = "a finite row for each id of the _s.npy beside it"
             problem = f"it is an array {table.shape} for ids up to {last}"
             raise InputError(file, problem, wanted, "Write both files of the frame again.")
@@ -98,10 +98,10 @@ def feature_size(folder: Path) -> int:
 
 def _read_table(file: Path) -> np.ndarray:
     try:
-        table = map_array(file)
+        table = map_npy(file)
         if table.ndim == 0:
             raise ValueError("a single number")
-    except UNREADABLE as error:
+    except READ_ERRORS as error:
         wanted, remedy = "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."
-        raise InputError(file, f"there is nothing readable ({why(error)})", wanted, remedy) from error
+        raise InputError(file, f"there is nothing readable ({describe_error(error)})", wanted, remedy) from error
     return table

@@ -13,8 +13,8 @@ from jaxtyping import Int16
 from jsecon.data.frames import Progress
 from jsecon.data.images import TRANSPOSED, read_ids, turned
 from jsecon.data.mask_names import Masks, find_masks, object_ids
-from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, map_array
+from jsecon.errors import InputError, describe_error
+from jsecon.files import READ_ERRORS, map_npy
 from jsecon.types import ImageFile
 
 LEVELS = ("default", "s", "m", "l")
@@ -265,10 +265,12 @@ def read_level(path: Path, level: str | int) -> np.ndarray:
     if level not in (*LEVELS, 0, 1, 2, 3):
         raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     try:
-        image = map_array(path)
-    except UNREADABLE as error:
+        image = map_npy(path)
+    except READ_ERRORS as error:
         wanted = f"a .npy of shape ({len(LEVELS)}, H, W)"
-        raise InputError(path, f"there is no whole array ({why(error)})", wanted, "Write the masks again.") from error
+        raise InputError(
+            path, f"there is no whole array ({describe_error(error)})", wanted, "Write the masks again."
+        ) from error
     if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
         wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
         raise InputError(path, f"the array has shape {image.shape}", wanted, remedy)

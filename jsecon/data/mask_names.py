@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from jsecon.data.images import IMAGE_ENDINGS
 from jsecon.errors import InputError
-from jsecon.files import made_by_jsecon
+from jsecon.files import is_output_folder
 from jsecon.types import ImageFile
 
 DEEPEST = 4
@@ -135,7 +135,7 @@ def _files_beneath(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
     found = []
     for place, inner, files in os.walk(folder, followlinks=True):
         folders = Path(place).relative_to(folder).parts
-        kept = (name for name in inner if not name.startswith(".") and not made_by_jsecon(Path(place) / name))
+        kept = (name for name in inner if not name.startswith(".") and not is_output_folder(Path(place) / name))
         inner[:] = sorted(kept) if len(folders) < DEEPEST else []
         found += [(Path(place) / name, folders) for name in sorted(files) if not name.startswith(".")]
     return found

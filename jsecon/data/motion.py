@@ -28,7 +28,7 @@ from jsecon.data.frames import frame_names
 from jsecon.data.images import IMAGE_ENDINGS, image_header, read_image, write_image
 from jsecon.data.motion_steps import FEWEST
 from jsecon.errors import InputError
-from jsecon.files import files_beneath, write_text
+from jsecon.files import list_files, write_text
 
 _FOCAL, _FOCAL_35, _MODEL, _EXIF = 0x920A, 0xA405, 0x0110, 0x8769
 """tags of EXIF, and of the folder within it that holds the first two"""
@@ -79,7 +79,7 @@ def photographs(path: Path) -> list[Path]:
     own = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
     if own:
         return own
-    found = [file for file in files_beneath(folder) if _is_image(file)]
+    found = [file for file in list_files(folder) if _is_image(file)]
     names = set(found)
     aside = [file.relative_to(folder).parts[:-1] for file in found]
     return [

@@ -20,7 +20,7 @@ from jsecon.data.ply import load_points_ply
 from jsecon.data.poses import inverse_pose, rigid
 from jsecon.errors import InputError
 from jsecon.files import read_json
-from jsecon.numerics import sane
+from jsecon.numerics import is_finite_and_bounded
 
 MILLIMETRE = 0.001
 """nerfstudio's default depth unit, metres"""
@@ -112,7 +112,7 @@ def _key(file: Path, record: dict[str, Any], key: str, where: str, kind: type) -
 
 def _number(file: Path, record: dict[str, Any], key: str, default: float) -> float:
     value = record.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not sane(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not is_finite_and_bounded(value):
         raise _bad(file, f"{key} = {value!r}", "a finite number")
     return float(value)
 
@@ -133,7 +133,7 @@ def _to_source(file: Path, scene: dict[str, Any], scale: float) -> np.ndarray:
     transform = np.eye(4)
     if "applied_transform" in scene:
         transform = _matrix(file, _key(file, scene, "applied_transform", "the file", list), "applied_transform")
-    scaled = np.diag([scale, scale, scale, 1.0]) @ (transform if sane(transform) else np.zeros((4, 4)))
+    scaled = np.diag([scale, scale, scale, 1.0]) @ (transform if is_finite_and_bounded(transform) else np.zeros((4, 4)))
     size = np.abs(scaled[:3, :3]).max()
     turn = scaled[:3, :3] / size if size > 0 else np.zeros((3, 3))
     if not (np.linalg.det(turn) > 0 and np.allclose(turn @ turn.T, (turn @ turn.T)[0, 0] * np.eye(3), atol=1e-3)):

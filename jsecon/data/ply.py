@@ -13,8 +13,8 @@ from jaxtyping import Float, UInt8
 
 from jsecon.data.ply_file import bad_ply, property_types, read_vertices, vertex_blocks
 from jsecon.errors import InputError, require_shape
-from jsecon.files import written_whole
-from jsecon.numerics import sane
+from jsecon.files import atomic_write
+from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import check_gaussians, unusable_rows
 from jsecon.splat.transform import carried, float32_rounds, transformed_blocks
 from jsecon.types import Array, Gaussians
@@ -217,7 +217,7 @@ def save_ply(
     kinds = ("double" if double and name in _POSITION else "float" for name in names)
     properties = (f"property {kind} {name}" for kind, name in zip(kinds, names))
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         for own, part in usable_blocks(path, gaussians, similarity):
             colours = part.sh if rgb is None else ((np.asarray(rgb[own], np.float64) - 0.5) / SH_DC)[:, None]
@@ -261,7 +261,7 @@ def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[n
     if missing := [name for name in _POSITION if name not in names]:
         raise bad_ply(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION, np.float64)
-    if not sane(points):
+    if not is_finite_and_bounded(points):
         raise bad_ply(path, "its points have NaN, infinite or absurd coordinates", "finite points")
     if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), GREY, np.uint8)

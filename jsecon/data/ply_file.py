@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
 TYPES = {name: kind for kind, old in (_NAMES | {"f8": "double"}).items() for name in (old, np.dtype(kind).name)}
@@ -132,7 +132,7 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             yield file
     except OSError as error:
-        raise bad_ply(path, why(error), "a .ply file", "Check the path.") from error
+        raise bad_ply(path, describe_error(error), "a .ply file", "Check the path.") from error
 
 
 def property_types(path: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import InputError
-from jsecon.numerics import sane
+from jsecon.numerics import is_finite_and_bounded
 
 RIGID_TOLERANCE = 1e-3
 """largest entry of R R^T - I still taken for rounding in a text file; the rotation is then made exact"""
@@ -19,7 +19,7 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     """The pose with its rotation made exactly orthonormal; InputError where it is not finite or not rigid at all."""
     pose = np.asarray(pose, np.float64)
     remedy = "Estimate the poses again, or take this frame out of the capture."
-    if not sane(pose):
+    if not is_finite_and_bounded(pose):
         raise InputError(where, f"a pose of {name} with NaN, infinite or absurd numbers", "finite poses", remedy)
     rotation = pose[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()

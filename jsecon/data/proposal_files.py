@@ -23,8 +23,8 @@ from jaxtyping import Bool
 from jsecon.data.images import MOST_PIXELS, read_ids
 from jsecon.data.mask_files import Fit, black_and_white, read_level
 from jsecon.data.mask_names import Masks, Names, find_masks
-from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, map_array, read_json
+from jsecon.errors import InputError, describe_error
+from jsecon.files import READ_ERRORS, map_npy, read_json
 from jsecon.types import ImageFile
 
 ENDINGS = (".json", "_s.npy", ".png", ".npy")
@@ -43,7 +43,7 @@ def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
         counts = rle["counts"]
         runs = np.asarray(_numbers(counts) if isinstance(counts, str) else counts, np.int64)
     except (TypeError, KeyError, ValueError, IndexError, OverflowError) as error:
-        raise InputError(where, f"the mask cannot be read: {why(error)}", *_RLE) from error
+        raise InputError(where, f"the mask cannot be read: {describe_error(error)}", *_RLE) from error
     fits = runs.ndim == 1 and ((runs >= 0) & (runs <= MOST_PIXELS)).all() and min(height, width) > 0
     if not fits or height * width > MOST_PIXELS or runs.sum() != height * width:
         raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", *_RLE)
@@ -202,8 +202,8 @@ def _read(path: Path, level: str, frame: tuple[int, int]) -> list[np.ndarray]:
 def _stack(path: Path) -> list[np.ndarray] | None:
     """The masks of a .npy of shape (M, H, W); None where it has another."""
     try:
-        masks = map_array(path)
-    except UNREADABLE:
+        masks = map_npy(path)
+    except READ_ERRORS:
         return None  # `read_ids` tells
     if masks.ndim != 3 or 1 in (masks.shape[0], masks.shape[2]):
         return None
@@ -234,7 +234,7 @@ def _read_json(file: Path, frame: tuple[int, int]) -> list[np.ndarray]:
         told = [content.get("image"), *content.get("images", [])[:1]] if isinstance(content, dict) else []
         size = next((size for size in map(_size, told) if size is not None), frame)
     except (ValueError, TypeError) as error:
-        raise InputError(file, f"it holds no masks: {why(error)}", _LIST, _REMEDY) from error
+        raise InputError(file, f"it holds no masks: {describe_error(error)}", _LIST, _REMEDY) from error
     return _decoded(file, records, size)
 
 
@@ -285,7 +285,7 @@ def _of_dataset(
             by_image[record["image_id"]].append(record)
         called = {number: PurePosixPath(str(image["file_name"])) for number, image in images.items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(file, f"it is no COCO file: {why(error)}", _LIST, _REMEDY) from error
+        raise InputError(file, f"it is no COCO file: {describe_error(error)}", _LIST, _REMEDY) from error
     matches = {n: known.match(Path(path.name), path.parts[:-1], "") for n, path in called.items()}
     own = {match.frame: number for number, match in matches.items() if match is not None}
     if not own:

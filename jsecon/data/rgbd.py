@@ -20,9 +20,9 @@ from jsecon.data.frames import LEAST_FOCAL, Posed, Shot
 from jsecon.data.images import MOST_PIXELS, image_header, image_size
 from jsecon.data.lens import Lens
 from jsecon.data.poses import inverse_pose
-from jsecon.errors import InputError, why
-from jsecon.files import UNREADABLE, parsed_json, read_text
-from jsecon.numerics import sane
+from jsecon.errors import InputError, describe_error
+from jsecon.files import READ_ERRORS, parse_json, read_text
+from jsecon.numerics import is_finite_and_bounded
 
 _TUM = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
@@ -57,8 +57,8 @@ def _reading(file: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except UNREADABLE as error:
-        found = f"it cannot be read ({why(error)})"
+    except READ_ERRORS as error:
+        found = f"it cannot be read ({describe_error(error)})"
         raise InputError(file, found, "the numbers of its format", "Export the capture again.") from error
 
 
@@ -96,7 +96,12 @@ def _lens(width: Any, height: Any, *numbers: Any) -> Lens:
     """Of numbers as a file has them. Raises ValueError for a frame without pixels, without a focal length, or whose
     centre lies outside of it: the numbers are then those of another size."""
     fx, fy, cx, cy = map(float, numbers)
-    if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS and sane(numbers) and min(fx, fy) >= LEAST_FOCAL):
+    if not (
+        1 <= width <= MOST_PIXELS
+        and 1 <= height <= MOST_PIXELS
+        and is_finite_and_bounded(numbers)
+        and min(fx, fy) >= LEAST_FOCAL
+    ):
         raise ValueError(f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g}")
     if not (0 < cx < width and 0 < cy < height):
         raise ValueError(f"a frame of {width}x{height} with its centre at {cx:g}, {cy:g}")
@@ -201,7 +206,7 @@ def _polycam(path: Path) -> Posed:
         file = _beside(frames / f"{kind}cameras", image.stem, ".json")
         if file.is_file():
             with _reading(file):
-                told = parsed_json(file.read_bytes())
+                told = parse_json(file.read_bytes())
                 size = _polycam_size(told, _beside(frames / "cameras", image.stem, ".json"), image)
                 lens = _lens(*size, *(told[name] for name in ("fx", "fy", "cx", "cy")))
                 pose = np.array([[told[f"t_{i}{j}"] for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]], np.float64)
@@ -215,7 +220,7 @@ def _polycam_size(told: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
     if "width" in told and "height" in told:
         return told["width"], told["height"]
     own = image_header(image).about(told.get("cx"), told.get("cy"))
-    before = parsed_json(uncorrected.read_bytes()) if uncorrected.is_file() else {}
+    before = parse_json(uncorrected.read_bytes()) if uncorrected.is_file() else {}
     width, height = before.get("width", own[0]), before.get("height", own[1])
     return (width, height) if abs(width * own[1] - height * own[0]) <= max(width, height) else own
 
@@ -225,7 +230,7 @@ def _record3d(path: Path) -> Posed:
     images, shots = _images(path / ("rgbd" if unpacked else "rgb")), []
     file = path / ("metadata" if unpacked else "metadata.json")
     with _reading(file):
-        told = parsed_json(file.read_bytes())
+        told = parse_json(file.read_bytes())
         k = told["K"]  # by columns
         numbers = told.get("perFrameIntrinsicCoeffs") or [(k[0], k[4], k[6], k[7])] * len(told["poses"])
         poses = np.array(told["poses"], np.float64).reshape(-1, 7)

@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.data.ply import sound, usable_blocks
-from jsecon.errors import InputError, why
-from jsecon.files import written_whole
+from jsecon.errors import InputError, describe_error
+from jsecon.files import atomic_write
 from jsecon.splat.project import check_gaussians
 from jsecon.splat.transform import transform_axes
 from jsecon.types import Array, Gaussians
@@ -76,7 +76,7 @@ def save_spz(path: str | Path, gaussians: Gaussians, *, similarity: Float[Array,
         raise InputError(path, f"{gaussians.count} Gaussians", "fewer than 2^32 in a .spz", "Write a .ply.")
     degree = math.isqrt(gaussians.sh.shape[1]) - 1
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, gaussians.count, degree, bits, 0, 0)
-    with written_whole(path) as temporary, contextlib.ExitStack() as stack:
+    with atomic_write(path) as temporary, contextlib.ExitStack() as stack:
         columns = [stack.enter_context(tempfile.TemporaryFile(dir=temporary.parent)) for _ in range(6)]
         for _, part in usable_blocks(path, gaussians, into):
             for column, data in zip(columns, _packed(part, bits), strict=True):
@@ -175,7 +175,7 @@ def load_spz(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(path, why(error), _WANTED, "Check the path.") from error
+        raise InputError(path, describe_error(error), _WANTED, "Check the path.") from error
     try:
         head, columns, records = (_unzipped if data[:2] == b"\x1f\x8b" else _streams)(path, data)
         axes, notes = _recorded(path, records)

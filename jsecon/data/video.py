@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jsecon.errors import InputError
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
 VIDEO_FRAMES = 150
@@ -65,7 +65,7 @@ def write_frames(
     for number, (image, _) in enumerate(_decoded(video)):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")
-            with written_whole(written[-1]) as temporary:  # imwrite would not tell that the disk is full
+            with atomic_write(written[-1]) as temporary:  # imwrite would not tell that the disk is full
                 temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes())
         if progress is not None:
             progress(len(sharpness) + number + 1, 2 * len(sharpness))

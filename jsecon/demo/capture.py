@@ -18,7 +18,7 @@ from jsecon.demo.crowd import crowded_room
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import Room, make_room
 from jsecon.errors import require
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
 
 LABEL_PIXELS = 40
@@ -198,5 +198,5 @@ def _box(mask):
 
 def write_ids(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:
     """Writes a label image as a grey PNG, whole or not at all."""
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())

@@ -18,7 +18,7 @@ from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
 from jsecon.demo import write_room
 from jsecon.demo.film import write_film
 from jsecon.evaluate.lerf import Row
-from jsecon.files import write_text, written_whole
+from jsecon.files import atomic_write, write_text
 from jsecon.pipeline import networks, pipeline
 from jsecon.pipeline.options import Options, require_writable
 from jsecon.pipeline.pipeline import Run
@@ -47,7 +47,7 @@ def demo(
     given = pipeline.run(true_masks, out / "true_masks", listener=listener, cache_folder=out / "cache")
 
     labels = load_lerf_labels(capture / "label")
-    embedder = networks.embedder_of_field(found.field)
+    embedder = networks.field_embedder(found.field)
     listener.say("measured on the held-out views")
     results = evaluation.evaluate(found.field, embedder, labels, listener)
     with_true = evaluation.evaluate(given.field, embedder, labels, listener, ("anchored", "one_step"))
@@ -105,7 +105,7 @@ def _metrics(results: dict[str, tuple[list[Row], dict[str, Any]]], found: Run, g
         "gaussians": found.field.gaussians.count,
         "seconds": {name: round(value, 2) for name, value in seconds.items()},
         "seconds_in_all": round(sum(seconds.values()), 1),
-        "left_out": {f"{name} (true masks)": why for name, why in given.left_out.items()} | found.left_out,
+        "left_out": {f"{name} (true masks)": why for name, why in given.skipped.items()} | found.skipped,
         "peak_memory_mib": 0.0,
     }
 
@@ -181,7 +181,7 @@ def write_pictures(
         "codes of the Gaussians": codes.colours(t, pictures.code_colours(run.field)),
         "answers to texts": pictures.answers_overlay(frames[frame], masks),
     }
-    with written_whole(out / "demo.jpg") as temporary:
+    with atomic_write(out / "demo.jpg") as temporary:
         image = cv2.cvtColor(pictures.strip(panels), cv2.COLOR_RGB2BGR)
         temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
     write_film(run.field, [answer for answer in answers.values() if answer.mask.any()], out / "demo.webp")

@@ -10,7 +10,7 @@ from PIL import Image
 from jsecon.app.ask import Answer
 from jsecon.app.pictures import Renderer
 from jsecon.demo.capture import look_at
-from jsecon.files import written_whole
+from jsecon.files import atomic_write
 from jsecon.fit.schedule import resized
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, LanguageField
@@ -50,7 +50,7 @@ def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> i
         frames.append(Image.fromarray(image))
     first, *rest = frames
     how = {"duration": 1000 // PER_SECOND, "loop": 0, "quality": QUALITY, "method": 2}
-    with written_whole(file) as temporary:
+    with atomic_write(file) as temporary:
         first.save(temporary, format="WEBP", save_all=True, append_images=rest, **how)
     return file.stat().st_size
 

@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require
-from jsecon.parallel import over_devices
+from jsecon.parallel import map_over_devices
 from jsecon.splat.fusion import stored, surely
 from jsecon.types import Array
 
@@ -117,7 +117,7 @@ def _loss_and_gradient(image: Array, target: Array, mesh: Mesh) -> tuple[Array, 
         total, gradient = _of_rows(x, y, ((row >= 0) & (row < height))[:, None], channels)
         return total[None], gradient
 
-    totals, gradient = over_devices(local, (), (flat(image), flat(target)), mesh)
+    totals, gradient = map_over_devices(local, (), (flat(image), flat(target)), mesh)
     return totals.sum() / image.size, gradient[:height].reshape(height, width, channels) / image.size
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.fit.photometric import psnr, ssim_map
 from jsecon.fit.schedule import resized, resized_frame, resized_mask
-from jsecon.parallel import dealt_out
+from jsecon.parallel import map_over_processes
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Capture, Gaussians, Quality
 
@@ -68,7 +68,7 @@ def quality(
                 counted = ~resized_mask(np.asarray(capture.ignored[t]), cameras)
             yield [float(value) for value in _compare(image, frame, counted)]
 
-    values = dealt_out(len(chosen), rows, progress)
+    values = map_over_processes(len(chosen), rows, progress)
     by_frame = np.array(values).reshape(-1, 2)
     return Quality(chosen, by_frame[:, 0], by_frame[:, 1])
 

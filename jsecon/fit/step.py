@@ -13,7 +13,7 @@ from jsecon.fit.corrections import Refine, Refined, refined_further
 from jsecon.fit.growth import lengthened, noise, pressure, with_free_rows
 from jsecon.fit.schedule import LearningRates, rates_at
 from jsecon.fit.view import View, Views, view_loss
-from jsecon.parallel import AXIS, MESH_OPTIONS, over_rows
+from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.types import Array, Gaussians
 
@@ -75,7 +75,7 @@ def step(
 
     rate = rates_at(numbers["done"], numbers["rates"], gaussians, numbers["extent"], numbers["degree"])
     rows = gaussians, gradient, first, second
-    gaussians, first, second = over_rows(update, rows, (numbers["step"], rate), mesh)
+    gaussians, first, second = map_rows(update, rows, (numbers["step"], rate), mesh)
     if growth == "mcmc":
         means = gaussians.means + noise(gaussians, rate.means, numbers["step"])
         gaussians = dataclasses.replace(gaussians, means=means)

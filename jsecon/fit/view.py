@@ -10,7 +10,7 @@ from jsecon.errors import InputError
 from jsecon.fit.corrections import Corrections, away_from_rest, corrected_camera, exposed
 from jsecon.fit.photometric import photometric_loss
 from jsecon.fit.schedule import resized, resized_frame, resized_mask
-from jsecon.parallel import over_rows
+from jsecon.parallel import map_rows
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Capture, Gaussians, record
@@ -105,7 +105,7 @@ def view_loss(
     are not wanted.
     """
     camera = view.camera if own is None else corrected_camera(view.camera, own.twists)
-    colours = over_rows(colours_from_sh, gaussians, camera, mesh)
+    colours = map_rows(colours_from_sh, gaussians, camera, mesh)
     # The votes are the gradient of a fourth channel that shows nothing: they cost no pass of their own.
     features = jnp.concatenate([colours, nothing], axis=1)
     rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import WHOLE, cosine, is_traced, normalize
+from jsecon.numerics import FULL_PRECISION, cosine, is_traced, normalize
 from jsecon.types import Array, Key
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
@@ -236,11 +236,11 @@ def _layers() -> tuple[Any, Any]:
 
         @nn.compact
         def __call__(self, x, train: bool):
-            x = nn.Dense(self.widths[0], param_dtype=x.dtype, precision=WHOLE)(x)
+            x = nn.Dense(self.widths[0], param_dtype=x.dtype, precision=FULL_PRECISION)(x)
             for width in self.widths[1:]:
                 norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
                 x = nn.relu(norm(x))
-                x = nn.Dense(width, param_dtype=x.dtype, precision=WHOLE)(x)
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(x)
             return normalize(x)
 
     class Decoder(nn.Module):
@@ -249,7 +249,7 @@ def _layers() -> tuple[Any, Any]:
         @nn.compact
         def __call__(self, x):
             for index, width in enumerate(self.widths):
-                x = nn.Dense(width, param_dtype=x.dtype, precision=WHOLE)(nn.relu(x) if index else x)
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(nn.relu(x) if index else x)
             return normalize(x)
 
     return Encoder, Decoder

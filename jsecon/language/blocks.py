@@ -23,12 +23,12 @@ from jax import lax
 from jaxtyping import Float
 
 from jsecon.errors import InputError, require, require_shape
-from jsecon.files import map_array, write_column, written_whole
+from jsecon.files import atomic_write, map_npy, write_npy
 from jsecon.language.distill import LEAST_LABELLED, distill_votes
 from jsecon.language.records import append, summed_columns
 from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
-from jsecon.numerics import NEAR, WHOLE, require_labels
+from jsecon.numerics import FULL_PRECISION, NEAR, require_labels
 from jsecon.splat.banded import listed, still_open
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
 from jsecon.splat.fusion import stored
@@ -127,9 +127,9 @@ def codes_in_blocks(
     """`distill_votes` of mapped votes, block by block: the codes (N, d) as a memory map of the .npy `path`."""
     shape = (votes.regions.shape[0], region_codes.shape[1])
     blocks = (distill_votes(own, region_codes, reduce, least_labelled=least_labelled) for own in vote_blocks(votes))
-    with written_whole(path) as temporary:
-        write_column(temporary, shape, np.float32, map(np.asarray, blocks))
-    return map_array(Path(path))
+    with atomic_write(path) as temporary:
+        write_npy(temporary, shape, np.float32, map(np.asarray, blocks))
+    return map_npy(Path(path))
 
 
 @contextlib.contextmanager
@@ -245,7 +245,7 @@ def _cast_band(
             weight = weight * covered[:, None]
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-            own = jnp.einsum("bcp,bps->bcs", weight, columns, precision=WHOLE)
+            own = jnp.einsum("bcp,bps->bcs", weight, columns, precision=FULL_PRECISION)
             own = jnp.concatenate([own, weight.max(-1)[..., None]], axis=2)
             return transmittance, (cast.at[chunk.places].set(own, mode="drop"), transmittance)
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import require
 from jsecon.language.autoencoder import require_finite, train_autoencoder
-from jsecon.numerics import WHOLE, cosine_matrix, normalize
+from jsecon.numerics import FULL_PRECISION, cosine_matrix, normalize
 from jsecon.types import Array, Key
 
 MAX_COSINE_LOSS = 1e-4
@@ -46,11 +46,11 @@ class Rotation:
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
         """(..., E) -> (..., d) unit codes: the part of the embedding inside the span, brought to unit length."""
-        return normalize(jnp.matmul(normalize(jnp.asarray(embeddings)), self.basis, precision=WHOLE))
+        return normalize(jnp.matmul(normalize(jnp.asarray(embeddings)), self.basis, precision=FULL_PRECISION))
 
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
         """(..., d) -> (..., E) unit embeddings inside the span."""
-        return normalize(jnp.matmul(jnp.asarray(codes), jnp.asarray(self.basis).T, precision=WHOLE))
+        return normalize(jnp.matmul(jnp.asarray(codes), jnp.asarray(self.basis).T, precision=FULL_PRECISION))
 
 
 @jax.tree_util.register_dataclass
@@ -80,7 +80,7 @@ def _among(x: Array, keys: Array, values: Array) -> Array:
     similarity = jnp.where(known[None], SHARPNESS * cosine_matrix(rows, keys), -jnp.inf)
     share = jax.nn.softmax(similarity, axis=-1)
     share = jnp.where(jnp.any(known), share, 0.0)
-    found = normalize(jnp.matmul(share, values, precision=WHOLE))
+    found = normalize(jnp.matmul(share, values, precision=FULL_PRECISION))
     found = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), found, 0.0)
     return found.reshape(*x.shape[:-1], values.shape[-1])
 
@@ -201,7 +201,7 @@ def _spread(start: Array, target: Array, distinct: Array, alike: Array, separati
 
     def loss(points):
         codes = normalize(points)
-        cosines = jnp.matmul(codes, codes.T, precision=WHOLE)
+        cosines = jnp.matmul(codes, codes.T, precision=FULL_PRECISION)
         error = jnp.where(distinct | alike, cosines - target, 0.0)
         too_near = jnp.where(distinct, jnp.maximum(cosines - (separation - 0.03), 0.0), 0.0)
         too_far = jnp.where(alike, jnp.maximum(separation + 0.03 - cosines, 0.0), 0.0)

@@ -19,17 +19,17 @@ import numpy as np
 from jaxtyping import Int
 
 from jsecon.data.images import MOST_PIXELS
-from jsecon.errors import InputError, require, why
+from jsecon.errors import InputError, describe_error, require
 from jsecon.files import (
-    UNREADABLE,
+    READ_ERRORS,
     ForeignFileError,
-    packed,
-    parsed_json,
+    atomic_write,
+    pack_tree,
+    parse_json,
     read_arrays,
     read_zip,
-    unpacked,
+    unpack_tree,
     write_arrays,
-    written_whole,
 )
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
@@ -94,8 +94,8 @@ def save_field(path: str | os.PathLike, field: LanguageField) -> None:
     """
     problem, arrays = _disagreement(field) or _oddity(field), {}
     require(problem is None, "save_field", problem, "what load_field reads", "Build the field from one run.")
-    tree = packed(field, "", arrays, lambda kind: kind.__name__ if kind in _RECORDS.values() else None)
-    with written_whole(path) as temporary:
+    tree = pack_tree(field, "", arrays, lambda kind: kind.__name__ if kind in _RECORDS.values() else None)
+    with atomic_write(path) as temporary:
         write_arrays(temporary, arrays, {"format": FORMAT, "version": VERSION, "field": tree})
 
 
@@ -138,9 +138,9 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     try:
         if is_zip:  # field.npz, as it was written before field.safetensors
             members = read_zip(path)
-            header = parsed_json(members.pop("header", np.zeros(0, np.uint8)).tobytes() or b"null")
+            header = parse_json(members.pop("header", np.zeros(0, np.uint8)).tobytes() or b"null")
         else:
-            header, members = read_arrays(path, mapped=mapped, checked=checked)
+            header, members = read_arrays(path, memory_map_above=mapped, verify=checked)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             problem = "it is an archive of another program" if is_zip else "it is a file of jsecon, but no field"
             raise InputError(path, problem, "a field file", _REMEDY)
@@ -148,7 +148,7 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         if (version := header.get("version")) != expected:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
             raise InputError(path, f"version {version}", f"version {expected}", remedy)
-        field = unpacked(_known(header["field"]), members, _RECORDS.__getitem__)
+        field = unpack_tree(_known(header["field"]), members, _RECORDS.__getitem__)
         whole = isinstance(field, LanguageField)
         problem = _disagreement(field) or _oddity(field, checked) if whole else "no field at its root"
         field = jax.tree.map(_on_device, field)
@@ -156,8 +156,8 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
         raise
     except ForeignFileError as error:
         raise InputError(path, str(error), "a field file", _REMEDY) from error
-    except UNREADABLE as error:
-        found = f"the field file is damaged ({why(error)})"
+    except READ_ERRORS as error:
+        found = f"the field file is damaged ({describe_error(error)})"
         raise InputError(path, found, "a whole one", changed) from error
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
@@ -221,7 +221,7 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     if field.gaussians.sh.shape[1] not in BANDS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     texts = (*field.names, field.embedder, field.provenance)
-    if not all(isinstance(text, str) for text in texts) or not isinstance(parsed_json(field.provenance), dict):
+    if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"
     if not 0 < field.cameras.width * field.cameras.height <= MOST_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"

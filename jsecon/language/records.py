@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import sparse
 
-from jsecon.files import map_array
+from jsecon.files import map_npy
 
 _KINDS = {
     "votes": np.dtype([("gaussian", "<u4"), ("region", "<i4"), ("weight", "<f4")]),
@@ -75,7 +75,7 @@ def summed_columns(
             own = _block(spool, first // rows, min(rows, count - first), regions, top, shows, views)
             for name, (dtype, _) in kinds.items():
                 files[name].write(np.ascontiguousarray(own[name], dtype).tobytes())
-    return {"shown": None, "by_view": None} | {name: map_array(folder / f"{name}.npy") for name in kinds}
+    return {"shown": None, "by_view": None} | {name: map_npy(folder / f"{name}.npy") for name in kinds}
 
 
 def _block(spool: Path, block: int, count: int, regions: int, top: int, shows: np.ndarray | None, views: int):

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import normalize, require_labels
-from jsecon.parallel import dealt_out
+from jsecon.parallel import map_over_processes
 from jsecon.types import Array, Parts, Regions
 
 ALIKE_THRESHOLD = 0.9
@@ -91,7 +91,7 @@ def pooled(
             yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float64) if len(seen) else None
 
     total: np.ndarray | None = None
-    for t, found in enumerate(dealt_out(len(labels), rows, progress)):
+    for t, found in enumerate(map_over_processes(len(labels), rows, progress)):
         if found is not None:
             seen = np.flatnonzero(pixels[:, t])
             require_shape("embed", found, (len(seen), "E"), "An embedder returns one row per mask.")

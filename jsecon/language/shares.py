@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
 from jsecon.language.regions import ALIKE_THRESHOLD, apart_from_mean
-from jsecon.numerics import WHOLE, cosine_matrix
+from jsecon.numerics import FULL_PRECISION, cosine_matrix
 from jsecon.types import Array, Regions, Votes
 
 SHARE_THRESHOLD = 0.5
@@ -106,7 +106,7 @@ def _with_shown(votes: Votes, shows: Array, block: int) -> Votes:
         first = jnp.minimum(i * block, count - block)  # the last block overlaps the one before it
         seen = lax.dynamic_slice_in_dim(by_view, first, block, axis=1)
         wanted = lax.dynamic_slice_in_dim(regions, first, block, axis=0)
-        of_regions = jnp.einsum("tn,rt->nr", seen, shows.astype(seen.dtype), precision=WHOLE)
+        of_regions = jnp.einsum("tn,rt->nr", seen, shows.astype(seen.dtype), precision=FULL_PRECISION)
         rows = jnp.take_along_axis(of_regions, jnp.maximum(wanted, 0), axis=1)
         return lax.dynamic_update_slice_in_dim(shown, jnp.where(wanted >= 0, rows, 0.0), first, axis=0)
 

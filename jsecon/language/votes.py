@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Float, Int, Shaped
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import NEAR, WHOLE, is_traced, require_labels
-from jsecon.parallel import lanes_at_once, spread_over_devices
+from jsecon.numerics import FULL_PRECISION, NEAR, is_traced, require_labels
+from jsecon.parallel import accumulate_over_views, concurrent_lanes
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.splat.fusion import stored
 from jsecon.splat.plan import ViewPlan, plan_view
@@ -105,7 +105,7 @@ def region_votes(
             state, totals = lax.scan(one_view, start, (cameras, labels))
         else:
             report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
-            state, totals = spread_over_devices(
+            state, totals = accumulate_over_views(
                 _add_view, start, _merge, common, (cameras, labels), prepare=_plan_view, static=static, progress=report
             )
             if capacity is None and (missing := np.asarray(state["missing"])):
@@ -131,7 +131,7 @@ def bytes_of_votes(count: int, views: int, regions: int) -> int:
     """What `region_votes` with `by_view` takes in memory beside what it is given, about: the views' totals, a copy of
     the Gaussians with one band of colour, and the dense block of each lane that is worked on and of their sum."""
     dense = 4 * count * _regions_at_once(count, regions)
-    return (4 * views + _BARE_BYTES) * count + (lanes_at_once(views, dense) + 1) * dense
+    return (4 * views + _BARE_BYTES) * count + (concurrent_lanes(views, dense) + 1) * dense
 
 
 def _empty(xp: Any, count: int, regions: int, dtype) -> dict[str, Array]:
@@ -208,7 +208,7 @@ def _add_view(
                 weight = weight * covered[:, None]
                 if centre:
                     weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-                cast = jnp.einsum("bcp,bps->bcs", weight, is_slot, precision=WHOLE)
+                cast = jnp.einsum("bcp,bps->bcs", weight, is_slot, precision=FULL_PRECISION)
                 target = jnp.where(slots >= 0, slots, votes.shape[1])  # out of range: dropped
                 votes = votes.at[chunk.ids[:, :, None], target[:, None]].add(cast, mode="drop")
                 total = total.at[chunk.ids].add(jnp.where(first_pass, weight.sum(-1), 0.0))

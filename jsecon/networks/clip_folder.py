@@ -12,13 +12,13 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 from jsecon.files import read_json
 from jsecon.networks.file_tokenizer import TextRules
 from jsecon.networks.onnx_graph import Graph, content_digest, describe, graph_files
 from jsecon.networks.sigmoid import LOGITS
 from jsecon.networks.text_rules import read_text_rules
-from jsecon.numerics import sane
+from jsecon.numerics import is_finite_and_bounded
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """of RGB in 0..1, where a folder does not say"""
@@ -142,8 +142,16 @@ def read_preprocessing(path: Path, *, whole: bool = False) -> tuple[tuple[float,
         size = _side(content.get("crop_size", content.get("size")))
         mean, std = tuple(map(float, mean)), tuple(map(float, std))
     except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-        raise InputError(path, f"it cannot be read ({why(error)})", expected, "Fetch the file again.") from error
-    if len(mean) != 3 or len(std) != 3 or not sane(mean, std) or min(std) < 1e-6 or not 1 <= (size or 1) <= MOST_SIDE:
+        raise InputError(
+            path, f"it cannot be read ({describe_error(error)})", expected, "Fetch the file again."
+        ) from error
+    if (
+        len(mean) != 3
+        or len(std) != 3
+        or not is_finite_and_bounded(mean, std)
+        or min(std) < 1e-6
+        or not 1 <= (size or 1) <= MOST_SIDE
+    ):
         raise InputError(path, f"mean {mean}, std {std}, size {size}", expected, "Fetch the file again.")
     return mean, std, size
 

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from jsecon.errors import InputError, why
-from jsecon.files import parsed_json
+from jsecon.errors import InputError, describe_error
+from jsecon.files import parse_json
 from jsecon.networks.tokenizer import cleaned, mended
 
 CLEANINGS = ("canonicalize", "lower", "whitespace")
@@ -44,7 +44,7 @@ class FileTokenizer:
         self.rules, self._path = rules, Path(path)
         with _read(self._path, f"a tokenizer of Hugging Face's kind with the token {rules.pad!r}"):
             text = self._path.read_text(encoding="utf-8")
-            _check_ends(parsed_json(text).get("post_processor"))
+            _check_ends(parse_json(text).get("post_processor"))
             self._tokenizer = Tokenizer.from_str(text)
             number = self._tokenizer.token_to_id(rules.pad)
             if number is None:
@@ -91,5 +91,5 @@ def _read(path: Path, expected: str) -> Iterator[None]:
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # an abort in its Rust
             raise
-        found = f"no such tokenizer ({why(error)})"
+        found = f"no such tokenizer ({describe_error(error)})"
         raise InputError(path, found, expected, "Fetch tokenizer.json and tokenizer_config.json again.") from error

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 from jsecon.files import read_json
 from jsecon.networks.onnx_graph import Graph, describe
-from jsecon.numerics import sane
+from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import Logits
 
 LOGITS = "logits.json"
@@ -36,7 +36,7 @@ def read_logits(path: Path) -> Logits:
     try:
         found = Logits(float(content["scale"]), float(content["bias"]))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(path, f"it cannot be read ({why(error)})", expected, REMEDY) from error
+        raise InputError(path, f"it cannot be read ({describe_error(error)})", expected, REMEDY) from error
     return _checked(found, path, expected)
 
 
@@ -56,7 +56,11 @@ def fitted_logits(graph: Graph, images: np.ndarray, ids: np.ndarray) -> Logits:
     logits, texts, seen = (np.asarray(found[name], np.float64) for name in names)
     lengths = np.linalg.norm(seen, axis=-1)[:, None] * np.linalg.norm(texts, axis=-1)
     expected = "logits on one line over cosines that differ"
-    if seen.shape[1:] != texts.shape[1:] or logits.shape != lengths.shape or not sane(logits, texts, seen):
+    if (
+        seen.shape[1:] != texts.shape[1:]
+        or logits.shape != lengths.shape
+        or not is_finite_and_bounded(logits, texts, seen)
+    ):
         shapes = f"shapes {logits.shape}, {texts.shape}, {seen.shape}, or numbers that are not finite"
         raise InputError(graph.path, shapes, "finite (B, Q), (Q, E), (B, E)", REMEDY)
     if not (lengths > 0).all():
@@ -74,6 +78,6 @@ def fitted_logits(graph: Graph, images: np.ndarray, ids: np.ndarray) -> Logits:
 
 
 def _checked(found: Logits, where: Path, expected: str) -> Logits:
-    if not (sane(*found) and 0 < found.scale <= MOST_SCALE and abs(found.bias) <= MOST_BIAS):
+    if not (is_finite_and_bounded(*found) and 0 < found.scale <= MOST_SCALE and abs(found.bias) <= MOST_BIAS):
         raise InputError(where, f"scale {found.scale:g}, bias {found.bias:g}", expected, REMEDY)
     return found

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from jsecon.errors import InputError, why
-from jsecon.files import parsed_json
+from jsecon.errors import InputError, describe_error
+from jsecon.files import parse_json
 
 CONTEXT_LENGTH = 77
 """ids per text, where the graph does not fix it"""
@@ -68,7 +68,7 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
     """
     path = Path(path)
     try:
-        content = parsed_json(path.read_bytes())
+        content = parse_json(path.read_bytes())
         if path.name == "vocab.json":
             lines = path.with_name("merges.txt").read_text(encoding="utf-8").split("\n")
             vocabulary, merges = content, [line for line in lines if line and not line.startswith("#version")]
@@ -84,7 +84,7 @@ def load_tokenizer(path: str | Path) -> ClipTokenizer:
     except Exception as error:  # of the package tokenizers, whose own have no other base
         expected = "JSON of type BPE with vocab and merges (or vocab.json with merges.txt beside it): all 256 bytes, "
         expected += f"also with </w>, every merge, and {' and '.join(_STORED_ENDS)}"
-        found = f"no tokenizer of CLIP's kind ({why(error)})"
+        found = f"no tokenizer of CLIP's kind ({describe_error(error)})"
         remedy = "Fetch the file again, from a CLIP model; for SigLIP with the model's config.json in the folder."
         raise InputError(path, found, expected, remedy) from error
 

@@ -23,16 +23,16 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.errors import why
+from jsecon.errors import describe_error
 from jsecon.files import (
-    UNREADABLE,
-    files_beneath,
-    packed,
+    READ_ERRORS,
+    atomic_write,
+    list_files,
+    pack_tree,
     read_arrays,
-    unpacked,
+    unpack_tree,
     write_arrays,
     write_text,
-    written_whole,
 )
 
 PACKAGE = Path(jsecon.__file__).parent
@@ -49,7 +49,7 @@ class CorruptCacheError(Exception):
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
+class CachedResult:
     """The result of a stage.
 
     Attributes:
@@ -81,12 +81,12 @@ _WRITTEN = (".spz", ".glb", ".splat", ".sog", ".html")
 """endings of files that programs write beside a capture, and that are never input"""
 
 
-def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str:
-    """Hashes names, sizes and times of files, and of all files beneath folders (`files_beneath`).
+def files_digest(paths: Iterable[Path], *, exclude: Path | None = None) -> str:
+    """Hashes names, sizes and times of files, and of all files beneath folders (`list_files`).
 
     Args:
       paths: Files and folders.
-      leave_out: Output folder of the run. If it lies inside of one of the folders, it is skipped, and so is the scene
+      exclude: Output folder of the run. If it lies inside of one of the folders, it is skipped, and so is the scene
         of the same name beside it, which `jsecon fit` writes.
 
     Returns:
@@ -94,9 +94,9 @@ def files_digest(paths: Iterable[Path], *, leave_out: Path | None = None) -> str
     """
     entries = []
     for root in paths:
-        output = None if leave_out is None or leave_out.resolve() == root.resolve() else leave_out
+        output = None if exclude is None or exclude.resolve() == root.resolve() else exclude
         written = None if output is None else output.resolve().with_name(f"{output.name}.ply")
-        for path in files_beneath(root, leave_out=output) if root.is_dir() else [root]:
+        for path in list_files(root, exclude=output) if root.is_dir() else [root]:
             inside = path.relative_to(root) if path != root else Path(path.name)
             if path != root and (path.suffix.lower() in _WRITTEN or path.absolute() == written):
                 continue
@@ -157,7 +157,7 @@ def fetch(
     *,
     note: Callable[[str], None] | None = None,
     begin: Callable[[], None] | None = None,
-) -> Kept:
+) -> CachedResult:
     """Reads the result of a stage, or computes and stores it.
 
     A fresh result passes through the same packing as a stored one, so that later stages see the same arrays after a
@@ -175,7 +175,7 @@ def fetch(
     if path.exists():
         try:
             value, seconds = _read(path)
-            return Kept(value, seconds, fresh=False)
+            return CachedResult(value, seconds, fresh=False)
         except CorruptCacheError as error:
             if note is not None:
                 stage = path.stem.partition("-")[0]
@@ -189,7 +189,7 @@ def fetch(
     tree, arrays = pack(value)
     _write(path, tree, arrays, seconds)
     mapped = any(isinstance(array, np.memmap) for array in arrays.values())
-    return Kept(_read(path)[0] if mapped else unpack(tree, arrays), seconds, fresh=True)
+    return CachedResult(_read(path)[0] if mapped else unpack(tree, arrays), seconds, fresh=True)
 
 
 def save(path: Path, value: Any) -> None:
@@ -210,7 +210,7 @@ def load(path: Path) -> Any:
 
 
 def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float) -> None:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         write_arrays(temporary, arrays, {"tree": tree, "seconds": seconds})
         with open(temporary, "r+b") as file:
             os.fsync(file.fileno())  # a rename may reach the disk before the content does
@@ -218,10 +218,10 @@ def _write(path: Path, tree: Any, arrays: dict[str, np.ndarray], seconds: float)
 
 def _read(path: Path) -> tuple[Any, float]:
     try:
-        description, arrays = read_arrays(path, mapped=MAPPED)
+        description, arrays = read_arrays(path, memory_map_above=MAPPED)
         return unpack(description["tree"], arrays), float(description["seconds"])
-    except UNREADABLE as error:
-        raise CorruptCacheError(why(error)) from error
+    except READ_ERRORS as error:
+        raise CorruptCacheError(describe_error(error)) from error
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
@@ -232,7 +232,7 @@ def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
         ours = dataclasses.is_dataclass(kind) and kind.__module__.startswith("jsecon.")
         return f"{kind.__module__}:{kind.__qualname__}" if ours else None
 
-    return packed(value, "root", arrays, name_of), arrays
+    return pack_tree(value, "root", arrays, name_of), arrays
 
 
 def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
@@ -243,7 +243,7 @@ def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
       arrays: Arrays by path.
 
     Raises:
-      Exception: One of UNREADABLE, if `pack` did not write the tree.
+      Exception: One of READ_ERRORS, if `pack` did not write the tree.
     """
 
     def kind_of(name: str) -> type:
@@ -253,4 +253,4 @@ def unpack(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
             raise ValueError(f"{name} is not a record of jsecon")
         return record
 
-    return unpacked(tree, arrays, kind_of)
+    return unpack_tree(tree, arrays, kind_of)

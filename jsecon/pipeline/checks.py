@@ -18,11 +18,11 @@ from jsecon.data.video import VIDEO_FRAMES, is_video, size_of
 from jsecon.errors import InputError
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.stages import Work, require_training
+from jsecon.pipeline.stages import RunContext, require_training
 from jsecon.types import ImageFile
 
 
-def check_inputs(work: Work, running: Collection[str], results: Mapping[str, Path]) -> None:
+def check_inputs(work: RunContext, running: Collection[str], results: Mapping[str, Path]) -> None:
     """Checks the inputs of a run.
 
     Args:
@@ -70,7 +70,7 @@ def require_place(folder: Path) -> None:
         raise InputError(folder, f"{parent} cannot be written", "a folder that can be written", remedy)
 
 
-def _extent(work: Work, running: Collection[str], results: Mapping[str, Path]) -> Extent:
+def _extent(work: RunContext, running: Collection[str], results: Mapping[str, Path]) -> Extent:
     """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
     options = work.options
     size_options = {name: getattr(options, name) for name in ("downscale", "long_side", "frames")}

@@ -14,15 +14,15 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.language.regions import Embed
 from jsecon.pipeline.progress import Progress
-from jsecon.pipeline.stages import Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, Stage, StageResult, training_frames
 from jsecon.types import LanguageField, Regions
 
 
-def regions(work: Work) -> Stage:
+def regions(work: RunContext) -> Stage:
     """One embedding for each region: by the embedder, or from files."""
     options, embedder = work.options, work.networks.embedder
 
-    def embedded(results: Results, progress: Progress, record: Record) -> Outcome:
+    def embedded(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.language.regions import region_embeddings
 
         capture = results["load"]
@@ -31,9 +31,9 @@ def regions(work: Work) -> Stage:
             frames, results["masklets"], embedder.embed_regions, weighting=options.weighting, progress=progress
         )
         work.networks.close()
-        return Outcome(found)
+        return StageResult(found)
 
-    def read(results: Results, progress: Progress, record: Record) -> Outcome:
+    def read(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.data.langsplat_files import load_features
         from jsecon.language.regions import given_embeddings
 
@@ -49,11 +49,11 @@ def regions(work: Work) -> Stage:
         found = given_embeddings(labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress)
         bare = int((~found.embeddings.any(1)).sum())
         notes = (f"{len(given.embeddings)} embeddings in the files",)
-        return Outcome(found, notes=(*notes, f"{bare} regions lie on no mask with one") if bare else notes)
+        return StageResult(found, notes=(*notes, f"{bare} regions lie on no mask with one") if bare else notes)
 
     how, given, left = f"embedded by {embedder.name!r}", {"embedder": embedder.name}, {}
     if options.features is not None:
-        how, given = f"embeddings read from {options.features.name}, level {options.level}", work.given("level")
+        how, given = f"embeddings read from {options.features.name}, level {options.level}", work.key_options("level")
         left = {"embedder": f"embeddings are given ({options.features.name})"}
     return Stage(
         "regions",
@@ -61,18 +61,18 @@ def regions(work: Work) -> Stage:
         embedded if options.features is None else read,
         "language",
         after=("load", "masklets"),
-        given=work.given("weighting") | given,
+        key_options=work.key_options("weighting") | given,
         files=options.features,
-        left_out=left,
+        skipped=left,
         shared=options.features is None,
     )
 
 
-def parts(work: Work) -> Stage:
+def parts(work: RunContext) -> Stage:
     """Small parts of the scene, each with the embeddings of all masks of single frames that hold it."""
     options, embedder = work.options, work.networks.embedder
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.association.consensus import pieces_on_masks
         from jsecon.association.views import SceneViews
         from jsecon.language.regions import scene_parts
@@ -85,7 +85,7 @@ def parts(work: Work) -> Stage:
         piece, cast = pieces_on_masks(frames, views, seed=options.seed, progress=progress)
         rows = np.concatenate([embed(t, masks(t)) for t in range(len(train))])
         work.networks.close()
-        return Outcome(scene_parts(piece, cast, rows))
+        return StageResult(scene_parts(piece, cast, rows))
 
     return Stage(
         "parts",
@@ -93,12 +93,12 @@ def parts(work: Work) -> Stage:
         compute,
         "association",
         after=("load", "gaussians", "masklets"),
-        given=work.given("seed", "level", "granularity", "centre") | {"embedder": embedder.name},
+        key_options=work.key_options("seed", "level", "granularity", "centre") | {"embedder": embedder.name},
         files=options.features,
     )
 
 
-def _masks_of(work: Work, results: Results) -> tuple[Callable[[int], np.ndarray], Embed]:
+def _masks_of(work: RunContext, results: Results) -> tuple[Callable[[int], np.ndarray], Embed]:
     """masks (M, H, W) bool of the t-th training frame, and what embeds them: those of --features, else the proposals,
     else the masklets that were given."""
     options, capture = work.options, results["load"]
@@ -115,16 +115,16 @@ def _masks_of(work: Work, results: Results) -> tuple[Callable[[int], np.ndarray]
     if options.masks is not None:
         labels = results["masklets"]
         return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
-    from jsecon.pipeline.masklet_stages import proposals_of
+    from jsecon.pipeline.masklet_stages import frame_proposals
 
-    return proposals_of(work, capture, results["gaussians"])[0], by_model
+    return frame_proposals(work, capture, results["gaussians"])[0], by_model
 
 
-def codes(work: Work) -> Stage:
+def codes(work: RunContext) -> Stage:
     """(codes (R, d), coder): the regions' embeddings, compressed only where they don't fit as they are."""
     options = work.options
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.language.autoencoder import Autoencoder
         from jsecon.language.codes import region_codes
 
@@ -133,25 +133,25 @@ def codes(work: Work) -> Stage:
         )
         trained, why = isinstance(coder, Autoencoder), why.partition(": ")[2] or why
         notes = (f"autoencoder: {why}",) if trained else ()
-        return Outcome((table, coder), {} if trained else {"autoencoder": why}, notes)
+        return StageResult((table, coder), {} if trained else {"autoencoder": why}, notes)
 
     auto = options.latent == "auto"
     how = "as few numbers per region as keep them apart" if auto else f"at most {options.latent} numbers per region"
-    return Stage("codes", how, compute, "language", after=("regions",), given=work.given("latent", "seed"))
+    return Stage("codes", how, compute, "language", after=("regions",), key_options=work.key_options("latent", "seed"))
 
 
-def votes(work: Work) -> Stage:
+def votes(work: RunContext) -> Stage:
     """The weight that each region casts on each Gaussian over the training frames, with each frame's total. Where
     memory has no room for that (`memory_budget`) it is cast in blocks, to the same up to float32's rounding."""
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.language.blocks import region_votes_in_blocks
         from jsecon.language.votes import bytes_of_votes, region_votes
         from jsecon.process import memory_budget
 
         capture, scene, labels = results["load"], results["gaussians"], results["masklets"]
         cameras = capture.cameras[training_frames(capture)]
-        count, how, notes = int(labels.max()) + 1, work.given("top", "centre"), ()
+        count, how, notes = int(labels.max()) + 1, work.key_options("top", "centre"), ()
         needed, room = bytes_of_votes(scene.count, len(labels), count), memory_budget()
         if needed > room and jax.process_count() == 1:  # several processes cast them together, each its own views
             shutil.rmtree(record.folder, ignore_errors=True)  # what a stopped run left
@@ -163,7 +163,7 @@ def votes(work: Work) -> Stage:
             cast = region_votes(scene, cameras, labels, count, by_view=True, progress=progress, **how)
         unseen = int((np.asarray(cast.views) == 0).sum())
         left = {"unseen Gaussians": f"{unseen} of {scene.count} that no frame sees get no code"} if unseen else {}
-        return Outcome(cast, left, notes)
+        return StageResult(cast, left, notes)
 
     return Stage(
         "votes",
@@ -171,26 +171,26 @@ def votes(work: Work) -> Stage:
         compute,
         "language",
         after=("load", "gaussians", "masklets"),
-        given=work.given("top", "centre"),
+        key_options=work.key_options("top", "centre"),
         shared=True,
     )
 
 
-def distil(work: Work) -> Stage:
+def distil(work: RunContext) -> Stage:
     """codes (N, d) of the Gaussians, from their votes."""
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.language.distill import distill_votes
 
         table, cast = results["codes"][0], results["votes"]
         if isinstance(cast.regions, np.memmap):
             from jsecon.language.blocks import codes_in_blocks
 
-            return Outcome(codes_in_blocks(cast, table, record.folder / "codes.npy", work.options.reduce))
-        return Outcome(distill_votes(cast, table, reduce=work.options.reduce))
+            return StageResult(codes_in_blocks(cast, table, record.folder / "codes.npy", work.options.reduce))
+        return StageResult(distill_votes(cast, table, reduce=work.options.reduce))
 
     how = f"a Gaussian's code is its votes' {work.options.reduce}"
-    return Stage("distil", how, compute, "language", after=("votes", "codes"), given=work.given("reduce"))
+    return Stage("distil", how, compute, "language", after=("votes", "codes"), key_options=work.key_options("reduce"))
 
 
 def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jsecon.errors import InputError
 from jsecon.pipeline.progress import Progress
-from jsecon.pipeline.stages import Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.pipeline.stages import Checkpoint, Results, RunContext, Stage, StageResult, training_frames
 from jsecon.types import Capture, Gaussians
 from jsecon.vision.protocols import Segmenter
 
@@ -19,16 +19,16 @@ GRAIN = 0.02
 """least distance between them, as a share of the median depth: nearer ones show a sensor's noise, not the surface"""
 
 
-def masklets(work: Work) -> Stage:
+def masklets(work: RunContext) -> Stage:
     """labels (T, H, W) int16 of the training frames, -1 = none: of mask files, or found in the frames."""
     return _found(work) if work.options.masks is None else _read(work)
 
 
-def _read(work: Work) -> Stage:
+def _read(work: RunContext) -> Stage:
     options, folder = work.options, work.options.masks
     assert folder is not None
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.data.mask_files import load_labels
 
         capture = results["load"]
@@ -36,28 +36,28 @@ def _read(work: Work) -> Stage:
         how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
         found = load_labels(folder, names, size, **how, progress=progress)
         _require_regions(found.labels, str(folder))
-        return Outcome(found.labels, notes=(f"{len(found.ids)} regions in the masks", *found.notes))
+        return StageResult(found.labels, notes=(f"{len(found.ids)} regions in the masks", *found.notes))
 
-    how, given, why = f"read from {folder.name}", work.given("level"), f"masks are given ({folder.name})"
+    how, given, why = f"read from {folder.name}", work.key_options("level"), f"masks are given ({folder.name})"
     left = {"segmenter": why, "association": why}
-    return Stage("masklets", how, compute, "data", after=("load",), given=given, files=folder, left_out=left)
+    return Stage("masklets", how, compute, "data", after=("load",), key_options=given, files=folder, skipped=left)
 
 
-def _found(work: Work) -> Stage:
+def _found(work: RunContext) -> Stage:
     """The proposals of each frame, brought together over the frames by what the scene's own Gaussians say, by consensus
     or by tracking, or by a tracker of its own."""
     options, segmenter, tracker = work.options, work.networks.segmenter, work.networks.tracker
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         capture, scene = results["load"], results["gaussians"]
-        proposals, notes = proposals_of(work, capture, scene)
-        labels = associated(work, capture, scene, proposals, progress, record)
+        proposals, notes = frame_proposals(work, capture, scene)
+        labels = associate_masks(work, capture, scene, proposals, progress, record)
         work.networks.close()
         _require_regions(labels, str(options.capture))
-        return Outcome(labels, notes=notes)
+        return StageResult(labels, notes=notes)
 
     if options.proposals is not None:
-        how, given = f"proposals read from {options.proposals.name}", work.given("level")
+        how, given = f"proposals read from {options.proposals.name}", work.key_options("level")
     elif segmenter is not None:
         assert options.segmenter is not None
         crops = f" and {options.crop_layers} layers of crops" if options.crop_layers else ""
@@ -65,26 +65,27 @@ def _found(work: Work) -> Stage:
         how = f"proposals of level {options.level} by {options.segmenter.name}, asked at {grid} points{crops}"
         given = {"model": segmenter.name}
     else:
-        how, given = f"{options.granularity} proposals by colour and texture", work.given("granularity")
+        how, given = f"{options.granularity} proposals by colour and texture", work.key_options("granularity")
     if options.associated_by == "consensus":
-        how, given = f"{how}, what the views agree on", given | work.given("agreement", "seed", "centre")
+        how, given = f"{how}, what the views agree on", given | work.key_options("agreement", "seed", "centre")
     else:
         by = "through the Gaussians" if options.tracker is None else f"by the SAM 2 of {options.tracker.name}"
-        how, given = f"{how}, followed {by}", given | work.given("iou_threshold")
+        how, given = f"{how}, followed {by}", given | work.key_options("iou_threshold")
     return Stage(
         "masklets",
         how,
         compute,
         "association",
         after=("load", "gaussians"),
-        given=given | {"association": options.associated_by, "tracker": None if tracker is None else tracker.name},
+        key_options=given
+        | {"association": options.associated_by, "tracker": None if tracker is None else tracker.name},
         files=options.proposals,
         shared=options.associated_by == "consensus",
     )
 
 
-def proposals_of(
-    work: Work, capture: Capture, gaussians: Gaussians
+def frame_proposals(
+    work: RunContext, capture: Capture, gaussians: Gaussians
 ) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
     """masks (M, H, W) bool of the t-th training frame, as a function of t: from disk where they are given, else by a
     segmenter, else by colour and texture at the granularity asked for; and notes."""
@@ -143,13 +144,13 @@ def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussian
     return ClassicalSegmenter(**setting)
 
 
-def associated(
-    work: Work,
+def associate_masks(
+    work: RunContext,
     capture: Capture,
     gaussians: Gaussians,
     proposals: Callable[[int], np.ndarray],
     progress: Progress,
-    record: Record | None = None,
+    record: Checkpoint | None = None,
 ) -> np.ndarray:
     """labels (T, H, W) int16 of the training frames: their proposals brought together as the options say. A tracker
     that was stopped goes on behind the last frame of `record`."""

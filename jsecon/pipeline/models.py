@@ -27,7 +27,7 @@ class Use:
 
 
 @dataclasses.dataclass(frozen=True)
-class Findings:
+class ModelReport:
     """What lies in a folder."""
 
     folder: Path
@@ -36,7 +36,7 @@ class Findings:
     uses: tuple[Use, ...]
 
 
-def examine(folder: str | Path) -> Findings:
+def inspect_models(folder: str | Path) -> ModelReport:
     """Opens every graph of a folder, and puts each kind of model in it to the test.
 
     Raises InputError where there is no such folder.
@@ -45,10 +45,10 @@ def examine(folder: str | Path) -> Findings:
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "a folder of models", "Check the path.")
     graphs = {path.relative_to(folder).as_posix(): _signature(path) for path in sorted(folder.rglob("*.onnx"))}
-    return Findings(folder, graphs, tuple(_tried(model, use, folder) for model, use in _KINDS.items()))
+    return ModelReport(folder, graphs, tuple(_tried(model, use, folder) for model, use in _KINDS.items()))
 
 
-def report_lines(findings: Findings) -> Iterable[str]:
+def report_lines(findings: ModelReport) -> Iterable[str]:
     """The findings as lines of text."""
     yield f"{findings.folder}: {len(findings.graphs)} graphs"
     for path, signature in findings.graphs.items():
@@ -59,7 +59,7 @@ def report_lines(findings: Findings) -> Iterable[str]:
         yield f"  {use.told}"
 
 
-def unusable(findings: Findings) -> list[InputError]:
+def unusable(findings: ModelReport) -> list[InputError]:
     """That the folder can be used for nothing, where that is so."""
     if any(use.usable for use in findings.uses):
         return []
@@ -72,7 +72,7 @@ def _signature(path: Path) -> str:
     try:
         graph = Graph(path, threads=1, optimise=False)
     except InputError as error:
-        return f"cannot be opened: {error.problem}"
+        return f"cannot be opened: {error.sentence}"
     return f"in   {describe(graph.inputs.values())}\nout  {describe(graph.outputs.values())}"
 
 
@@ -116,7 +116,7 @@ def _sam2(folder: Path) -> str:
         graphs = open_sam2(folder)
     except InputError as error:
         remedy = f"{error.remedy} {SAM2_PUBLISHED}"
-        raise InputError(error.where, error.found, error.expected, remedy) from error
+        raise InputError(error.where, error.sentence, error.expected, remedy) from error
     return f"SAM {graphs.version}: objects followed through the frames: jsecon run --tracker {folder}"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import sources_of
+from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Networks
 from jsecon.vision.stores import StoredSegmenter
@@ -19,7 +19,7 @@ from jsecon.vision.stores import StoredSegmenter
 _NAME = "given-"
 
 
-class GivenSpace:
+class ExternalSpace:
     """Embedder (jsecon.vision.protocols) of a space of `dim` numbers that no model here knows: it has no texts and no
     canonical phrases, and embeds nothing. Its regions can be asked for by a pixel."""
 
@@ -36,7 +36,7 @@ class GivenSpace:
         raise missing_model(self.dim)
 
 
-def given_dim(name: str | None) -> int | None:
+def external_dim(name: str | None) -> int | None:
     """How many numbers an embedding has in the given space of this name; None for every other space."""
     return int(name.removeprefix(_NAME)) if name is not None and name.startswith(_NAME) else None
 
@@ -48,7 +48,7 @@ def missing_model(dim: int) -> InputError:
     return InputError("field", found, "the CLIP model that made them", remedy)
 
 
-def networks_of(options: Options, store: Path) -> Networks:
+def open_networks(options: Options, store: Path) -> Networks:
     """SAM, SAM 2 and CLIP where the options name their folders; what they find is kept under `store`.
 
     Raises InputError where a folder holds no such model.
@@ -68,14 +68,14 @@ def networks_of(options: Options, store: Path) -> Networks:
     if options.features is not None:
         from jsecon.data.langsplat_files import feature_size
 
-        given = GivenSpace(feature_size(options.features))
+        given = ExternalSpace(feature_size(options.features))
         if options.embedder is None:
             return Networks(given, segmenter, tracker)
     name = None if given is None else given.name
-    return Networks(embedder_named(name, folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
+    return Networks(open_embedder(name, folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
 
 
-def embedder_named(
+def open_embedder(
     name: str | None = None,
     *,
     folder: Path | None = None,
@@ -83,12 +83,12 @@ def embedder_named(
     store: Path | None = None,
 ) -> Embedder:
     """The embedder whose space is called `name` (None: any): CLIP where its folder is given, else colours. In a given
-    space (`GivenSpace`) only CLIP knows texts, and any will do whose embeddings have as many numbers.
+    space (`ExternalSpace`) only CLIP knows texts, and any will do whose embeddings have as many numbers.
 
     `templates` are phrases for CLIP to put texts into. Raises InputError where the folder holds no CLIP model, or the
     embedder found is of another space.
     """
-    dim = given_dim(name)
+    dim = external_dim(name)
     if dim is not None and folder is None:
         raise missing_model(dim)
     if folder is not None:
@@ -115,15 +115,13 @@ def embedder_named(
     return found
 
 
-def embedder_of_field(
-    field: LanguageField, folder: Path | None = None, *, templates: Sequence[str] = ("{}",)
-) -> Embedder:
+def field_embedder(field: LanguageField, folder: Path | None = None, *, templates: Sequence[str] = ("{}",)) -> Embedder:
     """The embedder that a field's regions live with: from `folder`, else from where the run had it, if the same model
-    is still there (`sources_of`). Raises InputError where it cannot be had."""
+    is still there (`locate_sources`). Raises InputError where it cannot be had."""
     if folder is None:
-        sources = sources_of(field)
+        sources = locate_sources(field)
         folder = sources.model if sources.model is not None and _holds(sources.model, sources.embedder) else None
-    return embedder_named(field.embedder, folder=folder, templates=templates)
+    return open_embedder(field.embedder, folder=folder, templates=templates)
 
 
 def _holds(folder: Path, name: str | None) -> bool:

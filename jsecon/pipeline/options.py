@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeAlias, TypeVar
 
 import tyro
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 
 T = TypeVar("T")
 
@@ -253,4 +253,4 @@ def require_writable(folder: Path) -> None:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         remedy = "Choose another output folder, or mend its permissions."
-        raise InputError(folder, why(error), "a folder that can be written", remedy) from error
+        raise InputError(folder, describe_error(error), "a folder that can be written", remedy) from error

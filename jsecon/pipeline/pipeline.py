@@ -35,17 +35,17 @@ import numpy as np
 
 import jsecon
 from jsecon.errors import InputError
-from jsecon.files import alone
+from jsecon.files import exclusive_lock
 from jsecon.pipeline import cache, networks, processes
 from jsecon.pipeline.language_stages import codes, distil, field_of, parts, regions, votes
 from jsecon.pipeline.masklet_stages import masklets
 from jsecon.pipeline.options import Options, require_inputs, require_own_folder, require_writable
-from jsecon.pipeline.processes import First
+from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
-from jsecon.pipeline.scene_stages import gaussians, held_out, loaded
-from jsecon.pipeline.sources import folders_told
-from jsecon.pipeline.stages import KEY_FILE, Outcome, Record, Stage, Work
-from jsecon.process import programs_built
+from jsecon.pipeline.scene_stages import capture_stages, gaussians, held_out
+from jsecon.pipeline.sources import relative_folders
+from jsecon.pipeline.stages import KEY_FILE, Checkpoint, RunContext, Stage, StageResult
+from jsecon.process import compilation_counts
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
 
@@ -81,16 +81,16 @@ class Run:
         return np.asarray(self.held_out.psnr)
 
     @property
-    def left_out(self) -> dict[str, str]:
+    def skipped(self) -> dict[str, str]:
         """part -> why it was not needed."""
-        return {step.name: step.why for step in self.steps if step.status == "left out"}
+        return {step.name: step.why for step in self.steps if step.status == "skipped"}
 
 
-def stages_of(work: Work) -> list[Stage]:
+def stages_of(work: RunContext) -> list[Stage]:
     """The stages of a run in order. Mask files come before the long fit: what is wrong with them is said at once."""
     first = (masklets, gaussians) if work.options.masks is not None else (gaussians, masklets)
     then = (regions, *((parts,) if work.options.parts else ()), codes, votes, distil, held_out)
-    return [*loaded(work), *(stage(work) for stage in (*first, *then))]
+    return [*capture_stages(work), *(stage(work) for stage in (*first, *then))]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Plan:
     steps: list[Step]
 
 
-def _planned(work: Work, stages: list[Stage], folder: Path) -> _Plan:
+def _planned(work: RunContext, stages: list[Stage], folder: Path) -> _Plan:
     """The stages, and which of them `folder` holds already; writes nothing. Raises InputError for bad options."""
     options, keys, files = work.options, {}, {}
     require_inputs(options)
@@ -117,10 +117,10 @@ def _planned(work: Work, stages: list[Stage], folder: Path) -> _Plan:
         files[stage.name] = stage.files_digest(work)
         keys[stage.name] = stage.key(work, keys, files[stage.name])
     place = {name: cache.path_of(folder, name, key) for name, key in keys.items()}
-    stale = [stage.name for stage in stages if stage.leaves is not None and not _left(stage, stages, place)]
+    stale = [stage.name for stage in stages if stage.output_dir is not None and not _left(stage, stages, place)]
     held = {name for name, path in place.items() if path.exists() and name not in stale}
     steps = [Step(stage.name, "cached" if stage.name in held else "run", stage.how) for stage in stages]
-    steps += [Step(part, "left out", why) for stage in stages for part, why in stage.left_out.items()]
+    steps += [Step(part, "skipped", why) for stage in stages for part, why in stage.skipped.items()]
     return _Plan(keys, files, place, stale, steps)
 
 
@@ -136,16 +136,18 @@ class _Done:
     built: dict[str, dict[str, int]]
 
 
-def _computed(work: Work, stages: list[Stage], folder: Path, listener: Listener, first: First) -> _Done:
+def _computed(work: RunContext, stages: list[Stage], folder: Path, listener: Listener, first: Coordinator) -> _Done:
     """The stages, told first, then each computed or read from `folder`."""
     with listener.progress("plan"):
         plan = _planned(work, stages, folder)
         require_writable(work.out)
-    with alone(work.out):
+    with exclusive_lock(work.out):
         return _in_turn(work, stages, plan, folder, listener, first)
 
 
-def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listener: Listener, first: First) -> _Done:
+def _in_turn(
+    work: RunContext, stages: list[Stage], plan: _Plan, folder: Path, listener: Listener, first: Coordinator
+) -> _Done:
     place, steps = plan.place, plan.steps
     cache.prepare(folder)
     for name in plan.stale:
@@ -154,11 +156,11 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
     work.networks.require_ready([step.name for step in steps if step.status == "run"])
     done = _Done({}, plan.keys, {}, steps, [], {})
     for stage in stages:
-        record, before = Record(cache.record_path_of(place[stage.name])), programs_built()
+        record, before = Checkpoint(cache.record_path_of(place[stage.name])), compilation_counts()
         with listener.progress(stage.name) as progress:
             given = (work, plan.files[stage.name], done.results, progress, record)
             compute = functools.partial(stage.computed, *given)
-            begin = functools.partial(first.call, stage, done.results)
+            begin = functools.partial(first.broadcast, stage, done.results)
             try:
                 kept = cache.fetch(place[stage.name], compute, note=listener.note, begin=begin)
             except (MemoryError, jax.errors.JaxRuntimeError) as error:
@@ -166,13 +168,13 @@ def _in_turn(work: Work, stages: list[Stage], plan: _Plan, folder: Path, listene
                     found, remedy = f"no memory left ({str(error)[:200]})", f"{SMALLER} What is done is kept."
                     raise InputError(f"stage {stage.name}", found, "more memory", remedy) from error
                 raise
-        outcome: Outcome = kept.value
+        outcome: StageResult = kept.value
         done.results[stage.name], done.seconds[stage.name] = outcome.value, kept.seconds
         done.built[stage.name] = _since(before)
         record.remove()
         listener.done(stage.name, kept.seconds, kept.fresh)
-        for part, why in outcome.left_out.items():
-            steps.append(Step(part, "left out", why))
+        for part, why in outcome.skipped.items():
+            steps.append(Step(part, "skipped", why))
             listener.step(steps[-1])
         for note in outcome.notes:
             done.notes.append(note)
@@ -187,7 +189,7 @@ def run(
     listener: Listener | None = None,
     load: Callable[[], Capture] | None = None,
     cache_folder: Path | None = None,
-    first: First | None = None,
+    first: Coordinator | None = None,
 ) -> Run:
     """Builds the field of a capture, keeps each stage under `cache_folder` (default OUT/cache), writes FIELD_FILE.
     `first` calls the other processes of the run (`assist`), where there are any.
@@ -196,10 +198,10 @@ def run(
     layout is one of a kind (the files beneath `options.capture` must still be all that it reads). Raises InputError for
     bad input; what was computed before stays.
     """
-    listener, before = listener or Listener(), programs_built()
+    listener, before = listener or Listener(), compilation_counts()
     folder = cache_folder or out / "cache"
-    work = Work(options, networks.networks_of(options, folder), out, load)
-    done = _computed(work, stages_of(work), folder, listener, first or First(several=False))
+    work = RunContext(options, networks.open_networks(options, folder), out, load)
+    done = _computed(work, stages_of(work), folder, listener, first or Coordinator(several=False))
     started = time.monotonic()
     with listener.progress("field"):
         from jsecon.language.field import save_field
@@ -215,13 +217,13 @@ def run(
     return Run(field, capture, labels, quality, done.seconds, steps, notes, options, _since(before), done.built)
 
 
-def assist(options: Options, out: Path) -> None:
+def run_worker(options: Options, out: Path) -> None:
     """What every process of a run but the first does, see `processes`."""
-    processes.assist(stages_of(Work(options, networks.networks_of(options, out / "cache"), out)), out)
+    processes.run_worker(stages_of(RunContext(options, networks.open_networks(options, out / "cache"), out)), out)
 
 
 def _since(before: dict[str, int]) -> dict[str, int]:
-    return {name: count - before[name] for name, count in programs_built().items()}
+    return {name: count - before[name] for name, count in compilation_counts().items()}
 
 
 def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: Listener) -> dict[str, Any]:
@@ -242,8 +244,8 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
     from jsecon.pipeline.checks import check_inputs
 
     with listener.progress("plan"):
-        work = Work(options, networks.networks_of(options, out / "cache"), out)
-        stages = [*loaded(work), gaussians(work), held_out(work)] if scene_only else stages_of(work)
+        work = RunContext(options, networks.open_networks(options, out / "cache"), out)
+        stages = [*capture_stages(work), gaussians(work), held_out(work)] if scene_only else stages_of(work)
         plan = _planned(work, stages, out / "cache")
         running = [step.name for step in plan.steps if step.status == "run"]
         work.networks.require_ready(running)
@@ -256,15 +258,15 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, listener: 
 def fit(options: Options, out: Path, *, listener: Listener | None = None) -> tuple[Gaussians, Capture, Quality]:
     """The stages of `run` that make and measure the scene; OUT/cache is theirs too, so a `run` into OUT goes on from
     it. Returns the Gaussians, their capture, and the quality of the frames held out."""
-    work = Work(options, networks.networks_of(options, out / "cache"), out)
-    stages = [*loaded(work), gaussians(work), held_out(work)]
-    results = _computed(work, stages, out / "cache", listener or Listener(), First(several=False)).results
+    work = RunContext(options, networks.open_networks(options, out / "cache"), out)
+    stages = [*capture_stages(work), gaussians(work), held_out(work)]
+    results = _computed(work, stages, out / "cache", listener or Listener(), Coordinator(several=False)).results
     return results["gaussians"], results["load"], results["held_out"]
 
 
 def _left(stage: Stage, stages: list[Stage], place: dict[str, Path]) -> bool:
     """Whether the folder that the stage left is still its own, or nobody will look for it."""
-    key = stage.leaves / KEY_FILE if stage.leaves is not None else None
+    key = stage.output_dir / KEY_FILE if stage.output_dir is not None else None
     if key is not None and key.is_file() and key.read_text() == cache.record_path_of(place[stage.name]).stem:
         return True
     return all(place[other.name].exists() for other in stages if stage.name in other.after)
@@ -275,4 +277,4 @@ def _provenance(options: Options, keys: dict[str, str], embedder: str, out: Path
     chosen = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     chosen = {name: str(value) if isinstance(value, Path) else value for name, value in chosen.items()}
     told = {"jsecon": jsecon.__version__, "options": chosen, "keys": keys, "embedder": embedder}
-    return json.dumps(told | {"folders": folders_told(options, out)}, sort_keys=True)
+    return json.dumps(told | {"folders": relative_folders(options, out)}, sort_keys=True)

@@ -2,8 +2,8 @@
 
 The first process runs the stages as always: it alone reads and writes the cache, holds the output folder's lock and
 tells the user. When it comes to a stage that is `shared`, it sends the others what the stage reads, all compute it
-together (`parallel.dealt_out`, `parallel.spread_over_devices`), and the others wait for the next one. So nothing but
-the inputs and the models needs to lie on every machine.
+together (`parallel.map_over_processes`, `parallel.accumulate_over_views`), and the others wait for the next one. So
+nothing but the inputs and the models needs to lie on every machine.
 
 Every command starts its processes as children and watches them: one that dies ends the others, with one message.
 """
@@ -23,11 +23,11 @@ from pathlib import Path
 
 import jsecon
 from jsecon.errors import InputError
-from jsecon.parallel import exchanged, keep_own_programs, parcel, parcel_read
+from jsecon.parallel import allgather_bytes, cache_worker_programs, deserialize_tree, serialize_tree
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.stages import Record, Results, Stage
-from jsecon.process import MEMBER, cores
+from jsecon.pipeline.stages import Checkpoint, Results, Stage
+from jsecon.process import WORKER, cores
 
 MEET_SECONDS = 300
 """that processes wait for each other at the start"""
@@ -42,7 +42,7 @@ _TOLD = (1, 2, 130)
 AGAIN = "What is done is kept: give the same command again and it goes on."
 
 
-def launched(argv: Sequence[str], count: int, coordinator: str | None, index: int | None) -> int:
+def launch(argv: Sequence[str], count: int, coordinator: str | None, index: int | None) -> int:
     """Starts `jsecon` with `argv` as all of `count` processes of this machine, each with its part of the cores, or as
     the one of `index`; returns the exit code when all have ended.
 
@@ -63,7 +63,7 @@ def launched(argv: Sequence[str], count: int, coordinator: str | None, index: in
         for place, i in enumerate(own):
             share = usable[i::count] if index is None and usable[i::count] else usable
             given = {
-                "env": {**environ, MEMBER: f"{i} {count} {host}:{port} {','.join(map(str, share))}"},
+                "env": {**environ, WORKER: f"{i} {count} {host}:{port} {','.join(map(str, share))}"},
                 "stdout": subprocess.DEVNULL if place else None,
                 "stderr": said[place],
             }
@@ -127,7 +127,7 @@ def _free_port() -> int:
 
 
 def join(options: Options, index: int, count: int, address: str) -> None:
-    """Joins the processes of the run, in a child of `launched`; before jax makes an array.
+    """Joins the processes of the run, in a child of `launch`; before jax makes an array.
 
     The coordinator listens at its own address alone, loopback where no other was given. Raises InputError where the
     processes don't meet, or were not started for the same run.
@@ -149,9 +149,9 @@ def join(options: Options, index: int, count: int, address: str) -> None:
         remedy = "Start all of them, and see that the address is process 0's own and can be reached."
         raise InputError(f"--coordinator {address}", found, "all of them at that address", remedy) from error
     atexit.unregister(jax.distributed.shutdown)  # it waits for the others, also where this one ends in an error
-    keep_own_programs()
+    cache_worker_programs()
     mine = f"jsecon {jsecon.__version__}, {options}"
-    first = exchanged(mine.encode())[0].decode()
+    first = allgather_bytes(mine.encode())[0].decode()
     if first != mine:
         raise InputError(f"process {index}", mine, first, "Give all processes the same options and version.")
 
@@ -175,33 +175,33 @@ def lost_touch() -> Iterator[None]:
         os._exit(LOST)  # gloo's threads wait for the others
 
 
-class First:
+class Coordinator:
     """What the first process tells the others; alone, nothing."""
 
     def __init__(self, several: bool):
         self.several = several
         self._sent: set[str] = set()
 
-    def call(self, stage: Stage, results: Results) -> None:
+    def broadcast(self, stage: Stage, results: Results) -> None:
         """All compute this stage, now."""
         if self.several and stage.shared:
             news = {name: results[name] for name in stage.after if name not in self._sent}
             self._sent |= set(news)
             tree, arrays = cache.pack(news)
-            exchanged(parcel({"stage": stage.name, "tree": json.dumps(tree), "arrays": arrays}))
+            allgather_bytes(serialize_tree({"stage": stage.name, "tree": json.dumps(tree), "arrays": arrays}))
 
-    def dismiss(self) -> None:
+    def shutdown(self) -> None:
         """No more stages: all leave."""
         if self.several:
-            exchanged(parcel({"stage": ""}))
+            allgather_bytes(serialize_tree({"stage": ""}))
             leave()
 
 
-def assist(stages: Sequence[Stage], out: Path) -> None:
+def run_worker(stages: Sequence[Stage], out: Path) -> None:
     """What every process but the first does: computes each stage that it is called for, until it is dismissed. `out`:
     the run's folder, where it leaves nothing of its own."""
     by_name, results = {stage.name: stage for stage in stages}, {}
-    while (called := parcel_read(exchanged(b"")[0]))["stage"]:
+    while (called := deserialize_tree(allgather_bytes(b"")[0]))["stage"]:
         results |= cache.unpack(json.loads(called["tree"]), called["arrays"])
-        by_name[called["stage"]].compute(results, lambda done, total: None, Record(out / "assist"))
+        by_name[called["stage"]].compute(results, lambda done, total: None, Checkpoint(out / "assist"))
     leave()

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 Progress: TypeAlias = Callable[[int, int], None]
 """callback with the progress of a step: (done, total)"""
-Status: TypeAlias = Literal["run", "cached", "left out"]
+Status: TypeAlias = Literal["run", "cached", "skipped"]
 
 QUIET_SECONDS = 2.0
 """s; shorter steps show no progress"""

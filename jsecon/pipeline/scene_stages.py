@@ -15,16 +15,25 @@ from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.pipeline.options import SceneOptions
 from jsecon.pipeline.progress import Progress
-from jsecon.pipeline.stages import KEY_FILE, WARNING, Outcome, Record, Results, Stage, Work, training_frames
+from jsecon.pipeline.stages import (
+    KEY_FILE,
+    WARNING,
+    Checkpoint,
+    Results,
+    RunContext,
+    Stage,
+    StageResult,
+    training_frames,
+)
 from jsecon.types import Camera, Capture, Gaussians
 
 
-def loaded(work: Work) -> list[Stage]:
+def capture_stages(work: RunContext) -> list[Stage]:
     """The capture; before it, where there are photographs or a video without poses, the poses."""
     if work.load is not None or not _bare(work.options.capture):
         return [load(work)]
     found = poses(work)
-    posed = dataclasses.replace(work, options=dataclasses.replace(work.options, capture=found.leaves))
+    posed = dataclasses.replace(work, options=dataclasses.replace(work.options, capture=found.output_dir))
     return [found, dataclasses.replace(load(posed), after=("poses",), files=None)]
 
 
@@ -39,14 +48,14 @@ def _bare(capture: Path) -> bool:
     return is_video(capture)
 
 
-def poses(work: Work) -> Stage:
+def poses(work: RunContext) -> Stage:
     """The poses of bare photographs or of a video's frames, as a COLMAP capture in OUT/poses."""
     from jsecon.data.motion import find_poses, photographs
     from jsecon.data.video import VIDEO_FRAMES, is_video, write_frames
 
     capture, out, video = work.options.capture, work.out / "poses", is_video(work.options.capture)
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         folder = record.folder
         if video:
             photos = write_frames(capture, folder / "frames", frames=work.options.frames, progress=progress)
@@ -59,7 +68,7 @@ def poses(work: Work) -> Stage:
         shutil.rmtree(out, ignore_errors=True)
         shutil.move(posed, out)
         write_text(out / KEY_FILE, folder.name)
-        return Outcome(found, notes=(*found.notes(), f"The poses are in {out}: COLMAP opens them."))
+        return StageResult(found, notes=(*found.notes(), f"The poses are in {out}: COLMAP opens them."))
 
     if video:
         what = f"the {work.options.frames or VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
@@ -67,9 +76,11 @@ def poses(work: Work) -> Stage:
         what = f"{len(photographs(capture))} photographs, which have none"
     how = f"found by structure from motion (pycolmap) for {what}"
     if video:
-        return Stage("poses", how, compute, "data", given=work.given("frames"), files=capture, leaves=out)
+        return Stage(
+            "poses", how, compute, "data", key_options=work.key_options("frames"), files=capture, output_dir=out
+        )
     given = {"names": [photo.relative_to(capture).as_posix() for photo in photographs(capture)]}
-    return Stage("poses", how, compute, "data", given=given, files=lambda: photographs(capture), leaves=out)
+    return Stage("poses", how, compute, "data", key_options=given, files=lambda: photographs(capture), output_dir=out)
 
 
 STEP_SECONDS = 0.024, 0.2
@@ -77,13 +88,13 @@ STEP_SECONDS = 0.024, 0.2
 estimates how many steps --minutes allows"""
 
 
-def load(work: Work) -> Stage:
+def load(work: RunContext) -> Stage:
     """Loads the capture at the size that the options ask for, and corrects it where they ask for that."""
     as_it_is = refinement(work) == "none" and work.options.drop_frames == "none"
     return _as_it_is(work) if as_it_is else _put_right(work)
 
 
-def refinement(work: Work) -> Literal["none", "poses", "exposure", "both", "auto"]:
+def refinement(work: RunContext) -> Literal["none", "poses", "exposure", "both", "auto"]:
     """What a run corrects of poses and exposures; "auto" only where depth and the data can still decide it."""
     options = work.options
     if options.refine != "auto":
@@ -95,11 +106,11 @@ def refinement(work: Work) -> Literal["none", "poses", "exposure", "both", "auto
     return "auto" if work.load is not None or may_have_depth(options.capture) else "none"
 
 
-def _put_right(work: Work) -> Stage:
+def _put_right(work: RunContext) -> Stage:
     """Corrects poses and exposures by probe fits, and leaves out the frames that these do not explain."""
     options, plain, asked = work.options, _as_it_is(work), refinement(work)
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.fit.corrections import Refine
         from jsecon.fit.settle import settled
 
@@ -119,17 +130,17 @@ def _put_right(work: Work) -> Stage:
             progress=progress,
         )
         training_frames(better)
-        return Outcome(better, notes=(*loaded.notes, *better.notes[len(capture.notes) :]))
+        return StageResult(better, notes=(*loaded.notes, *better.notes[len(capture.notes) :]))
 
-    given = work.given("drop_frames", "seed") | {"refine": asked}
+    given = work.key_options("drop_frames", "seed") | {"refine": asked}
     if asked == "auto":
-        given |= work.given("steps", "minutes")
+        given |= work.key_options("steps", "minutes")
         how = "poses and exposures corrected where that helps, in about half of the fit's time at most (--refine auto)"
     else:
         how = f"corrected by short fits (--refine {asked})" if asked != "none" else ""
     left = "frames that a short fit does not explain left out" if options.drop_frames == "auto" else ""
     how = ", ".join(part for part in (plain.how, how, left) if part)
-    return Stage("load", how, compute, "fit", given={**plain.given, **given}, files=plain.files)
+    return Stage("load", how, compute, "fit", key_options={**plain.key_options, **given}, files=plain.files)
 
 
 def _fit_steps(options: SceneOptions, capture: Capture) -> float:
@@ -141,11 +152,11 @@ def _fit_steps(options: SceneOptions, capture: Capture) -> float:
     return 60 * options.minutes / (once + by_pixels * pixels)
 
 
-def _as_it_is(work: Work) -> Stage:
+def _as_it_is(work: RunContext) -> Stage:
     """The capture as its files say."""
-    options, asked = work.options, work.given("downscale", "long_side", "frames", "holdout")
+    options, asked = work.options, work.key_options("downscale", "long_side", "frames", "holdout")
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         if work.load is not None:
             return _checked(work.load(), "by its adapter")
         from jsecon.data.capture import load_capture
@@ -159,10 +170,10 @@ def _as_it_is(work: Work) -> Stage:
     count = "all frames" if options.frames is None else f"at most {options.frames} frames"
     held = f"1 in {options.holdout} held out" if options.holdout else "none held out"
     given = asked | {"loader": getattr(work.load, "__qualname__", None)}
-    return Stage("load", f"{count}, {size}, {held}", compute, "data", given=given, files=options.capture)
+    return Stage("load", f"{count}, {size}, {held}", compute, "data", key_options=given, files=options.capture)
 
 
-def _checked(capture: Capture, size: str) -> Outcome:
+def _checked(capture: Capture, size: str) -> StageResult:
     """The capture as an Outcome that says what it is. Raises InputError where its views cannot be used together."""
     from jsecon.data.capture import check_views_overlap
 
@@ -171,32 +182,39 @@ def _checked(capture: Capture, size: str) -> Outcome:
     count, height, width = capture.frames.shape[:3]
     told = f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out"
     points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
-    return Outcome(capture, notes=(f"{told}, {points}", *capture.notes))
+    return StageResult(capture, notes=(f"{told}, {points}", *capture.notes))
 
 
-def gaussians(work: Work) -> Stage:
+def gaussians(work: RunContext) -> Stage:
     """The scene's Gaussians: of a file in the capture's world, or fitted to the training frames."""
     return _fitted(work) if work.options.gaussians is None else _read(work)
 
 
-def _read(work: Work) -> Stage:
+def _read(work: RunContext) -> Stage:
     path = work.options.gaussians
     assert path is not None
     trained = path.parent / "dataparser_transforms.json"
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.data.nerfstudio import trained_to_source
 
         capture, (given, said) = results["load"], given_gaussians(path)
         told = trained_to_source(trained) if trained.is_file() else None
         found, notes = _in_the_captures_world(given, capture, path, told, progress)
         check_overlap(found, capture.cameras[training_frames(capture)], str(path))
-        return Outcome(found, notes=(*notes, *said))
+        return StageResult(found, notes=(*notes, *said))
 
     given = {"trained": trained.read_text(errors="replace")} if trained.is_file() else {}
     left = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     return Stage(
-        "gaussians", f"read from {path.name}", compute, "fit", after=("load",), given=given, files=path, left_out=left
+        "gaussians",
+        f"read from {path.name}",
+        compute,
+        "fit",
+        after=("load",),
+        key_options=given,
+        files=path,
+        skipped=left,
     )
 
 
@@ -288,10 +306,10 @@ def _rounded_note(gaussians: Gaussians, path: Path) -> tuple[str, ...]:
     return (f"{WARNING}{told} Export them in double precision, or nearer to the origin.",)
 
 
-def _fitted(work: Work) -> Stage:
+def _fitted(work: RunContext) -> Stage:
     options, minutes = work.options, work.options.minutes
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.fit.optimise import fit_gaussians
         from jsecon.fit.schedule import Schedule, gaussians_for
         from jsecon.fit.start import starting_gaussians
@@ -318,7 +336,7 @@ def _fitted(work: Work) -> Stage:
         )
         if options.growth != "none":
             notes = (*notes, f"{found.count} Gaussians after {len(losses)} steps")
-        return Outcome(found, notes=notes)
+        return StageResult(found, notes=notes)
 
     left = {} if options.growth != "none" else {"densification": "the fit keeps the points that it starts from"}
     if options.sh_degree == 0:
@@ -327,8 +345,8 @@ def _fitted(work: Work) -> Stage:
     most = options.gaussians_at_most
     number = "" if most is None or options.growth == "none" else f", at most {most} Gaussians"
     how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
-    given = work.given("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "start", "seed")
-    return Stage("gaussians", how, compute, "fit", after=("load",), given=given, left_out=left)
+    given = work.key_options("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "start", "seed")
+    return Stage("gaussians", how, compute, "fit", after=("load",), key_options=given, skipped=left)
 
 
 def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: float = 0.01) -> None:
@@ -343,10 +361,10 @@ def check_overlap(gaussians: Gaussians, cameras: Camera, where: str, *, least: f
         raise InputError(where, found, "views that overlap, and a scene in the world of their poses", remedy)
 
 
-def held_out(work: Work) -> Stage:
+def held_out(work: RunContext) -> Stage:
     """PSNR and SSIM of the frames held out, against the photographs; and which of the others stay far below them."""
 
-    def compute(results: Results, progress: Progress, record: Record) -> Outcome:
+    def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.fit.quality import GLANCE, quality, weak
 
         capture, scene = results["load"], results["gaussians"]
@@ -357,7 +375,7 @@ def held_out(work: Work) -> Stage:
         more = f" and {len(low) - 5} more" if len(low) > 5 else ""
         told = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
         told += "something moved (--drop-frames auto leaves them out)"
-        return Outcome(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
+        return StageResult(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
     how = "PSNR and SSIM of the rendered colours"
     return Stage("held_out", how, compute, "fit", after=("load", "gaussians"), shared=True)

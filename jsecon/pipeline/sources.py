@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NamedTuple
 
 from jsecon.errors import InputError
-from jsecon.files import parsed_json
+from jsecon.files import parse_json
 from jsecon.pipeline.options import Options
 from jsecon.types import LanguageField
 
@@ -25,7 +25,7 @@ class Sources(NamedTuple):
     """the capture's, if that is still there."""
 
 
-def folders_told(options: Options, out: Path) -> dict[str, str]:
+def relative_folders(options: Options, out: Path) -> dict[str, str]:
     """The hints of a run: option -> its folder as it is reached from that of the field."""
     told = {}
     for name in ("embedder", "capture"):
@@ -37,7 +37,7 @@ def folders_told(options: Options, out: Path) -> dict[str, str]:
     return told
 
 
-def sources_of(field: LanguageField, beside: Path | None = None) -> Sources:
+def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     """Where the model and the capture of a field are, by the hints of its run.
 
     Args:
@@ -49,7 +49,7 @@ def sources_of(field: LanguageField, beside: Path | None = None) -> Sources:
     """
     beside = getattr(field.provenance, "folder", None) if beside is None else beside
     try:
-        told = parsed_json(field.provenance or "{}")
+        told = parse_json(field.provenance or "{}")
     except ValueError:
         told = None
     parts: list[Any] = [_part(told, part, kind) for part, kind in _PARTS.items()]

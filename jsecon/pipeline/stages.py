@@ -1,7 +1,7 @@
 """What a stage of a run is: its name, what its result depends on, what it leaves out and why, and its function.
 
 The stages themselves stand in `scene_stages` (load, gaussians, held_out), `masklet_stages` and `language_stages`
-(regions, codes, votes, distil), each made whole by one function of the run's `Work`.
+(regions, codes, votes, distil), each made whole by one function of the run's `RunContext`.
 """
 
 import contextlib
@@ -32,19 +32,19 @@ KEY_FILE = "made_by.txt"
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class StageResult:
     """What a stage made."""
 
     value: Any
     """the result, a tree of arrays and records."""
-    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
     """part that was not needed -> why."""
     notes: tuple[str, ...] = ()
     """what the user should know, a sentence each."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Work:
+class RunContext:
     """What the stages of one run share."""
 
     options: Options
@@ -54,12 +54,12 @@ class Work:
     load: Callable[[], Capture] | None = None
     """takes the loader's place for data whose layout is one of a kind."""
 
-    def given(self, *names: str) -> dict[str, Any]:
+    def key_options(self, *names: str) -> dict[str, Any]:
         """The named options, as a part of a stage's key."""
         return {name: getattr(self.options, name) for name in names}
 
 
-class Record:
+class Checkpoint:
     """How far a stage in progress has come, on disk, so that it goes on there after a stop."""
 
     def __init__(self, path: Path):
@@ -91,7 +91,7 @@ class Record:
 
 Results: TypeAlias = Mapping[str, Any]
 """of the stages that are done, by name"""
-Compute: TypeAlias = Callable[[Results, Progress, Record], Outcome]
+Compute: TypeAlias = Callable[[Results, Progress, Checkpoint], StageResult]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,18 +106,18 @@ class Stage:
     """the last room of `cache.ROOMS` that `compute` imports; the source up to there is a part of the key."""
     after: tuple[str, ...] = ()
     """the stages whose results it reads."""
-    given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    key_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """options and models that its result depends on; models by their content, not by the place of their files."""
     files: Path | Callable[[], Sequence[Path]] | None = None
     """input file or folder, or what lists the input files."""
-    left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """what the options alone make needless: part -> why."""
     shared: bool = False
     """whether several processes compute it together: its function then makes the same calls in each."""
-    leaves: Path | None = None
+    output_dir: Path | None = None
     """folder that it leaves for those after it, with its key in KEY_FILE; where another run left it, it runs again."""
 
-    def key(self, work: Work, keys: Mapping[str, str], files: str | None) -> str:
+    def key(self, work: RunContext, keys: Mapping[str, str], files: str | None) -> str:
         """Hashes all that the result depends on.
 
         Args:
@@ -133,19 +133,19 @@ class Stage:
             {
                 "source": cache.source_digest(self.room),
                 "after": [keys[other] for other in self.after],
-                "given": dict(self.given),
+                "given": dict(self.key_options),
                 "files": files,
             },
         )
 
-    def files_digest(self, work: Work) -> str | None:
+    def files_digest(self, work: RunContext) -> str | None:
         """Digest of the names, sizes and times of its files."""
         if self.files is None:
             return None
         paths = [self.files] if isinstance(self.files, Path) else self.files()
-        return cache.files_digest(paths, leave_out=work.out)
+        return cache.files_digest(paths, exclude=work.out)
 
-    def computed(self, work: Work, files: str | None, *given: Any) -> Outcome:
+    def computed(self, work: RunContext, files: str | None, *given: Any) -> StageResult:
         """What it makes of its files. Raises InputError where they are no longer those of the digest `files`: its key
         would stand for a result of others, or of some of each."""
         found = self.compute(*given)

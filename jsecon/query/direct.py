@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import WHOLE, into_range, normalize
+from jsecon.numerics import FULL_PRECISION, normalize, safe_scale
 from jsecon.types import Array, Leaf, Selection
 
 NARROW = 32
@@ -127,7 +127,7 @@ def _product(rows: Array, unit: Array) -> Array:
         columns = (rows[:, k] * unit[k] for k in range(rows.shape[1]))
         return sum(columns, start=jnp.zeros(rows.shape[0], rows.dtype))
     # One column of a product of matrices: matrix times vector can be silently wrong (jax issue 39103).
-    return jnp.matmul(rows, unit[:, None], precision=WHOLE)[:, 0]
+    return jnp.matmul(rows, unit[:, None], precision=FULL_PRECISION)[:, 0]
 
 
 def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
@@ -136,7 +136,7 @@ def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
     columns = [codes[:, k] for k in range(codes.shape[1])]
     zero = jnp.zeros(codes.shape[0], codes.dtype)
     largest = functools.reduce(jnp.maximum, (jnp.abs(column) for column in columns), zero)
-    factor = jnp.where(jnp.isfinite(largest), into_range(largest), 0.0)
+    factor = jnp.where(jnp.isfinite(largest), safe_scale(largest), 0.0)
     scaled = [column * factor for column in columns]
     dots = sum((column * unit[k] for k, column in enumerate(scaled)), start=zero)
     return largest, dots, sum((column * column for column in scaled), start=zero)
@@ -145,7 +145,7 @@ def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
 def _by_row(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
     # Multiply and sum: a matrix-vector product here can be silently wrong under jit and vmap (jax issue 39103).
     largest = jnp.max(jnp.abs(codes), axis=-1, initial=0.0)
-    scaled = codes * jnp.where(jnp.isfinite(largest), into_range(largest), 0.0)[:, None]
+    scaled = codes * jnp.where(jnp.isfinite(largest), safe_scale(largest), 0.0)[:, None]
     return largest, jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
 
 

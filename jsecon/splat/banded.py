@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from jsecon.numerics import MIN_TRANSMITTANCE, NEAR, WHOLE
+from jsecon.numerics import FULL_PRECISION, MIN_TRANSMITTANCE, NEAR
 from jsecon.splat.bands import MOST_HELD, Bounds, band_size, bands, block_bounds
 from jsecon.splat.fusion import stored
 from jsecon.splat.project import Projection
@@ -86,7 +86,7 @@ def _composite_band(
         def body(transmittance, inner, chunk):
             total, _ = inner
             weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
-            total = total + jnp.einsum("bkp,bkd->bdp", weight, chunk.columns, precision=WHOLE)
+            total = total + jnp.einsum("bkp,bkd->bdp", weight, chunk.columns, precision=FULL_PRECISION)
             return transmittance, (total, transmittance)
 
         start = left[ids_of_tiles]

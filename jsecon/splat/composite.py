@@ -8,7 +8,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
-from jsecon.numerics import MIN_TRANSMITTANCE, WHOLE
+from jsecon.numerics import FULL_PRECISION, MIN_TRANSMITTANCE
 from jsecon.splat.fusion import stored
 from jsecon.splat.strips import join, over_strips, split
 from jsecon.splat.tiles import TileLists
@@ -91,7 +91,7 @@ def composite_features_vjp(
 
             def body(transmittance, gradient, chunk):
                 weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
-                own = jnp.einsum("bcp,bdp->bcd", weight, values, precision=WHOLE)
+                own = jnp.einsum("bcp,bdp->bcd", weight, values, precision=FULL_PRECISION)
                 return transmittance, gradient.at[chunk.ids].add(own)
 
             return walk(table, lists, batches, tiles, body, gradient)[0], None

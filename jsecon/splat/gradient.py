@@ -10,7 +10,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from jsecon.numerics import MAX_ALPHA, WHOLE
+from jsecon.numerics import FULL_PRECISION, MAX_ALPHA
 from jsecon.splat.fusion import stored
 from jsecon.splat.strips import over_strips, split
 from jsecon.splat.tiles import TileLists
@@ -69,9 +69,9 @@ def composite_vjp(
                 weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
                 along = _along(chunk.columns, local) - along_transmittance[:, None]
                 slope, before = stored(chunk.always, _slopes, weight, chunk.alpha, along, before, final)
-                moments = jnp.einsum("bcp,mp->bcm", slope, monomials, precision=WHOLE)
+                moments = jnp.einsum("bcp,mp->bcm", slope, monomials, precision=FULL_PRECISION)
                 by_attribute = _attribute_gradient(moments, chunk.attributes, corners, lists.tile / 2)
-                by_feature = jnp.einsum("bcp,bdp->bcd", weight, local, precision=WHOLE)
+                by_feature = jnp.einsum("bcp,bdp->bcd", weight, local, precision=FULL_PRECISION)
                 rows = jnp.concatenate([by_attribute, by_feature], axis=-1)
                 return transmittance, (before, gradient.at[chunk.ids].add(rows))
 
@@ -89,7 +89,7 @@ def composite_vjp(
 def _along(features: Array, cotangent: Array) -> Array:
     """(B, CHUNK, D), (B, D, pixels) -> (B, CHUNK, pixels), the sum over the channels."""
     if features.shape[-1] > _UNROLLED:
-        return jnp.einsum("bcd,bdp->bcp", features, cotangent, precision=WHOLE)
+        return jnp.einsum("bcd,bdp->bcp", features, cotangent, precision=FULL_PRECISION)
     terms = [features[..., d, None] * cotangent[:, None, d] for d in range(features.shape[-1])]
     return sum(terms[1:], terms[0])
 

@@ -12,8 +12,8 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import NEAR, finite, is_traced
-from jsecon.parallel import MESH_OPTIONS, over_rows
+from jsecon.numerics import NEAR, all_finite, is_traced
+from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.splat.autodiff import splat_contained, view_lists
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import check_shapes, project
@@ -81,13 +81,13 @@ def plan_view(
 
 def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array, mesh: Mesh | None) -> ViewPlan:
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    projection = over_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
+    projection = map_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
     lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
     columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
     # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
     splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
     depths = jnp.where(projection.visible, projection.depths, 0.0)
-    sound = finite(*jax.tree.leaves(camera))
+    sound = all_finite(*jax.tree.leaves(camera))
     return ViewPlan(splats, depths, sound, lists, camera.width, camera.height, mesh)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, finite, normalize, sigmoid
+from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, all_finite, normalize, sigmoid
 from jsecon.splat.fusion import stored, surely
 from jsecon.splat.sh import BANDS
 from jsecon.types import Array, Camera, Gaussians, Leaf, record
@@ -215,7 +215,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
 def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
     """Both with harmless numbers in place of bad ones, and (N,) bool the Gaussians that are themselves: a bad number
     must be gone before the first product, or its gradient, zero times NaN, is NaN and reaches the pose."""
-    sound = finite(*jax.tree.leaves(camera))
+    sound = all_finite(*jax.tree.leaves(camera))
     drawn = usable(gaussians) & sound
     keep = lambda array: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)
     harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)

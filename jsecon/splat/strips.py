@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from jsecon.parallel import over_devices
+from jsecon.parallel import map_over_devices
 from jsecon.types import Array
 
 BLOCK = 4
@@ -67,8 +67,10 @@ def join(strips: Array, tile: int, height: int) -> Array:
 
 
 def over_strips(local: Callable, dealt: Any, common: Any, mesh: Mesh | None, *, total: bool = False) -> Any:
-    """`local(strip, dealt, common)` for the strip of each device of `mesh`, see `over_devices`; without a mesh for the
-    whole image."""
+    """`local(strip, dealt, common)` for the strip of each device of `mesh`, see `map_over_devices`; without a mesh for
+    the whole image."""
     if mesh is None:
         return local(WHOLE, dealt, common)
-    return over_devices(lambda index, *rest: local(Strip(index, mesh.size), *rest), dealt, common, mesh, total=total)
+    return map_over_devices(
+        lambda index, *rest: local(Strip(index, mesh.size), *rest), dealt, common, mesh, total=total
+    )

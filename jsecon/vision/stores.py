@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.files import UNREADABLE, read_arrays, write_arrays, written_whole
+from jsecon.files import READ_ERRORS, atomic_write, read_arrays, write_arrays
 from jsecon.vision.protocols import NamedSegmenter
 
 
@@ -36,7 +36,7 @@ class EmbeddingStore:
             _, stored = read_arrays(self._path(frame))
             pairs = zip(stored["keys"], stored["vectors"], strict=True)
             return {key.tobytes(): vector for key, vector in pairs if np.isfinite(vector).all()}
-        except UNREADABLE:
+        except READ_ERRORS:
             return {}
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
@@ -51,7 +51,7 @@ class EmbeddingStore:
 
 
 def _write(path: Path, **arrays: np.ndarray) -> None:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         write_arrays(temporary, arrays)
 
 
@@ -100,7 +100,7 @@ class StoredSegmenter:
             if bits.shape[1] != -(-pixels // 8):
                 raise ValueError(f"{bits.shape[1]} bytes a mask")
             return np.unpackbits(bits, axis=1, count=pixels).reshape(-1, *frame.shape[:2]).astype(bool)
-        except UNREADABLE:
+        except READ_ERRORS:
             masks = np.asarray(self._segmenter(frame, index), bool)
         bits = np.packbits(masks.reshape(len(masks), frame.shape[0] * frame.shape[1]), axis=1)
         _write(path, bits=bits, shape=np.asarray(masks.shape))

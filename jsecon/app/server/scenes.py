@@ -17,7 +17,7 @@ from jsecon.app.outputs import best_frames, selected
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
-from jsecon.pipeline.networks import embedder_of_field
+from jsecon.pipeline.networks import field_embedder
 from jsecon.query.masks import selection_mask
 from jsecon.types import LanguageField
 
@@ -144,7 +144,7 @@ def open_scenes(files: list[Path], embedder: Path | None) -> dict[str, Scene]:
         if name in scenes:
             raise InputError(file, f"it is a second field named {name!r}", remedy="Rename one of the folders.")
         field = load_field(file)
-        scenes[name] = Scene(name, field, embedder_of_field(field, embedder))
+        scenes[name] = Scene(name, field, field_embedder(field, embedder))
         with contextlib.suppress(InputError):  # an embedder that has no word for it
             scenes[name].mask(scenes[name].answer(Question("red")), 0)
     return scenes

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.query.retrieval import PIECE_NEARNESS
 
@@ -157,7 +157,7 @@ def state_of(link: str) -> ViewState:
         state = ViewState(**told)
         _require_kinds(state)
     except (ValueError, TypeError, RecursionError) as error:
-        found = f"{link[:60]!r} is not a line that a viewer gave ({why(error)})"
+        found = f"{link[:60]!r} is not a line that a viewer gave ({describe_error(error)})"
         raise InputError("link", found, remedy="Copy the whole line.") from error
     return state
 

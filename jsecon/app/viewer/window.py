@@ -32,7 +32,7 @@ from jsecon.app.viewer.static_page import NOWHERE
 from jsecon.app.viewer.view_state import Ask, History, ViewState
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
-from jsecon.pipeline.networks import GivenSpace, given_dim
+from jsecon.pipeline.networks import ExternalSpace, external_dim
 from jsecon.types import LanguageField
 
 REMEDY = 'pip install "jsecon[viewer]"'
@@ -296,8 +296,8 @@ def view(asked: Any, embedder_of: Callable[..., Any], say: Callable[[str], objec
     state = view_state.asked(state, "; ".join(asked.texts)) if asked.texts else state
     field, name, dim = load_field(asked.field), asked.field.resolve().parent.name, None
     if not asked.texts and asked.embedder is None:
-        dim = given_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
-    embedder = embedder_of(field, asked) if dim is None else GivenSpace(dim)
+        dim = external_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
+    embedder = embedder_of(field, asked) if dim is None else ExternalSpace(dim)
     place = {"host": asked.host, "port": asked.port, "token": token, "hosts": asked.allow_host}
     viewer = open_viewer(field, embedder, name=name, state=state, **place)
     say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")

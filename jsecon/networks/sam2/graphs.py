@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.files import UNREADABLE
+from jsecon.files import READ_ERRORS
 from jsecon.networks.onnx_graph import Graph, Tensor, content_digest, graph_files
 
 STRIDE = 16
@@ -157,7 +157,7 @@ def _read_constants(path: Path) -> dict[str, np.ndarray]:
             constants = {name: file[name].astype(np.float32) for name in file.files}
         if not all(np.isfinite(array).all() and array.size for array in constants.values()):
             raise ValueError("arrays without numbers, or numbers that are not finite")
-    except (*UNREADABLE, MemoryError) as error:
+    except (*READ_ERRORS, MemoryError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else f"it cannot be read ({error})"
         raise _bad(path, found, f"the arrays {', '.join(CONSTANTS)}") from error
     return constants
