@@ -1,0 +1,545 @@
+"""Models by name: which public repository a name stands for, and its files in the cache of the Hugging Face hub.
+
+A model is asked for by a name of `CATALOGUE` ("clip"), by repository ("hub:owner/name" or "hub:owner/name@revision"),
+or by folder. huggingface_hub transfers the files and keeps the cache, so HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE and
+HF_TOKEN work as they do elsewhere. A transfer is planned first (`plan_download`: commit, files, size, licence), so
+that a user can be asked before anything is fetched. Afterwards each file is compared with the hub's hash.
+"""
+
+import contextlib
+import dataclasses
+import errno
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from jsecon.errors import InputError, why
+
+Role = Literal["embedder", "segmenter", "tracker", "phrases"]
+Precision = Literal["fp32", "fp16", "int8"]
+
+SUFFIXES: Mapping[Precision, str] = {"fp32": "", "fp16": "_fp16", "int8": "_quantized"}
+"""precision -> what public exports append to the name of a graph"""
+PREFIX = "hub:"
+CHUNK = 1 << 20
+"""bytes that are hashed at once"""
+
+
+@dataclasses.dataclass(frozen=True)
+class FileSet:
+    """The files of one public layout of a model. `{p}` stands for the suffix of the precision.
+
+    Attributes:
+      required: Files without which the model does not work.
+      optional: Files that are fetched where the repository has them.
+    """
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+
+
+_TEXTS = ("config.json", "tokenizer_config.json")
+LAYOUTS: Mapping[Role, tuple[FileSet, ...]] = {
+    "embedder": (
+        FileSet(
+            ("onnx/vision_model{p}.onnx", "onnx/text_model{p}.onnx", "preprocessor_config.json", "tokenizer.json"),
+            (*_TEXTS, "logits.json"),
+        ),
+        FileSet(
+            ("visual/model.onnx", "textual/model.onnx", "visual/preprocess_cfg.json", "textual/tokenizer.json"),
+            (*_TEXTS, "textual/tokenizer_config.json", "logits.json"),
+        ),
+    ),
+    "segmenter": (
+        FileSet(
+            ("onnx/vision_encoder{p}.onnx", "onnx/prompt_encoder_mask_decoder{p}.onnx"),
+            ("preprocessor_config.json", "config.json"),
+        ),
+    ),
+    "tracker": (
+        FileSet(
+            tuple(
+                f"onnx/{part}.onnx"
+                for part in ("vision_encoder", "mask_decoder", "memory_attention", "memory_encoder", "pointer_tpos")
+            ),
+            ("constants.json", "onnx/constants.json"),
+        ),
+    ),
+    "phrases": (
+        FileSet(
+            ("sam3/sam3_image_encoder.onnx", "sam3/sam3_language_encoder.onnx", "sam3/sam3_decoder.onnx"),
+            ("sam3/tokenizer.json",),
+        ),
+    ),
+}
+"""role -> the layouts that its public exports have. A graph's external data (`.onnx_data`) comes with the graph."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedModel:
+    """A row of the catalogue.
+
+    Attributes:
+      name: What a user types.
+      role: What it does in jsecon.
+      repository: "owner/name" on the hub.
+      revision: Commit that is fetched, or a branch.
+      megabytes: Size of the files by precision. Precisions that are missing are not offered.
+      licence: Licence of the weights.
+      purpose: What it is good for, in one sentence.
+      precision: Precision that is taken unless the user asks for another.
+      sha256: File -> hash of the content, where it is known from elsewhere than the hub.
+      refused: Precision -> why it is not offered.
+    """
+
+    name: str
+    role: Role
+    repository: str
+    revision: str
+    megabytes: Mapping[Precision, int]
+    licence: str
+    purpose: str
+    precision: Precision = "fp32"
+    sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    refused: Mapping[Precision, str] = dataclasses.field(default_factory=dict)
+
+
+CATALOGUE: tuple[NamedModel, ...] = (
+    NamedModel(
+        "clip",
+        "embedder",
+        "Xenova/clip-vit-base-patch16",
+        "main",
+        {"fp32": 599, "fp16": 300, "int8": 152},
+        "MIT",
+        "OpenAI's CLIP ViT-B/16: names of everyday objects.",
+    ),
+    NamedModel(
+        "siglip2",
+        "embedder",
+        "onnx-community/siglip2-base-patch16-224-ONNX",
+        "main",
+        {"fp32": 1500, "fp16": 750, "int8": 378},
+        "Apache-2.0",
+        "SigLIP 2 base: better names than CLIP, many languages, and a probability that a text is present.",
+    ),
+    NamedModel(
+        "mobileclip",
+        "embedder",
+        "Xenova/mobileclip_s0",
+        "main",
+        {"fp32": 216, "fp16": 108},
+        "Apple sample code licence",
+        "MobileCLIP S0: the fastest image encoder, less exact names.",
+        refused={"int8": "Its 8-bit image graph is reported to give wrong embeddings."},
+    ),
+    NamedModel(
+        "edgetam",
+        "segmenter",
+        "onnx-community/EdgeTAM-ONNX",
+        "main",
+        {"fp32": 41},
+        "Apache-2.0",
+        "EdgeTAM on single frames: the fastest masks on a CPU.",
+    ),
+    NamedModel(
+        "slimsam",
+        "segmenter",
+        "Xenova/slimsam-77-uniform",
+        "main",
+        {"fp32": 40, "fp16": 21},
+        "Apache-2.0",
+        "SlimSAM: SAM's masks from a pruned encoder.",
+    ),
+    NamedModel(
+        "sam2",
+        "segmenter",
+        "onnx-community/sam2.1-hiera-tiny-ONNX",
+        "main",
+        {"fp32": 155},
+        "Apache-2.0",
+        "SAM 2.1 tiny on single frames: finer masks, slower.",
+    ),
+    NamedModel(
+        "sam2",
+        "tracker",
+        "square-zero-labs/sam2.1-tiny-video-onnx",
+        "3b2984dd865f6e9d2cc6aed0be6a5a5c2eb352ce",
+        {"fp32": 190},
+        "Apache-2.0",
+        "SAM 2.1 tiny with memory: follows objects through the frames.",
+        sha256={
+            "onnx/vision_encoder.onnx": "aa7a8542942f042e235a993a1ab0ccf5f049918500577802a7f10ec1b39bb873",
+            "onnx/mask_decoder.onnx": "0461896de3db00936fe1643506f129d71cb6d5d2ae15754811756b7ea1b070c6",
+            "onnx/memory_attention.onnx": "791e648ce8f5ef91ad00ba06e83066ff261ae5a645f0b042b4f46a89fd054baf",
+            "onnx/memory_encoder.onnx": "580d246c109de88838f600ba7c1c0d03d1fe267f7641b06f8c88c5f0dc5834cd",
+            "onnx/pointer_tpos.onnx": "7e71df1d75dba09bc18dd4ae745c2a2cceebdd14d84eadea2fe65d0205f101fc",
+        },
+    ),
+    NamedModel(
+        "edgetam",
+        "tracker",
+        "jax-image-tools/edgetam-video-onnx",
+        "main",
+        {"fp32": 65},
+        "Apache-2.0",
+        "EdgeTAM with memory: follows objects at a third of the size.",
+    ),
+    NamedModel(
+        "sam3",
+        "phrases",
+        "nrl-ai/samexporter-onnx-models",
+        "main",
+        {"fp32": 3900},
+        "SAM License",
+        "SAM 3 asked by a phrase: every instance that the phrase names.",
+    ),
+)
+RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"}
+"""what `--models auto` takes"""
+
+
+@dataclasses.dataclass(frozen=True)
+class HubModel:
+    """A model on the hub.
+
+    Attributes:
+      role: What it does in jsecon.
+      repository: "owner/name".
+      revision: Commit, branch or tag.
+      precision: Precision of its graphs.
+      sha256: File -> hash of its content, where it is known beforehand.
+    """
+
+    role: Role
+    repository: str
+    revision: str = "main"
+    precision: Precision = "fp32"
+    sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def address(self) -> str:
+        """The model as a user can type it: "hub:owner/name@revision"."""
+        return f"{PREFIX}{self.repository}@{self.revision}"
+
+
+@dataclasses.dataclass(frozen=True)
+class HubFile:
+    """A file of a repository: its path there, its bytes, and its hash (SHA-256, or that of a git blob)."""
+
+    path: str
+    size: int
+    digest: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Download:
+    """What has to be fetched for a model.
+
+    Attributes:
+      model: The model.
+      commit: Commit that its revision names now.
+      files: Files of the commit that the model needs.
+      licence: Licence by the repository's own card, or "not stated".
+    """
+
+    model: HubModel
+    commit: str
+    files: tuple[HubFile, ...]
+    licence: str
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(file.size for file in self.files)
+
+    def __str__(self) -> str:
+        megabytes = max(round(self.size / 1e6), 1)
+        return f"{self.model.address} ({len(self.files)} files, {megabytes:,} MB, licence: {self.licence})"
+
+
+def parse_model(text: str, role: Role, precision: Precision | None = None) -> HubModel | Path:
+    """Reads what a user typed for a model.
+
+    Args:
+      text: A name of the catalogue, "hub:owner/name", "hub:owner/name@revision", or a folder.
+      role: What the model is for.
+      precision: Precision of its graphs; None takes the model's default.
+
+    Returns:
+      The model on the hub, or the folder.
+
+    Raises:
+      InputError: It is none of these, or the precision is not offered.
+    """
+    if text.startswith(PREFIX):
+        address = re.fullmatch(r"([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?", text.removeprefix(PREFIX))
+        if address is None:
+            raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
+        return HubModel(role, address[1], address[2] or "main", precision or "fp32")
+    if Path(text).exists():
+        return Path(text)
+    names = {row.name: row for row in CATALOGUE if row.role == role}
+    if text not in names:
+        remedy = f"Known names: {', '.join(names)}. Or give a folder, or hub:owner/name."
+        raise InputError(text, f"no folder and no known {role}", "", remedy)
+    row = names[text]
+    precision = precision or row.precision
+    if precision not in row.megabytes:
+        reason = row.refused.get(precision, "Its repository has no such graphs.")
+        problem = f"{text} is not offered in {precision}. {reason}"
+        raise InputError("--precision", problem, "", f"Use {' or '.join(row.megabytes)}.")
+    return HubModel(role, row.repository, row.revision, precision, row.sha256)
+
+
+def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:
+    """Chooses the files that a model needs from those of its repository.
+
+    Args:
+      model: The model.
+      paths: All files of the repository.
+
+    Returns:
+      Their paths, sorted.
+
+    Raises:
+      InputError: The repository has none of the layouts that jsecon reads.
+    """
+    known = set(paths)
+    missing = []
+    for layout in LAYOUTS[model.role]:
+        required = _named(layout.required, model.precision)
+        optional = _named(layout.optional, model.precision)
+        missing.append([name for name in required if name not in known])
+        if not missing[-1]:
+            data = [path for path in paths if any(path.startswith(f"{name}_data") for name in required)]
+            return tuple(sorted({*required, *known.intersection(optional), *data}))
+    fewest = min(missing, key=len)
+    problem = f"no {model.role} of {model.precision} that jsecon reads: {', '.join(fewest)} missing"
+    remedy = f"Choose another repository or --precision. `jsecon models list` has {model.role} models that work."
+    raise InputError(model.address, problem, "", remedy)
+
+
+def cached_folder(model: HubModel) -> Path | None:
+    """Looks for a model in the hub's cache, without any request.
+
+    Args:
+      model: The model.
+
+    Returns:
+      The folder of its files, or None if one of them is not there.
+    """
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    for layout in LAYOUTS[model.role]:
+        required = _named(layout.required, model.precision)
+        patterns = [*required, *_named(layout.optional, model.precision), *(f"{name}_data*" for name in required)]
+        try:
+            folder = snapshot_download(
+                model.repository, revision=model.revision, local_files_only=True, allow_patterns=patterns
+            )
+        except LocalEntryNotFoundError:
+            continue
+        if all((Path(folder) / name).is_file() for name in required):
+            return Path(folder)
+    return None
+
+
+def _named(templates: Sequence[str], precision: Precision) -> tuple[str, ...]:
+    """Returns the names of a layout's files in one precision."""
+    return tuple(template.format(p=SUFFIXES[precision]) for template in templates)
+
+
+def plan_download(model: HubModel) -> Download:
+    """Asks the hub which files a model needs.
+
+    Args:
+      model: The model.
+
+    Returns:
+      The files, and the commit.
+
+    Raises:
+      InputError: The hub does not answer, or has no such repository, revision or files.
+    """
+    from huggingface_hub import HfApi
+    from huggingface_hub.hf_api import RepoFile
+
+    with _hub_errors(model):
+        api = HfApi()
+        info = api.model_info(model.repository, revision=model.revision)
+        tree = api.list_repo_tree(model.repository, recursive=True, revision=info.sha)
+        files = {
+            entry.path: HubFile(entry.path, entry.size, entry.lfs.sha256 if entry.lfs else entry.blob_id)
+            for entry in tree
+            if isinstance(entry, RepoFile)
+        }
+    chosen = tuple(files[path] for path in choose_files(model, list(files)))
+    licences = [tag.removeprefix("license:") for tag in info.tags or () if tag.startswith("license:")]
+    return Download(model, str(info.sha), chosen, ", ".join(licences) or "not stated")
+
+
+def fetch(download: Download) -> Path:
+    """Brings a model into the hub's cache and compares each file with its hash.
+
+    Files that are in the cache already are not fetched again. A transfer that breaks is taken up where it stopped.
+
+    Args:
+      download: What to fetch.
+
+    Returns:
+      The folder with the files.
+
+    Raises:
+      InputError: The transfer fails, or a file differs from its hash; that file is removed from the cache.
+    """
+    from huggingface_hub import snapshot_download
+
+    model = download.model
+    names = [file.path for file in download.files]
+    with _hub_errors(model):
+        folder = Path(snapshot_download(model.repository, revision=model.revision, allow_patterns=names))
+    for file in download.files:
+        expected = {file.digest} | ({model.sha256[file.path]} if file.path in model.sha256 else set())
+        if any(content_hash(folder / file.path, digest) != digest for digest in expected):
+            broken = folder / file.path
+            broken.resolve().unlink()
+            broken.unlink(missing_ok=True)
+            problem = "its content differs from the hash that the hub gives for it, so it was removed"
+            raise InputError(f"{model.address} {file.path}", problem, "", f"Fetch it again: {get_command(model)}")
+    return folder
+
+
+def content_hash(path: Path, like: str) -> str:
+    """Hashes a file.
+
+    Args:
+      path: The file.
+      like: A hash of the kind asked for: 64 hexadecimal digits are SHA-256, 40 are the hash of a git blob.
+
+    Returns:
+      Its hash as hexadecimal digits.
+    """
+    digest = hashlib.sha256() if len(like) == 64 else hashlib.sha1(b"blob %d\0" % path.stat().st_size)
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def cached_commit(folder: Path) -> str | None:
+    """Returns the commit of a folder in the hub's cache, or None for every other folder."""
+    parts = folder.absolute().parts
+    inside = len(parts) > 2 and parts[-2] == "snapshots" and parts[-3].startswith("models--")
+    return parts[-1] if inside else None
+
+
+def remove(model: HubModel) -> int:
+    """Removes a repository from the hub's cache, all its revisions.
+
+    Args:
+      model: The model.
+
+    Returns:
+      Bytes that were freed; 0 if it was not there.
+    """
+    from huggingface_hub import scan_cache_dir
+    from huggingface_hub.errors import CacheNotFound
+
+    try:
+        cache = scan_cache_dir()
+    except CacheNotFound:
+        return 0
+    commits = [
+        revision.commit_hash
+        for repository in cache.repos
+        if repository.repo_id == model.repository and repository.repo_type == "model"
+        for revision in repository.revisions
+    ]
+    plan = cache.delete_revisions(*commits)
+    plan.execute()
+    return plan.expected_freed_size
+
+
+def catalogue_rows() -> Iterator[dict[str, Any]]:
+    """Yields the rows of `jsecon models list`: each named model, and the precisions that are in the cache."""
+    for row in CATALOGUE:
+        cached = [
+            precision
+            for precision in row.megabytes
+            if cached_folder(HubModel(row.role, row.repository, row.revision, precision)) is not None
+        ]
+        yield {
+            "name": row.name,
+            "role": row.role,
+            "repository": row.repository,
+            "megabytes": dict(row.megabytes),
+            "licence": row.licence,
+            "purpose": row.purpose,
+            "cached": cached,
+        }
+
+
+def get_command(model: HubModel) -> str:
+    """Returns the command that fetches a model."""
+    named = [row for row in CATALOGUE if row.repository == model.repository and row.role == model.role]
+    name = named[0].name if named and model.revision == named[0].revision else model.address
+    precision = "" if model.precision == "fp32" else f" --precision {model.precision}"
+    return f"jsecon models get {name} --role {model.role}{precision}"
+
+
+@contextlib.contextmanager
+def _hub_errors(model: HubModel) -> Iterator[None]:
+    """Turns the errors of huggingface_hub and of the disk into an InputError with one sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        problem, remedy = _explain(model, error)
+        if not problem:
+            raise
+        raise InputError(model.address, problem, "", remedy) from error
+
+
+def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
+    """Returns what is wrong and what to do, for an error during a request; empty for a fault of the program."""
+    from huggingface_hub import constants, errors
+
+    page = f"{constants.ENDPOINT}/{model.repository}"
+    again = f"Run it again: {get_command(model)}"
+    if isinstance(error, errors.OfflineModeIsEnabled):
+        return (
+            "not in the cache, and HF_HUB_OFFLINE forbids requests",
+            f"Unset HF_HUB_OFFLINE, then {get_command(model)}",
+        )
+    if isinstance(error, errors.GatedRepoError):
+        remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get_command(model)}"
+        return "its owner grants access to accounts only", remedy
+    if isinstance(error, errors.RevisionNotFoundError):
+        return f"the repository has no revision {model.revision}", f"See {page}/commits/main for those it has."
+    if isinstance(error, errors.RepositoryNotFoundError):
+        return "the hub has no such repository, or it is private", "Check the name; for a private one set HF_TOKEN."
+    if isinstance(error, errors.RemoteEntryNotFoundError):
+        return "a file of the repository is missing on the hub", again
+    if isinstance(error, errors.LocalEntryNotFoundError):
+        cause = error.__cause__
+        if cause is not None and not isinstance(cause, errors.LocalEntryNotFoundError):
+            return _explain(model, cause)
+        return f"{constants.ENDPOINT} cannot be reached", f"Check the network or HF_ENDPOINT, then {get_command(model)}"
+    if isinstance(error, errors.HfHubHTTPError):
+        status = error.response.status_code
+        return f"the hub answers with HTTP status {status}", f"Wait a minute. {again}"
+    library = type(error).__module__.partition(".")[0]
+    if isinstance(error, ConnectionError) or library in ("httpx", "httpx2"):  # by the version of huggingface_hub
+        return f"{constants.ENDPOINT} cannot be reached or the transfer broke", f"Check the network. {again}"
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return f"no space left for it in {constants.HF_HUB_CACHE}", "Free some space, or set HF_HOME to another disk."
+    if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno == errno.EROFS):
+        return f"no permission to write in {constants.HF_HUB_CACHE}", "Set HF_HOME to a folder of yours."
+    if isinstance(error, OSError):
+        return why(error), again
+    return "", ""

@@ -1,0 +1,150 @@
+"""A server on this machine that speaks the part of the Hugging Face hub's protocol that huggingface_hub uses.
+
+It serves repositories from memory, counts the requests, and can break them on purpose.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import threading
+import time
+from collections.abc import Iterator
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+LARGE = 1000
+"""bytes from which a file is stored as LFS, with a SHA-256"""
+
+
+@dataclasses.dataclass
+class Repository:
+    """One repository: its files, and what is wrong with it.
+
+    Attributes:
+      files: Path -> content.
+      licence: Licence on its card.
+      gated: Answers 403 with GatedRepo.
+      corrupt: Paths whose content is sent with its first byte changed.
+      breaks: Path -> number of transfers that break in the middle.
+    """
+
+    files: dict[str, bytes]
+    licence: str = "mit"
+    gated: bool = False
+    corrupt: frozenset[str] = frozenset()
+    breaks: dict[str, int] = dataclasses.field(default_factory=dict)
+
+    @property
+    def commit(self) -> str:
+        """40 hexadecimal digits that follow from the content."""
+        digest = hashlib.sha1()
+        for path, content in sorted(self.files.items()):
+            digest.update(path.encode() + b"\0" + content)
+        return digest.hexdigest()
+
+    def entry(self, path: str) -> dict:
+        """What the hub tells of a file in a listing."""
+        content = self.files[path]
+        blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+        entry = {"type": "file", "path": path, "size": len(content), "oid": blob}
+        if len(content) >= LARGE:
+            entry["lfs"] = {"oid": hashlib.sha256(content).hexdigest(), "size": len(content), "pointerSize": 130}
+        return entry
+
+
+class Hub:
+    """The server: `repositories` by name, `requests` as "METHOD path" and "METHOD path Range"."""
+
+    def __init__(self) -> None:
+        self.repositories: dict[str, Repository] = {}
+        self.requests: list[str] = []
+        self.endpoint = ""
+
+    def _find(self, request: Request) -> Repository | Response:
+        self.requests.append(f"{request.method} {request.url.path} {request.headers.get('range', '')}".strip())
+        repository = self.repositories.get(f"{request.path_params['owner']}/{request.path_params['name']}")
+        if repository is None:
+            return JSONResponse({"error": "Repository not found"}, 404, {"X-Error-Code": "RepoNotFound"})
+        if repository.gated:
+            return JSONResponse({"error": "gated"}, 403, {"X-Error-Code": "GatedRepo"})
+        revision = request.path_params.get("revision", "main")
+        if revision not in ("main", repository.commit):
+            return JSONResponse({"error": "Revision not found"}, 404, {"X-Error-Code": "RevisionNotFound"})
+        return repository
+
+    async def info(self, request: Request) -> Response:
+        """GET /api/models/OWNER/NAME/revision/REVISION."""
+        repository = self._find(request)
+        if isinstance(repository, Response):
+            return repository
+        name = f"{request.path_params['owner']}/{request.path_params['name']}"
+        siblings = [{"rfilename": path} for path in sorted(repository.files)]
+        tags = [f"license:{repository.licence}"]
+        return JSONResponse({"id": name, "sha": repository.commit, "siblings": siblings, "tags": tags})
+
+    async def tree(self, request: Request) -> Response:
+        """GET /api/models/OWNER/NAME/tree/REVISION."""
+        repository = self._find(request)
+        if isinstance(repository, Response):
+            return repository
+        return JSONResponse([repository.entry(path) for path in sorted(repository.files)])
+
+    async def resolve(self, request: Request) -> Response:
+        """HEAD and GET /OWNER/NAME/resolve/REVISION/PATH."""
+        repository = self._find(request)
+        if isinstance(repository, Response):
+            return repository
+        path = request.path_params["path"]
+        if path not in repository.files:
+            return Response(status_code=404, headers={"X-Error-Code": "EntryNotFound"})
+        content, entry = repository.files[path], repository.entry(path)
+        etag = entry["lfs"]["oid"] if "lfs" in entry else entry["oid"]
+        headers = {"X-Repo-Commit": repository.commit, "ETag": f'"{etag}"', "Accept-Ranges": "bytes"}
+        if path in repository.corrupt:
+            content = bytes([content[0] ^ 255]) + content[1:]
+        if request.method == "HEAD":
+            return Response(headers=headers | {"Content-Length": str(len(content))})
+        start = 0
+        if request.headers.get("range", "").startswith("bytes="):
+            start = int(request.headers["range"].removeprefix("bytes=").split("-")[0])
+            headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
+        rest = content[start:]
+        headers["Content-Length"] = str(len(rest))
+        if repository.breaks.get(path, 0) > 0:
+            repository.breaks[path] -= 1
+            return StreamingResponse(_half(rest), 206 if start else 200, headers)
+        return Response(rest, 206 if start else 200, headers)
+
+
+async def _half(content: bytes):
+    """Yields half of a content, then breaks the connection."""
+    yield content[: len(content) // 2]
+    raise ConnectionResetError("the transfer breaks on purpose")
+
+
+@contextlib.contextmanager
+def running_hub() -> Iterator[Hub]:
+    """Runs a hub on a free port of this machine while the context lasts."""
+    hub = Hub()
+    home = "/{owner}/{name}"
+    app = Starlette(
+        routes=[
+            Route(f"/api/models{home}", hub.info),
+            Route(f"/api/models{home}/revision/{{revision:path}}", hub.info),
+            Route(f"/api/models{home}/tree/{{revision}}", hub.tree),
+            Route(f"{home}/resolve/{{revision}}/{{path:path}}", hub.resolve, methods=["GET", "HEAD"]),
+        ]
+    )
+    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="critical"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    hub.endpoint = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    yield hub
+    server.should_exit = True
+    thread.join()

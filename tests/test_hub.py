@@ -1,0 +1,227 @@
+"""Models by name, from a hub on this machine (hub_server)."""
+
+import multiprocessing
+import os
+
+import pytest
+from hub_server import Hub, Repository, running_hub
+
+from jsecon import InputError
+from jsecon.networks import hub
+
+GRAPH = bytes(range(256)) * 40
+SLIMSAM = {
+    "onnx/vision_encoder.onnx": GRAPH,
+    "onnx/vision_encoder_fp16.onnx": GRAPH[: len(GRAPH) // 2],
+    "onnx/prompt_encoder_mask_decoder.onnx": GRAPH[::-1],
+    "preprocessor_config.json": b"{}",
+    "README.md": b"# SlimSAM",
+}
+NAME = "Xenova/slimsam-77-uniform"
+NEEDED = {"onnx/vision_encoder.onnx", "onnx/prompt_encoder_mask_decoder.onnx", "preprocessor_config.json"}
+
+
+@pytest.fixture(scope="module")
+def server():
+    with running_hub() as running:
+        yield running
+
+
+@pytest.fixture
+def local(server: Hub, tmp_path, monkeypatch) -> Hub:
+    """An empty cache in front of a hub that has SlimSAM."""
+    from huggingface_hub import constants
+
+    server.repositories = {NAME: Repository(dict(SLIMSAM), licence="apache-2.0")}
+    server.requests.clear()
+    for name, value in {
+        "ENDPOINT": server.endpoint,
+        "HUGGINGFACE_CO_URL_TEMPLATE": server.endpoint + "/{repo_id}/resolve/{revision}/{filename}",
+        "HF_HUB_CACHE": str(tmp_path / "cache"),
+        "HF_HUB_OFFLINE": False,
+    }.items():
+        monkeypatch.setattr(constants, name, value)
+    return server
+
+
+def slimsam(precision=None) -> hub.HubModel:
+    model = hub.parse_model("slimsam", "segmenter", precision)
+    assert isinstance(model, hub.HubModel)
+    return model
+
+
+def get(model) -> set[str]:
+    folder = hub.fetch(hub.plan_download(model))
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_name_brings_its_files_and_no_others(local):
+    model = slimsam()
+    assert hub.cached_folder(model) is None
+    plan = hub.plan_download(model)
+    assert {file.path for file in plan.files} == NEEDED
+    assert plan.size == 2 * len(GRAPH) + 2
+    assert plan.licence == "apache-2.0"
+    assert plan.commit == local.repositories[NAME].commit
+    folder = hub.fetch(plan)
+    assert (folder / "onnx/vision_encoder.onnx").read_bytes() == GRAPH
+    assert hub.cached_commit(folder) == plan.commit
+    assert not (folder / "README.md").exists()
+
+
+def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):
+    from huggingface_hub import constants
+
+    get(slimsam())
+    local.requests.clear()
+    for offline in (False, True):
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
+        folder = hub.cached_folder(slimsam())
+        assert folder is not None
+        assert hub.cached_folder(hub.HubModel("segmenter", NAME, hub.cached_commit(folder))) == folder
+        assert hub.cached_folder(slimsam("fp16")) is None
+    assert local.requests == []
+
+
+def test_offline_without_cache_names_the_command(local, monkeypatch):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(InputError, match="jsecon models get slimsam"):
+        hub.plan_download(slimsam())
+
+
+def test_a_file_of_another_content_is_refused_and_removed(local):
+    local.repositories[NAME].corrupt = frozenset({"onnx/vision_encoder.onnx"})
+    with pytest.raises(InputError, match="hash"):
+        get(slimsam())
+    assert hub.cached_folder(slimsam()) is None
+    local.repositories[NAME].corrupt = frozenset()
+    assert get(slimsam()) == NEEDED
+
+
+def test_a_hash_known_beforehand_is_checked_too(local):
+    plan = hub.plan_download(hub.HubModel("segmenter", NAME, sha256={"onnx/vision_encoder.onnx": "0" * 64}))
+    with pytest.raises(InputError, match="hash"):
+        hub.fetch(plan)
+
+
+def test_a_broken_transfer_goes_on_where_it_stopped(local):
+    local.repositories[NAME].files["onnx/vision_encoder.onnx"] = bytes(24 << 20)
+    local.repositories[NAME].breaks = {"onnx/vision_encoder.onnx": 1}
+    assert get(slimsam()) == NEEDED
+    assert any("bytes=" in request for request in local.requests)
+
+
+@pytest.mark.parametrize(
+    ("change", "clause"),
+    [
+        (lambda local: local.repositories.clear(), "no such repository"),
+        (lambda local: setattr(local.repositories[NAME], "gated", True), "HF_TOKEN"),
+        (lambda local: local.repositories[NAME].files.pop("onnx/vision_encoder.onnx"), "onnx/vision_encoder.onnx"),
+    ],
+    ids=["unknown", "gated", "incomplete"],
+)
+def test_what_the_hub_refuses_is_said_in_a_sentence(local, change, clause):
+    change(local)
+    with pytest.raises(InputError, match=clause):
+        get(slimsam())
+
+
+def test_an_unknown_revision_is_named(local):
+    with pytest.raises(InputError, match="no revision v9"):
+        hub.plan_download(hub.parse_model(f"hub:{NAME}@v9", "segmenter"))
+
+
+def test_a_hub_that_is_away(local, monkeypatch):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(InputError, match="cannot be reached"):
+        hub.plan_download(slimsam())
+
+
+def test_a_branch_that_moved_keeps_the_cached_commit_until_it_is_fetched(local):
+    get(slimsam())
+    first = hub.cached_folder(slimsam())
+    local.repositories[NAME].files["preprocessor_config.json"] = b'{"size": 1024}'
+    assert hub.cached_folder(slimsam()) == first
+    get(slimsam())
+    second = hub.cached_folder(slimsam())
+    assert second != first
+    assert hub.cached_folder(hub.HubModel("segmenter", NAME, hub.cached_commit(first))) == first
+
+
+def fetch_at_once(endpoint, cache, barrier):
+    os.environ |= {"HF_ENDPOINT": endpoint, "HF_HUB_CACHE": cache}
+    barrier.wait()
+    assert get(slimsam()) == NEEDED
+
+
+def test_two_processes_fetch_at_once(local, tmp_path):
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(2)
+    both = [
+        context.Process(target=fetch_at_once, args=(local.endpoint, str(tmp_path / "cache"), barrier)) for _ in range(2)
+    ]
+    for process in both:
+        process.start()
+    for process in both:
+        process.join()
+    assert [process.exitcode for process in both] == [0, 0]
+    assert hub.cached_folder(slimsam()) is not None
+
+
+def test_a_full_disk_is_named(local, monkeypatch):
+    from huggingface_hub import file_download
+
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(file_download, "http_get", full)
+    with pytest.raises(InputError, match="no space left"):
+        get(slimsam())
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="the user may write everywhere")
+def test_a_cache_that_cannot_be_written_is_named(local, tmp_path):
+    (tmp_path / "cache").mkdir(mode=0o500)
+    with pytest.raises(InputError, match="no permission"):
+        get(slimsam())
+
+
+def test_removing_frees_the_cache(local):
+    get(slimsam())
+    assert hub.remove(slimsam()) >= 2 * len(GRAPH)
+    assert hub.cached_folder(slimsam()) is None
+    assert hub.remove(slimsam()) == 0
+
+
+def test_the_catalogue_says_what_is_cached(local):
+    get(slimsam())
+    cached = {(row["name"], row["role"]): row["cached"] for row in hub.catalogue_rows()}
+    assert cached["slimsam", "segmenter"] == ["fp32"]
+    assert cached["sam2", "tracker"] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "role", "precision", "clause"),
+    [
+        ("clap", "embedder", None, "clip, siglip2, mobileclip"),
+        ("hub:owner", "embedder", None, "hub:owner/name"),
+        ("mobileclip", "embedder", "int8", "wrong embeddings"),
+        ("edgetam", "segmenter", "fp16", "fp32"),
+    ],
+)
+def test_what_is_no_model_is_refused(text, role, precision, clause):
+    with pytest.raises(InputError, match=clause):
+        hub.parse_model(text, role, precision)
+
+
+def test_a_folder_stays_a_folder(tmp_path):
+    assert hub.parse_model(str(tmp_path), "tracker") == tmp_path
+
+
+def test_external_data_comes_with_its_graph():
+    paths = [*NEEDED, "onnx/vision_encoder.onnx_data", "onnx/vision_encoder.onnx_data_1", "onnx/other.onnx_data"]
+    assert set(hub.choose_files(slimsam(), paths)) == set(paths) - {"onnx/other.onnx_data"}
