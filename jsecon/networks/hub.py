@@ -1,6 +1,6 @@
 """Models by name: which public repository a name stands for, and its files in the cache of the Hugging Face hub.
 
-A model is asked for by a name of `CATALOGUE` ("clip"), by repository ("hub:owner/name" or "hub:owner/name@revision"),
+A model is asked for by a name of catalogue.toml ("clip"), by repository ("hub:owner/name", "hub:owner/name@revision"),
 or by folder. huggingface_hub transfers the files and keeps the cache, so HF_HOME, HF_ENDPOINT, HF_HUB_OFFLINE and
 HF_TOKEN work as they do elsewhere. A transfer is planned first (`plan_download`: commit, files, size, licence), so
 that a user can be asked before anything is fetched. Afterwards each file is compared with the hub's hash.
@@ -9,8 +9,10 @@ that a user can be asked before anything is fetched. Afterwards each file is com
 import contextlib
 import dataclasses
 import errno
+import functools
 import hashlib
 import re
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -97,108 +99,24 @@ class NamedModel:
     name: str
     role: Role
     repository: str
-    revision: str
     megabytes: Mapping[Precision, int]
     licence: str
     purpose: str
+    revision: str = "main"
     precision: Precision = "fp32"
     sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
     refused: Mapping[Precision, str] = dataclasses.field(default_factory=dict)
 
 
-CATALOGUE: tuple[NamedModel, ...] = (
-    NamedModel(
-        "clip",
-        "embedder",
-        "Xenova/clip-vit-base-patch16",
-        "main",
-        {"fp32": 599, "fp16": 300, "int8": 152},
-        "MIT",
-        "OpenAI's CLIP ViT-B/16: names of everyday objects.",
-    ),
-    NamedModel(
-        "siglip2",
-        "embedder",
-        "onnx-community/siglip2-base-patch16-224-ONNX",
-        "main",
-        {"fp32": 1500, "fp16": 750, "int8": 378},
-        "Apache-2.0",
-        "SigLIP 2 base: better names than CLIP, many languages, and a probability that a text is present.",
-    ),
-    NamedModel(
-        "mobileclip",
-        "embedder",
-        "Xenova/mobileclip_s0",
-        "main",
-        {"fp32": 216, "fp16": 108},
-        "Apple sample code licence",
-        "MobileCLIP S0: the fastest image encoder, less exact names.",
-        refused={"int8": "Its 8-bit image graph is reported to give wrong embeddings."},
-    ),
-    NamedModel(
-        "edgetam",
-        "segmenter",
-        "onnx-community/EdgeTAM-ONNX",
-        "main",
-        {"fp32": 41},
-        "Apache-2.0",
-        "EdgeTAM on single frames: the fastest masks on a CPU.",
-    ),
-    NamedModel(
-        "slimsam",
-        "segmenter",
-        "Xenova/slimsam-77-uniform",
-        "main",
-        {"fp32": 40, "fp16": 21},
-        "Apache-2.0",
-        "SlimSAM: SAM's masks from a pruned encoder.",
-    ),
-    NamedModel(
-        "sam2",
-        "segmenter",
-        "onnx-community/sam2.1-hiera-tiny-ONNX",
-        "main",
-        {"fp32": 155},
-        "Apache-2.0",
-        "SAM 2.1 tiny on single frames: finer masks, slower.",
-    ),
-    NamedModel(
-        "sam2",
-        "tracker",
-        "square-zero-labs/sam2.1-tiny-video-onnx",
-        "3b2984dd865f6e9d2cc6aed0be6a5a5c2eb352ce",
-        {"fp32": 190},
-        "Apache-2.0",
-        "SAM 2.1 tiny with memory: follows objects through the frames.",
-        sha256={
-            "onnx/vision_encoder.onnx": "aa7a8542942f042e235a993a1ab0ccf5f049918500577802a7f10ec1b39bb873",
-            "onnx/mask_decoder.onnx": "0461896de3db00936fe1643506f129d71cb6d5d2ae15754811756b7ea1b070c6",
-            "onnx/memory_attention.onnx": "791e648ce8f5ef91ad00ba06e83066ff261ae5a645f0b042b4f46a89fd054baf",
-            "onnx/memory_encoder.onnx": "580d246c109de88838f600ba7c1c0d03d1fe267f7641b06f8c88c5f0dc5834cd",
-            "onnx/pointer_tpos.onnx": "7e71df1d75dba09bc18dd4ae745c2a2cceebdd14d84eadea2fe65d0205f101fc",
-        },
-    ),
-    NamedModel(
-        "edgetam",
-        "tracker",
-        "jax-image-tools/edgetam-video-onnx",
-        "main",
-        {"fp32": 65},
-        "Apache-2.0",
-        "EdgeTAM with memory: follows objects at a third of the size.",
-    ),
-    NamedModel(
-        "sam3",
-        "phrases",
-        "nrl-ai/samexporter-onnx-models",
-        "main",
-        {"fp32": 3900},
-        "SAM License",
-        "SAM 3 asked by a phrase: every instance that the phrase names.",
-    ),
-)
 RECOMMENDED: Mapping[Role, str] = {"segmenter": "edgetam", "embedder": "siglip2"}
 """what `--models auto` takes"""
+
+
+@functools.cache
+def catalogue() -> tuple[NamedModel, ...]:
+    """Reads the table of named models, catalogue.toml beside this file."""
+    rows = tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text())["model"]
+    return tuple(NamedModel(**row) for row in rows)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,7 +199,7 @@ def parse_model(text: str, role: Role, precision: Precision | None = None) -> Hu
         return HubModel(role, address[1], address[2] or "main", precision or "fp32")
     if Path(text).exists():
         return Path(text)
-    names = {row.name: row for row in CATALOGUE if row.role == role}
+    names = {row.name: row for row in catalogue() if row.role == role}
     if text not in names:
         remedy = f"Known names: {', '.join(names)}. Or give a folder, or hub:owner/name."
         raise InputError(text, f"no folder and no known {role}", "", remedy)
@@ -466,7 +384,7 @@ def remove(model: HubModel) -> int:
 
 def catalogue_rows() -> Iterator[dict[str, Any]]:
     """Yields the rows of `jsecon models list`: each named model, and the precisions that are in the cache."""
-    for row in CATALOGUE:
+    for row in catalogue():
         cached = [
             precision
             for precision in row.megabytes
@@ -485,7 +403,7 @@ def catalogue_rows() -> Iterator[dict[str, Any]]:
 
 def get_command(model: HubModel) -> str:
     """Returns the command that fetches a model."""
-    named = [row for row in CATALOGUE if row.repository == model.repository and row.role == model.role]
+    named = [row for row in catalogue() if row.repository == model.repository and row.role == model.role]
     name = named[0].name if named and model.revision == named[0].revision else model.address
     precision = "" if model.precision == "fp32" else f" --precision {model.precision}"
     return f"jsecon models get {name} --role {model.role}{precision}"
