@@ -190,7 +190,7 @@ def finish(output: Output, result: VerbResult, code: int = 0) -> int:
 def _plain(value: Any) -> Any:
     """Returns what JSON takes of an error, a record, or a path."""
     if isinstance(value, InputError):
-        parts = {"name": value.where, "found": value.found, "expected": value.expected, "remedy": value.remedy}
+        parts = {"name": value.where, "found": value.problem, "expected": value.expected, "remedy": value.remedy}
         return {"message": str(value)} | parts
     return vars(value) if dataclasses.is_dataclass(value) else str(value)
 

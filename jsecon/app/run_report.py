@@ -83,7 +83,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
         "size": [run.capture.cameras.width, run.capture.cameras.height],
         **quality_metrics(run.held_out),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
-        "left_out": run.left_out,
+        "left_out": run.skipped,
         "notes": list(run.notes),
         "programs_compiled": run.programs,
         "peak_memory_mib": round(peak_memory_mib(), 1),

@@ -149,7 +149,7 @@ def _later(act: Any) -> Any:
 
 
 def _error(error: InputError) -> str:
-    told, remedy = error.problem, error.remedy
+    told, remedy = error.sentence, error.remedy
     return f"<details><summary>{html.escape(told)}</summary>{html.escape(remedy)}</details>"
 
 
