@@ -80,7 +80,7 @@ def test_each_kind_of_ill_is_told():
 
 
 @pytest.mark.parametrize(
-    "length", [("--mutations", "20"), pytest.param(("--seconds", "5", "--seed", "1"), marks=pytest.mark.slow)]
+    "length", [("--mutations", "20"), pytest.param(("--seconds", "5", "--seed", "1"), marks=pytest.mark.long)]
 )
 def test_every_reader_stands_damage(length):
     """Longer, and by other seeds: python -m tests.fuzz."""

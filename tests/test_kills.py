@@ -7,7 +7,7 @@ import kills
 import pytest
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_runs_killed_and_one_on_a_full_disk_end_in_the_same_field(room, tmp_path):
     """Thirty and ten: python -m tests.kills."""
     given = {"kills": 2, "cold": 0, "steps": 50, "seed": 1}

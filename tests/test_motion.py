@@ -362,7 +362,7 @@ def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):
     assert not record.folder.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_bonsai_is_found_as_its_poses_are_given(shared, tmp_path):
     capture = shared / "captures" / "bonsai"
     told, folder = find_poses(photographs(capture), tmp_path)

@@ -103,7 +103,7 @@ def test_a_server_starts_there_and_answers(ran, encoding):
 MANY = 100_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_hundred_thousand_frames_are_listed_in_seconds(tmp_path):
     """Their names and poses, in each format, and the digest of the files; of the pictures a few are read."""
     (tmp_path / "images").mkdir()

@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import transforms
-from test_api import jsecon_imports
 
 import jsecon
-from jsecon.app import ask, cli
+from jsecon.app import cli
 from jsecon.association.algorithm1 import iou_matrix
 from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
@@ -32,7 +31,6 @@ from jsecon.process import peak_memory_mib
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
-HOME = Path(pipeline.__file__).parent.parent
 STAGES = ("load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out")
 
 
@@ -338,8 +336,32 @@ def field_writer_that_stops(path, arrays, description):
     raise Killed
 
 
+def raise_killed():
+    raise Killed
+
+
 def kill():
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def stop_by_error(run, out, victim, monkeypatch):
+    """A run that an error ends while it writes a file of the stage `victim`, or the field."""
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(cache, "write_arrays", writer_that_stops(raise_killed, victim))
+        patch.setattr(field_file, "write_arrays", field_writer_that_stops)
+        with pytest.raises(Killed):
+            pipeline.run(run.options, out)
+    assert not (out / "field.safetensors").exists()
+
+
+def test_a_run_stopped_while_it_writes_goes_on_to_the_same_bytes(room_run, tmp_path, monkeypatch):
+    run, straight = room_run
+    out = shutil.copytree(straight, tmp_path / "out", ignore=shutil.ignore_patterns("votes-*", "field.safetensors"))
+    for victim in ("votes", "field"):
+        stop_by_error(run, out, victim, monkeypatch)
+    pipeline.run(run.options, out)
+    assert (out / "field.safetensors").read_bytes() == (straight / "field.safetensors").read_bytes()
 
 
 DRIVER = """
@@ -355,23 +377,13 @@ test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, s
 """
 
 
+@pytest.mark.long
 def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(room_run, room, tmp_path, monkeypatch):
     """Killed by the kernel while it writes a record of a stage in progress, and a result; elsewhere by an error."""
     run, straight = room_run
     out = tmp_path / "out"
     paths = (Path(__file__).parent, Path(pipeline.__file__).parent.parent.parent)
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
-
-    def raise_killed():
-        raise Killed
-
-    def stop_by_error(victim):
-        with monkeypatch.context() as patch:
-            patch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
-            patch.setattr(cache, "write_arrays", writer_that_stops(raise_killed, victim))
-            patch.setattr(field_file, "write_arrays", field_writer_that_stops)
-            with pytest.raises(Killed):
-                pipeline.run(run.options, out)
 
     def stop_by_signal(victim, nth):
         command = [sys.executable, "-c", DRIVER, str(room), str(out), victim, str(nth)]
@@ -380,121 +392,14 @@ def test_a_run_killed_in_each_stage_and_started_again_ends_in_the_same_bytes(roo
     order = ("load", "masklets", "gaussians checkpoint", "gaussians", "regions", "codes", "votes", "distil", "held_out")
     assert {victim.split()[0] for victim in order} == set(STAGES)
     for victim in (*order, "field"):
-        if victim == "gaussians checkpoint":
-            stop_by_signal(victim, 2)
-        elif victim == "votes":
-            stop_by_signal(victim, 1)
+        if victim in ("gaussians checkpoint", "votes"):
+            stop_by_signal(victim, 2 if "checkpoint" in victim else 1)
         else:
-            stop_by_error(victim)
+            stop_by_error(run, out, victim, monkeypatch)
         for path in (out / "cache").glob("[!.]*.safetensors"):  # whatever has its final name is whole
             cache.load(path)
-        assert not (out / "field.safetensors").exists()
     listener = Recorder()
     pipeline.run(run.options, out, listener=listener)
     assert {name for name, fresh in listener.fresh.items() if fresh} == {"field"}
     assert (out / "field.safetensors").read_bytes() == (straight / "field.safetensors").read_bytes()
     assert not list(out.rglob("*.checkpoint.safetensors"))
-
-
-@pytest.fixture(scope="module")
-def watched(room, tmp_path_factory):
-    """What a process that ran each stage, and then asked, tells of the files of jsecon whose functions ran."""
-    folder = tmp_path_factory.mktemp("watched")
-    done = subprocess.run(
-        [sys.executable, "-c", WATCHER, str(room), str(folder)],
-        env=os.environ | {"PYTHONPATH": str(HOME.parent)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads((folder / "ran.json").read_text())
-
-
-def test_each_stage_executes_nothing_that_its_key_does_not_cover(watched):
-    """The files of jsecon whose functions run in each stage lie among those whose source its key digests."""
-    assert set(watched["stages"]) == set(STAGES)
-    for stage, told in watched["stages"].items():
-        assert told["ran"], stage
-        assert set(told["ran"]) <= set(told["covered"]), stage
-
-
-@pytest.mark.parametrize(("module", "most"), [(pipeline, 26), (ask, 12)], ids=["run", "query"])
-def test_the_files_to_read_are_those_that_run(watched, module, most):
-    """Each file that a docstring lists runs on the way, and one that runs without being listed is the ground's, the
-    engine's, or imported by its own room's listed ones."""
-    listed = {HOME / f"{name}.py" for name in re.findall(r"\b[a-z]+/[a-z_0-9]+\b", module.__doc__.split(":\n\n")[1])}
-    assert len(listed) <= most
-    ran = {Path(file) for file in watched["run" if module is pipeline else "query"] if Path(file).parent != HOME}
-    assert listed <= ran
-    behind, new = set(), listed
-    while new:
-        behind |= new
-        new = {other for file in new for other in imported(file) if other.parent == file.parent} - behind
-    measures = {HOME / "fit/quality.py"}  # the field does not need it
-    assert {file for file in ran - behind - measures if file.parent.name != "splat"} == set()
-
-
-def imported(file):
-    """The files of jsecon that one of them imports."""
-    names = {name.rpartition(".") for name in jsecon_imports(file)}
-    places = [HOME.parent.joinpath(*f"{module}.{last}".split(".")).with_suffix(".py") for module, _, last in names]
-    places += [HOME.parent.joinpath(*module.split(".")).with_suffix(".py") for module, _, _ in names]
-    return {place for place in places if place.is_file()}
-
-
-WATCHER = """
-import inspect, json, sys, threading
-from pathlib import Path
-import jsecon
-from jsecon.app import ask, outputs
-from jsecon.pipeline import cache, pipeline
-from jsecon.pipeline.options import Options
-from jsecon.pipeline.stages import Stage
-from jsecon.language.field import load_field
-from jsecon.vision.colours import ColourEmbedder
-
-home, ran = Path(jsecon.__file__).parent, {}
-digested, on_the_way, seen = [], [], set()
-read = Path.read_bytes
-Path.read_bytes = lambda path: digested.append(str(path)) or read(path)
-key = Stage.key
-
-def key_and_cover(stage, *given):
-    digested.clear()
-    cache.source_digest.cache_clear()
-    found = key(stage, *given)
-    ran[stage.name] = {"covered": list(digested), "ran": []}
-    return found
-
-fetch = cache.fetch
-
-def listen(frame, event, _):
-    if event == "call" and frame.f_code.co_flags & inspect.CO_OPTIMIZED:  # no module's or class's body
-        seen.add(frame.f_code.co_filename)
-
-def ran_since():
-    found = sorted(file for file in seen.copy() if file.startswith(str(home)))
-    seen.clear()
-    return found
-
-def watched(path, compute, **kwargs):
-    def alone():
-        on_the_way.extend(ran_since())
-        value = compute()
-        ran[path.stem.partition("-")[0]]["ran"] = ran_since()
-        return value
-
-    return fetch(path, alone, **kwargs)
-
-Stage.key, cache.fetch = key_and_cover, watched
-threading.settrace(listen)  # it returns no function for the lines within
-sys.settrace(listen)
-pipeline.run(Options(Path(sys.argv[1]), holdout=4, steps=20), Path(sys.argv[2]) / "out")
-on_the_way += ran_since() + [file for told in ran.values() for file in told["ran"]]
-field = load_field(Path(sys.argv[2]) / "out/field.safetensors")
-answer = ask.ask_text(field, ColourEmbedder(), "red")
-assert answer.mask.any()
-outputs.write_answer(field, answer, Path(sys.argv[2]), outputs.answer_masks(field, answer, 1))
-told = {"stages": ran, "run": on_the_way, "query": ran_since()}
-(Path(sys.argv[2]) / "ran.json").write_text(json.dumps(told))
-"""

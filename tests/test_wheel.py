@@ -33,7 +33,7 @@ def built(tmp_path_factory):
         return names, set(wheel.namelist()), email.message_from_bytes(wheel.read(told))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_wheel_holds_the_packages_files_and_nothing_else(built):
     source, wheel, _ = built
     own = {path for path in (HOME / "jsecon").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
@@ -46,7 +46,7 @@ def test_the_wheel_holds_the_packages_files_and_nothing_else(built):
     assert not any(name.startswith("tests/") for name in source)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_wheel_says_what_it_needs_and_offers(built):
     told = built[2]
     assert (told["Name"], told["License-Expression"]) == ("jsecon", PROJECT["license"])

@@ -129,7 +129,7 @@ def test_replica_views_agree_on_depth_and_label(shared):
         assert (labels[b][y, x] == labels[a][row, column][inside])[near].mean() > 0.97
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_apc_small_voxels_select_an_object(shared):
     """The whole chain on five views of the real bin, coarse enough to be quick; the figure itself is the
     experiment's."""

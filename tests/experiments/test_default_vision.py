@@ -67,7 +67,7 @@ def test_optical_flow_carries_an_id_along():
     assert np.unique(default_vision.by_flow(frames, away)[2]).tolist() == [-1, 3]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stopped_measurement_goes_on(flat_capture, tmp_path, monkeypatch, capsys):
     """The cells that are there are read; what is measured is two views of a plane, half of it another colour."""
     truth = np.zeros((2, 40, 40), np.int32)

@@ -25,7 +25,7 @@ def task(scene, cameras):
     return paths.Task("small", scene, cameras, labels, codes, regions, texts, np.arange(REGIONS), members)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_solver_is_below_the_votes_it_starts_from(task):
     rows = {row["path"]: row for row in paths.votes_paths(task, loyalties=(0.1,), sweeps=(8,))}
     assert len(rows) == 5

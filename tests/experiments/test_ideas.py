@@ -129,7 +129,7 @@ def test_a_mask_under_another_id_is_outvoted_and_right_ones_stay():
     np.testing.assert_array_equal(agree(sparse.csr_matrix(0 * votes), ids), ids)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_autoencoder_experiment_runs_and_a_rotation_of_full_rank_loses_nothing(tmp_path):
     options = dataclasses.replace(autoencoder.QUICK, texts=str(tmp_path), regions=(6,), latents=(6,), epochs=4)
     rows = autoencoder.main(dataclasses.replace(options, out=str(tmp_path / "out")))["rows"]

@@ -152,7 +152,7 @@ def test_a_table_on_another_fit_keeps_its_own_cells_and_takes_those_of_the_table
     assert plans["default"].cells == "elsewhere/cells.jsonl"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_default_fit_has_as_many_gaussians_as_its_start_or_more(folder):  # noqa: F811
     data = dataclasses.replace(lerf.QUICK.data, twins=str(folder / "grown"))
     counts = [

@@ -87,7 +87,7 @@ def test_table_1_and_its_resumption(folder, monkeypatch):
     assert strip(again["cells"]) == strip(metrics["cells"])
 
 
-@pytest.mark.slow  # .ci/run makes the whole quick table
+@pytest.mark.long  # .ci/run makes the whole quick table
 def test_table_2(folder):
     plan = with_gaussians(small(ovs3d.QUICK, folder, "ovs3d", methods=(TRACKED,)))
     ovs3d.main(plan)
@@ -97,7 +97,7 @@ def test_table_2(folder):
     assert "| seconGS (the paper) | 70.58 / - |" in text
 
 
-@pytest.mark.slow  # .ci/run makes the whole quick table
+@pytest.mark.long  # .ci/run makes the whole quick table
 def test_table_3(folder):
     replica.main(small(replica.QUICK, folder, "replica", methods=(TRACKED,)))
     metrics, text = read(folder, "replica")
@@ -106,7 +106,7 @@ def test_table_3(folder):
     assert "mean recall" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scannet_goes_through_the_same_code(folder):
     size = (("views", 6), ("width", 64), ("height", 48), ("num_objects", 4), ("fine_m", 0.03), ("coarse_m", 0.2))
     data = twins.Data("scannet", scenes=("scene0000_00",), seeds=(0,), size=size, twins=str(folder / "twins"))
@@ -116,7 +116,7 @@ def test_scannet_goes_through_the_same_code(folder):
     assert cell["pairs"] >= 5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_levels_of_noise_share_a_fit(folder):
     data = dataclasses.replace(lerf.QUICK.data, twins=str(folder / "fits"))
     for level in ("perfect", "medium"):
@@ -127,7 +127,7 @@ def test_levels_of_noise_share_a_fit(folder):
     assert len(list((folder / "fits" / "fitted").iterdir())) == 2  # another room
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ablations(folder):
     few = ("masklets, anchored by code", "each frame's own masks, anchored by code", TRACKED)
     plan = small(ablation_components.QUICK, folder, "components", methods=few)
@@ -145,7 +145,7 @@ def test_ablations(folder):
     assert not (folder / "query" / "cells.jsonl").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_threshold_sweep(folder):
     threshold_sweep.main(small(threshold_sweep.QUICK, folder, "sweep", thresholds=(0.5, 0.9)))
     metrics, _ = read(folder, "sweep")
@@ -162,7 +162,7 @@ def test_best_thresholds_are_those_of_single_queries():
     assert found == pytest.approx((3, 0.4, 0.32, 0.72, (0.8 + 0.6 + 0.9) / 3 - 0.5))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_protocols(folder):
     plan = with_gaussians(small(two_protocols.QUICK, folder, "protocols", methods=("VALA",), level="perfect"))
     two_protocols.main(plan)
@@ -187,7 +187,7 @@ def test_levels_that_are_alike_are_learnt_once(folder, tmp_path):
     assert len(smaller.embeddings) == len(large.embeddings) - len(setting.names)  # the first mask of each frame
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("table", ["lerf", "replica"])
 def test_qualitative(folder, table):
     qualitative.main(small(qualitative.plans(table)[1], folder, "qualitative", methods=CHEAP))
