@@ -24,12 +24,12 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jsecon.data.capture import load_capture
-from jsecon.fit.growth import rows_for, with_free_rows
+from jsecon.fit.growth import pad_with_free_rows, padded_row_count
 from jsecon.fit.photometric import l1, photometric_loss
 from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.step import Current, Steps, Way, on_devices
-from jsecon.fit.view import Views
+from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
+from jsecon.fit.view import TrainingViews
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.render import render, render_rgb
@@ -45,7 +45,7 @@ def main() -> None:
     asked = parser.parse_args()
     capture = load_capture(asked.capture, long_side=asked.long_side, frames=9)
     gaussians, _ = starting_gaussians(capture, sh_degree=asked.sh_degree)
-    gaussians = with_free_rows(jax.tree.map(np.asarray, gaussians), rows_for(gaussians.count))
+    gaussians = pad_with_free_rows(jax.tree.map(np.asarray, gaussians), padded_row_count(gaussians.count))
     mesh = host_mesh()
     options: dict[str, Any] = {} if mesh is None else {"compiler_options": MESH_OPTIONS}
     put = lambda tree: jax.device_put(tree, None if mesh is None else NamedSharding(mesh, PartitionSpec()))
@@ -60,10 +60,10 @@ def main() -> None:
         return l1(image, frame.astype(jnp.float32) / 255)
 
     zeros = jax.tree.map(np.zeros_like, gaussians)
-    current = on_devices(Current(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
-    views = Views(dataclasses.replace(capture, held_out=np.arange(9) != 4))
-    steps = Steps(views, mesh)
-    ways = [Way(3, growth, LearningRates(), None, gaussians.count) for growth in ("votes", "none")]
+    current = put_on_devices(TrainState(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
+    views = TrainingViews(dataclasses.replace(capture, held_out=np.arange(9) != 4))
+    steps = StepRunner(views, mesh)
+    ways = [StepConfig(3, growth, LearningRates(), None, gaussians.count) for growth in ("votes", "none")]
     voting, plain_step = (functools.partial(steps.take, current, 0, 0, 0.0, way) for way in ways)
     reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current[0], camera, frame)
     runs = {"l1": reference, "step": plain_step, "step_with_votes": voting}

@@ -85,7 +85,7 @@ def main() -> None:
 
     from jsecon.association.algorithm1 import masklets
     from jsecon.association.consensus import consensus_masklets
-    from jsecon.association.runs import remembered
+    from jsecon.association.run_lengths import memoized_masks
     from jsecon.association.tracker import GeometricTracker
     from jsecon.fit.start import gaussians_from_points
     from jsecon.types import Camera
@@ -106,7 +106,7 @@ def main() -> None:
     def true_masks(t: int) -> np.ndarray:
         return draw(poses[t], focal, size, centres)[0] == np.arange(count + 1)[:, None, None]
 
-    proposals = remembered(true_masks)  # as a run keeps what its segmenter finds
+    proposals = memoized_masks(true_masks)  # as a run keeps what its segmenter finds
     tracker = GeometricTracker(gaussians, cameras, proposals)
     start = time.perf_counter()
     tracker.views.all(frames)

@@ -23,7 +23,7 @@ from experiments.tables.answers import Answers, Method, Steps
 from experiments.tables.fill import fill, place_of, twins_asked
 from experiments.tables.rows import rows_of
 from experiments.tables.setting import Setting
-from jsecon.evaluate.lerf import resized
+from jsecon.evaluate.lerf import resize_camera
 from jsecon.query.masks import selection_mask
 from jsecon.types import Selection
 
@@ -74,7 +74,7 @@ def things(setting: Setting, select) -> dict[str, float]:
     shown = held = of_kind = 0
     for frame in bench.frames:
         truth = cv2.imread(str(root / "truth" / bench.name / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED).astype(int) - 1
-        camera = jax.tree.map(jnp.asarray, resized(setting.cameras[frame.name], truth.shape[1], truth.shape[0]))
+        camera = jax.tree.map(jnp.asarray, resize_camera(setting.cameras[frame.name], truth.shape[1], truth.shape[0]))
         pixels = np.bincount(truth[truth >= 0], minlength=len(names))
         objects = (pixels >= LEAST_PX) & ~np.isin(names, SURROUNDINGS)
         for text in frame.objects:

@@ -24,7 +24,7 @@ from experiments.tables.fill import Plan, options_of
 from experiments.tables.methods import METHODS
 from experiments.tables.setting import Setting, prepare
 from jsecon.app.pictures import selection_overlay
-from jsecon.evaluate.lerf import resized
+from jsecon.evaluate.lerf import resize_camera
 from jsecon.evaluate.metrics import iou
 from jsecon.query.masks import selection_mask
 from jsecon.splat.render import render
@@ -66,7 +66,7 @@ def seen(setting: Setting) -> Seen:
     bench = setting.bench
     if bench.frames:
         frame = bench.frames[0]
-        camera = jax.tree.map(jnp.asarray, resized(setting.cameras[frame.name], frame.width, frame.height))
+        camera = jax.tree.map(jnp.asarray, resize_camera(setting.cameras[frame.name], frame.width, frame.height))
         true = {text: frame.objects[text][0] for text in frame.objects}
         picture = np.asarray(bench.capture.frames[bench.capture.names.index(frame.name)])
 

@@ -23,8 +23,8 @@ from scipy.linalg import expm
 from experiments import results
 from jsecon.demo import make_room, render_views, room_cameras
 from jsecon.fit.optimise import fit_gaussians
-from jsecon.fit.quality import quality
-from jsecon.fit.settle import settled
+from jsecon.fit.quality import measure_quality
+from jsecon.fit.refine import refine_capture
 from jsecon.fit.start import starting_gaussians
 from jsecon.types import Capture
 
@@ -76,7 +76,7 @@ def fitted(capture: Capture, options: Options, seed: int) -> dict:
     start, _ = starting_gaussians(capture, sh_degree=1)
     began = time.monotonic()
     gaussians, _ = fit_gaussians(capture, key=jax.random.key(seed), start=start, steps=options.steps)
-    found, seconds = quality(gaussians, capture), time.monotonic() - began
+    found, seconds = measure_quality(gaussians, capture), time.monotonic() - began
     return {"psnr": float(found.psnr.mean()), "ssim": float(found.ssim.mean()), "seconds": seconds}
 
 
@@ -92,8 +92,8 @@ def poses_off(capture: Capture, truth: Capture) -> tuple[float, float]:
 def corrected(rough: Capture, way: str, options: Options, seed: int) -> Capture:
     """The rough capture with poses and exposures corrected."""
     if way == "both":
-        return settled(rough, key=jax.random.key(seed))
-    return settled(rough, key=jax.random.key(seed), decide=True, at_most=options.steps / 2)
+        return refine_capture(rough, key=jax.random.key(seed))
+    return refine_capture(rough, key=jax.random.key(seed), decide=True, max_fit_steps=options.steps / 2)
 
 
 def main(options: Options) -> None:

@@ -25,10 +25,10 @@ import numpy as np
 
 from experiments import results
 from jsecon.data.capture import load_capture
-from jsecon.fit.quality import quality
+from jsecon.fit.quality import measure_quality
 from jsecon.fit.schedule import LearningRates, rates_at
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.view import Views, view_loss
+from jsecon.fit.view import TrainingViews, view_loss
 from jsecon.parallel import MESH_OPTIONS, host_mesh
 from jsecon.process import clear_programs
 from jsecon.splat.capacity import default_capacity
@@ -104,7 +104,7 @@ def step(state: State, view, numbers: dict[str, Any], *, gamma: float | None, lo
 def fitted(capture, start: Gaussians, way: str, options: Options) -> list[dict]:
     """Held-out PSNR and SSIM at so many looks along the way, with the seconds of the steps alone."""
     gamma, every = WAYS[way]
-    views, mesh = Views(capture), host_mesh()
+    views, mesh = TrainingViews(capture), host_mesh()
     strips = 1 if mesh is None else mesh.size
     capacity = 2 * default_capacity(start.count, views.cameras.width, views.cameras.height, strips=strips)
     zeros = jax.tree.map(jnp.zeros_like, start)
@@ -136,7 +136,7 @@ def fitted(capture, start: Gaussians, way: str, options: Options) -> list[dict]:
             state = taken(state, number)
         jax.block_until_ready(state)
         spent += time.monotonic() - began
-        found = quality(state.gaussians, capture)
+        found = measure_quality(state.gaussians, capture)
         cell = {"way": way, "steps": last, "seconds": spent}
         cells.append(cell | {"psnr": float(found.psnr.mean()), "ssim": float(found.ssim.mean())})
         print(json.dumps(cells[-1]), flush=True)

@@ -27,7 +27,7 @@ from experiments.tables.methods import RECOMMENDED, by_features, langsplat_of
 from experiments.tables.ours import ask_field, field_of
 from experiments.tables.setting import Setting
 from jsecon.data.lerf_labels import LabelledFrame
-from jsecon.evaluate.lerf import resized
+from jsecon.evaluate.lerf import resize_camera
 from jsecon.language.distill import distill_votes
 from jsecon.splat.render import render
 from jsecon.types import Array
@@ -41,7 +41,7 @@ def in_the_image(setting: Setting, maps: Sequence[Map]) -> dict[str, float]:
     gaussians = jax.tree.map(jnp.asarray, setting.evidence.gaussians)
     texts, canonical = jnp.asarray(setting.texts), jnp.asarray(setting.canonical)
     labels = setting.bench.frames
-    resize = lambda frame: resized(setting.cameras[frame.name], frame.width, frame.height)
+    resize = lambda frame: resize_camera(setting.cameras[frame.name], frame.width, frame.height)
     cameras = {frame.name: jax.tree.map(jnp.asarray, resize(frame)) for frame in labels}
 
     @functools.lru_cache(maxsize=1)  # the pairs come frame by frame

@@ -18,7 +18,7 @@ import jax
 from experiments import results
 from jsecon.data.capture import load_capture
 from jsecon.fit.optimise import fit_gaussians
-from jsecon.fit.quality import quality
+from jsecon.fit.quality import measure_quality
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import Start, starting_gaussians
 from jsecon.process import clear_programs, cores
@@ -62,8 +62,8 @@ WAYS: dict[str, Knobs] = {
     "MCMC": _with(growth="mcmc"),
     "full size only": _with(sizes=((1.0, 1.0),)),
     "three sizes": _with(sizes=((0.25, 0.2), (0.5, 0.5), (1.0, 1.0))),
-    "50,000 Gaussians": _with(at_most=50_000),
-    "200,000 Gaussians": _with(at_most=200_000),
+    "50,000 Gaussians": _with(max_gaussians=50_000),
+    "200,000 Gaussians": _with(max_gaussians=200_000),
     "dense start": _with(start="dense"),
     "dense start, no growth": _with(start="dense", growth="none"),
     "random start": _with(start="random"),
@@ -88,7 +88,7 @@ def fit(capture, knobs: Knobs, minutes: float) -> dict:
         rates=knobs.rates,
         on_checkpoint=lambda state: states.append((float(state.seconds), float(state.done))),
     )
-    found = quality(gaussians, capture)
+    found = measure_quality(gaussians, capture)
     return {
         "psnr": float(found.psnr.mean()),
         "ssim": float(found.ssim.mean()),

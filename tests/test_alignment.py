@@ -7,7 +7,7 @@ import pytest
 from conftest import look_at
 from scipy.linalg import expm
 
-from jsecon.fit.alignment import aligned
+from jsecon.fit.alignment import align_cameras
 from jsecon.types import Camera, Capture
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 10, 120, 90, 110.0
@@ -70,9 +70,9 @@ def test_poses_off_by_centimetres_and_degrees_are_found_again(noise, unknown):
     rough = dataclasses.replace(truth, frames=np.uint8(np.rint(truth.frames * gains)), depths=np.float32(depths))
     rough = moved(rough, 2.0, 1.0)
     before, train = off(np.float64(rough.cameras.world_to_camera), truth), ~truth.held_out
-    poses = aligned(rough, train)
+    poses = align_cameras(rough, train)
     assert np.array_equal(np.float32(poses[-1]), rough.cameras.world_to_camera[-1])
-    poses = aligned(posed(rough, poses), truth.held_out, train)
+    poses = align_cameras(posed(rough, poses), truth.held_out, train)
     after = off(poses, truth)
     assert before[0] > 10
     assert before[1] > 5
@@ -82,5 +82,5 @@ def test_poses_off_by_centimetres_and_degrees_are_found_again(noise, unknown):
 
 def test_exact_poses_stay_and_frames_that_share_nothing_have_none():
     truth = in_a_corner()
-    assert aligned(truth, ~truth.held_out) is None
-    assert aligned(dataclasses.replace(truth, depths=np.zeros_like(truth.depths)), ~truth.held_out) is None
+    assert align_cameras(truth, ~truth.held_out) is None
+    assert align_cameras(dataclasses.replace(truth, depths=np.zeros_like(truth.depths)), ~truth.held_out) is None

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.splat.bits import WORD, read_off, set_bits
+from jsecon.splat.bits import WORD, compact_tile_lists, tile_bits
 
 
 @pytest.mark.parametrize(("words", "density"), [(1, 0.5), (7, 0.0), (7, 1.0), (40, 0.03), (2500, 0.25)])
@@ -21,8 +21,8 @@ def test_lists_are_those_of_a_loop(words, density, filled):
 
     @jax.jit
     def lists(reached, owner, total):
-        members, before = set_bits(lambda owner, reached: reached, owner, reached, 16, total, WORD)
-        return members, before, read_off(members, before, owner, total, WORD)
+        members, before = tile_bits(lambda owner, reached: reached, owner, reached, 16, total, WORD)
+        return members, before, compact_tile_lists(members, before, owner, total, WORD)
 
     members, before, got = lists(jnp.asarray(reached), jnp.asarray(owner), jnp.int32(total))
     expected = np.concatenate([owner[bits[:, tile]] for tile in range(16)])

@@ -10,22 +10,22 @@ from conftest import look_at
 from scipy.linalg import expm
 
 from jsecon.errors import InputError
-from jsecon.fit import settle
+from jsecon.fit import refine
 from jsecon.fit.corrections import (
     Corrections,
-    Refine,
-    at_rest,
-    away_from_rest,
+    RefineOptions,
+    apply_exposure,
     corrected_camera,
-    exponential,
-    exposed,
+    correction_penalty,
+    identity_corrections,
+    se3_exp,
 )
-from jsecon.fit.optimise import fit_gaussians, start_state
+from jsecon.fit.optimise import fit_gaussians, init_fit_state
 from jsecon.fit.quality import evaluate_psnr
+from jsecon.fit.refine import _rigid_drift, refine_capture
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.settle import _drift, settled
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.view import Views, cameras_extent, view_loss
+from jsecon.fit.view import TrainingViews, cameras_extent, view_loss
 from jsecon.splat.render import render
 from jsecon.types import Camera, Capture, Gaussians
 
@@ -38,8 +38,8 @@ GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
 @pytest.fixture(autouse=True)
 def _one_size(monkeypatch):
     """A program less to compile, and captures of a few frames."""
-    monkeypatch.setattr(settle, "FINE", 1.0)
-    monkeypatch.setattr(settle, "ASIDE", (1, 8))
+    monkeypatch.setattr(refine, "FINE", 1.0)
+    monkeypatch.setattr(refine, "ASIDE", (1, 8))
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def same(a, b):
 
 def test_exponential_is_scipys_over_all_angles(x64):
     rng = np.random.default_rng(1)
-    one = jax.jit(exponential)
+    one = jax.jit(se3_exp)
     for angle in (0.0, 1e-30, 1e-9, 1e-4, 0.5, 0.999, 1.001, 3.0, 6.5, 40.0):
         twist = rng.normal(size=6)
         twist[:3] *= angle / np.linalg.norm(twist[:3])
@@ -108,8 +108,8 @@ def test_exponential_is_scipys_over_all_angles(x64):
 
 
 def test_exponential_is_smooth_everywhere(x64):
-    slope = jax.jit(jax.jacfwd(exponential))
-    back = jax.jit(jax.jacrev(exponential))
+    slope = jax.jit(jax.jacfwd(se3_exp))
+    back = jax.jit(jax.jacrev(se3_exp))
     for twist in (np.zeros(6), np.array([1e-20, 0, 0, 1, 2, 3]), np.array([0.6, -0.6, 0.529, 1, 2, 3]), np.ones(6)):
         steps = 1e-6 * np.eye(6)
         by = np.stack([(hat_exp(twist + h) - hat_exp(twist - h)) / 2e-6 for h in steps], axis=-1)
@@ -118,19 +118,19 @@ def test_exponential_is_smooth_everywhere(x64):
 
 
 def test_at_rest_nothing_changes(capture):
-    rest = jax.tree.map(lambda a: jnp.asarray(a[0]), at_rest(1))
+    rest = jax.tree.map(lambda a: jnp.asarray(a[0]), identity_corrections(1))
     camera = jax.tree.map(jnp.asarray, capture.cameras[0])
     assert same(corrected_camera(camera, rest.twists), camera)
     image = jnp.asarray(capture.frames[0], jnp.float32)
-    assert same(exposed(image, rest.colours), image)
-    assert float(away_from_rest(rest, jnp.float32(0))) == 0
+    assert same(apply_exposure(image, rest.colours), image)
+    assert float(correction_penalty(rest, jnp.float32(0))) == 0
 
 
 def test_gradients_through_the_whole_step_are_central_differences(capture, truth, x64):
     """Photometric loss, depth, pose, exposure and scene, in float64. (What is ignored is a constant to the gradient and
     has its own test.)"""
     rng = np.random.default_rng(2)
-    views = Views(dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1))
+    views = TrainingViews(dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1))
     double = lambda a: jnp.asarray(a, jnp.float64) if np.asarray(a).dtype == np.float32 else jnp.asarray(a)
     view = jax.tree.map(double, views[0])
     scene = jax.tree.map(lambda a: double(a) + 0.02 * rng.normal(size=a.shape), truth)
@@ -164,7 +164,7 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
     gains = rng.uniform(0.8, 1.0, VIEWS)
     told, states = rough(capture, twists=twists, gains=gains), []
-    given = GIVEN | {"rates": FROZEN, "refine": Refine(pose_rate=2e-3), "on_checkpoint": states.append}
+    given = GIVEN | {"rates": FROZEN, "refine": RefineOptions(pose_rate=2e-3), "on_checkpoint": states.append}
     fit_gaussians(told, start=truth, steps=40 * 5, **given)
     found, pixels = jax.tree.map(np.asarray, states[-1].refined.now), []
     for poses in (capture.cameras.world_to_camera, hat_exp_of(found.twists) @ told.cameras.world_to_camera):
@@ -179,17 +179,17 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
 
 def test_without_corrections_a_fit_is_what_it_was(capture, truth):
     """Rates of zero leave every frame at rest, and the scene as without."""
-    off = Refine(poses=False, exposure=False)
+    off = RefineOptions(poses=False, exposure=False)
     plain, losses = fit_gaussians(capture, start=truth, steps=10, **GIVEN)
     still, others = fit_gaussians(capture, start=truth, steps=10, refine=off, **GIVEN)
     np.testing.assert_allclose(losses, others, rtol=1e-5)
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(still), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
-    assert start_state(truth).refined is None
+    assert init_fit_state(truth).refined is None
 
 
 def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, truth):
-    states, given = [], {"steps": 30, "refine": Refine(), **GIVEN}
+    states, given = [], {"steps": 30, "refine": RefineOptions(), **GIVEN}
     whole, losses = fit_gaussians(capture, start=truth, on_checkpoint=states.append, **given)
     stopped, ends = jax.tree.map(np.asarray, states[0]), []
     again, others = fit_gaussians(capture, state=stopped, on_checkpoint=ends.append, **given)
@@ -204,18 +204,18 @@ def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_n
     twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
     told = rough(capture, twists=twists, gains=rng.uniform(0.8, 1.0, VIEWS))
     start = dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
-    better = settled(told, start, key=KEY, visits=15, probes=2)
+    better = refine_capture(told, start, key=KEY, visits=15, probes=2)
     assert "poses refined" in " ".join(better.notes)
     assert "held out" in better.notes[-1]
     assert same(better.cameras.fx, told.cameras.fx)
     assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
-    other = settled(dataclasses.replace(told, frames=frames), start, key=KEY, visits=15, probes=2)
+    other = refine_capture(dataclasses.replace(told, frames=frames), start, key=KEY, visits=15, probes=2)
     train = ~told.held_out
     assert same(other.cameras[train], better.cameras[train])
     assert same(other.frames[train], better.frames[train])
-    assert settled(told, start, key=KEY, refine=None) is told
+    assert refine_capture(told, start, key=KEY, refine=None) is told
 
 
 def errors(seed=4):
@@ -228,12 +228,12 @@ def errors(seed=4):
 def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_the_decision(capture, truth):
     told = rough(capture, **errors())
     given = {"key": KEY, "visits": 15, "probes": 2, "decide": True}
-    better = settled(told, truth, **given)
+    better = refine_capture(told, truth, **given)
     assert "are corrected" in " ".join(better.notes)
     assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
     frames = told.frames.copy()
     frames[2] = 255 - frames[2]
-    other = settled(dataclasses.replace(told, frames=frames), truth, **given)
+    other = refine_capture(dataclasses.replace(told, frames=frames), truth, **given)
     train = ~told.held_out
     assert same(other.cameras[train], better.cameras[train])
     assert same(other.frames[train], better.frames[train])
@@ -241,18 +241,18 @@ def test_a_rough_capture_is_corrected_and_its_held_out_frames_have_no_part_in_th
 
 
 def test_an_exact_capture_stays_as_it_is_bit_by_bit(capture, truth):
-    kept = settled(capture, truth, key=KEY, visits=15, probes=2, decide=True)
+    kept = refine_capture(capture, truth, key=KEY, visits=15, probes=2, decide=True)
     assert "stay as they are" in kept.notes[-1]
     assert same(dataclasses.replace(kept, notes=()), capture)
 
 
 def test_probes_that_take_too_long_or_have_nothing_to_be_tested_on_change_nothing(capture, truth):
     told = rough(capture, **errors())
-    short = settled(told, truth, key=KEY, decide=True, at_most=10.0)
+    short = refine_capture(told, truth, key=KEY, decide=True, max_fit_steps=10.0)
     assert "--steps" in short.notes[-1]
     assert same(dataclasses.replace(short, notes=()), told)
     few = dataclasses.replace(told, held_out=np.arange(VIEWS) > 1)
-    kept = settled(few, truth, key=KEY, decide=True)
+    kept = refine_capture(few, truth, key=KEY, decide=True)
     assert "too few" in kept.notes[-1]
     assert same(dataclasses.replace(kept, notes=()), few)
 
@@ -260,8 +260,10 @@ def test_probes_that_take_too_long_or_have_nothing_to_be_tested_on_change_nothin
 def test_probes_end_when_the_poses_have_settled(capture, truth):
     """The last one still comes."""
     steps = []
-    settled(capture, truth, key=KEY, visits=8, probes=9, progress=lambda done, total: steps.append((done, total)))
-    total = 8 * 9 * (VIEWS - 1) + settle.ALIGNING_VISITS
+    refine_capture(
+        capture, truth, key=KEY, visits=8, probes=9, progress=lambda done, total: steps.append((done, total))
+    )
+    total = 8 * 9 * (VIEWS - 1) + refine.ALIGNING_VISITS
     assert {whole for _, whole in steps} == {total}
     assert sorted(steps) == steps
     assert steps[-1] == (total, total)
@@ -271,14 +273,14 @@ def test_probes_end_when_the_poses_have_settled(capture, truth):
 def test_the_world_stays_where_it_was(capture):
     given = np.asarray(capture.cameras.world_to_camera, np.float64)
     motion = hat_exp([0.1, -0.2, 0.3, 1.0, 2.0, -1.0])
-    np.testing.assert_allclose(_drift(given @ np.linalg.inv(motion), given, 1.0), motion, atol=1e-6)
+    np.testing.assert_allclose(_rigid_drift(given @ np.linalg.inv(motion), given, 1.0), motion, atol=1e-6)
 
 
 @pytest.mark.parametrize("rate", [0.1, 10.0])
 def test_a_frame_ten_times_as_bright_or_dark_leaves_finite_numbers(capture, truth, rate):
     told = rough(capture, twists=np.zeros((VIEWS, 6)), gains=np.where(np.arange(VIEWS) == 3, rate, 1.0))
     depths = np.where(np.arange(32) < 9, np.nan, capture.depths).astype(np.float32)
-    better = settled(dataclasses.replace(told, depths=depths), truth, key=KEY, visits=8, probes=1)
+    better = refine_capture(dataclasses.replace(told, depths=depths), truth, key=KEY, visits=8, probes=1)
     assert np.isfinite(better.cameras.world_to_camera).all()
     found, losses = fit_gaussians(better, start=truth, steps=10, **GIVEN)
     assert all(np.isfinite(leaf).all() for leaf in (losses, *jax.tree.leaves(found)))
@@ -287,7 +289,7 @@ def test_a_frame_ten_times_as_bright_or_dark_leaves_finite_numbers(capture, trut
 def test_depth_that_is_not_known_teaches_nothing(capture, truth):
     unknown = dataclasses.replace(capture, depths=np.full_like(capture.depths, np.nan))
     zero = dataclasses.replace(capture, depths=np.zeros_like(capture.depths))
-    assert not Views(unknown)[0].depth.any()
+    assert not TrainingViews(unknown)[0].depth.any()
     (a, _), (b, _) = (fit_gaussians(c, start=truth, steps=10, **GIVEN) for c in (unknown, zero))
     assert same(a, b)
 
@@ -297,7 +299,7 @@ def test_three_frames_of_pure_rotation_are_fitted_or_refused(truth):
     turned = photographed(truth, [look_at((0, -0.6, -2.2), (x, 0, 0)) for x in np.linspace(-0.3, 0.3, VIEWS)])
     turned = dataclasses.replace(turned, held_out=np.arange(VIEWS) % 2 == 0)
     assert cameras_extent(turned.cameras) == pytest.approx(0, abs=1e-6)
-    better = settled(turned, truth, key=KEY, visits=8, probes=1)
+    better = refine_capture(turned, truth, key=KEY, visits=8, probes=1)
     assert np.isfinite(better.cameras.world_to_camera).all()
     np.testing.assert_allclose(better.cameras.centres, turned.cameras.centres, atol=1e-5)
     with pytest.raises(InputError):
@@ -307,7 +309,9 @@ def test_three_frames_of_pure_rotation_are_fitted_or_refused(truth):
 def test_a_frame_that_nothing_explains_is_left_out(capture, truth):
     frames = capture.frames.copy()
     frames[4] = np.random.default_rng(5).integers(0, 256, frames[4].shape, np.uint8)
-    kept = settled(dataclasses.replace(capture, frames=frames), truth, key=KEY, refine=None, drop_weak=True, visits=8)
+    kept = refine_capture(
+        dataclasses.replace(capture, frames=frames), truth, key=KEY, refine=None, drop_weak=True, visits=8
+    )
     assert kept.names == ("f0", "f1", "f2", "f3", "f5")
     assert "f4" in kept.notes[-1]
     assert len(kept.frames) == len(kept.depths) == len(kept.cameras.fx) == len(kept.held_out) == 5
@@ -320,7 +324,7 @@ def test_depths_and_masks_are_made_smaller_without_mixing(capture):
     ignored = np.zeros(capture.frames.shape[:3], bool)
     ignored[:, 5, 7] = True
     depths = np.tile(slope.astype(np.float32), (VIEWS, 1, 1))
-    views = Views(dataclasses.replace(capture, ignored=ignored, depths=depths))
+    views = TrainingViews(dataclasses.replace(capture, ignored=ignored, depths=depths))
     np.testing.assert_array_equal(views[0].depth, depths[0])
     assert np.array_equal(views[0].ignored, ignored[views.used[0]])
     views.at(0.5)

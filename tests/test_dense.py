@@ -29,8 +29,8 @@ def without_depth(capture):
 
 
 @functools.cache
-def room_points(at_most=3000):
-    return dense_points(without_depth(room()), at_most=at_most)
+def room_points(max_points=3000):
+    return dense_points(without_depth(room()), max_points=max_points)
 
 
 def seen_by(cameras, points):
@@ -72,7 +72,7 @@ def test_dense_points_cover_what_the_views_see():
 
 
 def test_the_same_points_come_every_time_and_no_more_than_asked_for():
-    again, colors = dense_points(without_depth(room()), at_most=3000)
+    again, colors = dense_points(without_depth(room()), max_points=3000)
     np.testing.assert_array_equal(again, room_points()[0])
     np.testing.assert_array_equal(colors, room_points()[1])
     assert 300 < len(room_points(500)[0]) <= 500
@@ -82,7 +82,7 @@ def test_held_out_frames_are_not_looked_at():
     frames = np.array(room().frames)
     frames[2] = 0
     black = dataclasses.replace(without_depth(room()), frames=frames)
-    np.testing.assert_array_equal(dense_points(black, at_most=3000)[0], room_points()[0])
+    np.testing.assert_array_equal(dense_points(black, max_points=3000)[0], room_points()[0])
     np.testing.assert_array_equal(random_points(black, 50)[1], random_points(room(), 50)[1])
 
 
@@ -91,7 +91,7 @@ def test_a_capture_without_points_is_matched_too():
     bare = dataclasses.replace(
         without_depth(room()), points=none.astype(np.float32), point_colors=none.astype(np.uint8)
     )
-    assert np.median(off_the_surface(*dense_points(bare, at_most=3000))[0]) < 0.01
+    assert np.median(off_the_surface(*dense_points(bare, max_points=3000))[0]) < 0.01
 
 
 def chosen(frames):
@@ -108,19 +108,19 @@ def chosen(frames):
 
 def test_what_cannot_be_matched_is_refused():
     with pytest.raises(InputError, match=r"1 frames to match.*at least 3"):
-        dense_points(chosen([0]), at_most=1000)
+        dense_points(chosen([0]), max_points=1000)
     blank = dataclasses.replace(without_depth(room()), frames=np.full_like(room().frames, 90))
     with pytest.raises(InputError, match=r"points that three views agree on.*texture"):
-        dense_points(blank, at_most=1000)
+        dense_points(blank, max_points=1000)
     apart = chosen([0, 1, 3])
     poses = np.array(apart.cameras.world_to_camera)
     for t in range(3):  # each camera is moved away to the side, so that no two see the same
         poses[t, 0, 3] += 1000 * t
     apart = dataclasses.replace(apart, cameras=dataclasses.replace(apart.cameras, world_to_camera=poses))
     with pytest.raises(InputError, match="overlap"):
-        dense_points(apart, at_most=1000)
-    with pytest.raises(ValueError, match="at_most"):
-        dense_points(without_depth(room()), at_most=3)
+        dense_points(apart, max_points=1000)
+    with pytest.raises(ValueError, match="max_points"):
+        dense_points(without_depth(room()), max_points=3)
 
 
 def test_random_points_lie_where_two_views_look():

@@ -9,7 +9,7 @@ import pytest
 from small_field import make_field
 
 import jsecon
-from jsecon.splat.project import check_shapes, usable
+from jsecon.splat.project import check_shapes, is_usable
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ REFUSED = {
 @pytest.mark.parametrize("how", HELD)
 def test_what_can_be_drawn_comes_back_from_fields_and_files(scene, camera, field, tmp_path, how):
     odd = changed(scene, **HELD[how])
-    assert bool(usable(odd).all())
+    assert bool(is_usable(odd).all())
     drawn = jsecon.render_rgb(odd, camera).features
     assert np.isfinite(np.asarray(drawn)).all()
     jsecon.save_field(tmp_path / "f.safetensors", dataclasses.replace(field, gaussians=odd))

@@ -11,7 +11,7 @@ from conftest import look_at
 from jsecon.errors import InputError
 from jsecon.fit import step as one_step
 from jsecon.fit.growth import in_use
-from jsecon.fit.optimise import fit_gaussians, start_state, view_order
+from jsecon.fit.optimise import fit_gaussians, init_fit_state, view_order
 from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.view import cameras_extent
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.few_steps
 KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
-SCHEDULE = Schedule(growth="none", degree_every=0.25)
+SCHEDULE = Schedule(growth="none", degree_interval=0.25)
 WHOLE = Schedule(sizes=((1.0, 1.0),), growth="none")
 INRIA_RATES = LearningRates(
     means=1.6e-4,
@@ -176,7 +176,7 @@ def test_overflowing_chunks_are_taken_again_with_more_room(capture, start, monke
 def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to_the_same(capture, start):
     """Half of the scene's Gaussians are missing: those that are there are told to multiply."""
     few = jax.tree.map(lambda a: a[:20], start)
-    schedule = dataclasses.replace(WHOLE, growth="votes", at_most=60, grows_from=0.1, grows_until=0.7)
+    schedule = dataclasses.replace(WHOLE, growth="votes", max_gaussians=60, growth_start=0.1, growth_end=0.7)
     given, states = {"steps": STEPS, "key": KEY, "schedule": schedule, "rates": RATES, "chunk": 5}, []
     gaussians, _ = fit_gaussians(capture, start=few, on_checkpoint=states.append, **given)
     counts = [int(in_use(state.gaussians).sum()) for state in states]
@@ -195,7 +195,7 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
 def test_the_votes_are_the_weights_on_the_errors(capture, start):
     """Against their definition: the gradient of sum(w e) as a feature's, one view."""
     states = []
-    voting = dataclasses.replace(WHOLE, growth="votes", at_most=80)
+    voting = dataclasses.replace(WHOLE, growth="votes", max_gaussians=80)
     fit_gaussians(capture, steps=1, key=KEY, start=start, schedule=voting, on_checkpoint=states.append)
     view = np.array([0, 1, 3, 4])[view_order(KEY, 4, 0, 1)[0]]
     camera, target = capture.cameras[view], capture.frames[view] / np.float32(255)
@@ -217,7 +217,7 @@ def test_one_program_serves_a_size_and_a_number_of_rows(capture, start):
     """Two sizes, rows that suffice: two programs, whatever the number of steps."""
     programs = one_step.step_compiled[host_mesh() is not None]
     before = programs._cache_size()
-    schedule = dataclasses.replace(SCHEDULE, sizes=((0.75, 0.5), (1.0, 1.0)), growth="votes", at_most=80)
+    schedule = dataclasses.replace(SCHEDULE, sizes=((0.75, 0.5), (1.0, 1.0)), growth="votes", max_gaussians=80)
     fit_gaussians(capture, steps=STEPS, key=KEY, start=start, schedule=schedule, chunk=5)
     assert programs._cache_size() - before <= 2
 
@@ -244,7 +244,7 @@ def test_first_step_is_adams_sign_step_at_the_stated_rates(capture, start):
     assert np.abs(after.sh[:, 0] - start.sh[:, 0]).max() == pytest.approx(2.5e-3, rel=1e-2)
     assert not np.asarray(after.sh[:, 1:]).any()  # degree 1 waits for its turn
     opened, _ = fit_gaussians(
-        capture, steps=2, key=KEY, start=start, rates=rates, schedule=dataclasses.replace(WHOLE, degree_every=0.0)
+        capture, steps=2, key=KEY, start=start, rates=rates, schedule=dataclasses.replace(WHOLE, degree_interval=0.0)
     )
     assert np.abs(opened.sh[:, 1:]).max() == pytest.approx(2 * 2.5e-3 / 20, rel=0.1)
 
@@ -260,7 +260,7 @@ def test_wrong_fits_are_refused(capture, start):
         fit_gaussians(capture, steps=1, key=KEY)
     with pytest.raises(ValueError, match="exactly one"):
         fit_gaussians(capture, steps=1, seconds=1.0, key=KEY, start=start)
-    half = dataclasses.replace(start_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
+    half = dataclasses.replace(init_fit_state(start), done=np.asarray(0.5), losses=np.ones(1, np.float32))
     with pytest.raises(ValueError, match="a fit of 4 steps"):
         fit_gaussians(capture, steps=4, key=KEY, state=half)
     with pytest.raises(InputError, match="held out"):
@@ -289,7 +289,7 @@ def _odd(capture, start, kind):
 )
 def test_odd_captures_are_fitted_without_a_number_that_is_none(capture, start, kind):
     capture, start = _odd(capture, start, kind)
-    schedule = dataclasses.replace(WHOLE, growth="votes", at_most=80, grows_from=0.1)
+    schedule = dataclasses.replace(WHOLE, growth="votes", max_gaussians=80, growth_start=0.1)
     gaussians, losses = fit_gaussians(capture, steps=20, key=KEY, start=start, schedule=schedule, rates=RATES, chunk=5)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaussians))
     assert np.isfinite(losses).all()

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from jsecon.fit.growth import (
-    FAINT,
-    compact,
+    MIN_OPACITY,
     copies,
-    drawn,
-    grown,
-    halves,
+    drop_free_rows,
+    grow,
     in_use,
     noise,
     opacities,
-    rows_for,
-    with_free_rows,
+    pad_with_free_rows,
+    padded_row_count,
+    sample_rows,
+    split_in_two,
 )
 from jsecon.types import Gaussians
 
@@ -48,7 +48,7 @@ def covariance(gaussians):
 
 def test_halves_have_the_mean_and_covariance_of_the_whole():
     whole = scene()
-    one, other = halves(whole)
+    one, other = split_in_two(whole)
     np.testing.assert_allclose((one.means + other.means) / 2, whole.means, atol=1e-6)
     offset = (one.means - whole.means)[:, :, None]
     both = covariance(one) + offset @ offset.transpose(0, 2, 1)
@@ -57,7 +57,7 @@ def test_halves_have_the_mean_and_covariance_of_the_whole():
 
 def test_halves_give_the_centre_the_alpha_it_had():
     whole = scene()
-    one, other = halves(whole)
+    one, other = split_in_two(whole)
     alpha = lambda g: 1 / (1 + np.exp(-g.opacity_logits))
     near = np.exp(-((0.6 / 0.8) ** 2) / 2)
     at_centre = 1 - (1 - near * alpha(one)) * (1 - near * alpha(other))
@@ -69,10 +69,10 @@ def test_halves_give_the_centre_the_alpha_it_had():
 
 def test_free_rows_are_not_in_use_and_go_when_compacted():
     whole = scene()
-    longer = with_free_rows(whole, 64)
+    longer = pad_with_free_rows(whole, 64)
     assert longer.count == 64
     np.testing.assert_array_equal(in_use(longer), np.arange(64) < 30)
-    for a, b in zip(jax.tree.leaves(compact(longer)), jax.tree.leaves(whole), strict=True):
+    for a, b in zip(jax.tree.leaves(drop_free_rows(longer)), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(a, b)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(longer))
 
@@ -81,21 +81,21 @@ def test_draws_follow_the_votes_and_never_repeat():
     votes = np.array([0.0, 1.0, 2.0, 4.0, 0.0, 8.0])
     counts = np.zeros(6)
     for seed in range(2000):
-        counts[drawn(votes, 1, np.random.default_rng(seed))] += 1
+        counts[sample_rows(votes, 1, np.random.default_rng(seed))] += 1
     np.testing.assert_allclose(counts / 2000, votes / votes.sum(), atol=0.04)
-    all_of_them = drawn(votes, 100, np.random.default_rng(0))
+    all_of_them = sample_rows(votes, 100, np.random.default_rng(0))
     assert sorted(all_of_them) == [1, 2, 3, 5]
 
 
 @pytest.mark.parametrize("target", [36, 80, 2000])
 def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target):
-    whole = with_free_rows(scene(), 32)
+    whole = pad_with_free_rows(scene(), 32)
     moments = jax.tree.map(np.ones_like, whole), jax.tree.map(np.ones_like, whole)
     votes = np.where(np.arange(32) < 30, 1.0 + np.arange(32), 7.0).astype(np.float32)
-    after, (first, second) = grown(whole, moments, votes, target, 2000, [0, 1])
+    after, (first, second) = grow(whole, moments, votes, target, 2000, [0, 1])
     added = min(target - 30, 10)  # at most 0.3 of those there are, and one
     assert in_use(after).sum() == 30 + added
-    assert after.count == rows_for(64)  # both, as few rows as there can be
+    assert after.count == padded_row_count(64)  # both, as few rows as there can be
     fresh = ~first.opacity_logits.astype(bool) & in_use(after)
     assert fresh.sum() == 2 * added
     assert not second.means[fresh].any()
@@ -106,17 +106,17 @@ def test_grown_scenes_have_as_many_as_wanted_and_their_moments_begin_anew(target
 
 def test_faint_gaussians_make_room():
     whole = scene()
-    whole.opacity_logits[:5] = np.log(FAINT / 2)
+    whole.opacity_logits[:5] = np.log(MIN_OPACITY / 2)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grown(whole, moments, np.ones(30, np.float32), 30, 30, [0])
+    after, _ = grow(whole, moments, np.ones(30, np.float32), 30, 30, [0])
     assert after.count == 30
     assert in_use(after).all()
 
 
 def test_nothing_is_added_where_nothing_is_wrong():
-    whole = with_free_rows(scene(), 64)
+    whole = pad_with_free_rows(scene(), 64)
     moments = jax.tree.map(np.zeros_like, whole), jax.tree.map(np.zeros_like, whole)
-    after, _ = grown(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
+    after, _ = grow(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -127,7 +127,7 @@ def test_copies_look_as_the_one_did():
     one, other = copies(whole)
     assert one is other
     before, after = opacities(whole), opacities(one)
-    free = (after > 2 * FAINT + 1e-9) & (after < 1 - FAINT - 1e-9)
+    free = (after > 2 * MIN_OPACITY + 1e-9) & (after < 1 - MIN_OPACITY - 1e-9)
     np.testing.assert_allclose((1 - (1 - after) ** 2)[free], before[free], rtol=1e-4)
     # The integral of 1 - (1 - o' g)^2 over a line, g = exp(-x^2 / 2 s'^2), against that of o g.
     x = np.linspace(-40, 40, 20001)[:, None]

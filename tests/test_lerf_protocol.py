@@ -14,7 +14,7 @@ from jsecon.evaluate.lerf import (
     VALA_THRESHOLD,
     evaluate_at_thresholds,
     evaluate_point_level_rendered,
-    resized,
+    resize_camera,
 )
 from jsecon.query.masks import selection_mask
 from jsecon.types import Selection
@@ -156,7 +156,7 @@ def test_localisation_by_the_box_is_spoilt_by_a_floater(scene, views, labelled):
 
 
 def test_labels_of_another_size_are_evaluated_at_their_own(scene, views, labelled):
-    camera = resized(views["view_0"], 96, 80)
+    camera = resize_camera(views["view_0"], 96, 80)
     mask = np.asarray(selection_mask(scene, jax.tree.map(jnp.asarray, camera), members(scene)["left"]))
     frame = LabelledFrame("view_0", 96, 80, {"left": (mask, box_of(mask))})
     rows, _ = evaluate_point_level_rendered(scene, views, [frame], lambda query: selection(members(scene)[query]))

@@ -9,7 +9,7 @@ from jsecon.parallel import host_mesh
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.reference import project_reference, weights_reference
 from jsecon.splat.render import render, render_depth
-from jsecon.splat.walk import _exp2, running
+from jsecon.splat.walk import _exp2, cumulative
 
 
 def features_of(count: int, channels: int) -> jax.Array:
@@ -86,7 +86,7 @@ def test_running_products_and_sums():
     values = np.random.default_rng(0).uniform(0.5, 1.5, (3, 16, 5)).astype(np.float32)
     start = np.float32([[1.0], [2.0], [3.0]]) * np.ones(5, np.float32)
     for combine, cumulate in ((jnp.multiply, np.cumprod), (jnp.add, np.cumsum)):
-        before, after = running(combine, jnp.asarray(start), jnp.asarray(values))
+        before, after = cumulative(combine, jnp.asarray(start), jnp.asarray(values))
         expected = cumulate(np.concatenate([start[:, None], values], axis=1).astype(np.float64), axis=1)
         np.testing.assert_allclose(before, expected[:, :-1], rtol=1e-5)
         np.testing.assert_allclose(after, expected[:, -1], rtol=1e-5)

@@ -16,7 +16,7 @@ from test_corrections import (
 )
 
 from jsecon.app import cli
-from jsecon.fit import settle
+from jsecon.fit import refine
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.pipeline import _computed
 from jsecon.pipeline.processes import Coordinator
@@ -56,9 +56,9 @@ def alike(a, b):
 @pytest.fixture
 def _small(monkeypatch, truth):
     """Frames of one size, and a start of the probes that few views can correct."""
-    monkeypatch.setattr(settle, "FINE", 1.0)
-    monkeypatch.setattr(settle, "ASIDE", (1, 8))
-    monkeypatch.setattr(settle, "starting_gaussians", lambda capture, **_: (truth, ""))
+    monkeypatch.setattr(refine, "FINE", 1.0)
+    monkeypatch.setattr(refine, "ASIDE", (1, 8))
+    monkeypatch.setattr(refine, "starting_gaussians", lambda capture, **_: (truth, ""))
 
 
 @pytest.mark.usefixtures("_small")

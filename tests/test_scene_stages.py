@@ -17,7 +17,7 @@ from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians as stage_of
 from jsecon.pipeline.stages import Checkpoint, RunContext
 from jsecon.splat.render import render_rgb
-from jsecon.splat.transform import carried, transform_gaussians
+from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -147,7 +147,7 @@ def test_a_file_whose_float32_has_rounded_the_places_is_told(tmp_path, near):
     to_source = np.eye(4)
     to_source[:3, 3] = 455123.4, 5411876.6, 1e7
     capture = dataclasses.replace(photographed(near), to_source=to_source, to_poses=to_source)
-    far = carried(near, to_source)
+    far = transform_gaussians_float64(near, to_source)
     save_gaussians(tmp_path / "scene.ply", dataclasses.replace(far, means=far.means.astype(np.float32)))
     found, _ = read(capture, tmp_path / "scene.ply")
     assert any("scene.ply holds positions in float32" in note for note in found.notes)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resized, resized_frame
+from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resize_cameras, resize_frame
 from jsecon.types import Camera, Gaussians
 
 
@@ -16,24 +16,24 @@ def test_sizes_follow_each_other():
 
 
 def test_the_number_of_gaussians_rises_evenly_and_stops():
-    schedule = Schedule(at_most=300, grows_from=0.1, grows_until=0.6)
+    schedule = Schedule(max_gaussians=300, growth_start=0.1, growth_end=0.6)
     assert [schedule.count(done, 100) for done in (0.05, 0.1, 0.35, 0.6, 0.61)] == [None, 100, 200, 300, None]
     assert schedule.count(0.3, 400) is None
     assert dataclasses.replace(schedule, growth="none").count(0.3, 100) is None
 
 
 def test_votes_are_counted_as_long_as_they_are_of_use():
-    schedule = Schedule(grows_until=0.5)
+    schedule = Schedule(growth_end=0.5)
     assert [schedule.growth_at(done) for done in (0.0, 0.5, 0.51)] == ["votes", "votes", "none"]
     assert dataclasses.replace(schedule, growth="mcmc").growth_at(0.9) == "mcmc"
 
 
 def test_degrees_open_one_after_another():
-    schedule = Schedule(degree_every=0.1)
+    schedule = Schedule(degree_interval=0.1)
     assert [schedule.degree(done) for done in (0.0, 0.09, 0.11, 0.35)] == [0, 0, 1, 3]
 
 
-@pytest.mark.parametrize("wrong", [{"sizes": ((0.5, 0.5),)}, {"sizes": ((0.0, 1.0),)}, {"grows_until": 0.01}])
+@pytest.mark.parametrize("wrong", [{"sizes": ((0.5, 0.5),)}, {"sizes": ((0.0, 1.0),)}, {"growth_end": 0.01}])
 def test_wrong_schedules_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Schedule(**wrong)
@@ -53,13 +53,13 @@ def test_rates_decay_log_linearly_and_frozen_positions_stay():
 def test_smaller_frames_are_means_seen_by_cameras_as_much_smaller():
     frames = np.random.default_rng(0).integers(0, 256, (2, 24, 32, 3)).astype(np.uint8)
     cameras = Camera(np.tile(np.eye(4), (2, 1, 1)), *(np.full(2, v) for v in (30.0, 31.0, 16.0, 12.0)), 32, 24)
-    half = resized(cameras, 0.5)
+    half = resize_cameras(cameras, 0.5)
     assert (half.width, half.height) == (16, 12)
-    small = resized_frame(frames[1], half)
+    small = resize_frame(frames[1], half)
     np.testing.assert_allclose(small, frames[1].reshape(12, 2, 16, 2, 3).mean(axis=(1, 3)), atol=0.51)
     np.testing.assert_allclose([half.fx[0], half.fy[0], half.cx[0], half.cy[0]], [15, 15.5, 8, 6])
-    odd = resized(cameras, 0.3)
+    odd = resize_cameras(cameras, 0.3)
     assert (odd.width, odd.height) == (10, 7)
-    assert resized_frame(frames[0], odd).shape == (7, 10, 3)
+    assert resize_frame(frames[0], odd).shape == (7, 10, 3)
     np.testing.assert_allclose(odd.cx / odd.width, cameras.cx / 32)  # the same part of the image
-    assert np.shares_memory(resized_frame(frames[0], resized(cameras, 1.0)), frames)
+    assert np.shares_memory(resize_frame(frames[0], resize_cameras(cameras, 1.0)), frames)

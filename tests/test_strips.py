@@ -9,14 +9,14 @@ from hypothesis import given, settings, strategies as st
 
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.project import project
-from jsecon.splat.strips import BLOCK, WHOLE, Strip, join, split, tile_rows
-from jsecon.splat.tiles import grid, pair_counts, tile_lists
+from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, join_strips, split_into_strips, tile_rows
+from jsecon.splat.tiles import pair_counts, tile_grid, tile_lists
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def there_and_back(image, tile, count):
-    strips = split(image, tile, count)
-    return strips, join(strips, tile, len(image))
+    strips = split_into_strips(image, tile, count)
+    return strips, join_strips(strips, tile, len(image))
 
 
 @settings(deadline=None, max_examples=30)
@@ -48,8 +48,8 @@ def test_strips_hold_the_lists_of_the_whole(scene, camera, count):
         tile_lists(splats, 48, 40, capacity=1024, strip=strip),
         pair_counts(splats, 48, 40, strip=strip).sum(),
     )
-    whole, pairs = jax.tree.map(np.asarray, jax.jit(lambda splats: every(splats, WHOLE))(splats))
-    across, down = grid(48, 40, 8)
+    whole, pairs = jax.tree.map(np.asarray, jax.jit(lambda splats: every(splats, FULL_IMAGE))(splats))
+    across, down = tile_grid(48, 40, 8)
     lists_of = jax.jit(lambda splats, index: every(splats, Strip(index, count)))
     seen = 0
     for k in range(count):

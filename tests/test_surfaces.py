@@ -5,7 +5,7 @@ import pytest
 
 from jsecon.types import Camera
 from jsecon.vision.classical import ClassicalSegmenter
-from jsecon.vision.surfaces import Surface, back_projected, cloud_normals, surfaces_from_depth
+from jsecon.vision.surfaces import Surface, camera_points, cloud_normals, surfaces_from_depth
 
 
 def corridor(height=60, width=80, focal=40.0):
@@ -44,7 +44,7 @@ def test_normals_of_a_sphere_and_of_a_box_s_edge():
 def test_a_plane_has_no_steps_however_steeply_it_is_seen():
     depth, which = corridor()
     camera = camera_of(60, 80, 40.0, [np.eye(4)])[0]
-    points = back_projected(depth, camera).astype(np.float32)
+    points = camera_points(depth, camera).astype(np.float32)
     normals = np.array([[0, -1, 0], [0, 1, 0], [0, 0, -1]], np.float32)[which]
     surface = Surface(points, normals)
     for axis, size in ((0, 60), (1, 80)):
@@ -68,7 +68,7 @@ def seen():
     rng = np.random.default_rng(0)
     depths = (0.04 * np.round((depths + rng.uniform(-0.02, 0.02, depths.shape)) / 0.04)).astype(np.float32)
     cameras = camera_of(60, 80, 40.0, poses)
-    clouds = [back_projected(d, cameras[t]) - poses[t, :3, 3] for t, d in enumerate(depths)]
+    clouds = [camera_points(d, cameras[t]) - poses[t, :3, 3] for t, d in enumerate(depths)]
     return depths, cameras, np.concatenate(clouds).reshape(-1, 3)[::2], which
 
 

@@ -14,8 +14,8 @@ from jsecon.splat.tiles import (
     _sorted_pairs,
     _sorted_pairs_by_rank,
     depth_order,
-    grid,
     pair_counts,
+    tile_grid,
     tile_lists,
 )
 from jsecon.types import Gaussians
@@ -25,7 +25,7 @@ def reaches(scene, camera, tile: int) -> np.ndarray:
     """(tiles, N) bool: alpha >= 1/255 at some pixel centre of the tile, in float64, by brute force."""
     splats = project_reference(scene, camera)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    across, down = grid(camera.width, camera.height, tile)
+    across, down = tile_grid(camera.width, camera.height, tile)
     home = (y // tile * across + x // tile).astype(int)
     out = np.zeros((across * down, scene.count), bool)
     for n in np.flatnonzero(splats["in_front"]):

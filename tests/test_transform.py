@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jsecon.splat.render import render_rgb
-from jsecon.splat.transform import quaternion_of, recentred, transform_gaussians
+from jsecon.splat.transform import quaternion_from_matrix, recenter, transform_gaussians
 from jsecon.types import Gaussians
 
 ANGLES = np.radians([20.0, -70.0, 130.0])
@@ -58,7 +58,7 @@ def test_there_and_back_is_where_it_began(scene):
 @pytest.mark.parametrize("angles", [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (3.1, 0.2, -3.0)])
 def test_quaternions_are_right_at_every_angle(angles):
     rotation = _rotation(angles)
-    w, x, y, z = quaternion_of(rotation)
+    w, x, y, z = quaternion_from_matrix(rotation)
     back = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -90,7 +90,7 @@ def test_a_recentred_scene_looks_the_same_from_every_camera(scene, cameras):
     poses = np.asarray(cameras.world_to_camera, np.float64)
     poses[:, :3, 3] -= poses[:, :3, :3] @ shift
     far = dataclasses.replace(scene, means=scene.means.astype(np.float64) + shift)
-    moved, views, back = recentred(far, dataclasses.replace(cameras, world_to_camera=poses))
+    moved, views, back = recenter(far, dataclasses.replace(cameras, world_to_camera=poses))
     assert moved.means.dtype == views.world_to_camera.dtype == np.float32
     np.testing.assert_allclose(moved.means + back[:3, 3], far.means, atol=1e-6)
     assert np.abs(moved.means).max() < 2
@@ -98,7 +98,7 @@ def test_a_recentred_scene_looks_the_same_from_every_camera(scene, cameras):
         np.testing.assert_allclose(
             render_rgb(moved, views[t]).features, render_rgb(scene, cameras[t]).features, atol=2e-5
         )
-    stays, same, none = recentred(scene, cameras, origin=np.zeros(3))
+    stays, same, none = recenter(scene, cameras, origin=np.zeros(3))
     np.testing.assert_array_equal(stays.means, scene.means)
     np.testing.assert_array_equal(same.world_to_camera, cameras.world_to_camera)
     np.testing.assert_array_equal(none, np.eye(4))
@@ -107,7 +107,7 @@ def test_a_recentred_scene_looks_the_same_from_every_camera(scene, cameras):
 def test_the_origin_is_found_beside_numbers_that_are_none(scene, camera):
     means = scene.means + np.float32(100)
     means[3] = np.nan
-    moved, _, back = recentred(dataclasses.replace(scene, means=means), camera)
+    moved, _, back = recenter(dataclasses.replace(scene, means=means), camera)
     assert np.abs(back[:3, 3] - 100).max() < 1
     assert np.isnan(moved.means[3]).all()
     assert np.isfinite(np.delete(moved.means, 3, axis=0)).all()

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.association.atoms import cast_on_atoms
+from jsecon.association.atoms import atom_votes
 from jsecon.language.votes import bytes_of_votes, region_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import plan_view
@@ -78,12 +78,12 @@ def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels
 def test_votes_on_atoms_are_those_of_the_view(scene, cameras, labels, expected, t):
     """Also where a tile shows more atoms than one walk counts (the noise of view 1)."""
     camera, atoms = cameras[t], labels[t] + 1
-    got = cast_on_atoms(scene, camera, atoms, negligible=0.0).toarray()
+    got = atom_votes(scene, camera, atoms, negligible=0.0).toarray()
     same = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1)
     np.testing.assert_allclose(got, same.dense(), rtol=1e-5, atol=1e-6)
-    few = cast_on_atoms(scene, camera, atoms, negligible=0.3).toarray()
+    few = atom_votes(scene, camera, atoms, negligible=0.3).toarray()
     np.testing.assert_array_equal(few, np.where(got > 0.3 * got.sum(1, keepdims=True), got, 0.0))
-    middle = cast_on_atoms(scene, camera, atoms, negligible=0.0, centre=1.0).toarray()
+    middle = atom_votes(scene, camera, atoms, negligible=0.0, centre=1.0).toarray()
     at_centre = region_votes(scene, cameras[t : t + 1], atoms[None], REGIONS + 1, top=REGIONS + 1, centre=1.0)
     np.testing.assert_allclose(middle, at_centre.dense(), rtol=1e-5, atol=1e-6)
     assert (middle > 0).sum(1).max() == 1

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.fit.depth import DepthPoints, back_projected, require_depths
+from jsecon.fit.depth import DepthPoints, back_project_frame, require_depths
 from jsecon.types import Array, Capture
 
 
@@ -27,7 +27,7 @@ def confirmed_depths(
     height, width = depths.shape[1:]
     filtered = depths.copy()
     for t in chosen:
-        world, _, pixels = back_projected(capture, int(t), 1)
+        world, _, pixels = back_project_frame(capture, int(t), 1)
         same, past = np.zeros(len(world), np.int32), np.zeros(len(world), np.int32)
         for other in chosen[chosen != t]:
             camera = capture.cameras[int(other)]

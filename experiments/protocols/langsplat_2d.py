@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import require
 from jsecon.evaluate.lerf import labelled_pairs
-from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
+from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
 from jsecon.query.direct import relevancies
 from jsecon.types import Array
 
@@ -131,7 +131,7 @@ def evaluate_langsplat_2d(
             rows.append(PixelRow(frame.name, query, 0.0, False, -1))
         else:
             found = decide(np.asarray(maps), threshold=threshold)
-            located = any(inside_any((int(x), int(y)), boxes) for y, x in np.argwhere(found.peak))
+            located = any(in_any_box((int(x), int(y)), boxes) for y, x in np.argwhere(found.peak))
             value = float(iou(found.mask, true)) if true.any() else 0.0
             rows.append(PixelRow(frame.name, query, value, located, found.level))
     ious = [row.iou for row in rows]

@@ -23,9 +23,9 @@ from scipy.spatial import KDTree
 from experiments.rivals.evidence import Evidence, local_masks
 from jsecon.language.votes import region_votes
 from jsecon.query.direct import relevancies
-from jsecon.splat.fusion import stored
+from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import make_batches, make_table, walk, weights
+from jsecon.splat.walk import blend_weights, make_batches, make_table, walk
 from jsecon.types import Array, Selection
 
 MASS, LEAST_WEIGHT, QUANTILE, SURE = 0.75, 0.13, 0.85, 0.15
@@ -115,7 +115,7 @@ def centre_weights(plan: ViewPlan) -> tuple[Float[Array, " n"], Int[Array, " n"]
         corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, splats.dtype))
 
         def body(transmittance, found, chunk):
-            weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             x, y = (
                 jnp.floor(chunk.attributes[..., k]).astype(jnp.int32) - corner.astype(jnp.int32)
                 for k, corner in enumerate((corner_x, corner_y))

@@ -17,7 +17,7 @@ from experiments.stability.case import (
     ordinary,
     quaternion_onto,
 )
-from jsecon.splat.transform import recentred
+from jsecon.splat.transform import recenter
 from jsecon.types import Camera
 
 CANCELS = (
@@ -209,7 +209,7 @@ def offsets() -> Iterator[Case]:
         ("1e6 m off, stored in float32, then recentred", (stored, stored_camera)),
         ("1e6 m off, recentred from float64", (far, far_camera)),
     ):
-        gaussians, camera, back = recentred(*exact)
+        gaussians, camera, back = recenter(*exact)
         yield dataclasses.replace(
             base, name=name, gaussians=gaussians, camera=camera, exact=exact, origin=tuple(back[:3, 3])
         )

@@ -124,7 +124,11 @@ def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int, fitted:
         start, _ = starting_gaussians(bench.capture, sh_degree=0 if fitted == "short" else Options.sh_degree)
         way: Any = FIT
         if fitted != "short":
-            way = {"schedule": Schedule(growth="votes", at_most=start.count * (2 if fitted == "default, twice" else 1))}
+            way = {
+                "schedule": Schedule(
+                    growth="votes", max_gaussians=start.count * (2 if fitted == "default, twice" else 1)
+                )
+            }
         gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **way)
         save_ply(file, gaussians)
     return load_ply(file)

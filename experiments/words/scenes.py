@@ -31,7 +31,7 @@ from experiments.replica_classes import CLASSES, NEAR_M, names_of_objects
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
 from experiments.words.conse import WORDS, Conse
-from jsecon.association.atoms import cast_on_atoms
+from jsecon.association.atoms import atom_votes
 from jsecon.data.capture import load_capture
 from jsecon.errors import InputError
 from jsecon.files import atomic_write
@@ -59,7 +59,7 @@ def back_projected(evidence: Evidence) -> sparse.csr_matrix:
         own = np.flatnonzero(frame == t)
         place = np.full(len(frame) + 1, -1, np.int32)
         place[own] = np.arange(len(own))
-        cast = cast_on_atoms(evidence.gaussians, evidence.cameras[t], place[image], negligible=0.0).tocoo()
+        cast = atom_votes(evidence.gaussians, evidence.cameras[t], place[image], negligible=0.0).tocoo()
         blocks.append((cast.data, cast.row, own[cast.col]))
     values, rows, columns = (np.concatenate(parts) for parts in zip(*blocks))
     return sparse.csr_matrix((values, (rows, columns)), shape=(evidence.gaussians.count, len(frame)))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.app.ask import Answer, ask_text
 from jsecon.errors import InputError
 from jsecon.language.shares import probability_inside
-from jsecon.splat.transform import carried
+from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import LanguageField
 
 STRAY = 0.02
@@ -76,7 +76,7 @@ def locate_answer(field: LanguageField, answer: Answer) -> Place:
         raise InputError(f"query {answer.question!r}", found, remedy="Ask with other words, or by a pixel.")
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # colours have no place
     rows = np.asarray(answer.mask)
-    chosen = carried(jax.tree.map(lambda a: np.asarray(a)[rows], plain), field.to_source)
+    chosen = transform_gaussians_float64(jax.tree.map(lambda a: np.asarray(a)[rows], plain), field.to_source)
     points = selected_centers(field, rows)
     spread = points - points.mean(0)
     axes = np.linalg.eigh(spread.T @ spread)[1][:, ::-1]

@@ -27,7 +27,7 @@ from jsecon.language.field import field_of_rows
 from jsecon.language.shares import probability_inside
 from jsecon.pipeline.progress import Listener
 from jsecon.query.masks import selection_mask
-from jsecon.splat.transform import carried
+from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Gaussians, LanguageField
 
 _MOST_BYTES = 80
@@ -127,7 +127,7 @@ def write_answer(
     """
     stem, count = file_stem(answer), field.gaussians.count
     field = part_of(field, answer)
-    chosen = carried(selected(field.gaussians, answer.mask), field.to_source)
+    chosen = transform_gaussians_float64(selected(field.gaussians, answer.mask), field.to_source)
     told = _figures(field, answer) | {"of": count, ending: None, "masks": {}}
     if answer.mask.any():
         told[ending] = f"{stem}.{ending}"

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Int16
 from scipy import sparse
 
 from jsecon.association.atoms import Sparse, one_hot
-from jsecon.association.runs import Runs, runs_of_masks, runs_of_rows
+from jsecon.association.run_lengths import RunLengthMasks, encode_masks, encode_rows
 from jsecon.errors import require, require_shape
 from jsecon.vision.protocols import Segmenter, Tracker
 
@@ -22,7 +22,8 @@ class MaskletState:
     done: int
     """frames whose proposals were prompted and tracked."""
     proposals: dict[str, np.ndarray]
-    """masks of every frame: `rows` (T,) masks per frame; `counts`, `starts`, `stops` of their runs, as in `Runs`."""
+    """masks of every frame: `rows` (T,) masks per frame; `counts`, `starts`, `stops` of their runs, as in
+    `RunLengthMasks`."""
     layers: dict[str, np.ndarray]
     """the same of what was tracked."""
 
@@ -188,7 +189,7 @@ class _Layers:
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
         empty = np.zeros(0, np.int32)
-        self._runs = [Runs(empty, empty, empty, height * width) for _ in range(count)]
+        self._runs = [RunLengthMasks(empty, empty, empty, height * width) for _ in range(count)]
 
     def size(self, t: int) -> int:
         return len(self._runs[t].counts)
@@ -199,14 +200,14 @@ class _Layers:
 
     def add_masks(self, t: int, masks: np.ndarray) -> None:
         """Appends masks (M, H, W) bool to frame t."""
-        self._runs[t] = self._runs[t].followed_by(runs_of_masks(masks))
+        self._runs[t] = self._runs[t].followed_by(encode_masks(masks))
 
     def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
         """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
         pixels = np.flatnonzero((labels >= 0) & (labels < number))
         ones = np.ones(len(pixels), np.float32)
         rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
-        self._runs[t] = self._runs[t].followed_by(runs_of_rows(rows))
+        self._runs[t] = self._runs[t].followed_by(encode_rows(rows))
 
     def record(self) -> dict[str, np.ndarray]:
         """All masks as plain arrays (see MaskletState)."""
@@ -220,7 +221,7 @@ class _Layers:
         places = np.cumsum([own.sum() for own in counts])[:-1]
         starts, stops = (np.split(record[name], places) for name in ("starts", "stops"))
         pixels = self.shape[0] * self.shape[1]
-        self._runs = [Runs(*frame, pixels) for frame in zip(starts, stops, counts)]
+        self._runs = [RunLengthMasks(*frame, pixels) for frame in zip(starts, stops, counts)]
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """The layers with those of one group (R,) united, in the order of the groups."""
@@ -230,7 +231,7 @@ class _Layers:
         for t in range(self.count):
             united = unite @ self.at(t)
             united.sort_indices()
-            result._runs[t] = runs_of_rows(united)
+            result._runs[t] = encode_rows(united)
         return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:

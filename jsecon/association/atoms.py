@@ -13,16 +13,16 @@ from scipy import sparse
 
 from jsecon.language.votes import at_centre, distinct_labels
 from jsecon.numerics import FULL_PRECISION
-from jsecon.splat.fusion import stored
+from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
+from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
 from jsecon.types import Array, Camera, Gaussians
-from jsecon.vision.region_graph import renumbered
-from jsecon.vision.surfaces import filled
+from jsecon.vision.region_graph import relabel_sequential
+from jsecon.vision.surfaces import fill_nearest
 
 Sparse: TypeAlias = Any
 """scipy.sparse.csr_matrix, of which type checkers know too little"""
-SMALLEST = 12
+MIN_ATOM_PX = 12
 """px: smaller pieces are taken for slivers along an edge"""
 _SLOTS = 8
 """labels of a tile that one walk counts; few tiles of 8x8 pixels show more, and then the view is walked again"""
@@ -42,14 +42,14 @@ def image_atoms(
     slic.iterate(6)
     pieces = np.asarray(slic.getLabels(), np.int64)
     for eight in np.packbits(masks, axis=0):
-        pieces = renumbered(pieces * 256 + eight)
-    large = np.bincount(pieces.reshape(-1))[pieces] >= SMALLEST
+        pieces = relabel_sequential(pieces * 256 + eight)
+    large = np.bincount(pieces.reshape(-1))[pieces] >= MIN_ATOM_PX
     if large.any() and not large.all():
-        pieces = filled(pieces, large)
-    return renumbered(pieces).astype(np.int32)
+        pieces = fill_nearest(pieces, large)
+    return relabel_sequential(pieces).astype(np.int32)
 
 
-def coverage(
+def atom_coverage(
     atoms: Int32[np.ndarray, "h w"], masks: Bool[np.ndarray, "m h w"], count: int
 ) -> Float32[np.ndarray, "m a"]:
     """(M, A) float32 share of each atom's pixels that lie in each mask."""
@@ -58,7 +58,7 @@ def coverage(
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
 
 
-def summed(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
+def sum_entries(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
     """The matrix of all entries, each (values, rows, columns); what repeats is added up."""
     values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
     return sparse.csr_matrix((values, (rows, columns)), shape=shape)
@@ -77,7 +77,7 @@ def label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int)
     return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
 
 
-def cast_on_atoms(
+def atom_votes(
     gaussians: Gaussians,
     camera: Camera,
     atoms: Int32[np.ndarray, "h w"],
@@ -103,7 +103,7 @@ def cast_on_atoms(
         cast = np.asarray(_cast_by_pair(plan, atoms, first, centre))[places]
         pair, slot = np.nonzero(cast)
         entries.append((cast[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
-    cast = summed(entries, (gaussians.count, int(atoms.max()) + 1))
+    cast = sum_entries(entries, (gaussians.count, int(atoms.max()) + 1))
     total = np.repeat(np.asarray(cast.sum(1)).ravel(), np.diff(cast.indptr))
     cast.data[cast.data <= negligible * total] = 0.0
     cast.eliminate_zeros()
@@ -130,7 +130,7 @@ def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: floa
         corners = batches.corners(ids_of_tiles, splats.dtype)
 
         def body(transmittance, cast, chunk):
-            weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
             own = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype), precision=FULL_PRECISION)

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 from scipy import sparse
 
-from jsecon.association.atoms import Sparse, one_hot, summed
-from jsecon.association.views import SceneViews, View, claim_atoms
+from jsecon.association.atoms import Sparse, one_hot, sum_entries
+from jsecon.association.views import FrameView, SceneViews, claim_atoms
 from jsecon.errors import require
-from jsecon.vision.region_graph import renumbered
+from jsecon.vision.region_graph import relabel_sequential
 
 PIECES = 3000
 """of a scene, at most"""
@@ -79,7 +79,7 @@ def scene_pieces(
     """Piece (N,) of each Gaussian, -1 where `weights` is 0: near each other in space, and in the same masks.
 
     k-means over the centres (distances beyond the scene's middle half shrink, so that far things get few pieces) and a
-    random projection of the masks, from the means of `spread_cells`. Two rounds end within 6 % of the sum of squares
+    random projection of the masks, from the means of `split_cells`. Two rounds end within 6 % of the sum of squares
     of k-means++ and mini-batches (bonsai, replica_apartment_0), in a tenth to a third of the time.
     """
     piece = np.full(len(means), -1, np.int64)
@@ -95,18 +95,18 @@ def scene_pieces(
     sketch = membership[live] @ basis
     sketch /= np.maximum(np.linalg.norm(sketch, axis=1, keepdims=True), 1e-12)
     points = np.concatenate([4.0 * centred, sketch], axis=1).astype(np.float32)
-    centres = _cell_means(points, spread_cells(points, min(pieces, max(len(live) // 4, 1))))
+    centres = _cell_means(points, split_cells(points, min(pieces, max(len(live) // 4, 1))))
     for _ in range(ROUNDS):
         # |p - c|^2 / 2 but for |p|^2 / 2, which is the same for all centres
         lines = np.concatenate([-centres, 0.5 * np.square(centres).sum(1, keepdims=True)], axis=1).astype(np.float32)
         parts = np.array_split(np.pad(points, [(0, 0), (0, 1)], constant_values=1.0), len(points) // 4096 + 1)
-        own = renumbered(np.concatenate([(part @ lines.T).argmin(1) for part in parts]))
+        own = relabel_sequential(np.concatenate([(part @ lines.T).argmin(1) for part in parts]))
         centres = _cell_means(points, own)
     piece[live] = own
     return piece
 
 
-def spread_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " n"]:
+def split_cells(points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " n"]:
     """Cells (N,), 0 .. K-1, K <= `count`, of points (N, D): round by round, those that spread most along some direction
     are cut there at their mean, up to half of all cells a round. Equal points stay together."""
     cell = np.zeros(len(points), np.int64)
@@ -180,7 +180,7 @@ def average_linkage(
             chain.append(b)
     while not np.array_equal(parent, parent[parent]):
         parent = parent[parent]
-    return renumbered(parent)
+    return relabel_sequential(parent)
 
 
 def consensus_masklets(
@@ -227,11 +227,11 @@ def pieces_on_masks(
         cast = view.on_masks.tocoo()
         entries.append((cast.data, view.seen[cast.row], start + cast.col))
         start += len(view.proposals)
-    return piece, summed(entries, (scene.count, start))
+    return piece, sum_entries(entries, (scene.count, start))
 
 
 def mask_signatures(
-    views: list[View], count: int, *, silent: bool = True
+    views: list[FrameView], count: int, *, silent: bool = True
 ) -> tuple[Sparse, Sparse, Float[np.ndarray, " n"]]:
     """(membership (N, M), visible (N, T), weights (N,)): what `group_by_consensus` asks for, of N = `count` Gaussians.
 
@@ -258,5 +258,5 @@ def mask_signatures(
         shares.append((share, view.seen[cast.row[keep]], start + cast.col[keep]))
         looks.append((heard.astype(np.float32), view.seen, np.full(len(view.seen), t)))
         start += len(view.proposals)
-    membership, visible = summed(shares, (count, start)), summed(looks, (count, len(views)))
+    membership, visible = sum_entries(shares, (count, start)), sum_entries(looks, (count, len(views)))
     return membership, visible, (weights / max(len(views), 1)).astype(np.float32)

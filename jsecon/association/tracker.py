@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 
-from jsecon.association.atoms import coverage, label_shares, one_hot, summed
-from jsecon.association.views import SceneViews, View, claim_atoms
+from jsecon.association.atoms import atom_coverage, label_shares, one_hot, sum_entries
+from jsecon.association.views import FrameView, SceneViews, claim_atoms
 from jsecon.errors import require_shape
 from jsecon.types import Camera, Gaussians
 
@@ -54,7 +54,7 @@ class GeometricTracker:
         evidence = np.zeros((self.views.count, len(classes)), np.float32)
         best = np.zeros(len(evidence), np.float32)
         start = views[index]
-        said = start.votes @ coverage(start.atoms, classes, start.votes.shape[1]).T
+        said = start.votes @ atom_coverage(start.atoms, classes, start.votes.shape[1]).T
         evidence[start.seen] = start.clarity[:, None] * said  # one seen from its side, over an outline, says little
         best[start.seen] = start.clarity
         owners = {}
@@ -104,7 +104,7 @@ class GeometricTracker:
                 shares = label_shares(view.atoms, labels[t], view.votes.shape[1], count)
                 cast = (view.votes @ shares).tocoo()
                 entries.append((cast.data, view.seen[cast.row], cast.col))
-            votes = summed(entries, (self.views.count, count))
+            votes = sum_entries(entries, (self.views.count, count))
             winner = np.asarray(votes.argmax(axis=1)).reshape(-1)
             # (R, R): row r's weight by the region that owns the Gaussian
             cast = (votes.T @ one_hot(winner, count)).toarray()
@@ -130,7 +130,7 @@ class GeometricTracker:
         return order
 
     def _match(
-        self, view: View, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
+        self, view: FrameView, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
     ) -> Int[np.ndarray, " a"]:
         """The class (A,) that owns each atom of a view, -1 = none; evidence (n, B + C) of the Gaussians it shows, and
         the clarity (n,) of the best look at each in the frames that the evidence is from."""
@@ -149,7 +149,7 @@ class GeometricTracker:
         return np.where(owner >= 0, classes[owner], -1)
 
 
-def _said(view: View, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _said(view: FrameView, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a view that gives its atoms to classes (A,), -1 = none, of `count`, says of its Gaussians: row, class and
     weight, by the clarity of the look, of each entry that is not 0."""
     cast = (view.votes @ one_hot(owner, count)).tocoo()

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy import sparse
 
-from jsecon.association.atoms import SMALLEST, Sparse, cast_on_atoms, coverage, image_atoms
+from jsecon.association.atoms import MIN_ATOM_PX, Sparse, atom_coverage, atom_votes, image_atoms
 from jsecon.errors import require
 from jsecon.parallel import map_over_processes
 from jsecon.process import cores
@@ -26,7 +26,7 @@ PROPOSAL_SHARE, ATOM_SHARE, MERGER, KNOWN_SHARE, COVERED = 0.4, 0.6, 0.5, 0.5, 0
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class FrameView:
     """What one frame says about the Gaussians."""
 
     atoms: np.ndarray
@@ -72,7 +72,7 @@ class SceneViews:
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
         self.atoms_per_frame, self.centre = atoms_per_frame, centre
         self.propose = proposals if callable(proposals) else proposals.__getitem__
-        self._views: list[View] = []
+        self._views: list[FrameView] = []
         self.shared = np.zeros((0, 0), np.float32)
         """(T, T) what any two frames see in common: the cosine of how much they see of each Gaussian. After `all`."""
 
@@ -80,7 +80,7 @@ class SceneViews:
         """(atoms (H, W), proposals (M, A) by the share of each atom that lies in them)."""
         masks = np.asarray(self.propose(t), bool)
         atoms = image_atoms(frame, masks, count=self.atoms_per_frame)
-        return atoms, coverage(atoms, masks, int(atoms.max()) + 1)
+        return atoms, atom_coverage(atoms, masks, int(atoms.max()) + 1)
 
     def _said(self, frames: UInt8[np.ndarray, "t h w 3"], own: Sequence[int]) -> Iterator[tuple]:
         """Of each frame of `own` its atoms, the Gaussians that it shows, the arrays and the shape of their votes, and
@@ -89,7 +89,7 @@ class SceneViews:
         pool = ThreadPoolExecutor(cores())
         try:
             for t, (atoms, within) in zip(own, pool.map(self._cut, (frames[t] for t in own), own)):
-                cast = cast_on_atoms(self.gaussians, self.cameras[t], atoms, centre=self.centre)
+                cast = atom_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
                 seen = np.flatnonzero(np.diff(cast.indptr))
                 votes = cast[seen]
                 yield atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
@@ -98,7 +98,7 @@ class SceneViews:
 
     def all(
         self, frames: UInt8[np.ndarray, "t h w 3"], progress: Callable[[int, int], None] | None = None
-    ) -> list[View]:
+    ) -> list[FrameView]:
         """All views, each with how clearly it sees its Gaussians; over several processes (`jax.distributed`) they are
         dealt out. Raises ValueError where the frames are not the cameras'."""
         expected = (*self.cameras.fx.shape, self.cameras.height, self.cameras.width)
@@ -106,7 +106,9 @@ class SceneViews:
         require(frames.shape[:3] == expected, "frames", frames.shape, f"{(*expected, 3)}", remedy)
         if not self._views:
             views = [
-                View(atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32))
+                FrameView(
+                    atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32)
+                )
                 for atoms, seen, votes, shape, within in map_over_processes(
                     len(frames), lambda own: self._said(frames, own), progress
                 )
@@ -128,7 +130,7 @@ class SceneViews:
 
 
 def claim_atoms(
-    view: View, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
+    view: FrameView, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
 ) -> Int[np.ndarray, " a"]:
     """The class (A,) that owns each atom of a view, -1 = none.
 
@@ -150,7 +152,7 @@ def claim_atoms(
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
     sure = (known_inside >= KNOWN_SHARE * (view.proposals @ total))[:, 0]
-    merged = (inside >= MERGER * mass.sum(0)) & (inside >= SMALLEST)
+    merged = (inside >= MERGER * mass.sum(0)) & (inside >= MIN_ATOM_PX)
 
     owner = np.where(sure_atom & (share_of_atom.max(1) >= ATOM_SHARE), share_of_atom.argmax(1), -1)
     strongest = np.where(sure, share.max(1), 0.0) if len(share) else np.zeros(0)

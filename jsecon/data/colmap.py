@@ -27,7 +27,7 @@ from jsecon.data.images import existing_image, write_image
 from jsecon.data.worlds import moved_poses
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, path_within
-from jsecon.splat.transform import quaternion_of
+from jsecon.splat.transform import quaternion_from_matrix
 from jsecon.types import Capture
 
 
@@ -130,7 +130,7 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
     from_world = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
     poses = moved_poses(np.asarray(cameras.world_to_camera, np.float64), from_world)
     for n, (file, pose, camera) in enumerate(zip(files, poses, which.ravel()), start=1):
-        quaternion = quaternion_of(pose[:3, :3])
+        quaternion = quaternion_from_matrix(pose[:3, :3])
         numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])
         head = struct.pack("<i7di", n, *numbers, camera + 1)
         image_bytes.append(head + os.fsencode(file) + b"\0" + struct.pack("<Q", 0))

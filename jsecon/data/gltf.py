@@ -22,8 +22,8 @@ from jsecon.data.ply import in_float32, needs_float64, sound, usable_blocks
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, atomic_write, parse_json
 from jsecon.splat.project import check_gaussians
-from jsecon.splat.sh import BANDS, C0
-from jsecon.splat.transform import carried, transformed_blocks
+from jsecon.splat.sh import C0, COEFFICIENT_COUNTS
+from jsecon.splat.transform import transform_blocks, transform_gaussians_float64
 from jsecon.types import Array, Gaussians
 
 _NAME = "KHR_gaussian_splatting"
@@ -76,7 +76,7 @@ def save_glb(
 
     middle = np.zeros(3)
     if needs_float64(gaussians, into):
-        middle = np.median(next(transformed_blocks(gaussians, into))[1].means, axis=0)
+        middle = np.median(next(transform_blocks(gaussians, into))[1].means, axis=0)
 
     def blocks(of: Gaussians) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         for own, part in usable_blocks(path, of, into):
@@ -182,7 +182,7 @@ def read_glb(path: Path) -> Gaussians:
                 count += len(arrays["means"])
                 if 12 * count > length:
                     raise InputError(path, f"{count} Gaussians do not fit into {length} bytes", _WANTED, _REMEDY)
-                found.append(carried(sound(path, arrays), _AXES @ matrix))
+                found.append(transform_gaussians_float64(sound(path, arrays), _AXES @ matrix))
     except InputError:
         raise
     except OSError as error:
@@ -294,7 +294,7 @@ def _arrays(path: Path, column: Callable[[str, int], np.ndarray], primitive: Any
     attributes = primitive["attributes"]
     harmonics = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)]
     there = [name in attributes for name in harmonics]
-    if (bands := sum(there)) not in BANDS or not all(there[:bands]):
+    if (bands := sum(there)) not in COEFFICIENT_COUNTS or not all(there[:bands]):
         found = f"it has {bands} coefficients of harmonics"
         raise InputError(path, found, "all of degree 0, and of each higher degree up to 3 all or none", _REMEDY)
     names = {"means": "POSITION"} | {name: f"{_NAME}:{name.upper()}" for name in ("rotation", "scale", "opacity")}

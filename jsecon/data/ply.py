@@ -16,7 +16,7 @@ from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import check_gaussians, unusable_rows
-from jsecon.splat.transform import carried, float32_rounds, transformed_blocks
+from jsecon.splat.transform import float32_rounding, transform_blocks, transform_gaussians_float64
 from jsecon.types import Array, Gaussians
 
 SH_DC = 0.5 / np.sqrt(np.pi)
@@ -157,8 +157,8 @@ def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"]
     """A file's Gaussians (NumPy) on jax's device, carried by `similarity` in float64 first. Raises InputError where
     float32 then does not hold where they are."""
     if similarity is not None:
-        gaussians = carried(gaussians, similarity)
-    rounded = float32_rounds(gaussians)
+        gaussians = transform_gaussians_float64(gaussians, similarity)
+    rounded = float32_rounding(gaussians)
     if len(rounded) and np.median(rounded) > ROUNDED_READ:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
         found = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
@@ -170,10 +170,10 @@ def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"]
 def usable_blocks(
     path: str | Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
 ) -> Iterator[tuple[slice, Gaussians]]:
-    """`transformed_blocks` of Gaussians that are to be written to a file. Raises ValueError where their shapes
+    """`transform_blocks` of Gaussians that are to be written to a file. Raises ValueError where their shapes
     disagree, and InputError where `load_gaussians` would refuse them."""
     check_gaussians(gaussians)
-    for own, part in transformed_blocks(gaussians, similarity):
+    for own, part in transform_blocks(gaussians, similarity):
         columns = {name: getattr(part, name) for name in (*_SIZES, "opacity_logits", "sh")}
         _require_usable(path, columns, own.start, "Remove these Gaussians first.")
         yield own, part
@@ -199,8 +199,8 @@ def save_ply(
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
     Written in blocks, so that mapped columns need not fit into memory; `similarity` (4, 4) carries each block into
-    another world (`carried`). Positions are written in double precision where float32 would not hold them (in a map
-    projection's coordinates, say), else in float.
+    another world (`transform_gaussians_float64`). Positions are written in double precision where float32 would
+    not hold them (in a map projection's coordinates, say), else in float.
 
     Float32 Gaussians come back bit by bit from `load_ply`. `rgb` (0..1) replaces the spherical harmonics by one
     colour a Gaussian, for showing codes or similarities; viewers such as SuperSplat open either. A selection is
@@ -231,7 +231,7 @@ def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None =
     if similarity is None and gaussians.means.dtype != np.float64:
         return False
     bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
-    far = sum(int((float32_rounds(part) > ROUNDED_WRITTEN).sum()) for _, part in transformed_blocks(bare, similarity))
+    far = sum(int((float32_rounding(part) > ROUNDED_WRITTEN).sum()) for _, part in transform_blocks(bare, similarity))
     return far > 0.01 * gaussians.count
 
 

@@ -11,7 +11,7 @@ from jsecon.app.ask import Answer
 from jsecon.app.pictures import Renderer
 from jsecon.demo.capture import look_at
 from jsecon.files import atomic_write
-from jsecon.fit.schedule import resized
+from jsecon.fit.schedule import resize_cameras
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, LanguageField
 
@@ -34,7 +34,7 @@ def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> i
     """Writes the film as an animated WebP of SECONDS; returns its bytes."""
     count = SECONDS * PER_SECOND
     around, long = orbit(field.cameras, count), max(field.cameras.width, field.cameras.height)
-    renderer = Renderer(field.gaussians, resized(around, min(WIDE / long, 2.0)))
+    renderer = Renderer(field.gaussians, resize_cameras(around, min(WIDE / long, 2.0)))
     own = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh, np.float32)[:, 0], 0, 1)
     dark = np.repeat(DIM * own.mean(1, keepdims=True), 3, axis=1)
     frames, every = [], count / (len(answers) + 1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
-from jsecon.evaluate.metrics import accuracy_at, inside_any, iou, mean_iou
+from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
 from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.types import Camera, Gaussians, Selection
 
@@ -99,7 +99,7 @@ def evaluate_at_thresholds(
     for done, (frame, category) in enumerate(pairs, start=1):
         if category not in answers:
             answers[category] = select(category)
-        camera = resized(cameras[frame.name], frame.width, frame.height)
+        camera = resize_camera(cameras[frame.name], frame.width, frame.height)
         found = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds)
         for threshold, row in zip(alpha_thresholds, found):
             rows[threshold].append(row)
@@ -136,7 +136,7 @@ def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> lis
     return pairs
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same view at another size, px: focal lengths and principal point scaled."""
     x, y = width / camera.width, height / camera.height
     return dataclasses.replace(
@@ -167,10 +167,10 @@ def _rows(
     for threshold in thresholds:
         mask = alpha > threshold
         share = float(iou(mask, true)) if true.any() else 0.0
-        located = point is not None and inside_any(point, boxes)
-        touched = any(inside_any((int(x), int(y)), boxes) for y, x in np.argwhere(_peak(mask)))
+        located = point is not None and in_any_box(point, boxes)
+        touched = any(in_any_box((int(x), int(y)), boxes) for y, x in np.argwhere(_peak(mask)))
         centre = _box_centre(mask)
-        centred = centre is not None and inside_any(centre, boxes)
+        centred = centre is not None and in_any_box(centre, boxes)
         rows.append(Row(frame.name, category, share, located, touched, centred, point, count, region, score, mask))
     return rows
 

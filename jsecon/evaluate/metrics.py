@@ -45,11 +45,11 @@ def localization_accuracy(points: Iterable[Point | None], boxes: Iterable[Float[
     Boxes are x1 y1 x2 y2. None, a missing prediction, counts as a failure. What the point is, is the caller's
     definition: say it beside the number, as published ones mean different things. NaN for no pairs.
     """
-    hits = [point is not None and inside_any(point, box) for point, box in zip(points, boxes, strict=True)]
+    hits = [point is not None and in_any_box(point, box) for point, box in zip(points, boxes, strict=True)]
     return float(np.mean(hits)) if hits else float("nan")
 
 
-def inside_any(point: Point, boxes: Float[Array, "b 4"]) -> bool:
+def in_any_box(point: Point, boxes: Float[Array, "b 4"]) -> bool:
     """Whether (x, y) lies inside any of the boxes x1 y1 x2 y2, edges included."""
     x, y = point
     boxes = np.asarray(boxes)

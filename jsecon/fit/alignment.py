@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from jsecon.fit.schedule import resized
+from jsecon.fit.schedule import resize_cameras
 from jsecon.fit.view import cameras_extent
 from jsecon.types import Camera, Capture
 
@@ -81,7 +81,7 @@ class _Differences(NamedTuple):
     seen: np.ndarray
 
 
-def aligned(
+def align_cameras(
     capture: Capture, moving: Bool[np.ndarray, " t"], fixed: Bool[np.ndarray, " t"] | None = None
 ) -> Float[np.ndarray, "t 4 4"] | None:
     """Aligns cameras by colour and measured depth.
@@ -125,7 +125,7 @@ def aligned(
 def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level:
     """The chosen frames with a longer side of at most `side` px."""
     whole = capture.cameras[chosen]
-    cameras = resized(whole, min(1.0, side / max(whole.width, whole.height)))
+    cameras = resize_cameras(whole, min(1.0, side / max(whole.width, whole.height)))
     shape = len(chosen), cameras.height, cameras.width
     grey, slopes, planes = (np.zeros((*shape, *own), np.float32) for own in ((), (2,), (3,)))
     points, shades = np.ones((len(chosen), POINTS, 3)), np.zeros((len(chosen), POINTS))

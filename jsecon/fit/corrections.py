@@ -35,7 +35,7 @@ class Corrections:
 
 
 @record
-class Refined:
+class CorrectionState:
     """Corrections under way."""
 
     now: Corrections
@@ -46,7 +46,7 @@ class Refined:
 
 
 @dataclasses.dataclass(frozen=True)
-class Refine:
+class RefineOptions:
     """What is corrected, and how fast. Rates are Adam's step each time that a view is taken, and decay log-linearly."""
 
     poses: bool = True
@@ -65,16 +65,16 @@ class Refine:
         return Corrections(np.repeat(np.array([pose, pose * extent], np.float32), 3), np.float32(colour))
 
 
-def at_rest(views: int) -> Corrections:
+def identity_corrections(views: int) -> Corrections:
     """None at all, of so many views."""
     return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
 
 
-def start_refined(views: int) -> Refined:
+def init_corrections(views: int) -> CorrectionState:
     """Before the first step."""
-    rest = at_rest(views)
+    rest = identity_corrections(views)
     zeros = jax.tree.map(np.zeros_like, rest)
-    return Refined(rest, zeros, zeros)
+    return CorrectionState(rest, zeros, zeros)
 
 
 def _series(squared: Array, first: int) -> Array:
@@ -85,7 +85,7 @@ def _series(squared: Array, first: int) -> Array:
     return total
 
 
-def exponential(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
+def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
     """The rigid motion of a twist (rotation, radians; translation): smooth everywhere, zero included, and right to the
     last digits (Lynch and Park 2017, eq. 3.88)."""
     x, y, z = twist[0], twist[1], twist[2]
@@ -109,19 +109,19 @@ def exponential(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
 
 def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
     """A camera moved by a twist of its own frame: exp(twist) world_to_camera."""
-    motion, pose = exponential(twist), camera.world_to_camera
+    motion, pose = se3_exp(twist), camera.world_to_camera
     # Multiply-and-sum: exact float32 on every backend.
     moved = (motion[:, :, None] * pose[None, :, :].astype(motion.dtype)).sum(1)
     return dataclasses.replace(camera, world_to_camera=moved)
 
 
-def exposed(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
+def apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
     """The rendered colours as the view's exposure shows them; not clamped."""
     r, g, b = image[..., 0], image[..., 1], image[..., 2]
     return jnp.stack([row[0] * r + row[1] * g + row[2] * b + row[3] for row in colour], axis=-1)
 
 
-def away_from_rest(own: Corrections, extent: Float[Array, ""]) -> Float[Array, ""]:
+def correction_penalty(own: Corrections, extent: Float[Array, ""]) -> Float[Array, ""]:
     """What one view's corrections add to its loss; translations count by the extent where there is any."""
     shift = own.twists[3:] / jnp.where(extent > 0, extent, 1.0)
     poses = jnp.sum(own.twists[:3] ** 2) + jnp.sum(shift**2)
@@ -131,12 +131,12 @@ def away_from_rest(own: Corrections, extent: Float[Array, ""]) -> Float[Array, "
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
-def refined_further(
-    refined: Refined, view: Int[Array, ""], gradient: Corrections, taken: Int[Array, ""], rate: Corrections
-) -> Refined:
+def update_corrections(
+    refined: CorrectionState, view: Int[Array, ""], gradient: Corrections, taken: Int[Array, ""], rate: Corrections
+) -> CorrectionState:
     """Adam's step of one view's row, which was `taken` so many times before."""
     own = jax.tree.map(lambda a: a[view], refined)
     moments: Any = optax.ScaleByAdamState(*cast(Any, (taken, own.first_moment, own.second_moment)))
     change, moments = _ADAM.update(cast(Any, gradient), moments)
     now = jax.tree.map(lambda p, u, r: p - r * u, own.now, change, rate)
-    return jax.tree.map(lambda a, row: a.at[view].set(row), refined, Refined(now, moments.mu, moments.nu))
+    return jax.tree.map(lambda a, row: a.at[view].set(row), refined, CorrectionState(now, moments.mu, moments.nu))

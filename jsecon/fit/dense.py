@@ -169,13 +169,13 @@ def _points(views: _Views, maps: list[np.ndarray], partners: list[np.ndarray], t
     return samples[confirmed]
 
 
-def _merged(samples: np.ndarray, at_most: int) -> np.ndarray:
-    """(P, 6) mean points and colours of those of at most `at_most` voxels that hold MIN_SAMPLES of the samples (S, 7).
+def _merged(samples: np.ndarray, max_points: int) -> np.ndarray:
+    """(P, 6) mean points and colours of at most `max_points` voxels with MIN_SAMPLES of the samples (S, 7).
 
     A voxel's edge is a number of pixels, of the power of two below the size of a pixel at the point: near things keep
     more points. It is the smallest number from 1/2 that leaves so few voxels and 2 MIN_SAMPLES samples in the mean one.
     """
-    at_most = max(1, min(at_most, len(samples) // (2 * MIN_SAMPLES)))
+    max_points = max(1, min(max_points, len(samples) // (2 * MIN_SAMPLES)))
     level = np.floor(np.log2(samples[:, 6])).astype(np.int64)
     offset, grid = samples[:, :3] - np.median(samples[:, :3], axis=0), np.exp2(level)[:, None]
     level = np.clip(level - level.min(), 0, 63)
@@ -186,7 +186,7 @@ def _merged(samples: np.ndarray, at_most: int) -> np.ndarray:
         return np.unique(ids, return_inverse=True, return_counts=True)[1:]
 
     def too_many(edge: float) -> bool:
-        return len(voxels(edge)[1]) > at_most
+        return len(voxels(edge)[1]) > max_points
 
     low = high = 0.5
     while too_many(high):
@@ -204,16 +204,16 @@ def _merged(samples: np.ndarray, at_most: int) -> np.ndarray:
 
 
 def dense_points(
-    capture: Capture, *, at_most: int, progress: Callable[[int, int], None] | None = None
+    capture: Capture, *, max_points: int, progress: Callable[[int, int], None] | None = None
 ) -> tuple[Float32[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """At most `at_most` points (world) on surfaces that three views agree on, and the mean colour of the pixels that
+    """At most `max_points` points (world) on surfaces that three views agree on, and the mean colour of the pixels that
     each was made of. Held-out frames are not looked at. Deterministic.
 
     The capture's sparse points say which views belong together and which depths to search; where it has none, they are
     triangulated. Surfaces without texture stay empty, and so do views that move straight ahead (their pairs cannot be
     rectified). Raises InputError where fewer than three views are left or fewer than MIN_POINTS points found.
     """
-    require(at_most >= MIN_POINTS, "at_most", at_most, f"at least {MIN_POINTS}", "100000 is usual.")
+    require(max_points >= MIN_POINTS, "max_points", max_points, f"at least {MIN_POINTS}", "100000 is usual.")
     views = _views(capture)
     total, report = len(views.frames), progress or (lambda done, total: None)
     if total < AGREEING + 1:
@@ -225,7 +225,7 @@ def dense_points(
     _, depths, inside = _project(views, some)
     partners = _partners(views, some, inside)
     width, height = views.size
-    step = max(1, int(np.sqrt(total * width * height / (20 * at_most))))  # enough to average, not all
+    step = max(1, int(np.sqrt(total * width * height / (20 * max_points))))  # enough to average, not all
     known = []
     for t in range(total):
         pairs = []
@@ -236,7 +236,7 @@ def dense_points(
         known.append(_agreed(maps) if len(maps) >= AGREEING else np.zeros((height, width), np.float32))
         report(t + 1, total)
     samples = np.concatenate([_points(views, known, partners, t, step) for t in range(total)])
-    merged = _merged(samples, at_most) if len(samples) else samples
+    merged = _merged(samples, max_points) if len(samples) else samples
     if len(merged) >= MIN_POINTS:
         return merged[:, :3].astype(np.float32), np.rint(merged[:, 3:6]).astype(np.uint8)
     remedy = "The views must overlap sideways and have texture, and the poses be theirs; or start from sparse points."

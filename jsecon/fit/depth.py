@@ -32,7 +32,7 @@ def require_depths(capture: Capture) -> None:
         raise InputError("capture", "no depth frames", "RGB-D frames", "Start from sparse points, or triangulate them.")
 
 
-def back_projected(capture: Capture, frame: int, stride: int):
+def back_project_frame(capture: Capture, frame: int, stride: int):
     """World points (S, 3), colours (S, 3) and pixels (S, 2) of the frame's known depths, every `stride` pixels."""
     camera = capture.cameras[frame]
     assert capture.depths is not None
@@ -84,7 +84,7 @@ def points_from_depth(
     require(exclusive, "voxel, max_points", given, "exactly one of the two", "voxel is in world units.")
     require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
-    parts = [back_projected(capture, int(t), stride) for t in chosen]
+    parts = [back_project_frame(capture, int(t), stride) for t in chosen]
     if not any(len(world) for world, _, _ in parts):
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
     points, colors, pixels = (np.concatenate(own) for own in zip(*parts))

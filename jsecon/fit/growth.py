@@ -21,7 +21,7 @@ from jsecon.numerics import normalize, sigmoid
 from jsecon.splat.capacity import round_capacity
 from jsecon.types import Array, Gaussians
 
-FAINT = 0.005
+MIN_OPACITY = 0.005
 """opacity below which a Gaussian is pruned (Kerbl et al. 2023)"""
 AT_ONCE = 0.3
 """most that an event adds, as a share of the Gaussians there are"""
@@ -36,35 +36,35 @@ _APART, _NARROWER = 0.6, 0.8
 
 def in_use(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     """(N,) bool: rows that hold a Gaussian which can be seen."""
-    return np.asarray(gaussians.opacity_logits) >= math.log(FAINT / (1 - FAINT))
+    return np.asarray(gaussians.opacity_logits) >= math.log(MIN_OPACITY / (1 - MIN_OPACITY))
 
 
-def compact(gaussians: Gaussians) -> Gaussians:
+def drop_free_rows(gaussians: Gaussians) -> Gaussians:
     """Without the free rows."""
     keep = in_use(gaussians)
     return jax.tree.map(lambda a: np.asarray(a)[keep], gaussians)
 
 
-def rows_for(count: int) -> int:
+def padded_row_count(count: int) -> int:
     """Rows that hold `count` Gaussians: few sizes, so that few programs are compiled."""
     return round_capacity(count)
 
 
-def lengthened(tree: Any, rows: int) -> Any:
+def pad_rows(tree: Any, rows: int) -> Any:
     """Every array filled up to `rows` rows with zeros."""
     fill = lambda a: np.concatenate([a, np.zeros((rows - len(a), *a.shape[1:]), a.dtype)])
     return jax.tree.map(lambda a: fill(np.asarray(a)), tree)
 
 
-def with_free_rows(gaussians: Gaussians, rows: int) -> Gaussians:
+def pad_with_free_rows(gaussians: Gaussians, rows: int) -> Gaussians:
     """Filled up to `rows` rows with free ones."""
-    count, longer = gaussians.count, lengthened(gaussians, rows)
+    count, longer = gaussians.count, pad_rows(gaussians, rows)
     for name, value in _FREE.items():
         getattr(longer, name)[count:] = value
     return longer
 
 
-def drawn(votes: Float[Array, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
+def sample_rows(votes: Float[Array, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
     """`count` different rows, each drawn in proportion to its votes among those left (Gumbel's top k); fewer where
     fewer have any."""
     with np.errstate(divide="ignore"):
@@ -72,7 +72,7 @@ def drawn(votes: Float[Array, " n"], count: int, rng: np.random.Generator) -> In
     return np.argsort(-keys, kind="stable")[: min(count, int(np.count_nonzero(np.asarray(votes) > 0)))]
 
 
-def halves(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
+def split_in_two(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Each Gaussian as two beside each other along its longest axis, which together have its mass and moments; their
     opacity is what gives its centre the alpha it had."""
     scales = np.asarray(gaussians.log_scales)
@@ -91,7 +91,7 @@ def halves(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
     narrower[rows, axis] += math.log(_NARROWER)
     opacity = opacities(gaussians)
     at_centre = math.exp(-((_APART / _NARROWER) ** 2) / 2)
-    opacity = np.clip(np.minimum((1 - np.sqrt(1 - opacity)) / at_centre, opacity), 2 * FAINT, 1 - FAINT)
+    opacity = np.clip(np.minimum((1 - np.sqrt(1 - opacity)) / at_centre, opacity), 2 * MIN_OPACITY, 1 - MIN_OPACITY)
     logits = np.log(opacity / (1 - opacity)).astype(scales.dtype)
     both = [np.asarray(gaussians.means) + side * offset for side in (-1, 1)]
     given = {"log_scales": narrower, "opacity_logits": logits}
@@ -107,7 +107,7 @@ def opacities(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
 def copies(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Each Gaussian as two in its place that together look as it did (arXiv 2404.09591, eq. 9, for two)."""
     opacity = opacities(gaussians)
-    half = np.clip(1 - np.sqrt(1 - opacity), 2 * FAINT, 1 - FAINT)
+    half = np.clip(1 - np.sqrt(1 - opacity), 2 * MIN_OPACITY, 1 - MIN_OPACITY)
     narrower = np.log(opacity / (2 * half - half**2 / math.sqrt(2)))[:, None]
     scales, logits = np.asarray(gaussians.log_scales), np.log(half / (1 - half))
     given = {"log_scales": (scales + narrower).astype(scales.dtype), "opacity_logits": logits.astype(scales.dtype)}
@@ -115,14 +115,14 @@ def copies(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
     return one, one
 
 
-def grown(
+def grow(
     gaussians: Gaussians,
     moments: tuple[Gaussians, Gaussians],
     votes: Float[Array, " n"],
     target: int,
     most: int,
     seed: list[int],
-    divide: Callable[[Gaussians], tuple[Gaussians, Gaussians]] = halves,
+    divide: Callable[[Gaussians], tuple[Gaussians, Gaussians]] = split_in_two,
 ) -> tuple[Gaussians, tuple[Gaussians, Gaussians]]:
     """The arrays with up to `target` Gaussians: as many as are wanted, drawn by their votes, are each divided in two.
     The moments of the two begin at zero. Where the rows do not suffice they are doubled, up to those of the `most` that
@@ -132,11 +132,11 @@ def grown(
     count = int(seen.sum())
     add = min(max(target - count, 0), int(AT_ONCE * count) + 1)
     if count + add > len(seen):
-        rows = max(rows_for(count + add), min(rows_for(most), rows_for(2 * len(seen))))
-        gaussians = with_free_rows(gaussians, rows)
-        moments, votes = lengthened((moments, np.asarray(votes)), rows)
+        rows = max(padded_row_count(count + add), min(padded_row_count(most), padded_row_count(2 * len(seen))))
+        gaussians = pad_with_free_rows(gaussians, rows)
+        moments, votes = pad_rows((moments, np.asarray(votes)), rows)
         seen = in_use(gaussians)
-    parents = drawn(np.where(seen, votes, 0.0), add, np.random.default_rng(seed))
+    parents = sample_rows(np.where(seen, votes, 0.0), add, np.random.default_rng(seed))
     places = np.flatnonzero(~seen)[: len(parents)]
     one, other = divide(jax.tree.map(lambda a: a[parents], gaussians))
     for part, where in ((one, parents), (other, places)):
@@ -157,7 +157,7 @@ def noise(gaussians: Gaussians, rate: Array, step: Array) -> Float[Array, "n 3"]
     """What MCMC moves the centres by: normal numbers of the Gaussian's covariance, times the positions' rate, on those
     that hardly show (arXiv 2404.09591, eq. 8)."""
     normal = jax.random.normal(jax.random.fold_in(jax.random.key(0), step), gaussians.means.shape)
-    shows = jax.nn.sigmoid(100 * (FAINT - sigmoid(gaussians.opacity_logits)))[:, None]
+    shows = jax.nn.sigmoid(100 * (MIN_OPACITY - sigmoid(gaussians.opacity_logits)))[:, None]
     w, x, y, z = (normalize(gaussians.quaternions)[:, i] for i in range(4))
     rotation = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

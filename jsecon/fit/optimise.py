@@ -15,11 +15,19 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
-from jsecon.fit.corrections import Refine, Refined, start_refined
-from jsecon.fit.growth import compact, copies, grown, halves, opacities, rows_for, with_free_rows
+from jsecon.fit.corrections import CorrectionState, RefineOptions, init_corrections
+from jsecon.fit.growth import (
+    copies,
+    drop_free_rows,
+    grow,
+    opacities,
+    pad_with_free_rows,
+    padded_row_count,
+    split_in_two,
+)
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import Current, Steps, Way, on_devices, on_host
-from jsecon.fit.view import Views
+from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
+from jsecon.fit.view import TrainingViews
 from jsecon.parallel import host_mesh
 from jsecon.types import Array, Capture, Gaussians, record
 
@@ -46,7 +54,7 @@ class FitState:
     """() Gaussians at the start"""
     losses: Array
     """(steps,) loss of each step's view before the step"""
-    refined: Refined | None = None
+    refined: CorrectionState | None = None
     """corrections of the capture's T frames, or None where nothing is refined"""
 
 
@@ -62,14 +70,14 @@ def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
     return jax.random.permutation(jax.random.fold_in(key, index), views)
 
 
-def start_state(gaussians: Gaussians, refined: int | None = None, *, at_least: int = 0) -> FitState:
+def init_fit_state(gaussians: Gaussians, refined: int | None = None, *, at_least: int = 0) -> FitState:
     """The state before the first step, with rows for `at_least` Gaussians; `refined` is the number of frames that
     corrections are kept of."""
     count = np.asarray(gaussians.count)
-    rows = rows_for(max(int(count), at_least))
-    gaussians = with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
+    rows = padded_row_count(max(int(count), at_least))
+    gaussians = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
-    corrections = None if refined is None else start_refined(refined)
+    corrections = None if refined is None else init_corrections(refined)
     numbers = zero, zero, zero, count, np.zeros(0, np.float32)
     return FitState(gaussians, zeros, zeros, zeros.opacity_logits, *numbers, corrections)
 
@@ -82,8 +90,8 @@ AHEAD = 2
 
 
 def _chunk(
-    current: Current, steps: Steps, order: np.ndarray, first: int, done: np.ndarray, way: Way
-) -> tuple[Current, list]:
+    current: TrainState, steps: StepRunner, order: np.ndarray, first: int, done: np.ndarray, way: StepConfig
+) -> tuple[TrainState, list]:
     """A step on each view of `order`, taken again with more room where one overflowed; and their losses."""
     while True:
         after, losses, overflow = current, [], []
@@ -109,7 +117,7 @@ def fit_gaussians(
     state: FitState | None = None,
     schedule: Schedule = _SCHEDULE,
     rates: LearningRates = _RATES,
-    refine: Refine | None = None,
+    refine: RefineOptions | None = None,
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -129,12 +137,16 @@ def fit_gaussians(
     require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
     given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
     require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
-    views, mesh = Views(capture), host_mesh()
-    taking = Steps(views, mesh)
+    views, mesh = TrainingViews(capture), host_mesh()
+    taking = StepRunner(views, mesh)
     if start is not None:
         # A doubling is one more program to compile, which takes as long as hundreds of steps over free rows.
-        room = 0 if schedule.growth == "none" else schedule.at_most // (1 if schedule.at_most <= AT_ONCE else 2)
-        state = start_state(start, None if refine is None else len(capture.names), at_least=room)
+        room = (
+            0
+            if schedule.growth == "none"
+            else schedule.max_gaussians // (1 if schedule.max_gaussians <= AT_ONCE else 2)
+        )
+        state = init_fit_state(start, None if refine is None else len(capture.names), at_least=room)
     assert state is not None
     given, alike = state.refined is not None, (state.refined is None) == (refine is None)
     require(alike, "state with corrections", given, f"{refine is not None}", "Go on with the options of its start.")
@@ -143,8 +155,8 @@ def fit_gaussians(
         found = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
         require(own, "state", found, f"a fit of {steps} steps", "Go on with the options of its start.")
     seed = int(jax.random.bits(key))
-    fitted = Current(state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined)
-    current = on_devices(fitted, mesh)
+    fitted = TrainState(state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined)
+    current = put_on_devices(fitted, mesh)
     while float(state.done) < 1:
         first, done = len(state.losses), float(state.done)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
@@ -152,12 +164,12 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         views.at(schedule.size(done))
         order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
-        way = Way(schedule.degree(done), schedule.growth_at(done), rates, refine, state.gaussians.count)
+        way = StepConfig(schedule.degree(done), schedule.growth_at(done), rates, refine, state.gaussians.count)
         taking.compile(current, int(order[0]), first, done, way)  # which is not the fit's time
         began = time.monotonic()
         current, taken = _chunk(current, taking, order, first, dones, way)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
-        host = on_host(current, way.rows)
+        host = to_host(current, way.rows)
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
         moved = jax.tree.leaves((losses[-1], host.gaussians, host.refined))
         if not all(np.isfinite(array).all() for array in moved):
@@ -167,7 +179,7 @@ def fit_gaussians(
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
             host = _grown(host, schedule, target, [seed, len(losses)])
-            current = on_devices(host, mesh)
+            current = put_on_devices(host, mesh)
         spent = float(state.seconds) + time.monotonic() - began
         now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
         state = FitState(
@@ -186,12 +198,12 @@ def fit_gaussians(
             on_checkpoint(state)
         if progress:
             progress(*((len(losses), steps) if steps is not None else (round(spent), round(cast(float, seconds)))))
-    return compact(state.gaussians), np.asarray(state.losses)
+    return drop_free_rows(state.gaussians), np.asarray(state.losses)
 
 
-def _grown(current: Current, schedule: Schedule, target: int, seed: list[int]) -> Current:
+def _grown(current: TrainState, schedule: Schedule, target: int, seed: list[int]) -> TrainState:
     """With up to `target` Gaussians, on the host; the votes are counted anew."""
-    by, divide = (opacities(current.gaussians), copies) if schedule.growth == "mcmc" else (current.votes, halves)
+    by, divide = (opacities(current.gaussians), copies) if schedule.growth == "mcmc" else (current.votes, split_in_two)
     moments = current.first_moment, current.second_moment
-    gaussians, moments = grown(current.gaussians, moments, by, target, schedule.at_most, seed, divide)
-    return Current(gaussians, *moments, np.zeros_like(current.votes, shape=gaussians.count), current.refined)
+    gaussians, moments = grow(current.gaussians, moments, by, target, schedule.max_gaussians, seed, divide)
+    return TrainState(gaussians, *moments, np.zeros_like(current.votes, shape=gaussians.count), current.refined)

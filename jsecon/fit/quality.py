@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jsecon.fit.photometric import psnr, ssim_map
-from jsecon.fit.schedule import resized, resized_frame, resized_mask
+from jsecon.fit.schedule import resize_cameras, resize_frame, resize_mask
 from jsecon.parallel import map_over_processes
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Capture, Gaussians, Quality
 
-GLANCE = 400
+QUICK_LONG_SIDE = 400
 """px of the longer side that weak frames are looked for at: a thousand large ones would take half an hour"""
 FAR_BELOW_DB = 5.0
 """below the median frame at least, for a frame to be called weak"""
@@ -31,7 +31,7 @@ def _compare(image: Array, frame: UInt8[Array, "h w 3"], counted: Bool[Array, "h
     return psnr(image, target) + 10 * jnp.log10(share), similarity
 
 
-def quality(
+def measure_quality(
     gaussians: Gaussians,
     capture: Capture,
     *,
@@ -57,15 +57,15 @@ def quality(
         chosen = np.array([t for t in chosen if not np.all(capture.ignored[t])], int)
     gaussians, cameras = jax.device_put(gaussians), capture.cameras
     if long_side is not None:
-        cameras = resized(cameras, min(1.0, long_side / max(cameras.width, cameras.height)))
+        cameras = resize_cameras(cameras, min(1.0, long_side / max(cameras.width, cameras.height)))
 
     def rows(own: Sequence[int]) -> Iterator[list[float]]:
         for t in chosen[list(own)]:
             image = render_rgb(gaussians, cameras[int(t)]).features
-            frame = resized_frame(np.asarray(capture.frames[t]), cameras)
+            frame = resize_frame(np.asarray(capture.frames[t]), cameras)
             counted = np.ones(frame.shape[:2], bool)
             if capture.ignored is not None:
-                counted = ~resized_mask(np.asarray(capture.ignored[t]), cameras)
+                counted = ~resize_mask(np.asarray(capture.ignored[t]), cameras)
             yield [float(value) for value in _compare(image, frame, counted)]
 
     values = map_over_processes(len(chosen), rows, progress)
@@ -77,10 +77,10 @@ def evaluate_psnr(
     gaussians: Gaussians, capture: Capture, *, progress: Callable[[int, int], None] | None = None
 ) -> Float[np.ndarray, " f"]:
     """PSNR (dB) of each held-out frame."""
-    return np.asarray(quality(gaussians, capture, progress=progress).psnr)
+    return np.asarray(measure_quality(gaussians, capture, progress=progress).psnr)
 
 
-def weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+def is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """(F,) bool: frames so far below the median that the scene does not explain them: a wrong pose, something that
     moved, a finger before the lens."""
     if not len(psnr):

@@ -55,20 +55,20 @@ class Schedule:
     growth: Literal["votes", "mcmc", "none"] = "votes"
     """Gaussians are added where the picture is wrong, or by their opacity while all are moved by noise (arXiv
     2404.09591), or keep their number"""
-    at_most: int = 100_000
+    max_gaussians: int = 100_000
     """Gaussians; a start with more keeps its number"""
-    grows_from: float = 0.05
-    grows_until: float = 0.5
-    """shares of the fit between which the number of Gaussians rises evenly to `at_most`"""
-    degree_every: float = 0.1
+    growth_start: float = 0.05
+    growth_end: float = 0.5
+    """shares of the fit between which the number of Gaussians rises evenly to `max_gaussians`"""
+    degree_interval: float = 0.1
     """share of the fit after which the degree of the spherical harmonics rises by one, up to what the start holds"""
 
     def __post_init__(self) -> None:
         ends = [end for _, end in self.sizes]
         sound = ends == sorted(ends) and ends[-1:] == [1.0] and all(0 < size <= 1 for size, _ in self.sizes)
         require(sound, "sizes", self.sizes, "pairs of a size in (0, 1] and its end, the last end 1", "((1, 1),) is one")
-        order = 0 <= self.grows_from < self.grows_until <= 1
-        require(order, "grows_from, grows_until", (self.grows_from, self.grows_until), "0 <= from < until <= 1", "")
+        order = 0 <= self.growth_start < self.growth_end <= 1
+        require(order, "growth_start, growth_end", (self.growth_start, self.growth_end), "0 <= from < until <= 1", "")
 
     def size(self, done: float) -> float:
         """Of the frames, as a share of their own."""
@@ -76,18 +76,18 @@ class Schedule:
 
     def degree(self, done: float) -> int:
         """The highest of the spherical harmonics that learns."""
-        return int(done / self.degree_every) if self.degree_every > 0 else 3
+        return int(done / self.degree_interval) if self.degree_interval > 0 else 3
 
     def growth_at(self, done: float) -> Literal["votes", "mcmc", "none"]:
         """What a step does for growth: votes are counted only as long as they are of use."""
-        return "none" if self.growth == "votes" and done > self.grows_until else self.growth
+        return "none" if self.growth == "votes" and done > self.growth_end else self.growth
 
     def count(self, done: float, start: int) -> int | None:
         """Gaussians wanted, or None where none are added now."""
-        if self.growth == "none" or not self.grows_from <= done <= self.grows_until or self.at_most <= start:
+        if self.growth == "none" or not self.growth_start <= done <= self.growth_end or self.max_gaussians <= start:
             return None
-        share = (done - self.grows_from) / (self.grows_until - self.grows_from)
-        return round(start + share * (self.at_most - start))
+        share = (done - self.growth_start) / (self.growth_end - self.growth_start)
+        return round(start + share * (self.max_gaussians - start))
 
 
 LONG_STEPS, LONG_MINUTES = 3000, 3.0
@@ -96,7 +96,7 @@ MOST = 100_000
 """Gaussians, where nothing else is asked for"""
 
 
-def gaussians_for(pixels: int, *, steps: int | None, minutes: float | None) -> int:
+def default_max_gaussians(pixels: int, *, steps: int | None, minutes: float | None) -> int:
     """How many Gaussians a fit to frames of so many pixels may have: one for every other pixel, in a long fit one for
     each, at most MOST. More of them make a step slower: bonsai at 400x266 after two minutes has 28.3 dB with 50,000,
     28.5 with 100,000, 27.8 with 200,000 (experiments/work_precision_fit.py)."""
@@ -104,7 +104,7 @@ def gaussians_for(pixels: int, *, steps: int | None, minutes: float | None) -> i
     return min(pixels if long else pixels // 2, MOST)
 
 
-def resized(cameras: Camera, size: float) -> Camera:
+def resize_cameras(cameras: Camera, size: float) -> Camera:
     """A batch of cameras whose images are `size` times theirs, in whole px."""
     width, height = max(round(cameras.width * size), 1), max(round(cameras.height * size), 1)
     x, y = np.float32(width / cameras.width), np.float32(height / cameras.height)
@@ -112,14 +112,14 @@ def resized(cameras: Camera, size: float) -> Camera:
     return Camera(cameras.world_to_camera, *lens, width=width, height=height)
 
 
-def resized_frame(frame: np.ndarray, cameras: Camera) -> np.ndarray:
+def resize_frame(frame: np.ndarray, cameras: Camera) -> np.ndarray:
     """A frame (h, w, 3) uint8 at the size of `cameras`: each pixel the mean of those that it covers."""
     if frame.shape[:2] == (cameras.height, cameras.width):
         return np.asarray(frame)
     return cv2.resize(np.asarray(frame), (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
 
 
-def resized_mask(mask: np.ndarray, cameras: Camera) -> np.ndarray:
+def resize_mask(mask: np.ndarray, cameras: Camera) -> np.ndarray:
     """A mask (h, w) bool at the size of `cameras`: a pixel is set where any of those that it covers is."""
     size = cameras.width, cameras.height
     return cv2.resize(np.asarray(mask, np.float32), size, interpolation=cv2.INTER_AREA) > 0

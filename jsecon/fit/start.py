@@ -28,14 +28,14 @@ def starting_gaussians(
     *,
     sh_degree: int = 0,
     start: Start = "auto",
-    at_most: int = MAX_DENSE,
+    max_points: int = MAX_DENSE,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Gaussians, str]:
     """The Gaussians that a fit of `capture` starts from, and one sentence on where they come from.
 
     `start` is "auto": from depth where there is depth, else as "sparse"; "sparse": the capture's own points, or points
     triangulated from the frames that are not held out; "dense": from depth where there is depth, else by stereo between
-    neighbouring views; "random": in the space that the cameras look at. All but sparse points are `at_most` at most.
+    neighbouring views; "random": in the space that the cameras look at. All but sparse points are `max_points` at most.
     Raises InputError where the views do not give such points, ValueError on another `start`.
 
     The scale (in units of the distance to the neighbours) is smaller and the opacity larger than INRIA's 1 and 0.1,
@@ -46,14 +46,14 @@ def starting_gaussians(
     require_one_of("start", start, ("auto", "sparse", "dense", "random"), "auto takes what the capture holds.")
     count, given = len(capture.points), {"opacity": 0.7, "scale": 0.6}
     if capture.depths is not None and start in ("auto", "dense"):
-        found = points_from_depth(capture, max_points=at_most, stride=2)
+        found = points_from_depth(capture, max_points=max_points, stride=2)
         points, colors, given = found.points, found.colors, {"opacity": 0.9, "scale": 0.5, "max_scale": 2 * found.voxel}
         origin = f"{len(points)} points from the depth frames, one a voxel of {found.voxel:.3g} world units"
     elif start == "dense":
-        points, colors = dense_points(capture, at_most=at_most, progress=progress)
+        points, colors = dense_points(capture, max_points=max_points, progress=progress)
         origin = f"{len(points)} points by stereo between neighbouring views"
     elif start == "random":
-        points, colors = random_points(capture, at_most)
+        points, colors = random_points(capture, max_points)
         given = {"opacity": 0.1, "scale": 1.0}
         origin = f"{len(points)} random points in the space that the cameras look at"
     elif count >= MIN_POINTS:

@@ -9,10 +9,10 @@ import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jsecon.fit.corrections import Refine, Refined, refined_further
-from jsecon.fit.growth import lengthened, noise, pressure, with_free_rows
+from jsecon.fit.corrections import CorrectionState, RefineOptions, update_corrections
+from jsecon.fit.growth import noise, pad_rows, pad_with_free_rows, pressure
 from jsecon.fit.schedule import LearningRates, rates_at
-from jsecon.fit.view import View, Views, view_loss
+from jsecon.fit.view import TrainingView, TrainingViews, view_loss
 from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.types import Array, Gaussians
@@ -21,7 +21,7 @@ Growth: TypeAlias = Literal["votes", "mcmc", "none"]
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
-class Current(NamedTuple):
+class TrainState(NamedTuple):
     """What a step moves."""
 
     gaussians: Gaussians
@@ -29,11 +29,11 @@ class Current(NamedTuple):
     second_moment: Gaussians
     votes: Array
     """(N,) see FitState."""
-    refined: Refined | None
+    refined: CorrectionState | None
     """the corrections of all frames, where they are refined"""
 
 
-class Way(NamedTuple):
+class StepConfig(NamedTuple):
     """How a step goes, beside its view."""
 
     degree: int
@@ -41,14 +41,14 @@ class Way(NamedTuple):
     growth: Growth
     """what it does for growth"""
     rates: LearningRates
-    refine: Refine | None
+    refine: RefineOptions | None
     rows: int
-    """of the scene, before `on_devices` filled it up"""
+    """of the scene, before `put_on_devices` filled it up"""
 
 
 def step(
-    current: Current, view: View, numbers: dict[str, Any], capacity: int, mesh: Mesh | None, growth: Growth
-) -> tuple[Current, Array, Array]:
+    current: TrainState, view: TrainingView, numbers: dict[str, Any], capacity: int, mesh: Mesh | None, growth: Growth
+) -> tuple[TrainState, Array, Array]:
     """One Adam step on one view. Returns what is current after it, the loss before it, the pairs that overflowed. Over
     a mesh, projection, compositing, loss and update are each shared out among its devices.
 
@@ -80,10 +80,10 @@ def step(
         means = gaussians.means + noise(gaussians, rate.means, numbers["step"])
         gaussians = dataclasses.replace(gaussians, means=means)
     if refined is not None:
-        refined = refined_further(refined, numbers["frame"], by_own, numbers["taken"], numbers["refine_rates"])
-    after = Current(gaussians, first, second, votes + by_error.sum(1), refined)
+        refined = update_corrections(refined, numbers["frame"], by_own, numbers["taken"], numbers["refine_rates"])
+    after = TrainState(gaussians, first, second, votes + by_error.sum(1), refined)
     if mesh is not None:  # as it came: one program serves every step
-        after = Current(*map(jax.lax.with_sharding_constraint, after, _places(mesh)))
+        after = TrainState(*map(jax.lax.with_sharding_constraint, after, _places(mesh)))
     return after, value, overflow
 
 
@@ -94,15 +94,15 @@ step_compiled = [
 ]
 
 
-def _places(mesh: Mesh) -> Current:
+def _places(mesh: Mesh) -> TrainState:
     """How what is current lies on the devices: each has its own rows of the scene, the moments and the votes, and all
     of the corrections. A scene that every device held whole would take as many times its memory, and every step would
     send all of it to each."""
     whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    return cast(Current, Current(*cast(Any, (rows, rows, rows, rows, whole))))
+    return cast(TrainState, TrainState(*cast(Any, (rows, rows, rows, rows, whole))))
 
 
-def on_devices(current: Current, mesh: Mesh | None) -> Current:
+def put_on_devices(current: TrainState, mesh: Mesh | None) -> TrainState:
     """What is current, where the devices of a step want it; over a mesh filled up with free rows, so that each device
     has as many."""
     if mesh is None:
@@ -110,29 +110,31 @@ def on_devices(current: Current, mesh: Mesh | None) -> Current:
     rows = -(-current.gaussians.count // mesh.size) * mesh.size
     if rows > current.gaussians.count:
         others = current.first_moment, current.second_moment, current.votes
-        first, second, votes = lengthened(others, rows)
-        current = Current(with_free_rows(current.gaussians, rows), first, second, votes, current.refined)
-    return Current(*map(jax.device_put, current, _places(mesh)))
+        first, second, votes = pad_rows(others, rows)
+        current = TrainState(pad_with_free_rows(current.gaussians, rows), first, second, votes, current.refined)
+    return TrainState(*map(jax.device_put, current, _places(mesh)))
 
 
-def on_host(current: Current, rows: int) -> Current:
-    """What is current as NumPy's arrays, without the rows that `on_devices` added to `rows`."""
+def to_host(current: TrainState, rows: int) -> TrainState:
+    """What is current as NumPy's arrays, without the rows that `put_on_devices` added to `rows`."""
     host = jax.tree.map(np.asarray, current)
     return jax.tree.map(lambda a: a[:rows], host._replace(refined=None))._replace(refined=host.refined)
 
 
-class Steps:
+class StepRunner:
     """Steps on the views of a capture: the programs that there are, and the room that views of a size need."""
 
-    def __init__(self, views: Views, mesh: Mesh | None):
+    def __init__(self, views: TrainingViews, mesh: Mesh | None):
         self.views, self.mesh = views, mesh
         self._capacity: dict[tuple[int, float], int] = {}
         self._compiled: set[tuple] = set()
 
-    def _shape(self, current: Current) -> tuple[int, float]:
+    def _shape(self, current: TrainState) -> tuple[int, float]:
         return current.gaussians.count, self.views.size
 
-    def take(self, current: Current, view: int, number: int, done: float, way: Way) -> tuple[Current, Array, Array]:
+    def take(
+        self, current: TrainState, view: int, number: int, done: float, way: StepConfig
+    ) -> tuple[TrainState, Array, Array]:
         """`step`, the `number`-th, on that view."""
         views, cameras, strips = self.views, self.views.cameras, 1 if self.mesh is None else self.mesh.size
         fresh = default_capacity(current.gaussians.count, cameras.width, cameras.height, strips=strips)
@@ -153,14 +155,14 @@ class Steps:
         run = step_compiled[self.mesh is not None]
         return run(current, *given, capacity=capacity, mesh=self.mesh, growth=way.growth)
 
-    def compile(self, current: Current, view: int, number: int, done: float, way: Way) -> None:
+    def compile(self, current: TrainState, view: int, number: int, done: float, way: StepConfig) -> None:
         """Makes the program of such a step, where there is none."""
         program = *self._shape(current), way.growth
         if program not in self._compiled:
             jax.block_until_ready(self.take(current, view, number, done, way))
             self._compiled.add(program)
 
-    def widen(self, current: Current, overflow: int) -> None:
+    def widen(self, current: TrainState, overflow: int) -> None:
         """Gives room for `overflow` pairs more in views of this size."""
         shape = self._shape(current)
         self._capacity[shape] = enough_capacity(self._capacity[shape], np.array([overflow]))

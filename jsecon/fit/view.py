@@ -7,9 +7,9 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jsecon.errors import InputError
-from jsecon.fit.corrections import Corrections, away_from_rest, corrected_camera, exposed
+from jsecon.fit.corrections import Corrections, apply_exposure, corrected_camera, correction_penalty
 from jsecon.fit.photometric import photometric_loss
-from jsecon.fit.schedule import resized, resized_frame, resized_mask
+from jsecon.fit.schedule import resize_cameras, resize_frame, resize_mask
 from jsecon.parallel import map_rows
 from jsecon.splat.render import render
 from jsecon.splat.sh import colours_from_sh
@@ -24,7 +24,7 @@ COVERED = 0.5
 
 
 @record
-class View:
+class TrainingView:
     """One view."""
 
     camera: Camera
@@ -36,7 +36,7 @@ class View:
     """(H, W) bool: what not to fit"""
 
 
-class Views:
+class TrainingViews:
     """The frames of a capture that are not held out, read one at a time, at the size that is wanted now.
 
     Raises InputError where every frame is held out.
@@ -55,9 +55,9 @@ class Views:
     def at(self, size: float) -> None:
         """Takes the frames at `size` times theirs."""
         if size != self.size:
-            self.size, self.cameras = size, resized(self._whole, size)
+            self.size, self.cameras = size, resize_cameras(self._whole, size)
 
-    def __getitem__(self, index: int) -> View:
+    def __getitem__(self, index: int) -> TrainingView:
         """The view of the `index`-th frame used. A depth is 0 where it is not finite and positive, and in a smaller
         frame where it is of several surfaces; what not to fit spreads to every pixel that it is part of."""
         capture, t, to = self._capture, self.used[index], (self.cameras.width, self.cameras.height)
@@ -67,9 +67,9 @@ class Views:
             depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
             depth = depth if depth.shape == to[::-1] else _smaller_depth(depth, to)
         if capture.ignored is not None:
-            ignored = resized_mask(np.asarray(capture.ignored[t]), self.cameras)
-        frame = resized_frame(np.asarray(capture.frames[t]), self.cameras)
-        return View(self.cameras[index], frame, depth, ignored)
+            ignored = resize_mask(np.asarray(capture.ignored[t]), self.cameras)
+        frame = resize_frame(np.asarray(capture.frames[t]), self.cameras)
+        return TrainingView(self.cameras[index], frame, depth, ignored)
 
 
 def _smaller_depth(depth: np.ndarray, to: tuple[int, int]) -> np.ndarray:
@@ -91,7 +91,7 @@ def view_loss(
     gaussians: Gaussians,
     nothing: Array,
     own: Corrections | None,
-    view: View,
+    view: TrainingView,
     extent: Array,
     capacity: int | None = None,
     mesh: Mesh | None = None,
@@ -110,7 +110,7 @@ def view_loss(
     features = jnp.concatenate([colours, nothing], axis=1)
     rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)
     image, fourth = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)
-    image = image if own is None else exposed(image, own.colours)
+    image = image if own is None else apply_exposure(image, own.colours)
     target = view.frame.astype(image.dtype) / 255.0
     if view.ignored is not None:  # as it is rendered there, which is exact: SSIM's windows reach across the border
         ignored, as_is = view.ignored[..., None], jax.lax.stop_gradient(image)
@@ -121,6 +121,6 @@ def view_loss(
         relative = jnp.abs(rendering.depth - view.depth) / jnp.where(known, view.depth, 1.0)
         value = value + DEPTH_WEIGHT * jnp.mean(jnp.where(known, relative, 0.0))
     if own is not None:
-        value = value + away_from_rest(own, extent)
+        value = value + correction_penalty(own, extent)
     error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
     return value + jnp.sum(error * fourth), (value, rendering.overflow)

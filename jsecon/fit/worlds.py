@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jsecon.data.frames import spread
-from jsecon.fit.quality import GLANCE
-from jsecon.fit.schedule import resized, resized_frame
+from jsecon.fit.quality import QUICK_LONG_SIDE
+from jsecon.fit.schedule import resize_cameras, resize_frame
 from jsecon.splat.render import render_rgb
 from jsecon.types import Capture, Gaussians
 
@@ -33,7 +33,7 @@ worlds, up to 3.6 in wrong ones (a tenth of the scene's size beside: 4.0)"""
 _SHUFFLES = 500
 
 
-class Likeness(NamedTuple):
+class PhotoSimilarity(NamedTuple):
     """How much a scene looks like the photographs."""
 
     correlation: float
@@ -52,16 +52,18 @@ class Likeness(NamedTuple):
         return self.correlation >= ALIKE or (self.correlation >= CRUDE and self.apart >= TOLD_APART)
 
 
-def likeness(gaussians: Gaussians, capture: Capture) -> Likeness:
+def photo_similarity(gaussians: Gaussians, capture: Capture) -> PhotoSimilarity:
     """How much Gaussians in the capture's world look like its training frames."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     views = train[spread(len(train), VIEWS)]
-    cameras = resized(capture.cameras, min(1.0, GLANCE / max(capture.cameras.width, capture.cameras.height)))
+    cameras = resize_cameras(
+        capture.cameras, min(1.0, QUICK_LONG_SIDE / max(capture.cameras.width, capture.cameras.height))
+    )
     gaussians = jax.device_put(gaussians)
     rendered, photos, psnr = [], [], []
     for t in views.tolist():
         image = np.clip(np.asarray(render_rgb(gaussians, cameras[t]).features), 0, 1)
-        photo = resized_frame(np.asarray(capture.frames[t]), cameras).astype(np.float32) / 255
+        photo = resize_frame(np.asarray(capture.frames[t]), cameras).astype(np.float32) / 255
         psnr.append(-10 * np.log10(max(float(np.mean((image - photo) ** 2)), 1e-10)))
         rendered.append(_pattern(image))
         photos.append(_pattern(photo))
@@ -70,7 +72,7 @@ def likeness(gaussians: Gaussians, capture: Capture) -> Likeness:
     shuffled = np.array([table[rows, draw.permutation(len(views))].sum() for _ in range(_SHUFFLES)])
     deviation = max(float(shuffled.std()), 1e-9)
     apart = float((np.trace(table) - shuffled.mean()) / deviation)
-    return Likeness(float(np.diag(table).mean()), apart, float(np.mean(psnr)), len(views))
+    return PhotoSimilarity(float(np.diag(table).mean()), apart, float(np.mean(psnr)), len(views))
 
 
 def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:

@@ -31,9 +31,9 @@ from jsecon.language.votes import at_centre, distinct_labels
 from jsecon.numerics import FULL_PRECISION, NEAR, require_labels
 from jsecon.splat.banded import listed, still_open
 from jsecon.splat.bands import MOST_HELD, ROWS, Band, Bounds, band_size, bands, block_bounds
-from jsecon.splat.fusion import stored
-from jsecon.splat.tiles import TILE, TileLists, grid
-from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
+from jsecon.splat.fusion import materialize
+from jsecon.splat.tiles import TILE, TileLists, tile_grid
+from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
 from jsecon.types import Array, Camera, Gaussians, Regions, Votes
 
 _SLOTS = 4
@@ -181,7 +181,7 @@ def _cast_view(
     pixel) of those that have any, and (Gaussian, region, weight), a row for each tile."""
     view = _prepared(labels)
     left = view.inside  # what is outside the image has stopped
-    across, down = grid(camera.width, camera.height, TILE)
+    across, down = tile_grid(camera.width, camera.height, TILE)
     names = np.asarray(view.distinct)
     several = (names >= 0).sum(1)
     is_open = lambda: np.asarray(still_open(left)).reshape(down, across)
@@ -241,7 +241,7 @@ def _cast_band(
 
         def body(transmittance, inner, chunk):
             cast, _ = inner
-            weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             weight = weight * covered[:, None]
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))

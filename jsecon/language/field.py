@@ -35,7 +35,7 @@ from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
 from jsecon.language.shares import votes_of_rows
 from jsecon.splat.project import unusable_rows
-from jsecon.splat.sh import BANDS
+from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT = "jsecon-field"
@@ -218,7 +218,7 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
                 return f"{name} with numbers that are not finite{' or zero' if own == 'quaternions' else ''}"
             if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
                 return f"{name} with numbers of none of {sizes[name]}"
-    if field.gaussians.sh.shape[1] not in BANDS:
+    if field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):

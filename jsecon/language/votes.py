@@ -20,9 +20,9 @@ from jsecon.errors import require, require_shape
 from jsecon.numerics import FULL_PRECISION, NEAR, is_traced, require_labels
 from jsecon.parallel import accumulate_over_views, concurrent_lanes
 from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.splat.fusion import stored
+from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
-from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
+from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
 from jsecon.types import Array, Camera, Gaussians, Votes
 
 # A tile of 8x8 pixels seldom shows more regions than this; where one does, the view is walked again for the rest.
@@ -204,7 +204,7 @@ def _add_view(
 
             def body(transmittance, inner, chunk):
                 votes, total, peak = inner
-                weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+                weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
                 weight = weight * covered[:, None]
                 if centre:
                     weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))

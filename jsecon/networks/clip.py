@@ -21,7 +21,7 @@ from jsecon.networks.sigmoid import fitted_logits, read_logits
 from jsecon.networks.tokenizer import CONTEXT_LENGTH, ClipTokenizer, load_tokenizer
 from jsecon.vision.protocols import CANONICAL, Logits
 from jsecon.vision.reference_words import REFERENCE_WORDS
-from jsecon.vision.stores import EmbeddingStore, known_vectors, mask_key
+from jsecon.vision.stores import EmbeddingStore, lookup_vectors, mask_key
 
 
 def masked_crop(
@@ -128,7 +128,7 @@ class ClipEmbedder:
         """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
         keys = [mask_key(mask) for mask in masks]
         known = {} if self._store is None else self._store.read(frame)
-        rows, missing = known_vectors(known, keys, self.dim)
+        rows, missing = lookup_vectors(known, keys, self.dim)
         missing = [index for index in missing if masks[index].any()]
         for start in range(0, len(missing), self._batch):
             chunk = missing[start : start + self._batch]

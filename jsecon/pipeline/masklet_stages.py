@@ -106,10 +106,10 @@ def frame_proposals(
                 return segmenter(frames[t], t)
 
         return ask, ()
-    from jsecon.association.runs import remembered
+    from jsecon.association.run_lengths import memoized_masks
 
     classical = _classical_segmenter(options.granularity, capture, gaussians)
-    return remembered(lambda t: classical(frames[t], t)), ()
+    return memoized_masks(lambda t: classical(frames[t], t)), ()
 
 
 def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussians) -> Segmenter:
@@ -121,7 +121,7 @@ def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussian
     from jsecon.fit.depth import points_from_depth
     from jsecon.splat.render import render_depth
     from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
-    from jsecon.vision.surfaces import steadied_depth, surfaces_from_depth
+    from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
     train = training_frames(capture)
     setting = GRANULARITIES[granularity]
@@ -138,7 +138,7 @@ def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussian
 
         def rendered(t: int) -> np.ndarray:
             depth, alpha = (np.asarray(image) for image in render_depth(gaussians, cameras[t]))
-            return steadied_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
+            return smooth_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
 
         return ClassicalSegmenter(**setting, depths=rendered)
     return ClassicalSegmenter(**setting)

@@ -111,22 +111,22 @@ def _put_right(work: RunContext) -> Stage:
     options, plain, asked = work.options, _as_it_is(work), refinement(work)
 
     def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
-        from jsecon.fit.corrections import Refine
-        from jsecon.fit.settle import settled
+        from jsecon.fit.corrections import RefineOptions
+        from jsecon.fit.refine import refine_capture
 
         loaded = plain.compute(results, progress, record)
-        capture, refine, at_most = loaded.value, None, None
+        capture, refine, max_fit_steps = loaded.value, None, None
         if asked == "auto" and capture.depths is not None:
-            refine, at_most = Refine(), _fit_steps(options, capture) / 2
+            refine, max_fit_steps = RefineOptions(), _fit_steps(options, capture) / 2
         elif asked not in ("auto", "none"):
-            refine = Refine(asked in ("poses", "both"), asked in ("exposure", "both"))
-        better = settled(
+            refine = RefineOptions(asked in ("poses", "both"), asked in ("exposure", "both"))
+        better = refine_capture(
             capture,
             key=jax.random.key(options.seed),
             refine=refine,
             drop_weak=options.drop_frames == "auto",
             decide=asked == "auto",
-            at_most=at_most,
+            max_fit_steps=max_fit_steps,
             progress=progress,
         )
         training_frames(better)
@@ -244,8 +244,8 @@ def _in_the_captures_world(
     back from, the capture files', the poses', those of known trainings. The one that looks like the frames is taken.
     """
     from jsecon.data.worlds import trained_worlds
-    from jsecon.fit.worlds import likeness
-    from jsecon.splat.transform import carried
+    from jsecon.fit.worlds import photo_similarity
+    from jsecon.splat.transform import transform_gaussians_float64
 
     to_source = np.asarray(capture.to_source, np.float64)
     to_poses = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
@@ -260,9 +260,9 @@ def _in_the_captures_world(
         worlds.append(("the poses, without the applied_transform undone", to_source @ np.linalg.inv(to_poses)))
 
     def seen_in(world: np.ndarray) -> tuple[Gaussians, Any]:
-        moved = carried(gaussians, np.linalg.inv(to_source) @ world)
+        moved = transform_gaussians_float64(gaussians, np.linalg.inv(to_source) @ world)
         scene = jax.tree.map(jnp.asarray, moved)
-        return scene, likeness(scene, capture)
+        return scene, photo_similarity(scene, capture)
 
     looked = []
     for n, (name, world) in enumerate(worlds):
@@ -311,7 +311,7 @@ def _fitted(work: RunContext) -> Stage:
 
     def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.fit.optimise import fit_gaussians
-        from jsecon.fit.schedule import Schedule, gaussians_for
+        from jsecon.fit.schedule import Schedule, default_max_gaussians
         from jsecon.fit.start import starting_gaussians
 
         capture, state = results["load"], record.read()
@@ -322,7 +322,7 @@ def _fitted(work: RunContext) -> Stage:
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
         pixels = capture.cameras.width * capture.cameras.height
-        most = options.gaussians_at_most or gaussians_for(pixels, steps=options.steps, minutes=minutes)
+        most = options.gaussians_at_most or default_max_gaussians(pixels, steps=options.steps, minutes=minutes)
         found, losses = fit_gaussians(
             capture,
             key=jax.random.key(options.seed),
@@ -330,7 +330,7 @@ def _fitted(work: RunContext) -> Stage:
             seconds=None if minutes is None else 60 * minutes,
             start=start,
             state=state,
-            schedule=Schedule(growth=options.growth, at_most=most),
+            schedule=Schedule(growth=options.growth, max_gaussians=most),
             on_checkpoint=lambda current: record.keep(lambda: current),
             progress=progress,
         )
@@ -365,17 +365,17 @@ def held_out(work: RunContext) -> Stage:
     """PSNR and SSIM of the frames held out, against the photographs; and which of the others stay far below them."""
 
     def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
-        from jsecon.fit.quality import GLANCE, quality, weak
+        from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 
         capture, scene = results["load"], results["gaussians"]
         train = np.flatnonzero(~np.asarray(capture.held_out))
-        fitted = quality(scene, capture, frames=train, long_side=GLANCE, progress=progress)
-        low = np.flatnonzero(weak(np.asarray(fitted.psnr)))
+        fitted = measure_quality(scene, capture, frames=train, long_side=QUICK_LONG_SIDE, progress=progress)
+        low = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
         names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in low[:5])
         more = f" and {len(low) - 5} more" if len(low) > 5 else ""
         told = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
         told += "something moved (--drop-frames auto leaves them out)"
-        return StageResult(quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
+        return StageResult(measure_quality(scene, capture, progress=progress), notes=(told,) if len(low) else ())
 
     how = "PSNR and SSIM of the rendered colours"
     return Stage("held_out", how, compute, "fit", after=("load", "gaussians"), shared=True)

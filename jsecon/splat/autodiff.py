@@ -26,7 +26,7 @@ from jaxtyping import Float
 from jsecon.splat.composite import composite, composite_features_vjp
 from jsecon.splat.gradient import composite_vjp
 from jsecon.splat.project import Projection
-from jsecon.splat.strips import over_strips
+from jsecon.splat.strips import map_strips
 from jsecon.splat.tiles import TILE, TileLists, tile_lists
 from jsecon.types import Array
 
@@ -41,12 +41,12 @@ def view_lists(
         del dealt
         return tile_lists(projection, width, height, capacity=each, tile=tile, strip=strip)
 
-    lists = sequential_vmap(lambda p: over_strips(local, (), p, mesh))
+    lists = sequential_vmap(lambda p: map_strips(local, (), p, mesh))
     return lists(jax.tree.map(lax.stop_gradient, projection))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
-def splat(
+def rasterize(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
 ) -> tuple[Array, Array]:
     """Image (H, W, D) and final transmittance (H, W) of `splats` (N, 6) with `features` (N, D); see composite.py."""
@@ -75,7 +75,7 @@ def _splat_backward(width, height, mesh, residual, cotangents):
     return by_splat, gradient.astype(features.dtype), None
 
 
-splat.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
+rasterize.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
 
 
 def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
@@ -121,7 +121,7 @@ def _unmerge(array: Array, sets: int) -> Array:
     return jnp.moveaxis(array.reshape(*array.shape[:-1], sets, -1), -2, 0)
 
 
-def splat_contained(
+def rasterize_contained(
     splats: Float[Array, "n 6"],
     features: Float[Array, "n d"],
     lists: TileLists,
@@ -129,14 +129,14 @@ def splat_contained(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
-    """`splat`, with NaN in every channel of the pixels that a Gaussian with a NaN or infinite feature touches, and in
-    no other. Those pixels and those numbers have gradient zero."""
+    """`rasterize`, with NaN in every channel of the pixels that a Gaussian with a NaN or infinite feature touches, and
+    in no other. Those pixels and those numbers have gradient zero."""
     sound = jnp.isfinite(features)
-    image, transmittance = splat(splats, jnp.where(sound, features, 0.0), lists, width, height, mesh)
+    image, transmittance = rasterize(splats, jnp.where(sound, features, 0.0), lists, width, height, mesh)
     bad = lax.stop_gradient(1.0 - sound.all(1, keepdims=True).astype(splats.dtype))
 
     def walk(bad) -> Array:
-        image, _ = cast(tuple[Array, Array], splat(lax.stop_gradient(splats), bad, lists, width, height, mesh))
+        image, _ = cast(tuple[Array, Array], rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh))
         return image[..., 0] > 0
 
     touched = lax.cond(_any(bad), walk, lambda bad: jnp.zeros((height, width), bool), bad)

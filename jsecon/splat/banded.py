@@ -16,11 +16,11 @@ from jaxtyping import Float
 
 from jsecon.numerics import FULL_PRECISION, MIN_TRANSMITTANCE, NEAR
 from jsecon.splat.bands import MOST_HELD, Bounds, band_size, bands, block_bounds
-from jsecon.splat.fusion import stored
+from jsecon.splat.fusion import materialize
 from jsecon.splat.project import Projection
 from jsecon.splat.sh import colours_from_sh
-from jsecon.splat.tiles import TILE, TileLists, grid, tile_lists
-from jsecon.splat.walk import make_batches, make_table, to_tiles, walk, weights
+from jsecon.splat.tiles import TILE, TileLists, tile_grid, tile_lists
+from jsecon.splat.walk import blend_weights, make_batches, make_table, to_tiles, walk
 from jsecon.types import Array, Camera, Gaussians
 
 
@@ -40,7 +40,7 @@ def render_in_blocks(
     """
     camera = jax.tree.map(np.asarray, camera)
     size = band_size(gaussians.count, camera.width, camera.height)
-    across, down = grid(camera.width, camera.height, TILE)
+    across, down = tile_grid(camera.width, camera.height, TILE)
     left = to_tiles(jnp.ones((camera.height, camera.width), jnp.float32), TILE)  # what is outside the image has stopped
     image = jnp.zeros((left.shape[0], 3, left.shape[1]), jnp.float32)
     is_open = lambda: np.asarray(still_open(left)).reshape(down, across)
@@ -85,7 +85,7 @@ def _composite_band(
 
         def body(transmittance, inner, chunk):
             total, _ = inner
-            weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             total = total + jnp.einsum("bkp,bkd->bdp", weight, chunk.columns, precision=FULL_PRECISION)
             return transmittance, (total, transmittance)
 

@@ -18,7 +18,7 @@ from jsecon.errors import require
 from jsecon.numerics import FRUSTUM_MARGIN, MIN_ALPHA
 from jsecon.splat.project import Projection, check_shapes, project
 from jsecon.splat.strips import BLOCK
-from jsecon.splat.tiles import TILE, grid, pair_counts
+from jsecon.splat.tiles import TILE, pair_counts, tile_grid
 from jsecon.types import Array, Camera, Gaussians
 
 ROWS = 1 << 18
@@ -132,7 +132,7 @@ def bands(
     """
     check_shapes(gaussians, camera)
     require(gaussians.count < 1 << 32, "bands", gaussians.count, "fewer than 2^32 Gaussians", "Split the scene.")
-    across, down = grid(camera.width, camera.height, BLOCK * TILE)
+    across, down = tile_grid(camera.width, camera.height, BLOCK * TILE)
     require(size >= across * down, "bands", size, f"a size of {across * down}: all blocks of the image", "Raise it.")
     blocks, behind = np.flatnonzero(may_touch(bounds, camera, near)).tolist(), None
     while is_open().any():
@@ -236,6 +236,6 @@ def _band(ids: np.ndarray, table: np.ndarray, size: int) -> Band:
 def band_size(count: int, width: int, height: int) -> int:
     """Splats and pairs of a band for a scene of `count` Gaussians: few for a small one, and room for one splat that
     covers every block of the image."""
-    across, down = grid(width, height, BLOCK * TILE)
+    across, down = tile_grid(width, height, BLOCK * TILE)
     few = max(4096, 1 << max(2 * count - 1, 1).bit_length())
     return max(min(BAND, few), 1 << (across * down - 1).bit_length())

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, UInt
 
-from jsecon.splat.fusion import stored
+from jsecon.splat.fusion import materialize
 from jsecon.types import Array
 
 WORD = 32
@@ -22,7 +22,7 @@ _SLOTS = 32768
 # slots at a time: what they need fits the second cache
 
 
-def in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
+def loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
     """`carry = step(first, carry)` for first = 0, size, 2 size and so on below `total`."""
     onward = lambda state: (state[0] + size, step(*state))
     return lax.while_loop(lambda state: state[0] < total, onward, (jnp.int32(0), carry))[1]
@@ -35,7 +35,7 @@ def transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, "
     return lax.reduce(bits, jnp.uint32(0), lax.bitwise_or, (1,))
 
 
-def set_bits(
+def tile_bits(
     reach: Callable[[Array, Array], Array], owner: Array, blocks: Array, tiles: int, total: Array, chunk: int
 ) -> tuple[UInt[Array, "words t"], Int[Array, "words t"]]:
     """The bits of all segments, `reach(owner, blocks)` transposed, and the set bits before each: tile after tile, and
@@ -44,7 +44,7 @@ def set_bits(
 
     def step(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         so_far, members, before = carry
-        reached = stored(first < total, reach, part(owner, first), part(blocks, first))
+        reached = materialize(first < total, reach, part(owner, first), part(blocks, first))
         own = transpose_words(reached, tiles)
         ends = so_far + lax.cumsum(lax.population_count(own).astype(jnp.int32))
         put = lambda whole, part: lax.dynamic_update_slice_in_dim(whole, part, first // WORD, 0)
@@ -52,13 +52,13 @@ def set_bits(
 
     words = owner.shape[0] // WORD
     nothing = jnp.zeros(tiles, jnp.int32), jnp.zeros((words, tiles), jnp.uint32), jnp.zeros((words, tiles), jnp.int32)
-    of_tile, members, before = in_chunks(total, chunk, step, nothing)
+    of_tile, members, before = loop_in_chunks(total, chunk, step, nothing)
     # Words that no pair fills count as after all others of their tile.
     filled = (lax.iota(jnp.int32, words) * WORD < total)[:, None]
     return members, jnp.where(filled, before, of_tile) + (lax.cumsum(of_tile) - of_tile)
 
 
-def read_off(
+def compact_tile_lists(
     members: UInt[Array, "words t"],
     before: Int[Array, "words t"],
     owner: Int[Array, " pairs"],
@@ -86,7 +86,7 @@ def read_off(
         return ends[-1], table, begins.at[place].add(mark, mode="promise_in_bounds")
 
     nothing = jnp.zeros((nowhere[0] + 1, 3), jnp.int32), jnp.zeros(nowhere[1] + 1, jnp.uint32)
-    _, table, begins = in_chunks(-(-total // WORD), chunk, gather, (lax.cumsum(counts) - counts, *nothing))
+    _, table, begins = loop_in_chunks(-(-total // WORD), chunk, gather, (lax.cumsum(counts) - counts, *nothing))
     columns = [table[:, i] for i in range(3)]
     until = (jnp.uint32(2) << lax.iota(jnp.uint32, WORD)) - 1
 
@@ -112,9 +112,9 @@ def read_off(
         own = lax.dynamic_slice(begins, (first // WORD,), (_SLOTS // WORD,))
         begun = begun + lax.cumsum(lax.population_count(own).astype(jnp.int32))
         always = first < last
-        segment = stored(always, segment_of, own, begun - lax.population_count(own).astype(jnp.int32))
-        pairs = stored(always, pair_of, first, *stored(always, lambda s: [c[s] for c in columns], segment))
+        segment = materialize(always, segment_of, own, begun - lax.population_count(own).astype(jnp.int32))
+        pairs = materialize(always, pair_of, first, *materialize(always, lambda s: [c[s] for c in columns], segment))
         return begun[-1], lax.dynamic_update_slice(out, owner[pairs], (first,))
 
-    out = in_chunks(last, _SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
+    out = loop_in_chunks(last, _SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
     return out[: WORD * words * tiles]

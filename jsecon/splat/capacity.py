@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from jsecon.splat.project import project
 from jsecon.splat.strips import BLOCK, Strip
-from jsecon.splat.tiles import TILE, grid, pair_counts, whole_words
+from jsecon.splat.tiles import TILE, pair_counts, round_up_to_words, tile_grid
 from jsecon.types import Array, Camera, Gaussians
 
 PER_GAUSSIAN, PER_BLOCK = 2, 256
@@ -49,7 +49,7 @@ def default_capacity(count: int, width: int, height: int, *, strips: int = 1) ->
     1944x1260, a view needs less than N + 330 for each block (benchmarks/results.md); time hardly follows the capacity,
     memory by about 110 bytes for each pair.
     """
-    across, down = grid(width, height, BLOCK * TILE)
+    across, down = tile_grid(width, height, BLOCK * TILE)
     blocks = across * -(-down // strips)
     each = min(count * blocks, -(-PER_GAUSSIAN * count // strips) + PER_BLOCK * blocks)
     return round_capacity(strips * each)
@@ -57,7 +57,7 @@ def default_capacity(count: int, width: int, height: int, *, strips: int = 1) ->
 
 def enough_capacity(capacity: int, overflow: Int[Array, " strips"]) -> int:
     """A capacity that holds what overflowed `capacity`, in powers of two for each strip: views share programs."""
-    each = whole_words(-(-capacity // overflow.shape[0])) + int(overflow.max())
+    each = round_up_to_words(-(-capacity // overflow.shape[0])) + int(overflow.max())
     return overflow.shape[0] << (each - 1).bit_length()
 
 

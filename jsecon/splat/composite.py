@@ -9,10 +9,10 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from jsecon.numerics import FULL_PRECISION, MIN_TRANSMITTANCE
-from jsecon.splat.fusion import stored
-from jsecon.splat.strips import join, over_strips, split
+from jsecon.splat.fusion import materialize
+from jsecon.splat.strips import join_strips, map_strips, split_into_strips
 from jsecon.splat.tiles import TileLists
-from jsecon.splat.walk import CHUNK, make_batches, make_table, to_image, to_tiles, walk, weights
+from jsecon.splat.walk import CHUNK, blend_weights, make_batches, make_table, to_image, to_tiles, walk
 from jsecon.types import Array
 
 WIDE = 6
@@ -43,7 +43,7 @@ def composite(
                 chunk = chunk._replace(columns=jnp.concatenate([given, chunk.columns], axis=-1))
             if channels <= WIDE:
                 return _summed_anew(transmittance, total, chunk)
-            weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+            weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             for k in range(CHUNK):
                 total = total + weight[:, None, k] * chunk.columns[:, k, :, None]
             return transmittance, total
@@ -60,8 +60,8 @@ def composite(
     # A last channel of ones sums the weights: the final transmittance is what they leave of 1.
     ones = jnp.ones_like(splats[:, :1])
     table = make_table(splats, ones) if apart else make_table(splats, features, ones)
-    image, transmittance, seen = over_strips(local, lists, (table, features if apart else None), mesh)
-    return join(image, lists.tile, height), join(transmittance, lists.tile, height), seen
+    image, transmittance, seen = map_strips(local, lists, (table, features if apart else None), mesh)
+    return join_strips(image, lists.tile, height), join_strips(transmittance, lists.tile, height), seen
 
 
 def _summed_anew(transmittance: Array, total: Array, chunk) -> tuple[Array, Array]:
@@ -90,7 +90,7 @@ def composite_features_vjp(
             values = jnp.moveaxis(cotangents[tiles], -1, 1)  # pixels innermost on both sides: the faster product
 
             def body(transmittance, gradient, chunk):
-                weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+                weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
                 own = jnp.einsum("bcp,bdp->bcd", weight, values, precision=FULL_PRECISION)
                 return transmittance, gradient.at[chunk.ids].add(own)
 
@@ -98,5 +98,5 @@ def composite_features_vjp(
 
         return lax.scan(one_batch, jnp.zeros((splats.shape[0], channels), splats.dtype), batches.tiles)[0]
 
-    strips = split(cotangent, lists.tile, 1 if mesh is None else mesh.size)
-    return over_strips(local, (lists, strips), make_table(splats), mesh, total=True)
+    strips = split_into_strips(cotangent, lists.tile, 1 if mesh is None else mesh.size)
+    return map_strips(local, (lists, strips), make_table(splats), mesh, total=True)

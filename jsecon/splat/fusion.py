@@ -14,7 +14,7 @@ from jax import lax
 from jsecon.types import Array
 
 
-def stored(always: Array, compute: Callable, *operands: Any) -> Any:
+def materialize(always: Array, compute: Callable, *operands: Any) -> Any:
     """`compute(*operands)`, computed once and kept in memory whatever reads it; `always` is true, unknown to the
     compiler."""
     shapes = jax.eval_shape(compute, *operands)
@@ -22,7 +22,7 @@ def stored(always: Array, compute: Callable, *operands: Any) -> Any:
     return lax.cond(always, compute, nothing, *operands)
 
 
-def surely(number: Array) -> Array:
+def opaque_true(number: Array) -> Array:
     """() bool, true whatever `number` () holds, which the compiler does not find out."""
     bits = lax.bitcast_convert_type(number, jnp.int32 if number.dtype.itemsize == 4 else jnp.int64)
     return (bits | 1) != 0

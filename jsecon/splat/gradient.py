@@ -11,19 +11,19 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.numerics import FULL_PRECISION, MAX_ALPHA
-from jsecon.splat.fusion import stored
-from jsecon.splat.strips import over_strips, split
+from jsecon.splat.fusion import materialize
+from jsecon.splat.strips import map_strips, split_into_strips
 from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import (
     ATTRIBUTES,
     BATCH_BACKWARD,
+    blend_weights,
+    cumulative,
     make_batches,
     make_table,
     pixel_centres,
-    running,
     to_tiles,
     walk,
-    weights,
 )
 from jsecon.types import Array
 
@@ -66,9 +66,9 @@ def composite_vjp(
 
             def body(transmittance, state, chunk):
                 before, gradient = state
-                weight, transmittance = stored(chunk.always, weights, transmittance, chunk.alpha)
+                weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
                 along = _along(chunk.columns, local) - along_transmittance[:, None]
-                slope, before = stored(chunk.always, _slopes, weight, chunk.alpha, along, before, final)
+                slope, before = materialize(chunk.always, _slopes, weight, chunk.alpha, along, before, final)
                 moments = jnp.einsum("bcp,mp->bcm", slope, monomials, precision=FULL_PRECISION)
                 by_attribute = _attribute_gradient(moments, chunk.attributes, corners, lists.tile / 2)
                 by_feature = jnp.einsum("bcp,bdp->bcd", weight, local, precision=FULL_PRECISION)
@@ -81,8 +81,8 @@ def composite_vjp(
         start = jnp.zeros((splats.shape[0], ATTRIBUTES + channels), splats.dtype)
         return lax.scan(one_batch, start, batches.tiles)[0]
 
-    strips = split(packed, lists.tile, 1 if mesh is None else mesh.size)
-    gradient = over_strips(local, (lists, strips), make_table(splats, features), mesh, total=True)
+    strips = split_into_strips(packed, lists.tile, 1 if mesh is None else mesh.size)
+    gradient = map_strips(local, (lists, strips), make_table(splats, features), mesh, total=True)
     return gradient[:, :ATTRIBUTES], gradient[:, ATTRIBUTES:]
 
 
@@ -97,7 +97,7 @@ def _along(features: Array, cotangent: Array) -> Array:
 def _slopes(weight: Array, alpha: Array, along: Array, before: Array, final: Array) -> tuple[Array, Array]:
     """alpha dL/dalpha of a chunk (B, CHUNK, pixels), and the running sum of w <G, f> behind it (B, pixels)."""
     share = weight * along
-    until, after = running(jnp.add, before, share)
+    until, after = cumulative(jnp.add, before, share)
     rest = final[:, None] - (until + share)
     live = (weight > 0) & (alpha < MAX_ALPHA)
     return jnp.where(live, share - rest * (alpha / (1 - alpha)), 0.0), after

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jsecon.errors import require, require_shape
 from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
-from jsecon.splat.autodiff import splat_contained, view_lists
+from jsecon.splat.autodiff import rasterize_contained, view_lists
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
 from jsecon.splat.project import check_shapes, project
 from jsecon.splat.tiles import TileLists
@@ -157,7 +157,7 @@ def _render_plan(plan: ViewPlan, features: Array, background: Array | None, dept
     if depth or features.dtype != jnp.bfloat16:
         features = features.astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
-    image, transmittance = splat_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
+    image, transmittance = rasterize_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
     image, transmittance = (jnp.where(plan.sound, a, jnp.nan) for a in (image, transmittance))
     alpha, expected = 1 - transmittance, None
     if depth:

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require, require_shape
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, all_finite, normalize, sigmoid
-from jsecon.splat.fusion import stored, surely
-from jsecon.splat.sh import BANDS
+from jsecon.splat.fusion import materialize, opaque_true
+from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
 
-def usable(gaussians: Gaussians) -> Bool[Array, " n"]:
+def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
     """(N,) the Gaussians that can be drawn; the others are hidden, and harm neither image nor gradient of the rest.
 
     A NaN, an infinite mean or quaternion, or an infinite size is no Gaussian. Minus infinity as a log scale is the
@@ -29,7 +29,7 @@ def usable(gaussians: Gaussians) -> Bool[Array, " n"]:
 
 
 def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
-    """(M,) rows of one of the fields of `Gaussians` that no file holds, on the host: what `usable` excludes, colours
+    """(M,) rows of one of the fields of `Gaussians` that no file holds, on the host: what `is_usable` excludes, colours
     that are not finite, and quaternions of length 0.
 
     Args:
@@ -53,7 +53,7 @@ def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None 
     `render` hides the former, and shows the latter as NaN on the pixels that they touch.
     """
     channels = gaussians.sh.reshape(gaussians.sh.shape[0], -1) if features is None else features
-    return jnp.sum(~(usable(gaussians) & jnp.isfinite(channels).all(1)), dtype=jnp.int32)
+    return jnp.sum(~(is_usable(gaussians) & jnp.isfinite(channels).all(1)), dtype=jnp.int32)
 
 
 # An axis longer than this (px) is flat over any image; it is shrunk to it, so that squares stay in float32.
@@ -81,7 +81,7 @@ class Projection:
     extents: Leaf
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
     visible: Leaf
-    """(N,) bool: `usable`, in front of the near plane, able to reach alpha 1/255, box touching the image."""
+    """(N,) bool: `is_usable`, in front of the near plane, able to reach alpha 1/255, box touching the image."""
 
     @property
     def conics(self) -> Array:
@@ -144,7 +144,9 @@ def check_gaussians(gaussians: Gaussians) -> None:
     _check_geometry(gaussians)
     require_shape("gaussians.sh", gaussians.sh, (gaussians.count, "K", 3), "Give one row for each of the means.")
     shape = tuple(gaussians.sh.shape)
-    require(shape[1] in BANDS, "gaussians.sh", shape, "(N, K, 3) with K of 1, 4, 9 or 16", "Pad it with zeros.")
+    require(
+        shape[1] in COEFFICIENT_COUNTS, "gaussians.sh", shape, "(N, K, 3) with K of 1, 4, 9 or 16", "Pad it with zeros."
+    )
 
 
 def _check_geometry(gaussians: Gaussians) -> None:
@@ -189,11 +191,11 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     y_ratio = jnp.clip(y_ratio, -camera.cy / camera.fy - margin_y, (height - camera.cy) / camera.fy + margin_y)
 
     # Each stage once, not once for every reader of its results: above all the gradient gains (4 times).
-    always = surely(gaussians.means[0, 0]) if gaussians.means.shape[0] else jnp.asarray(True)
-    unit = stored(always, lambda q: [normalize(q)[:, i] for i in range(4)], gaussians.quaternions)
+    always = opaque_true(gaussians.means[0, 0]) if gaussians.means.shape[0] else jnp.asarray(True)
+    unit = materialize(always, lambda q: [normalize(q)[:, i] for i in range(4)], gaussians.quaternions)
     rays = (x_ratio, y_ratio, camera.fx / z_safe, camera.fy / z_safe)
-    row_1, row_2 = stored(always, _covariance_root, w2c, unit, gaussians.log_scales, rays)
-    cov_xx, cov_yy, l11, l21, l22 = stored(always, _whitening, row_1, row_2)
+    row_1, row_2 = materialize(always, _covariance_root, w2c, unit, gaussians.log_scales, rays)
+    cov_xx, cov_yy, l11, l21, l22 = materialize(always, _whitening, row_1, row_2)
 
     opacities = sigmoid(gaussians.opacity_logits)
     reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))
@@ -216,7 +218,7 @@ def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, A
     """Both with harmless numbers in place of bad ones, and (N,) bool the Gaussians that are themselves: a bad number
     must be gone before the first product, or its gradient, zero times NaN, is NaN and reaches the pose."""
     sound = all_finite(*jax.tree.leaves(camera))
-    drawn = usable(gaussians) & sound
+    drawn = is_usable(gaussians) & sound
     keep = lambda array: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)
     harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)
     harmless = dataclasses.replace(harmless, world_to_camera=jnp.eye(4, dtype=camera.world_to_camera.dtype))

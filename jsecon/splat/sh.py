@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from jsecon.errors import require
 from jsecon.numerics import normalize
-from jsecon.splat.fusion import stored, surely
+from jsecon.splat.fusion import materialize, opaque_true
 from jsecon.types import Array, Camera, Gaussians
 
 C0 = 0.28209479177387814
@@ -16,13 +16,13 @@ C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.37317633259
       1.445305721320277, -0.5900435899266435)  # fmt: skip
 
 
-BANDS = (1, 4, 9, 16)
+COEFFICIENT_COUNTS = (1, 4, 9, 16)
 """numbers of coefficients that spherical harmonics of degree 0, 1, 2 and 3 have"""
 
 
 def sh_basis(directions: Float[Array, "n 3"], bands: int) -> Float[Array, "n k"]:
     """The first `bands` (1, 4, 9 or 16) basis functions at unit `directions`."""
-    require(bands in BANDS, "bands", bands, "1, 4, 9 or 16", "Pad sh to a whole degree.")
+    require(bands in COEFFICIENT_COUNTS, "bands", bands, "1, 4, 9 or 16", "Pad sh to a whole degree.")
     return jnp.stack(_basis(directions[:, 0], directions[:, 1], directions[:, 2], bands), axis=-1)
 
 
@@ -44,7 +44,7 @@ def _basis(x: Array, y: Array, z: Array, bands: int) -> list:
 def _shown(directions: Array, sh: Array) -> Array:
     """(N, 3) sum over the bands of sh (N, K, 3) times the basis at unit `directions`. A column of numbers at a time:
     stacked, XLA's CPU backend asks of every number in the innermost loop which band it is of."""
-    basis = stored(surely(sh[0, 0, 0]), lambda d: _basis(d[:, 0], d[:, 1], d[:, 2], sh.shape[1]), directions)
+    basis = materialize(opaque_true(sh[0, 0, 0]), lambda d: _basis(d[:, 0], d[:, 1], d[:, 2], sh.shape[1]), directions)
     colour = lambda c: sum((b * sh[:, k, c] for k, b in enumerate(basis[1:], start=1)), basis[0] * sh[:, 0, c])
     return jnp.stack([colour(c) for c in range(3)], axis=-1)
 
@@ -52,12 +52,12 @@ def _shown(directions: Array, sh: Array) -> Array:
 def _shown_backward(given: tuple[Array, Array], bar: Array) -> tuple[Array, Array]:
     directions, sh = given
     bands = sh.shape[1]
-    always, columns = surely(sh[0, 0, 0]), [directions[:, i] for i in range(3)]
-    by_basis = stored(always, lambda sh, bar: [(sh[:, k] * bar).sum(1) for k in range(bands)], sh, bar)
+    always, columns = opaque_true(sh[0, 0, 0]), [directions[:, i] for i in range(3)]
+    by_basis = materialize(always, lambda sh, bar: [(sh[:, k] * bar).sum(1) for k in range(bands)], sh, bar)
     of_bands = lambda x, y, z: _basis(x, y, z, bands)
     along = lambda x, y, z, by: jnp.stack(jax.vjp(of_bands, x, y, z)[1](by), axis=-1)
-    basis = stored(always, lambda d: sh_basis(d, bands), directions)
-    return stored(always, along, *columns, by_basis), basis[:, :, None] * bar[:, None]
+    basis = materialize(always, lambda d: sh_basis(d, bands), directions)
+    return materialize(always, along, *columns, by_basis), basis[:, :, None] * bar[:, None]
 
 
 _shown.defvjp(lambda directions, sh: (_shown(directions, sh), (directions, sh)), _shown_backward)
@@ -70,7 +70,13 @@ def colours_from_sh(gaussians: Gaussians, camera: Camera) -> Float[Array, "n 3"]
     its Gaussian is hidden anyway, and its gradient must not reach the camera.
     """
     bands = gaussians.sh.shape[1]
-    require(bands in BANDS, "gaussians.sh", gaussians.sh.shape, "(N, 1, 4, 9 or 16, 3)", "Pad sh to a whole degree.")
+    require(
+        bands in COEFFICIENT_COUNTS,
+        "gaussians.sh",
+        gaussians.sh.shape,
+        "(N, 1, 4, 9 or 16, 3)",
+        "Pad sh to a whole degree.",
+    )
     sound = jnp.isfinite(gaussians.sh).all((1, 2))[:, None]
     sh = jnp.where(sound[:, :, None], gaussians.sh, 0.0)
     if bands == 1 or not len(sh):

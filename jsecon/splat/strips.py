@@ -38,7 +38,7 @@ class Strip:
         return self.block_row(own // BLOCK) * BLOCK + own % BLOCK
 
 
-WHOLE = Strip()
+FULL_IMAGE = Strip()
 """the image as one strip"""
 
 
@@ -47,7 +47,7 @@ def tile_rows(height: int, tile: int, count: int) -> int:
     return -(-height // tile) if count == 1 else -(-height // (BLOCK * tile * count)) * BLOCK
 
 
-def split(image: Array, tile: int, count: int) -> Array:
+def split_into_strips(image: Array, tile: int, count: int) -> Array:
     """(H, W, ...) -> (count, rows of a strip, W, ...) in px, zero below the image."""
     height, *rest = image.shape
     rows = tile_rows(height, tile, count) * tile
@@ -57,8 +57,8 @@ def split(image: Array, tile: int, count: int) -> Array:
     return jnp.moveaxis(image.reshape(-1, count, BLOCK * tile, *rest), 1, 0).reshape(count, rows, *rest)
 
 
-def join(strips: Array, tile: int, height: int) -> Array:
-    """`split` undone: (count, rows, W, ...) -> (H, W, ...)."""
+def join_strips(strips: Array, tile: int, height: int) -> Array:
+    """`split_into_strips` undone: (count, rows, W, ...) -> (H, W, ...)."""
     count, rows, *rest = strips.shape
     if count == 1:
         return strips[0, :height]
@@ -66,11 +66,11 @@ def join(strips: Array, tile: int, height: int) -> Array:
     return blocks.reshape(count * rows, *rest)[:height]
 
 
-def over_strips(local: Callable, dealt: Any, common: Any, mesh: Mesh | None, *, total: bool = False) -> Any:
+def map_strips(local: Callable, dealt: Any, common: Any, mesh: Mesh | None, *, total: bool = False) -> Any:
     """`local(strip, dealt, common)` for the strip of each device of `mesh`, see `map_over_devices`; without a mesh for
     the whole image."""
     if mesh is None:
-        return local(WHOLE, dealt, common)
+        return local(FULL_IMAGE, dealt, common)
     return map_over_devices(
         lambda index, *rest: local(Strip(index, mesh.size), *rest), dealt, common, mesh, total=total
     )

@@ -15,9 +15,9 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.splat.bits import WORD, in_chunks, read_off, set_bits
+from jsecon.splat.bits import WORD, compact_tile_lists, loop_in_chunks, tile_bits
 from jsecon.splat.project import Projection
-from jsecon.splat.strips import BLOCK, WHOLE, Strip, tile_rows
+from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, tile_rows
 from jsecon.types import Array, Leaf, record, static
 
 TILE = 8
@@ -48,7 +48,7 @@ class TileLists:
     """tile edge, px."""
 
 
-def grid(width: int, height: int, tile: int) -> tuple[int, int]:
+def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
     """Tiles across and down."""
     return -(-width // tile), -(-height // tile)
 
@@ -56,7 +56,7 @@ def grid(width: int, height: int, tile: int) -> tuple[int, int]:
 def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
     """Inclusive-exclusive ranges (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat's box touches;
     empty where invisible."""
-    across, down = grid(width, height, edge)
+    across, down = tile_grid(width, height, edge)
     ranges = []
     for axis, limit in ((0, across), (1, down)):
         centre, extent = lax.stop_gradient(projection.means_px[:, axis]), projection.extents[:, axis]
@@ -70,7 +70,7 @@ def _rectangles(projection: Projection, width: int, height: int, edge: int, stri
 
 
 def pair_counts(
-    projection: Projection, width: int, height: int, *, tile: int = TILE, strip: Strip = WHOLE
+    projection: Projection, width: int, height: int, *, tile: int = TILE, strip: Strip = FULL_IMAGE
 ) -> Int[Array, " n"]:
     """(N,) int32 number of the strip's blocks of BLOCK x BLOCK tiles that each splat's box touches."""
     x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * tile, strip)
@@ -127,17 +127,17 @@ def _sorted_pairs_by_rank(blocks: Array, owner: Array, depths: Array) -> tuple[A
 
 
 def tile_lists(
-    projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, strip: Strip = WHOLE
+    projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, strip: Strip = FULL_IMAGE
 ) -> TileLists:
     """One strip's lists of up to `capacity` (block, Gaussian) pairs; what does not fit is counted in `overflow`."""
     most = (2**31 - 1) // _TILES - WORD  # whose tiles int32 can count
     require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render so large an image in parts.")
-    capacity = whole_words(capacity)
+    capacity = round_up_to_words(capacity)
     chunk = min(PAIRS, capacity)
     room = -(-capacity // chunk) * chunk
     edge = BLOCK * tile
     rows = tile_rows(height, tile, strip.count)
-    across, down = grid(width, rows * tile, edge)
+    across, down = tile_grid(width, rows * tile, edge)
     number = across * down
     x0, x1, y0, y1 = _rectangles(projection, width, height, edge, strip)
     # Pairs are laid out Gaussian after Gaussian; `owner` says whose pair the k-th is. int32 cumulative sums would wrap
@@ -159,7 +159,7 @@ def tile_lists(
         return owner[-1], put(blocks, block), put(owners, owner)
 
     nothing = jnp.full(room, number, jnp.int32), jnp.zeros(room, jnp.int32)
-    _, blocks, owner = in_chunks(total, chunk, lay_out, (jnp.int32(-1), *nothing))
+    _, blocks, owner = loop_in_chunks(total, chunk, lay_out, (jnp.int32(-1), *nothing))
     nowhere = jnp.asarray(1.0, projection.depths.dtype)
     depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), nowhere))
     blocks, owner = _sorted_pairs(blocks, owner, depths, number)
@@ -167,8 +167,8 @@ def tile_lists(
     ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
     ellipses = lax.stop_gradient(jnp.concatenate(ellipses, axis=1))
     reach = functools.partial(_reached_tiles, ellipses, across=across, number=number, tile=tile, strip=strip)
-    members, before = set_bits(reach, owner, blocks, _TILES, total, chunk)
-    gaussians = read_off(members, before, owner, total, chunk)
+    members, before = tile_bits(reach, owner, blocks, _TILES, total, chunk)
+    gaussians = compact_tile_lists(members, before, owner, total, chunk)
 
     # A tile's list runs from its block's first pair to the next block's.
     first = jnp.searchsorted(blocks, lax.iota(jnp.int32, number + 1)).astype(jnp.int32)
@@ -233,6 +233,6 @@ def _saturating_cumsum(areas: Array) -> Array:
     return jnp.where(wrapped, largest, exact)
 
 
-def whole_words(pairs: int) -> int:
+def round_up_to_words(pairs: int) -> int:
     """Pairs rounded up to whole words of bits."""
     return -(-pairs // WORD) * WORD

@@ -43,13 +43,13 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         return Gaussians(
             means=means @ like(means, scale * rotation.T) + like(means, matrix[:3, 3]),
             log_scales=gaussians.log_scales + like(gaussians.log_scales, np.log(scale)),
-            quaternions=turns @ like(turns, _product_matrix(quaternion_of(rotation))),
+            quaternions=turns @ like(turns, _product_matrix(quaternion_from_matrix(rotation))),
             opacity_logits=gaussians.opacity_logits,
             sh=like(sh, _sh_rotation(rotation, sh.shape[1])) @ sh,
         )
 
 
-def carried(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
+def transform_gaussians_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
     """`transform_gaussians` on the host, with the means in float64 before and after: NumPy arrays.
 
     Use it into a world of large coordinates (a map projection's), where float32 holds no millimetres, and out of it.
@@ -58,7 +58,7 @@ def carried(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
     return transform_gaussians(dataclasses.replace(host, means=host.means.astype(np.float64)), similarity)
 
 
-def float32_rounds(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
+def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     """(N,) by how much float32 rounds each of the means, in units of the Gaussian's largest standard deviation."""
     means = np.asarray(gaussians.means)
     moved = np.abs(means - means.astype(np.float32).astype(np.float64)).max(axis=1, initial=0.0)
@@ -89,18 +89,18 @@ def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians
     return transform_gaussians(mirrored, matrix @ np.diag([*flip, 1.0]))
 
 
-def transformed_blocks(
+def transform_blocks(
     gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
 ) -> Iterator[tuple[slice, Gaussians]]:
-    """`carried` of ROWS Gaussians after the other, and which they are: mapped columns need not fit into memory.
-    Without a similarity they come as they are, NumPy."""
+    """`transform_gaussians_float64` of ROWS Gaussians after the other, and which they are: mapped columns need not fit
+    into memory. Without a similarity they come as they are, NumPy."""
     for first in range(0, gaussians.count, ROWS):
         own = slice(first, min(first + ROWS, gaussians.count))
         part = jax.tree.map(lambda a, own=own: np.asarray(a[own]), gaussians)
-        yield own, part if similarity is None else carried(part, similarity)
+        yield own, part if similarity is None else transform_gaussians_float64(part, similarity)
 
 
-def recentred(
+def recenter(
     gaussians: Gaussians, cameras: Camera, *, origin: Float[np.ndarray, "3"] | None = None
 ) -> tuple[Gaussians, Camera, Float[np.ndarray, "4 4"]]:
     """The same scene and cameras (one, or a batch) in a world whose origin lies at `origin`, by default the middle of
@@ -123,7 +123,7 @@ def recentred(
     return moved, dataclasses.replace(cameras, world_to_camera=poses.astype(np.float32)), back
 
 
-def quaternion_of(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+def quaternion_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     """Unit wxyz of a rotation matrix: an eigenvector (Bar-Itzhack 2000), stable at every angle."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
     symmetric = np.array(

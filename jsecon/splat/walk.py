@@ -7,7 +7,7 @@ What XLA's CPU backend makes of this decides the speed; all of it measured on ga
 - A scan over single Gaussians starts four kernels for each and reads its slices unvectorised; a chunk at a time, the
   recurrence written out inside one kernel, took a third of that.
 - Fusion recomputes cheap arithmetic for every reader, and a chunk's exponentials written as a polynomial are cheap to
-  it. Only a conditional whose outcome it can't know makes it store them once: `stored`.
+  it. Only a conditional whose outcome it can't know makes it store them once: `materialize`.
 """
 
 import functools
@@ -20,9 +20,9 @@ from jax import lax
 from jaxtyping import Float
 
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
-from jsecon.splat.fusion import stored
-from jsecon.splat.strips import WHOLE, Strip
-from jsecon.splat.tiles import TileLists, grid
+from jsecon.splat.fusion import materialize
+from jsecon.splat.strips import FULL_IMAGE, Strip
+from jsecon.splat.tiles import TileLists, tile_grid
 from jsecon.types import Array
 
 BATCH = 64
@@ -51,7 +51,7 @@ class Batches(NamedTuple):
         return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
 
-def make_batches(lists: TileLists, width: int, strip: Strip = WHOLE, most: int | None = None) -> Batches:
+def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: int | None = None) -> Batches:
     """The batches of one strip's lists, the longest first, of at most `most` tiles (default BATCH).
 
     A batch walks as far as its longest list: where tiles are few their lists differ more, and batches are smaller.
@@ -78,7 +78,7 @@ def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> 
 def to_tiles(image: Array, tile: int) -> Array:
     """(H, W, ...) -> (tiles + 1, tile * tile, ...), zero outside the image; the last tile is the empty one."""
     height, width, *rest = image.shape
-    across, down = grid(width, height, tile)
+    across, down = tile_grid(width, height, tile)
     padding = [(0, down * tile - height), (0, across * tile - width)] + [(0, 0)] * len(rest)
     tiles = jnp.pad(image, padding).reshape(down, tile, across, tile, *rest)
     tiles = jnp.moveaxis(tiles, 2, 1).reshape(across * down, tile * tile, *rest)
@@ -117,7 +117,7 @@ class Chunk(NamedTuple):
     alpha: Array
     """(B, CHUNK, pixels), 0 below the cut."""
     always: Array
-    """() bool, true: for `stored`."""
+    """() bool, true: for `materialize`."""
 
 
 def make_table(splats: Float[Array, "n 6"], *columns: Array) -> Float[Array, "n k"]:
@@ -172,7 +172,7 @@ def pixel_alphas(splats: Float[Array, "p 6"], corners: tuple[Array, Array], tile
     return _alphas(_coefficients(splats, *corners, exponent)[:, None], tile)[:, 0]
 
 
-def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
+def cumulative(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
     """Along the second axis of `values` (B, CHUNK, pixels): `start` (B, pixels) combined with all values before
     each, and with all.
 
@@ -189,13 +189,13 @@ def running(combine: Callable, start: Array, values: Array) -> tuple[Array, Arra
     return jnp.stack(before, axis=2).reshape(values.shape), starts[-1]
 
 
-def weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
+def blend_weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
     """alpha T of a chunk (B, CHUNK, pixels), and the transmittance behind it (B, pixels).
 
     The transmittance is the plain product of 1 - alpha: it only falls, so a pixel has stopped before the first
     Gaussian that would take it to MIN_TRANSMITTANCE exactly where the product is still above.
     """
-    before, after = running(jnp.multiply, transmittance, 1 - alpha)
+    before, after = cumulative(jnp.multiply, transmittance, 1 - alpha)
     weight = before * alpha
     return jnp.where(before - weight > MIN_TRANSMITTANCE, weight, 0.0), after
 
@@ -231,7 +231,7 @@ def walk(
         exponent = jnp.where(index < length, rows[..., ATTRIBUTES], -jnp.inf)
         coefficients = _coefficients(rows, corner_x, corner_y, exponent)
         always = first < longest
-        alpha = stored(always, functools.partial(_alphas, tile=batches.tile), coefficients)
+        alpha = materialize(always, functools.partial(_alphas, tile=batches.tile), coefficients)
         places = jnp.where(index < length, start + index, lists.gaussians.shape[0])
         chunk = Chunk(ids, places, rows[..., ATTRIBUTES + 1 :], rows[..., :ATTRIBUTES], alpha, always)
         seen = jnp.where(transmittance.max(1) > MIN_TRANSMITTANCE, first + CHUNK, seen)

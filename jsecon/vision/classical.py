@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
 from jsecon.errors import InputError, require, require_shape
-from jsecon.vision.region_graph import borders, merge
+from jsecon.vision.region_graph import merge_regions, region_borders
 from jsecon.vision.surfaces import Surface, log_depth
 
 GRANULARITIES: dict[str, dict[str, Any]] = {
@@ -76,15 +76,17 @@ class ClassicalSegmenter:
         if surface is not None:
             features, seeds = self._with_surface(features, surface)
             atoms = oversegment(seeds)
-            edges = borders(atoms, features, surface, steepness=self.merge_distance / self.depth_jump)
-            return merge(atoms, features, edges, distance=self.merge_distance, min_area=minimum)
+            edges = region_borders(atoms, features, surface, steepness=self.merge_distance / self.depth_jump)
+            return merge_regions(atoms, features, edges, distance=self.merge_distance, min_area=minimum)
         shape = None
         if self.depths is not None:
             depth = self.depths(index)
             require_shape("depths", depth, frame.shape[:2], "Give depth of the frame's own size.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
-        return merge(atoms, features, borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum)
+        return merge_regions(
+            atoms, features, region_borders(atoms, features, shape), distance=self.merge_distance, min_area=minimum
+        )
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 6) colour and normal, in which a crease weighs as a step of `merge_distance`; and (H, W, 7) what small
@@ -102,7 +104,7 @@ def colour_features(
     frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
 ) -> Float32[np.ndarray, "h w 3"]:
     """(H, W, 3) uint8 -> (H, W, 3) float32: weighted L, a and b of the smoothed frame, CIELAB units."""
-    smooth = adapted(frame)
+    smooth = adapt_exposure(frame)
     if smoothing > 0:
         smooth = cv2.pyrMeanShiftFiltering(smooth, 5, smoothing, maxLevel=0)
         smooth = cv2.bilateralFilter(smooth, 7, 2.0 * smoothing, 3.0)
@@ -110,7 +112,7 @@ def colour_features(
     return lab * np.asarray([lightness_weight, 1.0, 1.0], np.float32)
 
 
-def adapted(
+def adapt_exposure(
     frame: UInt8[np.ndarray, "h w 3"], *, dark: float = 0.22, light: float = 0.3, most: float = 8.0
 ) -> UInt8[np.ndarray, "h w 3"]:
     """(H, W, 3) uint8 with lifted shadows or lowered lights, where the median of linear luminance is below `dark` (a

@@ -25,7 +25,7 @@ these"""
 
 
 @dataclasses.dataclass(frozen=True)
-class Borders:
+class RegionBorders:
     """The region graph's edges: one row a pair of neighbours."""
 
     pairs: np.ndarray
@@ -38,14 +38,14 @@ class Borders:
     """(E,) step of depth and normal, likewise; at most twice the unit a pixel; 0 where nothing is known."""
 
 
-def borders(
+def region_borders(
     atoms: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
     shape: Float32[np.ndarray, "h w c"] | Surface | None,
     *,
     steepness: float = 1.0,
     most: float = 40.0,
-) -> Borders:
+) -> RegionBorders:
     """Who borders on whom, and how hard.
 
     A step is measured between pixels two to either side of the border, so that the blur of an edge does not hide it. A
@@ -74,7 +74,7 @@ def borders(
     count = int(atoms.max()) + 1
     first, second = np.concatenate(keys).T.astype(np.int64)
     pairs, inverse = np.unique(first * count + second, return_inverse=True)
-    return Borders(
+    return RegionBorders(
         np.stack(np.divmod(pairs, count), -1),
         np.bincount(inverse, minlength=len(pairs)).astype(np.float64),
         np.bincount(inverse, np.concatenate(colours), len(pairs)),
@@ -82,10 +82,10 @@ def borders(
     )
 
 
-def merge(
+def merge_regions(
     atoms: Int32[np.ndarray, "h w"],
     features: Float32[np.ndarray, "h w d"],
-    edges: Borders,
+    edges: RegionBorders,
     *,
     distance: float,
     min_area: float,
@@ -98,7 +98,7 @@ def merge(
     labels (H, W) int32 0 .. M-1.
     """
     # Numbered as a reader meets them, so that ties fall the same way whatever the atoms are called.
-    flat = renumbered(atoms.reshape(-1))
+    flat = relabel_sequential(atoms.reshape(-1))
     count = int(flat.max()) + 1
     first = np.empty(count, np.int64)
     first[flat[::-1]] = np.arange(flat.size)[::-1]
@@ -158,10 +158,10 @@ def merge(
     for a in sorted((a for a in range(count) if parent[a] == a), key=lambda a: area[a]):
         if parent[a] == a and (area[a] < min_area or thin[a]) and links[a]:
             absorb(min(links[a], key=lambda other: dissimilarity(a, other)), a)
-    return renumbered(_roots(parent)[atoms]).astype(np.int32)
+    return relabel_sequential(_roots(parent)[atoms]).astype(np.int32)
 
 
-def renumbered(ids: Int[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
+def relabel_sequential(ids: Int[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
     """Small ids >= 0 as 0 .. K-1 in their own order: np.unique's inverse by a table, which takes no sorting."""
     used = np.zeros(int(ids.max()) + 1, bool)
     used[ids] = True

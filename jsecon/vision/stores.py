@@ -67,7 +67,7 @@ def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
     return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
 
 
-def known_vectors(
+def lookup_vectors(
     known: dict[bytes, np.ndarray], keys: list[bytes], dim: int
 ) -> tuple[Float32[np.ndarray, "m e"], list[int]]:
     """Rows (M, E) of the keys that are known, zero for the others, and the indices of those others."""

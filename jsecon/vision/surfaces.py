@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from jsecon.types import Camera
 
 
-def steadied_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, rounds: int = 3) -> np.ndarray:
+def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, rounds: int = 3) -> np.ndarray:
     """z-depth (H, W), 0 = unknown, as Gaussians render it -> the same without what is noise (relative steps below about
     `noise`), its jumps kept: a median, then bilateral filters on its logarithm. Unknown pixels are filled from the
     nearest known one; all 0 stays so."""
@@ -32,11 +32,11 @@ def steadied_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, ro
 def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
     """Natural logarithm of z-depth (H, W), 0 = unknown, filled from the nearest known pixel; 0 where none is known."""
     known = np.asarray(depth > 0)
-    depth = filled(depth, known) if known.any() else np.ones_like(depth)
+    depth = fill_nearest(depth, known) if known.any() else np.ones_like(depth)
     return np.log(np.maximum(depth, 1e-12))[..., None].astype(np.float32)
 
 
-def filled(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
+def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
     """values (H, W) with those of the unknown pixels taken from the nearest known one."""
     _, nearest = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
@@ -96,7 +96,7 @@ def surfaces_from_depth(
     """A function of a frame's index: its surface from depths (T, H, W), 0 = unknown, of `cameras` (a batch of T).
 
     points (P, 3), world: those of all frames together, thinned (a few centimetres apart in a room). The depth is
-    steadied (`steadied_depth`), which also fills what is unknown. None for a frame without any depth.
+    steadied (`smooth_depth`), which also fills what is unknown. None for a frame without any depth.
     """
     tree, normals = KDTree(points), cloud_normals(points)
     poses = np.asarray(cameras.world_to_camera, np.float64)
@@ -105,7 +105,7 @@ def surfaces_from_depth(
         if not (depths[t] > 0).any():
             return None
         rotation, camera = poses[t, :3, :3], cameras[t]
-        here = back_projected(steadied_depth(np.asarray(depths[t], np.float32)), camera)
+        here = camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
         # Normals change slowly: every second pixel is asked, in each direction.
         asked = here[::2, ::2].reshape(-1, 3)
         own = normals[tree.query((asked - poses[t, :3, 3]) @ rotation, workers=-1)[1]] @ rotation.T
@@ -116,7 +116,7 @@ def surfaces_from_depth(
     return surface_of
 
 
-def back_projected(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
+def camera_points(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
     """z-depth (H, W) -> points (H, W, 3) in the camera's axes; pixel centres lie at halves."""
     rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
     x = (columns - float(camera.cx)) / float(camera.fx)

@@ -12,7 +12,7 @@ from experiments.stability.case import GRADIENT, VALUE, ordinary
 from experiments.stability.cases import CANCELS, cases
 from experiments.stability.measure import evaluate
 from experiments.stability.render import engine
-from jsecon.splat.project import count_non_finite, usable
+from jsecon.splat.project import count_non_finite, is_usable
 from jsecon.splat.reference import weights_reference
 from jsecon.splat.render import render, render_depth, render_rgb
 
@@ -105,7 +105,7 @@ def test_colour_and_depth_of_bad_gaussians(touched):
     )
     np.testing.assert_array_equal(np.asarray(image)[~nan_pixels(image)], np.asarray(expected)[~nan_pixels(image)])
     assert bool(jnp.isfinite(render_depth(broken, case.camera)[0]).all())
-    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(usable(broken))), [7])
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(is_usable(broken))), [7])
     assert int(count_non_finite(broken)) == 2
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jsecon.app.viewer.static_page import main_regions
 from jsecon.numerics import sigmoid
-from jsecon.splat.project import usable
+from jsecon.splat.project import is_usable
 from jsecon.splat.sh import C0
 from jsecon.types import LanguageField
 
@@ -29,7 +29,7 @@ class Layers:
 
     def __init__(self, server: Any, field: LanguageField):
         gaussians = field.gaussians
-        sound = np.asarray(usable(gaussians))
+        sound = np.asarray(is_usable(gaussians))
         finite = lambda a: np.where(sound[:, None], a, np.float32(1))
         sizes = np.exp(np.asarray(finite(gaussians.log_scales), np.float64))
         there = sizes[sound]

@@ -12,7 +12,7 @@ from jsecon.association.atoms import Sparse
 
 
 @dataclasses.dataclass(frozen=True)
-class Runs:
+class RunLengthMasks:
     """R masks over P pixels, free to overlap. Arrays only."""
 
     starts: np.ndarray
@@ -37,13 +37,13 @@ class Runs:
         """(R, H, W) bool, where P = H W."""
         return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
 
-    def followed_by(self, others: "Runs") -> "Runs":
+    def followed_by(self, others: "RunLengthMasks") -> "RunLengthMasks":
         """These masks and then the others, over the same pixels."""
         starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
-        return Runs(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
+        return RunLengthMasks(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
 
 
-def runs_of_rows(rows: Sparse) -> Runs:
+def encode_rows(rows: Sparse) -> RunLengthMasks:
     """Runs of the nonzeros of a csr_matrix (R, P) with sorted indices."""
     new = np.ones(rows.nnz, bool)
     new[1:] = np.diff(rows.indices) != 1
@@ -52,21 +52,21 @@ def runs_of_rows(rows: Sparse) -> Runs:
     last = np.append(first[1:], rows.nnz) - 1 if len(first) else first
     counts = np.diff(np.searchsorted(first, rows.indptr))
     starts, stops = rows.indices[first], rows.indices[last] + 1
-    return Runs(starts.astype(np.int32), stops.astype(np.int32), counts.astype(np.int32), rows.shape[1])
+    return RunLengthMasks(starts.astype(np.int32), stops.astype(np.int32), counts.astype(np.int32), rows.shape[1])
 
 
-def runs_of_masks(masks: Bool[np.ndarray, "r h w"]) -> Runs:
+def encode_masks(masks: Bool[np.ndarray, "r h w"]) -> RunLengthMasks:
     """Runs of masks (R, H, W), P = H W."""
-    return runs_of_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
+    return encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
-def remembered(propose: Callable[[int], Bool[np.ndarray, "m h w"]]) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
+def memoized_masks(propose: Callable[[int], Bool[np.ndarray, "m h w"]]) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
     """`propose`, a function of a frame's index, asked once a frame: its masks are kept as runs."""
 
     @functools.cache
-    def kept(index: int) -> tuple[Runs, tuple[int, int]]:
+    def kept(index: int) -> tuple[RunLengthMasks, tuple[int, int]]:
         masks = propose(index)
-        return runs_of_masks(masks), masks.shape[1:]
+        return encode_masks(masks), masks.shape[1:]
 
     def masks_of(index: int) -> Bool[np.ndarray, "m h w"]:
         runs, size = kept(index)

@@ -28,11 +28,18 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jsecon.errors import require
-from jsecon.fit.alignment import aligned
-from jsecon.fit.corrections import Corrections, Refine, at_rest, corrected_camera, exponential, exposed
+from jsecon.fit.alignment import align_cameras
+from jsecon.fit.corrections import (
+    Corrections,
+    RefineOptions,
+    apply_exposure,
+    corrected_camera,
+    identity_corrections,
+    se3_exp,
+)
 from jsecon.fit.optimise import FitState, fit_gaussians
-from jsecon.fit.quality import GLANCE, quality, weak
-from jsecon.fit.schedule import LearningRates, Schedule, resized, resized_frame
+from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
+from jsecon.fit.schedule import LearningRates, Schedule, resize_cameras, resize_frame
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.view import cameras_extent
 from jsecon.splat.render import render_rgb
@@ -71,8 +78,8 @@ _STEP_PIXELS, _STEP_ONCE = 0.46, 0.072
 """time of a probe's step, in steps of the fit: for frames of the fit's size, and for its Gaussians"""
 _PLACING_STEPS = 1.0
 """time of aligning a frame by colour and depth, in steps of the fit"""
-_REFINE = Refine()
-_STILL = Refine(poses=False, exposure=False)
+_REFINE = RefineOptions()
+_STILL = RefineOptions(poses=False, exposure=False)
 """of a probe without corrections that shares the program of one with them"""
 _FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 
@@ -88,10 +95,16 @@ class _Plan(NamedTuple):
 
 
 def _planned(
-    capture: Capture, refine: Refine | None, *, visits: int, probes: int, decide: bool, at_most: float | None
+    capture: Capture,
+    refine: RefineOptions | None,
+    *,
+    visits: int,
+    probes: int,
+    decide: bool,
+    max_fit_steps: float | None,
 ) -> _Plan | None:
-    """The probes, with as many visits as fit into the time of `at_most` steps of the fit; None where those are fewer
-    than FEWEST_VISITS."""
+    """The probes, with as many visits as fit into the time of `max_fit_steps` steps; None where those are fewer than
+    FEWEST_VISITS."""
     held = np.asarray(capture.held_out)
     train, out = int((~held).sum()), int(held.sum()) if refine is not None else 0
     coarse = min(FINE, max(COARSE_LEAST, COARSE_PX / max(capture.cameras.width, capture.cameras.height)))
@@ -103,21 +116,21 @@ def _planned(
     if capture.depths is not None:
         fixed += _PLACING_STEPS * len(held) * (1 + decide)
     # Alignments are not cut short: a frame held out would be measured by a pose on its way.
-    allowed = visits if at_most is None else min(visits, int((at_most - fixed) / each))
+    allowed = visits if max_fit_steps is None else min(visits, int((max_fit_steps - fixed) / each))
     if allowed < min(FEWEST_VISITS, visits):
         return None
     return _Plan(coarse, probes, max(1, allowed))
 
 
-def settled(
+def refine_capture(
     capture: Capture,
     start: Gaussians | None = None,
     *,
     key: PRNGKeyArray,
-    refine: Refine | None = _REFINE,
+    refine: RefineOptions | None = _REFINE,
     drop_weak: bool = False,
     decide: bool = False,
-    at_most: float | None = None,
+    max_fit_steps: float | None = None,
     visits: int = VISITS,
     probes: int = PROBES,
     progress: Callable[[int, int], None] | None = None,
@@ -133,11 +146,11 @@ def settled(
       start: Gaussians that each probe starts from. Without, points made with the poses of the probe before.
       key: Draws the order of the frames.
       refine: What to correct, or None.
-      drop_weak: Leave out training frames that the last probe does not explain (`quality.weak`).
+      drop_weak: Leave out training frames that the last probe does not explain (`quality.is_weak`).
       decide: Correct only where that lowers the error of training frames kept aside. Otherwise the frames and the
         poses stay as they are.
-      at_most: The probes take at most about the time of so many steps of the fit: fewer visits. Where that leaves too
-        few of them, nothing is refined.
+      max_fit_steps: The probes take at most about the time of so many steps of the fit: fewer visits. Where that
+        leaves too few of them, nothing is refined.
       visits: Visits of each frame by each probe.
       probes: Maximum number of probes; one where no pose is refined.
       progress: Called with the number of steps done and of all.
@@ -160,14 +173,14 @@ def settled(
     if placed is not None:
         assert refine is not None
         probes, refine = 1, dataclasses.replace(refine, pose_rate=PLACED_RATE)
-    plan = _planned(capture, refine, visits=visits, probes=probes, decide=decide, at_most=at_most)
+    plan = _planned(capture, refine, visits=visits, probes=probes, decide=decide, max_fit_steps=max_fit_steps)
     if plan is None:
         refine, plan = None, _Plan(FINE, 1, visits)
         notes.append(f"poses and exposures stay as they are: {TOO_MANY.format(len(capture.names))}")
     steps, out = plan.visits * int(train.sum()), int((~train).sum()) if refine is not None else 0
     total, done = steps * (plan.probes + 2 * decide) + ALIGNING_VISITS * out, 0
 
-    def probed(capture: Capture, start: Gaussians, refine: Refine | None, size: float, steps: int, **given: Any):
+    def probed(capture: Capture, start: Gaussians, refine: RefineOptions | None, size: float, steps: int, **given: Any):
         nonlocal done
         before, done = done, done + steps
 
@@ -178,7 +191,7 @@ def settled(
         return _probed(capture, start, refine, key=key, steps=steps, size=size, progress=tell, **given)
 
     def begun(capture: Capture) -> Gaussians:
-        return starting_gaussians(capture, at_most=POINTS)[0] if start is None else start
+        return starting_gaussians(capture, max_points=POINTS)[0] if start is None else start
 
     left = plan.probes
     if decide and refine is not None:
@@ -211,14 +224,14 @@ def settled(
 
 def _placed(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
     """With the cameras of `train` aligned to each other by colour and depth, in the world that they had, and each of
-    the `others` to these; None where that does not bring them nearer to each other (`aligned`)."""
+    the `others` to these; None where that does not bring them nearer to each other (`align_cameras`)."""
     given = np.asarray(capture.cameras.world_to_camera, np.float64)
-    moved = aligned(capture, train)
+    moved = align_cameras(capture, train)
     if moved is None:
         return None
-    moved = moved @ _drift(moved[train], given[train], cameras_extent(capture.cameras[train]))
+    moved = moved @ _rigid_drift(moved[train], given[train], cameras_extent(capture.cameras[train]))
     placed = _with_poses(capture, moved)
-    moved = aligned(placed, others, train)
+    moved = align_cameras(placed, others, train)
     return placed if moved is None else _with_poses(placed, moved)
 
 
@@ -228,7 +241,7 @@ def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
 
 
 def _probed(
-    capture: Capture, start: Gaussians, refine: Refine | None, *, size: float, **given: Any
+    capture: Capture, start: Gaussians, refine: RefineOptions | None, *, size: float, **given: Any
 ) -> tuple[Gaussians, Corrections]:
     """A short fit to frames of this size, and its frames' corrections: none where nothing is refined."""
     last: list[FitState] = []
@@ -240,7 +253,7 @@ def _probed(
     schedule = Schedule(sizes=((size, 1.0),), growth="none")
     found, _ = fit_gaussians(capture, start=start, refine=refine, schedule=schedule, on_checkpoint=keep, **given)
     refined = last[0].refined
-    return found, at_rest(len(capture.names)) if refined is None else jax.tree.map(np.asarray, refined.now)
+    return found, identity_corrections(len(capture.names)) if refined is None else jax.tree.map(np.asarray, refined.now)
 
 
 def _with_aligned(
@@ -248,7 +261,7 @@ def _with_aligned(
     probe: Gaussians,
     found: Corrections,
     which: Bool[np.ndarray, " t"],
-    refine: Refine | None,
+    refine: RefineOptions | None,
     size: float,
     visits: int,
     probed: Callable[..., tuple[Gaussians, Corrections]],
@@ -263,7 +276,7 @@ def _with_aligned(
 def _compared(
     capture: Capture,
     start: Callable[[Capture], Gaussians],
-    refine: Refine,
+    refine: RefineOptions,
     plan: _Plan,
     probed: Callable[..., tuple[Gaussians, Corrections]],
     *,
@@ -288,7 +301,9 @@ def _compared(
     scene, found = probed(placed, start(placed), refine, plan.coarse, steps)
     plain, _ = probed(half, start(half), _STILL, plan.coarse, steps)
     found = _with_aligned(placed, scene, found, aside, refine, plan.coarse, DECIDING_VISITS, probed)
-    alike = _with_aligned(half, plain, at_rest(len(aside)), aside, refine, plan.coarse, DECIDING_VISITS, probed)
+    alike = _with_aligned(
+        half, plain, identity_corrections(len(aside)), aside, refine, plan.coarse, DECIDING_VISITS, probed
+    )
     seen = even & ~ignored
     better = _mean_psnr(scene, placed, found, aside, seen, plan.coarse)
     without = _mean_psnr(plain, capture, alike, aside, seen, plan.coarse)
@@ -304,13 +319,13 @@ def _mean_psnr(
     size: float,
 ) -> float:
     """Mean PSNR (dB) of the frames `which` on the pixels `seen`, rendered with their corrections at this size."""
-    cameras, values = resized(capture.cameras, size), []
+    cameras, values = resize_cameras(capture.cameras, size), []
     scene = jax.device_put(scene)
     for t in np.flatnonzero(which):
         own = jax.tree.map(lambda a, t=t: jnp.asarray(a[t]), found)
         camera = corrected_camera(jax.tree.map(jnp.asarray, cameras[int(t)]), own.twists)
-        image = np.clip(exposed(render_rgb(scene, camera).features, own.colours), 0, 1)
-        frame = resized_frame(np.asarray(capture.frames[t]), cameras) / 255.0
+        image = np.clip(apply_exposure(render_rgb(scene, camera).features, own.colours), 0, 1)
+        frame = resize_frame(np.asarray(capture.frames[t]), cameras) / 255.0
         share = cv2.resize(seen[t].astype(np.float32), frame.shape[1::-1], interpolation=cv2.INTER_AREA)
         squares = ((image - frame) ** 2)[share > 0.999]
         if len(squares):
@@ -346,16 +361,16 @@ def _projected(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -> tup
     return cameras.fx[t] * x / z + cameras.cx[t], cameras.fy[t] * y / z + cameras.cy[t]
 
 
-def _corrected(capture: Capture, found: Corrections, refine: Refine | None, *, at_home: bool = True) -> Capture:
+def _corrected(capture: Capture, found: Corrections, refine: RefineOptions | None, *, at_home: bool = True) -> Capture:
     """Cameras moved, frames with their exposures undone; `at_home`: in the world and the colours that were given."""
     if refine is None:
         return capture
     train, cameras = ~np.asarray(capture.held_out), capture.cameras
     if refine.poses:
         given = np.asarray(cameras.world_to_camera, np.float64)
-        moved = np.asarray(jax.vmap(exponential)(found.twists), np.float64) @ given
+        moved = np.asarray(jax.vmap(se3_exp)(found.twists), np.float64) @ given
         if at_home:
-            moved = moved @ _drift(moved[train], given[train], cameras_extent(cameras[train]))
+            moved = moved @ _rigid_drift(moved[train], given[train], cameras_extent(cameras[train]))
         capture = _with_poses(capture, moved)
     if refine.exposure:
         squared = lambda maps: np.concatenate([maps, np.broadcast_to(np.eye(4)[3:], (len(maps), 1, 4))], axis=1)
@@ -373,7 +388,7 @@ def _corrected(capture: Capture, found: Corrections, refine: Refine | None, *, a
     return capture
 
 
-def _drift(moved: Float[Array, "t 4 4"], given: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
+def _rigid_drift(moved: Float[Array, "t 4 4"], given: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
     """The rigid motion of the world that brings the `moved` cameras nearest to the `given` ones: their centres, and
     their axes as points an extent away (Umeyama 1991). Maps points of the given world to that of the moved ones."""
     centre = lambda poses: -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
@@ -387,7 +402,9 @@ def _drift(moved: Float[Array, "t 4 4"], given: Float[Array, "t 4 4"], extent: f
     return motion
 
 
-def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | None, *, by_depth: bool) -> list[str]:
+def _told(
+    before: Capture, after: Capture, found: Corrections, refine: RefineOptions | None, *, by_depth: bool
+) -> list[str]:
     """How far the frames were off, a sentence each."""
     notes, out = [], np.asarray(before.held_out)
     if refine is None:
@@ -410,10 +427,10 @@ def _told(before: Capture, after: Capture, found: Corrections, refine: Refine | 
 
 
 def weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
-    """Indices of the training frames that a scene fitted to them does not explain (`quality.weak`)."""
+    """Indices of the training frames that a scene fitted to them does not explain (`quality.is_weak`)."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    result = quality(gaussians, capture, frames=train, long_side=GLANCE)
-    return np.asarray(result.frames)[weak(np.asarray(result.psnr))]
+    result = measure_quality(gaussians, capture, frames=train, long_side=QUICK_LONG_SIDE)
+    return np.asarray(result.frames)[is_weak(np.asarray(result.psnr))]
 
 
 def _without(capture: Capture, left: np.ndarray) -> Capture:
