@@ -3,11 +3,9 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.language.distill import distill_l1
 from jsecon.language.votes import region_votes
 from jsecon.parallel import host_mesh
 from jsecon.process import compilation_counts
@@ -51,6 +49,7 @@ def test_jit_without_a_capacity_is_exact(scene, camera):
     np.testing.assert_allclose(inside.features, rendering.features, atol=5e-6)
 
 
+@pytest.mark.long
 def test_vmap_and_grad_without_a_capacity(scene, cameras):
     features, planned = features_of(scene.count), plan_capacity(scene, cameras)
 
@@ -68,7 +67,7 @@ def test_vmap_and_grad_without_a_capacity(scene, cameras):
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("mesh", [None, host_mesh()])
+@pytest.mark.parametrize("mesh", [None, pytest.param(host_mesh(), marks=pytest.mark.long)])
 def test_what_exceeds_it_is_rendered_with_enough_outside_a_trace_and_counted_inside(covering, camera, mesh):
     features = features_of(COVERING)
     pairs, room = 4 * COVERING, default_capacity(COVERING, 48, 40, strips=1 if mesh is None else 2)
@@ -91,7 +90,7 @@ def test_depth_that_lacks_something_is_no_number(covering, camera):
     assert np.isnan(alpha).all()
 
 
-def test_plans_votes_and_codes_hold_what_exceeds_it(covering, cameras):
+def test_plans_and_votes_hold_what_exceeds_it(covering, cameras):
     pair = jax.tree.map(lambda a: a[:2], cameras)
     plans = plan_views(covering, pair)
     assert np.asarray(plans.overflow).tolist() == [0, 0]
@@ -109,11 +108,6 @@ def test_plans_votes_and_codes_hold_what_exceeds_it(covering, cameras):
     np.testing.assert_allclose(np.asarray(votes.total).sum(), weight, rtol=1e-4)
     inside = jax.jit(lambda seen: region_votes(covering, pair, seen, 1))(labels)
     assert int(inside.overflow) == 2 * (4 * COVERING - default_capacity(COVERING, 48, 40))
-
-    codes = np.eye(1, 3, dtype=np.float32)
-    found, history = distill_l1(covering, pair, jnp.asarray(labels), codes, steps=2, key=jax.random.key(0))
-    assert np.isfinite(history).all()
-    assert found.shape == (COVERING, 3)
 
 
 def test_one_program_serves_all_views_and_selections_of_a_size(scene, cameras):

@@ -16,7 +16,7 @@ def features_of(count: int, channels: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(2).normal(size=(count, channels)), jnp.float32)
 
 
-@pytest.mark.parametrize("channels", [3, 16])
+@pytest.mark.parametrize("channels", [3, pytest.param(16, marks=pytest.mark.long)])
 def test_a_planned_render_is_a_render(scene, camera, channels):
     features, background = features_of(scene.count, channels), jnp.arange(channels, dtype=jnp.float32)
     plan = plan_view(scene, camera)
@@ -32,6 +32,7 @@ def test_a_planned_render_is_a_render(scene, camera, channels):
     np.testing.assert_allclose(by_plan, whole, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.long
 def test_plans_are_stacked_and_differentiated_through(scene, cameras):
     features = features_of(scene.count, 3)
     plans = jax.jit(jax.vmap(lambda camera: plan_view(scene, camera)))(cameras)
@@ -55,7 +56,7 @@ def test_a_plan_says_what_it_lacks(scene, camera):
     assert int(plan_view(scene, camera, capacity=32).overflow) > 0
 
 
-@pytest.mark.parametrize("channels", [3, 16])
+@pytest.mark.parametrize("channels", [3, pytest.param(16, marks=pytest.mark.long)])
 def test_several_devices_give_the_image_and_the_gradients_of_one(scene, camera, channels):
     """To rounding; to the last bit as shipped: tests/test_exact.py."""
     mesh, features = host_mesh(), features_of(scene.count, channels)

@@ -59,6 +59,7 @@ def by_most_similar_text(world, features):
     return miou(world, lambda query: select_text(labels, cosines, query))
 
 
+@pytest.mark.long
 def test_langsplat(world):
     model = train_langsplat(world[0], key=jax.random.key(0), steps=100, init="random", epochs=300)
     assert np.isfinite(model.history).all()
@@ -103,6 +104,7 @@ def test_gaussian_grouping_has_eight_bits_for_ids(world):
 SCHEDULE = Schedule(instance_steps=100, coarse_steps=20, fine_steps=20, roots=8, leaves=3, min_views=3, rate=0.05)
 
 
+@pytest.mark.long
 def test_opengaussian(world):
     model, history = train_opengaussian(world[0], key=jax.random.key(0), schedule=SCHEDULE)
     assert np.isfinite(history).all()
@@ -117,6 +119,7 @@ def test_opengaussian(world):
     assert not np.asarray(model.leaf_features)[unmatched].any()
 
 
+@pytest.mark.long
 def test_codebooks_share_their_first_stage(world):
     """The model is that of all stages at once, and what is shared is left as it was."""
     key, short = jax.random.key(0), dataclasses.replace(SCHEDULE, instance_steps=6, coarse_steps=2, fine_steps=2)
@@ -141,6 +144,7 @@ ROOMY = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("train", ROOMY.values(), ids=ROOMY)
 def test_room_behind_the_gaussians_changes_nothing(world, train, monkeypatch):
     assert world[0].gaussians.count % 2048

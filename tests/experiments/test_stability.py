@@ -18,10 +18,11 @@ from jsecon.splat.render import render, render_depth, render_rgb
 
 CAPACITY = 64 * 30
 CASES = cases()
-OF_THEIR_OWN = "one Gaussian", "image of 1x1", "image of 9x7"
-"""rows that share no program with others: compiled fast. The rest is the machine code that users run."""
-MARKS = [() if case.name in OF_THEIR_OWN else pytest.mark.as_shipped for case in CASES]
-ROWS = [pytest.param(case, marks=marks, id=case.name) for case, marks in zip(CASES, MARKS, strict=True)]
+COMPILED_TOGETHER = len(ordinary().gaussians.means), 48, 40
+"""rows of this many Gaussians and pixels share their programs, which are compiled as users run them; others are long"""
+SIZES = [(case.gaussians.count, case.camera.width, case.camera.height) for case in CASES]
+MARKS = [pytest.mark.as_shipped if size == COMPILED_TOGETHER else pytest.mark.long for size in SIZES]
+ROWS = [pytest.param(case, marks=mark, id=case.name) for case, mark in zip(CASES, MARKS, strict=True)]
 
 
 @pytest.mark.parametrize("case", ROWS)
