@@ -35,7 +35,7 @@ from jsecon.demo.surfaces import pattern
 from jsecon.errors import InputError
 from jsecon.types import Camera
 
-SEEDS = range(5)
+SEEDS = range(2)
 
 
 def alone(solid, hollow=None):
