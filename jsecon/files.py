@@ -256,14 +256,14 @@ def read_zip(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def read_arrays(
-    path: str | os.PathLike, *, mapped: int = sys.maxsize, checked: bool = True
+    path: str | os.PathLike, *, memory_map_above: int = sys.maxsize, verify: bool = True
 ) -> tuple[Any, dict[str, np.ndarray]]:
     """Reads what `write_arrays` wrote.
 
     Args:
       path: The file.
-      mapped: Arrays of more bytes are memory-mapped.
-      checked: Also compare the checksums of mapped arrays, which reads them. Those of the others are always compared.
+      memory_map_above: Arrays of more bytes are memory-mapped.
+      verify: Also compare the checksums of mapped arrays, which reads them. Those of the others are always compared.
 
     Returns:
       The description, and the arrays by name.
@@ -285,13 +285,13 @@ def read_arrays(
         told = parse_json(metadata["jsecon"])
         for name, entry in layout.items():
             dtype, shape, (begin, end) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
-            is_mapped = end - begin > mapped
+            is_mapped = end - begin > memory_map_above
             if is_mapped:
                 array = np.memmap(path, dtype, "r", 8 + length + begin, shape)
             else:
                 file.seek(8 + length + begin)
                 array = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
-            if (checked or not is_mapped) and _crc32(array) != told["crc32"][name]:
+            if (verify or not is_mapped) and _crc32(array) != told["crc32"][name]:
                 raise ValueError(f"{name} does not match its checksum")
             arrays[name] = array
     return told["description"], arrays
