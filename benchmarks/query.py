@@ -19,7 +19,8 @@ import numpy as np
 from metrics import Metric, interleaved, show
 
 from jsecon.query.anchored import query_anchored
-from jsecon.query.direct import query_one_step, unit_codes
+from jsecon.query.baselines import query_one_step
+from jsecon.query.similarity import unit_codes
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 
 REGIONS, TOP, TEXTS, SAMPLE = 40, 8, 100, 20_000

@@ -27,7 +27,7 @@ from jsecon.demo.demo import PLAIN, demo
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
 from jsecon.pipeline.progress import Listener
-from jsecon.query.direct import query_canonical, query_one_step
+from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.outliers import remove_outliers
 
 

@@ -29,11 +29,11 @@ from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.distill import distill_votes
-from jsecon.language.shares import with_shown
+from jsecon.language.membership import with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_region
-from jsecon.query.masks import selection_mask
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.render import selection_mask
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}

@@ -31,11 +31,11 @@ from jsecon.fit.depth import points_from_depth
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.schedule import Schedule
 from jsecon.fit.start import starting_gaussians
-from jsecon.language.shares import vote_shares, with_shown
+from jsecon.language.membership import vote_shares, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.pipeline.masklet_stages import CLOUD, GRAIN
-from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
-from jsecon.query.silhouette import silhouette_members
+from jsecon.query.render import ALPHA_THRESHOLD, render_selection
+from jsecon.query.silhouette import fit_silhouette
 from jsecon.splat.composite import composite_features_vjp
 from jsecon.splat.plan import plan_view
 from jsecon.types import Camera, Capture, Gaussians, Regions
@@ -179,7 +179,7 @@ def main(asked: Asked, out: Path) -> str:
             choosers = {
                 "threshold": [share[:, k] >= 0.5 for k in range(len(cuts))],
                 "silhouette": [
-                    np.asarray(silhouette_members(gaussians, cameras, np.float32(share[:, k] * best[:, k])))
+                    np.asarray(fit_silhouette(gaussians, cameras, np.float32(share[:, k] * best[:, k])))
                     for k in range(len(cuts))
                 ],
             }

@@ -7,7 +7,7 @@ vision (experiments.simulated_vision) at three levels of noise. One query per ob
 is compared with the Gaussians whose true object it is. All ideas work on one pass of votes, kept view by view. The
 letters name the ideas: A evidence hygiene, C neutral Gaussians, D object posterior over the views that
 show it, E consensus of views, F masks that disagree, several descriptors, G neighbours, H threshold by the largest gap.
-A text's region is the one with the largest cosine, "by contrast" the one that jsecon.query.retrieval finds."""
+A text's region is the one with the largest cosine, "by contrast" the one that jsecon.query.match finds."""
 
 import dataclasses
 import time

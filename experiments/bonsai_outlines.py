@@ -26,14 +26,14 @@ from jsecon.evaluate.metrics import iou
 from jsecon.pipeline import pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.query.anchored import query_region
-from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.pixel import region_at
-from jsecon.query.silhouette import silhouette_members
+from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
+from jsecon.query.silhouette import fit_silhouette
 from jsecon.types import Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 
-OUTLINES = results.HOME / "datasets" / "bonsai_outlines.json"
+SILHOUETTE_WEIGHTS = results.HOME / "datasets" / "bonsai_outlines.json"
 WAYS = ("pixel", "pixel, silhouette", "name", "name, all that answer", "best region")
 
 
@@ -47,7 +47,7 @@ class Options:
 
 def outlines(capture: Capture) -> dict[str, dict[int, np.ndarray]]:
     """thing -> frame -> (H, W) bool: its outline at the size of the frames, less what is in front of it."""
-    told = json.loads(OUTLINES.read_text())
+    told = json.loads(SILHOUETTE_WEIGHTS.read_text())
     height, width = capture.frames.shape[1:3]
     scale = np.array([width / told["width"], height / told["height"]])
     found: dict[str, dict[int, np.ndarray]] = {}
@@ -85,7 +85,7 @@ class Asked:
             found = query_region(self.field, region)
             mask = np.asarray(found.mask)
             if silhouette:
-                mask = np.asarray(silhouette_members(self.field.gaussians, self.field.cameras, found.similarity))
+                mask = np.asarray(fit_silhouette(self.field.gaussians, self.field.cameras, found.similarity))
             self._regions[region, silhouette] = remove_outliers(self.means, mask)
         return self._regions[region, silhouette]
 

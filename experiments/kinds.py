@@ -24,7 +24,7 @@ from experiments.tables.fill import fill, place_of, twins_asked
 from experiments.tables.rows import rows_of
 from experiments.tables.setting import Setting
 from jsecon.evaluate.lerf import resize_camera
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.types import Selection
 
 COVERED, LEAST_PX = 0.5, 40

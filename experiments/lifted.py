@@ -7,7 +7,7 @@ there; each is lifted from one frame, or from three, and judged in the others by
 selected Gaussians with all others deleted, alpha > 0.7: a plate under a ball is then whole, and the true mask, which
 lacks what the ball hides, is not. What their exact outlines get so is printed below. "In the scene"
 composites the selection through all Gaussians: its pixels are those of which it makes more than half. PRIOR_PX of
-`jsecon.query.lift` was chosen on plain rooms 0 and 1.
+`jsecon.query.outline` was chosen on plain rooms 0 and 1.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from jsecon.demo.raycast import trace
 from jsecon.demo.room import Room
 from jsecon.evaluate.metrics import iou
 from jsecon.pipeline.networks import field_embedder
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.splat.render import render
 from jsecon.types import Camera, Gaussians, LanguageField
 

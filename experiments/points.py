@@ -27,9 +27,9 @@ from experiments.tables.rows import NO_REFUSAL, own
 from experiments.tables.setting import Setting
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.language.shares import vote_shares
+from jsecon.language.membership import vote_shares
+from jsecon.query.match import MIN_PIECE_OVERLAP
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.retrieval import PIECE_OVERLAP
 from jsecon.splat.render import render_rgb
 from jsecon.types import Gaussians, LanguageField, Selection
 
@@ -80,7 +80,7 @@ def without_evidence(field: LanguageField) -> LanguageField:
 
 def pooled(field: LanguageField) -> LanguageField:
     """Each region with the mean embedding of all that share Gaussians with it, by their pixels."""
-    near = np.asarray(field.votes.overlap) >= PIECE_OVERLAP
+    near = np.asarray(field.votes.overlap) >= MIN_PIECE_OVERLAP
     np.fill_diagonal(near, True)
     summed = near @ (np.asarray(field.regions.pixels).sum(1)[:, None] * np.asarray(field.regions.embeddings))
     length = np.linalg.norm(summed, axis=1, keepdims=True)

@@ -26,7 +26,7 @@ from experiments.tables.setting import Setting, prepare
 from jsecon.app.pictures import selection_overlay
 from jsecon.evaluate.lerf import resize_camera
 from jsecon.evaluate.metrics import iou
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians
 

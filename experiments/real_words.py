@@ -47,11 +47,11 @@ from experiments.words.scenes import (
 )
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import iou
-from jsecon.language.shares import finish_votes
+from jsecon.language.membership import finish_votes
 from jsecon.query.anchored import query_anchored
 from jsecon.query.classes import query_classes
-from jsecon.query.masks import ALPHA_THRESHOLD, render_selection
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, NEARNESS, RETRIEVAL_THRESHOLD
+from jsecon.query.match import CONTRAST_THRESHOLD, KIND_THRESHOLD, RETRIEVAL_THRESHOLD
+from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField, Regions, Votes
 
@@ -175,7 +175,7 @@ def _by_regions(kind: str, way: str) -> Chooser:
         area = case.regions.pixels.sum(axis=1).astype(float)
         chosen = {
             "best region": lambda: rules.best_of(table),
-            "all near": lambda: rules.near_best(table, NEARNESS),
+            "all near": lambda: rules.near_best(table, KIND_THRESHOLD),
             CLASS_LIST: lambda: rules.best_text(table),
             f"{CLASS_LIST}, standardised": lambda: rules.best_text(rules.standardised(table)),
             f"{CLASS_LIST}, standardised by pixels": lambda: rules.best_text(rules.standardised(table, area)),

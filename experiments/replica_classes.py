@@ -9,9 +9,9 @@ so that no text and no embedding plays a part: what is measured is the step from
 of a Gaussian is the object that the views whose masks did not vote show there, with its name. IoU over the Gaussians
 with a truth, mean over the classes.
 
-Three rules, see `jsecon.language.shares`: weight over that of all views, over that of the views that show the region,
-and the latter with evidence (the library's). Masks as they are; lost, where each mask of each view is missing with some
-probability; and swallowed, where its pixels then go to the nearest mask.
+Three rules, see `jsecon.language.membership`: weight over that of all views, over that of the views that show the
+region, and the latter with evidence (the library's). Masks as they are; lost, where each mask of each view is missing
+with some probability; and swallowed, where its pixels then go to the nearest mask.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from experiments.datasets.depth_points import labels_of_points
 from experiments.default_vision import connected_parts
 from experiments.replica_apartment_0 import Options as Scan, load_replica, points_as_gaussians
 from jsecon.errors import InputError
-from jsecon.language.shares import SHARE_THRESHOLD, share_of, with_shown
+from jsecon.language.membership import SHARE_THRESHOLD, share_of, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.types import Regions, Votes
 

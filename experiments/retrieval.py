@@ -21,8 +21,8 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import State, consensus, point_miou, tracked
-from jsecon.query.direct import relevancies
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
+from jsecon.query.baselines import relevancies
+from jsecon.query.match import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
 
 
 @dataclasses.dataclass(frozen=True)

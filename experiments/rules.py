@@ -34,9 +34,9 @@ from jsecon.fit.start import gaussians_from_points
 from jsecon.language.votes import region_votes
 from jsecon.process import clear_programs
 from jsecon.query.anchored import found_of, query_anchored
+from jsecon.query.match import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import parts_instead, query_parts
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField
 
@@ -125,9 +125,9 @@ ROWS: dict[str, Row] = {
     AS_IT_IS: anchored(),
     "the region by the plain cosine": anchored(retrieval="cosine"),
     "a few pixels are evidence enough": anchored(without_evidence),
-    "no pieces": anchored(piece_nearness=None),
-    "pieces at 0.25 of the way": anchored(piece_nearness=0.25),
-    "pieces at 0.75 of the way": anchored(piece_nearness=0.75),
+    "no pieces": anchored(piece_threshold=None),
+    "pieces at 0.25 of the way": anchored(piece_threshold=0.25),
+    "pieces at 0.75 of the way": anchored(piece_threshold=0.75),
     "none alike": anchored(alike_threshold=None),
     "all regions that answer": every_region,
     "parts that answer": answering,

@@ -25,7 +25,7 @@ from experiments.datasets.benchmark import Benchmark
 from experiments.ideas.state import unit
 from experiments.simulated_vision.worlds import SHARED_STRENGTH
 from experiments.tables import twins
-from jsecon.query.retrieval import evidence
+from jsecon.query.match import evidence
 
 REAL = {
     "text to text": "0.29 to 0.33",
@@ -111,7 +111,7 @@ def pooled(bench: Benchmark, root: Path, level: str, seed: int) -> Pooled:
 
 
 def contrasts(found: Pooled, texts: np.ndarray, *, equal: bool = False) -> np.ndarray:
-    """(Q, R) the contrast of texts with regions, as `jsecon.query.retrieval.contrasts` has it; with `equal` weights of
+    """(Q, R) the contrast of texts with regions, as `jsecon.query.match.contrasts` has it; with `equal` weights of
     the regions in the scene's mean, in place of their pixels."""
     weight = found.pixels.sum(1)
     weight = (weight > 0).astype(float) if equal else weight

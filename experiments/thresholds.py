@@ -25,12 +25,12 @@ from jsecon.evaluate.metrics import iou, mean_iou
 from jsecon.language.codes import Spread, encode, region_codes, spread_codes
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field
+from jsecon.language.membership import membership_probability, with_shown
 from jsecon.language.regions import region_embeddings
-from jsecon.language.shares import membership_probability, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored
-from jsecon.query.direct import query_canonical, query_one_step
-from jsecon.query.masks import selection_mask
+from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.query.render import selection_mask
 from jsecon.types import Camera, Gaussians, LanguageField
 
 

@@ -21,28 +21,25 @@ from .language.blocks import (
 )
 from .language.distill import distill_l1 as distill_l1, distill_votes as distill_votes
 from .language.field import check_field as check_field, load_field as load_field, save_field as save_field
-from .language.regions import region_embeddings as region_embeddings
-from .language.shares import (
+from .language.membership import (
     finish_votes as finish_votes,
     membership_probability as membership_probability,
     with_overlap as with_overlap,
     with_shown as with_shown,
 )
+from .language.regions import region_embeddings as region_embeddings
 from .language.votes import region_votes as region_votes
 from .parallel import host_mesh as host_mesh
 from .query.anchored import query_anchored as query_anchored, query_region as query_region
+from .query.baselines import query_canonical as query_canonical, query_one_step as query_one_step
 from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
-from .query.direct import (
-    query_canonical as query_canonical,
-    query_one_step as query_one_step,
-    unit_codes as unit_codes,
-)
-from .query.lift import lift as lift
-from .query.masks import selection_mask as selection_mask
 from .query.outliers import remove_outliers as remove_outliers
+from .query.outline import lift as lift
 from .query.pixel import region_at as region_at
+from .query.render import selection_mask as selection_mask
 from .query.several import query_several as query_several
+from .query.similarity import unit_codes as unit_codes
 from .splat.capacity import plan_capacity as plan_capacity
 from .splat.plan import plan_view as plan_view, render_plan as render_plan
 from .splat.project import project as project

@@ -275,7 +275,7 @@ class LanguageField(_Shown):
     """what single masks say of small parts of the scene, where the run was asked for it."""
     reference: Array | None = None
     """(W, E) embeddings of words that have nothing to do with the scene, W may be 0: what a text's similarity is
-    measured against (jsecon.query.retrieval). None: a field of an earlier version."""
+    measured against (jsecon.query.match). None: a field of an earlier version."""
 
 
 @record

@@ -6,7 +6,7 @@ import numpy as np
 
 from jsecon.language.codes import region_codes
 from jsecon.language.distill import distill_votes
-from jsecon.language.shares import LABELLED_PART, SEEN_PART
+from jsecon.language.membership import LABELLED_PART, SEEN_PART
 from jsecon.language.votes import region_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render

@@ -11,12 +11,12 @@ import pytest
 from small_field import REGIONS, field_of, make_field, shares, true_regions, unit_rows
 
 from jsecon.errors import InputError
-from jsecon.language.shares import finish_votes, vote_shares, with_shown
+from jsecon.language.membership import finish_votes, vote_shares, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.classes import query_classes
+from jsecon.query.match import contrasts
 from jsecon.query.pixel import pixel_weights, region_at, region_shares_at
-from jsecon.query.retrieval import contrasts
 from jsecon.query.several import query_several
 from jsecon.splat.render import render
 from jsecon.types import Regions, Votes

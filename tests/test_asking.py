@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jsecon.app import ask, cli
-from jsecon.language import field as field_file, shares
-from jsecon.language.field import field_of_rows, load_field, save_field
+from jsecon.language import field as field_file, membership
+from jsecon.language.field import load_field, save_field, subset_field
 from jsecon.query import pixel
 from jsecon.types import Parts
 from jsecon.vision.colours import ColourEmbedder
@@ -21,7 +21,7 @@ def forced(monkeypatch):
     """No room in memory, every column on disk, a handful of blocks."""
     monkeypatch.setenv("JSECON_MEMORY", "1e-9")
     monkeypatch.setattr(field_file, "MAPPED", 0)
-    monkeypatch.setattr(shares, "ROWS", 700)
+    monkeypatch.setattr(membership, "ROWS", 700)
     monkeypatch.setattr(pixel, "ROWS", 700)
 
 
@@ -69,7 +69,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
             np.testing.assert_array_equal(own.rows[own.mask], np.flatnonzero(memory.mask))
             np.testing.assert_array_equal(own.selection.similarity[own.mask], memory.selection.similarity[memory.mask])
             assert own.dropped == memory.dropped
-    few = field_of_rows(mapped, np.array([3, 5]))
+    few = subset_field(mapped, np.array([3, 5]))
     np.testing.assert_array_equal(few.gaussians.means, np.asarray(field.gaussians.means)[[3, 5]])
     assert few.votes.overlap.shape == field.votes.overlap.shape
 

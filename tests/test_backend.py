@@ -10,7 +10,7 @@ import jsecon
 import jsecon.backend as backend
 from jsecon.language.codes import Rotation
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
-from jsecon.query.direct import similarities, unit_codes
+from jsecon.query.similarity import similarities, unit_codes
 
 pytestmark = pytest.mark.as_shipped
 

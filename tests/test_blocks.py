@@ -12,12 +12,12 @@ from small_field import make_field
 from test_votes import REGIONS, expected, labels  # noqa: F401
 
 from jsecon.errors import InputError
-from jsecon.language import blocks as module, shares
+from jsecon.language import blocks as module, membership
 from jsecon.language.blocks import codes_in_blocks, region_votes_in_blocks
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field, save_field
+from jsecon.language.membership import with_overlap, with_shown
 from jsecon.language.records import strongest
-from jsecon.language.shares import with_overlap, with_shown
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored
 from jsecon.query.blocks import query_in_blocks
@@ -137,7 +137,7 @@ def test_shown_is_that_of_votes_by_view(scene, cameras, labels, tmp_path, small_
     )
     np.testing.assert_array_equal(cast.regions, memory.regions)
     np.testing.assert_allclose(cast.shown, memory.shown, rtol=1e-5, atol=1e-6)
-    monkeypatch.setattr(shares, "_BLOCK", 24)
+    monkeypatch.setattr(membership, "_BLOCK", 24)
     how = {"top": 4, "rows": 16, "by_view": True}
     kept = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "w")
     whole = region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True).by_view
@@ -225,7 +225,7 @@ def fields(scene, cameras, tmp_path, monkeypatch):
     field = dataclasses.replace(field, votes=with_overlap(field.votes))
     save_field(tmp_path / "a.safetensors", field)
     monkeypatch.setattr(home, "MAPPED", 0)
-    monkeypatch.setattr(shares, "ROWS", 10)
+    monkeypatch.setattr(membership, "ROWS", 10)
     return field, load_field(tmp_path / "a.safetensors", mapped=True)
 
 

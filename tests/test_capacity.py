@@ -9,7 +9,7 @@ import pytest
 from jsecon.language.votes import region_votes
 from jsecon.parallel import host_mesh
 from jsecon.process import compilation_counts
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.splat.capacity import default_capacity, enough_capacity, plan_capacity
 from jsecon.splat.plan import plan_view, plan_views, render_plan
 from jsecon.splat.reference import render_reference

@@ -10,7 +10,7 @@ import pytest
 from small_field import seen_of, unit_rows
 
 from jsecon.query import classes
-from jsecon.query.retrieval import contrasts
+from jsecon.query.match import contrasts
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 from jsecon.vision.protocols import Logits
 

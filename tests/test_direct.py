@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.direct import query_canonical, query_one_step, unit_codes
+from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.query.similarity import unit_codes
 
 
 def exact_cosines(codes, code):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from small_field import REGIONS, labels_of, true_regions, unit_rows
 
-from jsecon.language.distill import descend, descent, distill_l1, distill_votes
+from jsecon.language.distill import continue_distillation, distill_l1, distill_votes, start_distillation
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
 from jsecon.types import Votes
@@ -110,8 +110,8 @@ def test_what_is_mostly_unlabelled_is_unknown():
     votes = dataclasses.replace(make_votes([[0, 1]] * 3, [[2.0, 1.0]] * 3, 2), total=jnp.asarray([3.0, 6.0, 7.0]))
     codes = jnp.eye(2)
     np.testing.assert_array_equal(distill_votes(votes, codes), [[1, 0], [1, 0], [0, 0]])
-    np.testing.assert_array_equal(distill_votes(votes, codes, least_labelled=0.0), [[1, 0]] * 3)
-    np.testing.assert_array_equal(distill_votes(votes, codes, least_labelled=0.9), [[1, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(distill_votes(votes, codes, min_labelled=0.0), [[1, 0]] * 3)
+    np.testing.assert_array_equal(distill_votes(votes, codes, min_labelled=0.9), [[1, 0], [0, 0], [0, 0]])
 
 
 def test_no_regions_at_all():
@@ -157,7 +157,7 @@ def test_steps_equal_the_definition_in_float64(task):
     weights, flat = dense_weights(scene, cameras), np.asarray(labels).reshape(4, -1)
     start = 0.1 * unit_rows(np.random.default_rng(2), scene.count, 3)
     got, history = distill_l1(scene, cameras, labels, codes, steps=3, key=KEY, init=start, capacity=capacity)
-    order = descent(scene, cameras, labels, codes, steps=3, key=KEY).order
+    order = start_distillation(scene, cameras, labels, codes, steps=3, key=KEY).order
     features, first, second = start.astype(np.float64), 0.0, 0.0
     for step, view in enumerate(np.asarray(order), start=1):
         length = np.linalg.norm(features, axis=1, keepdims=True)
@@ -176,10 +176,10 @@ def test_steps_equal_the_definition_in_float64(task):
 
 def test_every_view_comes_before_any_repeats(task):
     scene, cameras, labels, codes, _, _ = task
-    order = np.asarray(descent(scene, cameras, labels, codes, steps=10, key=KEY).order)
+    order = np.asarray(start_distillation(scene, cameras, labels, codes, steps=10, key=KEY).order)
     assert sorted(order[:4]) == sorted(order[4:8]) == [0, 1, 2, 3]
     assert len(order) == 10
-    other = np.asarray(descent(scene, cameras, labels, codes, steps=10, key=jax.random.key(5)).order)
+    other = np.asarray(start_distillation(scene, cameras, labels, codes, steps=10, key=jax.random.key(5)).order)
     assert (order != other).any()
 
 
@@ -207,12 +207,12 @@ def test_random_and_given_starts_learn_and_zero_is_the_trap(task):
 def test_a_stopped_run_goes_on_where_it_was(task):
     scene, cameras, labels, codes, _, capacity = task
     given = (scene, cameras, labels, codes)
-    start = descent(*given, steps=240, key=KEY, init="random")
-    whole = descend(start, *given, until=240, capacity=capacity)
-    half = descend(start, *given, until=77, capacity=capacity)
+    start = start_distillation(*given, steps=240, key=KEY, init="random")
+    whole = continue_distillation(start, *given, until=240, capacity=capacity)
+    half = continue_distillation(start, *given, until=77, capacity=capacity)
     assert int(half.step) == 77
     kept = jax.tree.map(np.asarray, half)
-    resumed = descend(kept, *given, until=240, capacity=capacity)
+    resumed = continue_distillation(kept, *given, until=240, capacity=capacity)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(resumed), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -12,7 +12,7 @@ from small_field import field_of
 import jsecon
 from jsecon.app import cli
 from jsecon.language.field import save_field
-from jsecon.language.shares import finish_votes
+from jsecon.language.membership import finish_votes
 from jsecon.types import Camera, Gaussians, Regions, Votes
 from jsecon.vision.colours import PALETTE, ColourEmbedder
 

@@ -15,7 +15,7 @@ from jsecon.files import read_arrays, write_arrays
 from jsecon.language import field as module
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.field import check_field, load_field, save_field
-from jsecon.language.shares import with_overlap
+from jsecon.language.membership import with_overlap
 from jsecon.types import Parts
 
 

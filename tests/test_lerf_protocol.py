@@ -16,7 +16,7 @@ from jsecon.evaluate.lerf import (
     evaluate_point_level_rendered,
     resize_camera,
 )
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.types import Selection
 
 

@@ -10,7 +10,7 @@ from small_field import REGIONS, make_field, true_regions
 
 from jsecon.errors import InputError
 from jsecon.language.votes import region_votes
-from jsecon.query.lift import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
+from jsecon.query.outline import INSIDE, OUTSIDE, PRIOR_PX, UNKNOWN, box_mask, lift
 
 
 @pytest.fixture(scope="module")

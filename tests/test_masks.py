@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.query.masks import render_selection, selection_mask
+from jsecon.query.render import render_selection, selection_mask
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
 

@@ -28,7 +28,7 @@ from jsecon.pipeline.masklet_stages import masklets
 from jsecon.pipeline.networks import ExternalSpace
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians, load
-from jsecon.query.retrieval import evidence
+from jsecon.query.match import evidence
 from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.stores import StoredSegmenter
 

@@ -17,7 +17,7 @@ from jsecon.data.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.networks.sam3 import PhraseMasks
-from jsecon.query.lift import lift
+from jsecon.query.outline import lift
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from small_field import make_field, shares
 
 from jsecon.query.anchored import query_anchored, query_region
-from jsecon.query.retrieval import is_piece
+from jsecon.query.match import is_piece
 from jsecon.query.several import query_several
 from jsecon.types import Regions
 
@@ -56,7 +56,7 @@ def test_a_text_finds_a_thing_with_its_pieces_but_no_other_of_its_kind(broken, r
     np.testing.assert_allclose(found.similarity, shares(broken, [0, 1]), atol=1e-6)
     np.testing.assert_array_equal(found.mask, shares(broken, [0, 1]) >= 0.5)
     assert int(found.region) == 0
-    alone = query_anchored(broken, text, retrieval=retrieval, piece_nearness=None)
+    alone = query_anchored(broken, text, retrieval=retrieval, piece_threshold=None)
     np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)
     for other in (with_other(broken, np.eye(5, dtype=np.float32)), with_other(broken, None)):  # apart; not known
         got = query_anchored(other, text, retrieval=retrieval)
@@ -74,9 +74,9 @@ def test_several_regions_take_their_pieces_with_them(broken):
     for field, options, regions in (
         (broken, {"several": False}, [0, 1]),
         (apart, {"several": False}, [0]),
-        (apart, {"nearness": 0.8}, [0, 1]),
-        (broken, {"nearness": 0.99}, [0, 1]),
-        (apart, {"nearness": 0.99}, [0]),
+        (apart, {"kind_threshold": 0.8}, [0, 1]),
+        (broken, {"kind_threshold": 0.99}, [0, 1]),
+        (apart, {"kind_threshold": 0.99}, [0]),
     ):
         found = query_several(field, text, **options)
         np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6, err_msg=str(options))
@@ -91,15 +91,15 @@ def test_texts_by_vmap_are_the_loop(broken):
 def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
     """As a text would whose embedding is the region's own."""
     for nearness, regions in ((None, [0]), (1.0, [0]), (0.5, [0, 1])):
-        found = query_region(broken, 0, piece_nearness=nearness)
+        found = query_region(broken, 0, piece_threshold=nearness)
         np.testing.assert_allclose(found.similarity, shares(broken, regions), atol=1e-6)
         assert int(found.region) == 0
     unknown = with_other(broken, None)
-    np.testing.assert_allclose(query_region(unknown, 0, piece_nearness=0.5).similarity, shares(broken, [0]), atol=1e-6)
-    assert int(query_region(broken, 99, piece_nearness=0.5).region) == -1
+    np.testing.assert_allclose(query_region(unknown, 0, piece_threshold=0.5).similarity, shares(broken, [0]), atol=1e-6)
+    assert int(query_region(broken, 99, piece_threshold=0.5).region) == -1
 
 
 def test_several_regions_leave_their_pieces_where_that_is_asked_for(broken):
     text = broken.regions.embeddings[:1]
-    alone = query_several(broken, text, several=False, piece_nearness=1.0)
+    alone = query_several(broken, text, several=False, piece_threshold=1.0)
     np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)

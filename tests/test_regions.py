@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
-from jsecon.language.regions import given_embeddings, region_embeddings, scene_parts
+from jsecon.language.regions import embeddings_of_masks, region_embeddings, scene_parts
 
 
 def embed(frame, masks):
@@ -61,11 +61,11 @@ def test_given_embeddings_equal_the_definition(seed, weighting):
                 mean = rows[masks[t][inside]].astype(np.float64).mean(0)
                 wanted[r] += mean / np.linalg.norm(mean) * ((labels[t] == r).sum() if weighting == "pixels" else 1)
     wanted /= np.maximum(np.linalg.norm(wanted, axis=1, keepdims=True), 1e-12)
-    found = given_embeddings(labels, masks, rows, weighting=weighting, num_regions=4)
+    found = embeddings_of_masks(labels, masks, rows, weighting=weighting, num_regions=4)
     np.testing.assert_allclose(found.embeddings, wanted, atol=1e-6)
     np.testing.assert_array_equal(found.pixels[3], 0)
     with pytest.raises(ValueError, match="masks"):
-        given_embeddings(labels, masks[:2], rows)
+        embeddings_of_masks(labels, masks[:2], rows)
 
 
 def test_a_large_view_outweighs_a_small_one_only_with_pixels():

@@ -16,8 +16,7 @@ from jsecon.language.field import load_field, save_field
 from jsecon.pipeline import networks
 from jsecon.query.anchored import query_anchored
 from jsecon.query.classes import query_classes
-from jsecon.query.direct import similarities
-from jsecon.query.retrieval import (
+from jsecon.query.match import (
     CONTRAST_THRESHOLD,
     QUANTILE,
     RELATED,
@@ -26,6 +25,7 @@ from jsecon.query.retrieval import (
     evidence,
 )
 from jsecon.query.several import query_several
+from jsecon.query.similarity import similarities
 from jsecon.types import Regions, Votes
 
 SIZE = 12

@@ -11,9 +11,9 @@ from jsecon.app.ask import ask_text
 from jsecon.app.outputs import write_answer
 from jsecon.errors import InputError
 from jsecon.query.anchored import query_anchored
-from jsecon.query.neighbours import evened, nearest
-from jsecon.query.retrieval import regions_of_text
+from jsecon.query.match import regions_of_text
 from jsecon.query.several import parts_of_question, query_several
+from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
 from jsecon.types import Regions
 
 
@@ -49,7 +49,7 @@ def test_the_rule_is_the_stated_one(field):
         for nearness in (0.3, 0.8):
             expected = ((similarity >= middle + nearness * (best - middle)) | alike) & known & (best >= 0.2)
             given = rows, similarity.astype(np.float32), known
-            got = regions_of_text(*given, nearness=nearness, accepted=bool(best >= 0.2))
+            got = regions_of_text(*given, kind_threshold=nearness, accepted=bool(best >= 0.2))
             np.testing.assert_array_equal(got, expected)
 
 
@@ -144,12 +144,12 @@ def test_shares_are_evened_out_over_neighbours_where_that_is_asked_for(field):
         def embed_text(self, texts):
             return np.asarray(field.regions.embeddings)[[0] * len(texts)]
 
-    near = nearest(field.gaussians.means)
+    near = nearest_neighbours(field.gaussians.means)
     for several in (False, True):
         plain, even = (
             ask_text(field, Words(), "a", several=several, near=given, outliers=False) for given in (None, near)
         )
-        share = np.asarray(evened(plain.selection.similarity, near))
+        share = np.asarray(smooth_over_neighbours(plain.selection.similarity, near))
         np.testing.assert_allclose(even.selection.similarity, share, rtol=1e-6)
         np.testing.assert_array_equal(even.mask, share >= 0.5)
     assert (even.mask != plain.mask).any()

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import beta
 from small_field import seen_of
 
-from jsecon.language.shares import (
+from jsecon.language.membership import (
     CORRELATION,
     finish_votes,
     membership_probability,

@@ -24,7 +24,7 @@ from jsecon.networks.file_tokenizer import FileTokenizer, TextRules
 from jsecon.pipeline import networks
 from jsecon.pipeline.models import inspect_models
 from jsecon.query.anchored import query_anchored
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, best_presence, contrasts, presence
+from jsecon.query.match import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, best_presence, contrasts, presence
 from jsecon.query.several import query_several
 from jsecon.vision.protocols import Embedder, Logits
 

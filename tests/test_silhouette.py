@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from balls import ring_of_balls
 
-from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
+from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.query.silhouette import (
-    OUTLINES,
+    SILHOUETTE_WEIGHTS,
     SWEEPS,
     WEIGHTS,
     Footprints,
     ascend,
+    fit_silhouette,
     footprints,
-    silhouette_members,
     views_of,
 )
 from jsecon.splat.plan import plan_view, render_plan
@@ -49,13 +49,13 @@ def expected(gaussians, views, share, mask, weights=WEIGHTS):
 def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     gaussians, cameras, share = world
     before = share >= 0.5
-    after = np.asarray(silhouette_members(gaussians, cameras, share))
+    after = np.asarray(fit_silhouette(gaussians, cameras, share))
     views = views_of(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
-    fit = lambda weights: np.asarray(silhouette_members(gaussians, cameras, share, weights=weights))
-    found = {weights: fit(weights) for weights in OUTLINES.values()}
-    for weights in OUTLINES.values():  # each fits best what it is to fit
+    fit = lambda weights: np.asarray(fit_silhouette(gaussians, cameras, share, weights=weights))
+    found = {weights: fit(weights) for weights in SILHOUETTE_WEIGHTS.values()}
+    for weights in SILHOUETTE_WEIGHTS.values():  # each fits best what it is to fit
         value = {other: expected(gaussians, views, share, mask, weights) for other, mask in found.items()}
         assert value[weights] > max(value.values()) - 1e-3
         assert value[weights] > expected(gaussians, views, share, before, weights)
@@ -138,27 +138,27 @@ def test_jit_is_eager():
 
 def test_nothing_to_choose_from_stays_nothing(world):
     gaussians, cameras, share = world
-    assert not np.asarray(silhouette_members(gaussians, cameras, np.zeros_like(share))).any()
+    assert not np.asarray(fit_silhouette(gaussians, cameras, np.zeros_like(share))).any()
     few = np.zeros_like(share)
     few[2500] = 1.0
-    assert np.asarray(silhouette_members(gaussians, cameras, few)).sum() == 1
+    assert np.asarray(fit_silhouette(gaussians, cameras, few)).sum() == 1
 
 
 def test_a_thing_that_no_camera_sees_is_left_as_it_is(world):
     gaussians, cameras, share = world
     behind = dataclasses.replace(gaussians, means=gaussians.means + np.float32([0, 50, 0]))
-    np.testing.assert_array_equal(silhouette_members(behind, cameras, share), share >= 0.5)
+    np.testing.assert_array_equal(fit_silhouette(behind, cameras, share), share >= 0.5)
 
 
 def test_shares_of_another_scene_are_refused(world):
-    with pytest.raises(ValueError, match="silhouette_members"):
-        silhouette_members(world[0], world[1], world[2][1:])
+    with pytest.raises(ValueError, match="fit_silhouette"):
+        fit_silhouette(world[0], world[1], world[2][1:])
 
 
 def test_float64_in_this_thread_alone_changes_nothing(world):
     gaussians, cameras, share = world
-    found = silhouette_members(gaussians, cameras, share)
+    found = fit_silhouette(gaussians, cameras, share)
     with jax.enable_x64(True):
         double = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), (gaussians, cameras))
-        again = silhouette_members(*double, share)
+        again = fit_silhouette(*double, share)
     np.testing.assert_array_equal(np.asarray(again), np.asarray(found))

@@ -13,7 +13,7 @@ from small_field import make_field
 
 from jsecon.app.ask import Answer
 from jsecon.app.viewer.static_page import NOWHERE, main_regions, page
-from jsecon.language.shares import vote_shares
+from jsecon.language.membership import vote_shares
 from jsecon.splat.sh import C0
 from jsecon.types import Selection
 

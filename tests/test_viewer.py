@@ -26,7 +26,7 @@ from jsecon.app.viewer.window import Viewer, open_viewer
 from jsecon.data.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
-from jsecon.language.shares import with_overlap
+from jsecon.language.membership import with_overlap
 from jsecon.query.pixel import region_shares_seen
 from jsecon.types import Camera
 from jsecon.vision.colours import BASIC, ColourEmbedder

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jsecon.association.atoms import atom_votes
-from jsecon.language.votes import bytes_of_votes, region_votes
+from jsecon.language.votes import region_votes, votes_memory
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import plan_view
 from jsecon.splat.reference import weights_reference
@@ -114,9 +114,9 @@ def test_what_they_take_is_told_beforehand(monkeypatch):
     for devices, lanes in ((1, 1), (2, 2), (6, 4), (16, 8)):
         local = jax.local_devices()[:1] * devices
         monkeypatch.setattr(jax, "devices", lambda local=local: local)
-        assert bytes_of_votes(count, 100, regions) == (4 * 100 + 56) * count + (lanes + 1) * dense
+        assert votes_memory(count, 100, regions) == (4 * 100 + 56) * count + (lanes + 1) * dense
     # a block of 1 GiB in each of two lanes, and one of their sum
-    assert bytes_of_votes(1 << 22, 100, 100) == (4 * 100 + 56) * (1 << 22) + 3 * (1 << 30)
+    assert votes_memory(1 << 22, 100, 100) == (4 * 100 + 56) * (1 << 22) + 3 * (1 << 30)
 
 
 def test_regions_in_blocks_are_the_same_votes(monkeypatch, cast, scene, cameras, labels):

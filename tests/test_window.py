@@ -22,12 +22,13 @@ from test_direct import exact_cosines, exact_relevancy
 from jsecon.fit.photometric import l1, psnr
 from jsecon.language.codes import Rotation, Spread
 from jsecon.language.distill import distill_votes
-from jsecon.language.shares import share_of, with_overlap, with_shown
+from jsecon.language.membership import share_of, with_overlap, with_shown
 from jsecon.query.anchored import query_anchored
+from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.classes import query_classes
-from jsecon.query.direct import query_canonical, query_one_step, similarities, unit_codes
-from jsecon.query.retrieval import contrasts
+from jsecon.query.match import contrasts
 from jsecon.query.several import query_several
+from jsecon.query.similarity import similarities, unit_codes
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians
@@ -105,7 +106,7 @@ def share(field, regions):
 def test_anchored(field):
     asked = np.array([0, 3])
     texts = field.regions.embeddings[asked]
-    ask = {"retrieval": "cosine", "alike_threshold": None, "piece_nearness": None}
+    ask = {"retrieval": "cosine", "alike_threshold": None, "piece_threshold": None}
     by_votes = compiled(lambda text, field: query_anchored(field, text, **ask).similarity, texts, field)
     by_code = compiled(lambda text, field: query_anchored(field, text, by="code", **ask).similarity, texts, field)
     for n, region in enumerate(asked):
@@ -115,7 +116,7 @@ def test_anchored(field):
 
 def test_several(field):
     sets = field.regions.embeddings[np.array([[0, 3], [1, 2]])]
-    ask = {"retrieval": "cosine", "several": False, "nearness": 2.0}
+    ask = {"retrieval": "cosine", "several": False, "kind_threshold": 2.0}
     found = compiled(lambda texts, field: query_several(field, texts, **ask).similarity, sets, field)
     for n, regions in enumerate(([0, 3], [1, 2])):
         np.testing.assert_allclose(found[n], share(field, regions), atol=1e-6)

@@ -16,8 +16,8 @@ from experiments.ideas import scenes
 from experiments.protocols.points import point_accuracy, point_class_means
 from experiments.simulated_vision.embeddings import TextSpace
 from jsecon.language.autoencoder import train_autoencoder
-from jsecon.language.distill import descend, descent, distill_votes
-from jsecon.language.shares import with_shown
+from jsecon.language.distill import continue_distillation, distill_votes, start_distillation
+from jsecon.language.membership import with_shown
 from jsecon.language.votes import region_votes
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.pipeline import cache
@@ -165,9 +165,9 @@ def votes_paths(task: Task, *, loyalties: tuple[float, ...], sweeps: tuple[int, 
     """Reductions of the votes, and the solver from the mode, with each loyalty and each most number of sweeps."""
     votes, spent = timed(lambda: votes_of(task))
     rows = []
-    ways = {r: functools.partial(distill_votes, votes, task.codes, r, least_labelled=0.0) for r in ("mean", "median")}
+    ways = {r: functools.partial(distill_votes, votes, task.codes, r, min_labelled=0.0) for r in ("mean", "median")}
     ways["geometric median"] = functools.partial(jax.jit(geometric_median), votes, task.codes)
-    ways["mode"] = functools.partial(distill_votes, votes, task.codes, "mode", least_labelled=0.0)
+    ways["mode"] = functools.partial(distill_votes, votes, task.codes, "mode", min_labelled=0.0)
     for name, way in ways.items():
         codes, own = timed(way)
         rows.append({"path": f"votes, {name}", "seconds": spent + own, **score(task, codes, votes)})
@@ -195,13 +195,13 @@ def adam_path(task: Task, start: str, record: Path, *, steps: int, looks: tuple[
     where there is one."""
     before, init, votes = 0.0, start, votes_of(task)
     if start == "votes":
-        init, before = timed(lambda: distill_votes(votes_of(task), task.codes, "mode", least_labelled=0.0))
+        init, before = timed(lambda: distill_votes(votes_of(task), task.codes, "mode", min_labelled=0.0))
     given = (task.gaussians, task.cameras, task.labels, task.codes)
-    state = descent(*given, steps=steps, key=jax.random.key(0), init=init)
+    state = start_distillation(*given, steps=steps, key=jax.random.key(0), init=init)
     seconds, rows = before, []
     plans, own = timed(lambda: plan_views(task.gaussians, task.cameras))
     seconds += own
-    go = functools.partial(descend, plans=plans)
+    go = functools.partial(continue_distillation, plans=plans)
     jax.block_until_ready(go(state, *given, until=1))  # compiles
     if record.exists():
         leaves, seconds, rows = cache.load(record)

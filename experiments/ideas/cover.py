@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD
-from jsecon.query.silhouette import LEAST_SHARE, footprints, views_of
+from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD
+from jsecon.query.silhouette import MIN_CANDIDATE_SHARE, footprints, views_of
 from jsecon.types import Array, Camera, Gaussians
 
 CORE = 0.9
@@ -16,7 +16,7 @@ MOST = 4096
 
 
 def core_and_cover(gaussians: Gaussians, cameras: Camera, share: Float[np.ndarray, " n"]) -> Bool[Array, " n"]:
-    """(N,) bool: {s >= CORE}, then, largest share s (N,) first, every Gaussian of s > LEAST_SHARE with
+    """(N,) bool: {s >= CORE}, then, largest share s (N,) first, every Gaussian of s > MIN_CANDIDATE_SHARE with
 
         sum pi min(a, (l* - l)_+) / l* >= LEAST_GAIN sum (1 - pi) 1[l <= l_0 < l + a]
 
@@ -25,7 +25,7 @@ def core_and_cover(gaussians: Gaussians, cameras: Camera, share: Float[np.ndarra
     """
     share = np.asarray(share, np.float32)
     chosen = share >= CORE
-    order = np.flatnonzero((share > LEAST_SHARE) & ~chosen)
+    order = np.flatnonzero((share > MIN_CANDIDATE_SHARE) & ~chosen)
     order = order[np.argsort(-share[order], kind="stable")[:MOST]]
     if not chosen.any() or not len(order):
         return jnp.asarray(chosen)

@@ -13,7 +13,7 @@ from scipy import sparse
 from experiments.ideas import scenes
 from jsecon.association.atoms import Sparse
 from jsecon.association.consensus import group_by_consensus
-from jsecon.query.retrieval import contrasts
+from jsecon.query.match import contrasts
 
 ROUNDS = 10
 """most rounds of `agree`; with a fifth of the masks wrong two or three suffice"""

@@ -17,7 +17,7 @@ from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import require
 from jsecon.evaluate.lerf import labelled_pairs
 from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
-from jsecon.query.direct import relevancies
+from jsecon.query.baselines import relevancies
 from jsecon.types import Array
 
 WINDOW = 30

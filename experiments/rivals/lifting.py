@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
 from jsecon.language.votes import region_votes
-from jsecon.query.direct import relevancies
+from jsecon.query.baselines import relevancies
 from jsecon.splat.fusion import materialize
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.walk import blend_weights, make_batches, make_table, walk

@@ -1,6 +1,6 @@
 """Two ways to say which Gaussians belong to a region that were measured and not kept: by the votes of all views, and by
 the lead over the strongest other region. The library's is the share in the views that show the region
-(jsecon.language.shares)."""
+(jsecon.language.membership)."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.query.retrieval import is_alike
+from jsecon.query.match import is_alike
 from jsecon.types import LanguageField, Selection
 
 LEAD_THRESHOLD = 0.5

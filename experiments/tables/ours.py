@@ -16,15 +16,15 @@ from jsecon.association.views import SceneViews
 from jsecon.language.autoencoder import train_autoencoder
 from jsecon.language.codes import encode, region_codes
 from jsecon.language.distill import distill_l1, distill_votes
+from jsecon.language.membership import finish_votes, membership_probability
 from jsecon.language.regions import scene_parts
-from jsecon.language.shares import finish_votes, membership_probability
 from jsecon.language.votes import region_votes
 from jsecon.query.anchored import query_anchored
+from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.classes import query_classes
-from jsecon.query.direct import query_canonical, query_one_step
+from jsecon.query.match import PIECE_THRESHOLD
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import parts_instead, query_parts
-from jsecon.query.retrieval import PIECE_NEARNESS
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
 
@@ -151,7 +151,7 @@ def ask_field(
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases = jnp.asarray(field.canonical)
-    nearness = PIECE_NEARNESS if pieces else None
+    nearness = PIECE_THRESHOLD if pieces else None
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
@@ -168,7 +168,7 @@ def ask_field(
             code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
             found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
         elif way == "probability":
-            found = query_anchored(field, text, retrieval=retrieval, piece_nearness=nearness)
+            found = query_anchored(field, text, retrieval=retrieval, piece_threshold=nearness)
             probability = membership_probability(found.similarity, field.votes)
             inside = (found.region >= 0) & (probability >= (0.5 if threshold is None else threshold))
             found = dataclasses.replace(found, mask=inside)
@@ -176,7 +176,7 @@ def ask_field(
             found = by_lead(field, query_anchored(field, text, retrieval=retrieval), threshold=threshold)
         else:
             by = "votes" if way == "all_views" else way
-            options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_nearness": nearness}
+            options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_threshold": nearness}
             options["retrieval_threshold"] = retrieval_threshold
             found = query_anchored(field, text, by=by, **options)
             whole = dataclasses.replace(field, parts=parts_of(setting)) if instead else field

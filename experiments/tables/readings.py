@@ -17,12 +17,12 @@ from experiments.rivals.evidence import Evidence
 from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
 from jsecon.numerics import cosine_matrix, normalize
-from jsecon.query.direct import relevancies
-from jsecon.query.silhouette import OUTLINES, silhouette_members
+from jsecon.query.baselines import relevancies
+from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.types import Selection
 
 RULES = ("cosine", "relevancy", "contrast")
-CHOOSERS = {"threshold": None} | {name.replace("_", " "): weights for name, weights in OUTLINES.items()}
+CHOOSERS = {"threshold": None} | {name.replace("_", " "): weights for name, weights in SILHOUETTE_WEIGHTS.items()}
 """a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha"""
 SHARP = ", sharp"
 """behind a chooser: the ascent is given the similarities as sharp shares (`as_share`)"""
@@ -73,7 +73,7 @@ def chosen_by(setting: Setting, chooser: str, found: Selection, share: Float[np.
     weights = CHOOSERS[chooser.removesuffix(SHARP)]
     if weights is None:
         return found
-    mask = silhouette_members(setting.evidence.gaussians, setting.evidence.cameras, share, weights=weights)
+    mask = fit_silhouette(setting.evidence.gaussians, setting.evidence.cameras, share, weights=weights)
     return dataclasses.replace(found, mask=jnp.asarray(mask))
 
 

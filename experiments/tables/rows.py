@@ -25,9 +25,9 @@ from experiments.tables.methods import (
 from experiments.tables.ours import ask_field, field_of, paper_field
 from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_share, chosen_by, read, scores
 from experiments.tables.setting import Setting
-from jsecon.language.shares import SHARE_THRESHOLD
-from jsecon.query.neighbours import evened, nearest
+from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
 from jsecon.types import Selection
 
 NO_REFUSAL = -1.0
@@ -114,13 +114,13 @@ def own(
 
 def _evened(setting: Setting, answers: Answers, *, clean: bool) -> Answers:
     means = np.asarray(setting.evidence.gaussians.means)
-    near = jnp.asarray(setting.shared.get("neighbours", lambda: nearest(means)))
+    near = jnp.asarray(setting.shared.get("neighbours", lambda: nearest_neighbours(means)))
 
     def select(k: int) -> Selection | None:
         found = answers.select(k)
         if found is None:
             return None
-        share = evened(jnp.asarray(found.similarity, jnp.float32), near)
+        share = smooth_over_neighbours(jnp.asarray(found.similarity, jnp.float32), near)
         mask = np.asarray(share >= SHARE_THRESHOLD)
         mask = remove_outliers(means, mask) if clean else mask
         return dataclasses.replace(found, mask=jnp.asarray(mask), similarity=share)

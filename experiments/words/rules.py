@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from experiments.rivals.lifting import NEIGHBOURS
-from jsecon.language.shares import SHARE_THRESHOLD, share_of
-from jsecon.query.direct import TEMPERATURE
-from jsecon.query.retrieval import apart_from_scene
+from jsecon.language.membership import SHARE_THRESHOLD, share_of
+from jsecon.query.baselines import TEMPERATURE
+from jsecon.query.match import scene_residuals
 from jsecon.types import Votes
 
 SCORES = ("cosine", "relevancy", "contrast")
@@ -29,11 +29,11 @@ def scores(
 ) -> Float[np.ndarray, "q r"]:
     """Scores of all texts with all regions, by one of SCORES; -inf for a region without an embedding.
 
-    "relevancy" is LERF's; "contrast" is `jsecon.query.retrieval.contrasts` for all texts at once.
+    "relevancy" is LERF's; "contrast" is `jsecon.query.match.contrasts` for all texts at once.
     """
     known = np.asarray(embeddings).any(axis=1)
     if kind == "contrast":
-        apart = np.asarray(apart_from_scene(jnp.asarray(embeddings), jnp.asarray(pixels))[0])
+        apart = np.asarray(scene_residuals(jnp.asarray(embeddings), jnp.asarray(pixels))[0])
         cone = _units(_units(canonical).sum(axis=0)[None])
         table = _units(texts - texts @ cone.T * cone) @ _units(apart).T
     else:

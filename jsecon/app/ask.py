@@ -1,10 +1,10 @@
 """One question put to a field: a text, a pixel, or what somebody outlined. Its answer becomes files in app/outputs.
 
 Read on the way from a text to its .ply, without the ground; behind each file lies more of its own room, behind
-splat/transform and query/masks the engine, behind silhouettes query/silhouette:
+splat/transform and query/render the engine, behind silhouettes query/silhouette:
 
-    ask     app/ask, language/field, vision/colours, query/several, query/anchored, query/retrieval
-    clean   language/shares, query/outliers
+    ask     app/ask, language/field, vision/colours, query/several, query/anchored, query/match
+    clean   language/membership, query/outliers
     write   app/outputs, query/masks, splat/transform, data/gaussian_files
 """
 
@@ -23,25 +23,25 @@ from jaxtyping import Bool, Float, Int
 from jsecon.data.images import read_stored
 from jsecon.data.mask_files import resize_nearest
 from jsecon.errors import InputError, require
-from jsecon.language.field import field_of_rows
+from jsecon.language.field import subset_field
+from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.language.shares import SHARE_THRESHOLD
 from jsecon.process import MEMORY, memory_budget
-from jsecon.query.anchored import Found, found_of, found_region, members, query_region
-from jsecon.query.blocks import Chosen, chosen_in_blocks
-from jsecon.query.direct import query_canonical, query_one_step
-from jsecon.query.lift import box_mask, lift
-from jsecon.query.neighbours import evened, nearest
-from jsecon.query.outliers import clean
+from jsecon.query.anchored import RegionMatch, found_of, found_region, query_region, select_gaussians
+from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.query.blocks import SparseSelection, select_in_blocks
+from jsecon.query.match import PIECE_THRESHOLD, QUANTILE, Refusal, best_presence
+from jsecon.query.outliers import split_outliers
+from jsecon.query.outline import box_mask, lift
 from jsecon.query.parts import InParts, parts_instead, query_parts
 from jsecon.query.pixel import region_at
-from jsecon.query.retrieval import PIECE_NEARNESS, QUANTILE, Refusal, best_presence
 from jsecon.query.several import found_of_several, parts_of_question
-from jsecon.query.silhouette import OUTLINES, silhouette_members
+from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
+from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
 from jsecon.types import Array, LanguageField, Selection
 
-BY_VOTES = ("votes", *OUTLINES)
-"""anchored, membership by a Gaussian's votes; of OUTLINES then one by one by the outline that they make"""
+BY_VOTES = ("votes", *SILHOUETTE_WEIGHTS)
+"""anchored, membership by a Gaussian's votes; of SILHOUETTE_WEIGHTS then one by one by the outline that they make"""
 BY_CODES = ("one_step", "canonical")
 """every Gaussian's code against the text, without regions"""
 METHODS = (*BY_VOTES, "code", *BY_CODES)
@@ -104,12 +104,12 @@ def ask_text(
     outliers: bool = True,
     several: bool = False,
     near: Int[np.ndarray, "n k"] | None = None,
-    piece_nearness: float = PIECE_NEARNESS,
+    piece_threshold: float = PIECE_THRESHOLD,
     quantile: float = QUANTILE,
 ) -> Answer:
     """The Gaussians that a text names; with `several`, of all regions that answer it (`query_several` has the rule).
     With `near` (N, K), the `nearest` of each Gaussian, shares of votes are evened out over them before they are cut.
-    `piece_nearness`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`). `quantile`: a
+    `piece_threshold`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`). `quantile`: a
     text selects nothing unless it is more similar to the scene than this share of unrelated words (`query_anchored`).
 
     A text may be composite: `"red mug" or "bowl" but not "handle"`. Of a field with parts, those answer a plain text
@@ -120,12 +120,12 @@ def ask_text(
     wanted, unwanted = parts_of_question(text)
     if by in BY_CODES and not several and len(wanted + unwanted) == 1:
         return answer_of(field, text, by, _compared(field, embedder, wanted[0], by, threshold), outliers, {})
-    given: dict[str, Any] = {"piece_nearness": piece_nearness, "quantile": quantile}
+    given: dict[str, Any] = {"piece_threshold": piece_threshold, "quantile": quantile}
     asked = sought(field, embedder, text, by=by, several=several, **given)
     if (found := unheld(asked, by, threshold)) is not None:
         selection, asked, left = found.selection, asked._replace(there=found.there), UNHELD
     else:
-        selection, left = members(field, asked.found, threshold, by="code" if by == "code" else "votes"), {}
+        selection, left = select_gaussians(field, asked.found, threshold, by="code" if by == "code" else "votes"), {}
         if several and field.parts is not None:
             selection = query_parts(asked.field, selection, asked.wanted)
     selection = _shaped(field, selection, by, threshold, near)
@@ -140,7 +140,7 @@ class Sought(NamedTuple):
     """with canonical phrases."""
     wanted: Float[Array, "q e"]
     """embeddings of what is wanted."""
-    found: Found
+    found: RegionMatch
     keep: str
     """of the selection's clusters: "largest", or "all" where there may be several things."""
     there: float | None
@@ -168,7 +168,7 @@ def sought(
     *,
     by: str = "votes",
     several: bool = False,
-    piece_nearness: float = PIECE_NEARNESS,
+    piece_threshold: float = PIECE_THRESHOLD,
     quantile: float = QUANTILE,
 ) -> Sought:
     """The regions that a text names; options and errors as for `ask_text`."""
@@ -176,7 +176,7 @@ def sought(
     wanted, unwanted = parts_of_question(text)
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
     logits = getattr(embedder, "logits", None)
-    how: dict[str, Any] = {"piece_nearness": piece_nearness, "logits": logits, "quantile": quantile}
+    how: dict[str, Any] = {"piece_threshold": piece_threshold, "logits": logits, "quantile": quantile}
     keep = "largest"
     if several or unwanted or len(wanted) > 1:
         if by not in BY_VOTES:
@@ -272,7 +272,7 @@ def ask_outline(
 ) -> Answer:
     """The Gaussians of one thing, outlined in one frame or several: frame -> mask (H, W), or what `box_mask` made.
 
-    Raises InputError as `jsecon.query.lift.lift` does.
+    Raises InputError as `jsecon.query.outline.lift` does.
     """
     frames = [frame_index(field, frame) for frame in outlines]
     least = SHARE_THRESHOLD if threshold is None else threshold
@@ -284,19 +284,21 @@ def ask_outline(
 def _shaped(
     field: LanguageField, selection: Selection, by: str, threshold: float | None, near: np.ndarray | None
 ) -> Selection:
-    """As it is, or of OUTLINES what fits the shares best in the views; with `near` shares are evened out first, where
-    a view sees the Gaussian."""
+    """As it is, or by a silhouette what fits the shares best in the views; with `near` shares are evened out first,
+    where a view sees the Gaussian."""
     least = SHARE_THRESHOLD if threshold is None else threshold
     if near is not None and by in BY_VOTES:
-        share = evened(jnp.asarray(selection.similarity), jnp.asarray(near))
+        share = smooth_over_neighbours(jnp.asarray(selection.similarity), jnp.asarray(near))
         seen = jnp.asarray(field.votes.views) > 0
         share = jnp.where(seen, share, 0.0)
         inside = seen & (share >= least) & jnp.any(selection.mask)
         selection = dataclasses.replace(selection, mask=inside, similarity=share)
-    if by not in OUTLINES:
+    if by not in SILHOUETTE_WEIGHTS:
         return selection
     given = field.gaussians, field.cameras, selection.similarity
-    mask = silhouette_members(*given, threshold=least, weights=OUTLINES[by]) & (jnp.asarray(field.votes.views) > 0)
+    mask = fit_silhouette(*given, threshold=least, weights=SILHOUETTE_WEIGHTS[by]) & (
+        jnp.asarray(field.votes.views) > 0
+    )
     return dataclasses.replace(selection, mask=mask & jnp.any(selection.mask))
 
 
@@ -335,16 +337,16 @@ def answer_of(
     """A selection as the answer to a question, without outliers; `left`: what was not needed, and why; `key` as in
     `Answer`.
 
-    With keep="largest", clusters that the views' masks support as much as FAIR_SHARE of the largest stay too: a mask
-    may show one thing in several pieces.
+    With keep="largest", clusters that the views' masks support as much as MIN_CLUSTER_SUPPORT of the largest stay too:
+    a mask may show one thing in several pieces.
     """
     if not outliers:
         left = left | {"DBSCAN": "not asked for"}
         return Answer(question, by, selection, np.asarray(selection.mask), left, key=key)
     seen = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
     keep = "supported" if keep == "largest" else keep
-    found = clean(field.gaussians.means, np.asarray(selection.mask), keep=keep, weight=seen)
-    left = left | ({"DBSCAN": found.unneeded} if found.unneeded else {})
+    found = split_outliers(field.gaussians.means, np.asarray(selection.mask), keep=keep, weight=seen)
+    left = left | ({"DBSCAN": found.skipped} if found.skipped else {})
     clusters = found.clusters_kept, found.clusters_dropped
     return Answer(question, by, selection, found.mask, left, clusters=clusters, key=key)
 
@@ -372,7 +374,7 @@ def queries_of(
     """What the command line asks of a field, each to be called: texts, pixels (frame, column, row), outlines (frame,
     file, frame, file, ... of one thing), boxes (frame, left, upper, right, lower end)."""
     shape: dict[str, Any] = {"threshold": threshold, "outliers": outliers}
-    how = shape | {"by": by, "near": nearest(field.gaussians.means) if even else None}
+    how = shape | {"by": by, "near": nearest_neighbours(field.gaussians.means) if even else None}
     found: list[Callable[[], Answer]] = []
     text_how = how | {"several": several, "quantile": quantile}
     found += [functools.partial(ask_text, field, embedder, text, **text_how) for text in texts]
@@ -453,7 +455,7 @@ class _Asked(NamedTuple):
 
     name: str
     by: str
-    found: Found
+    found: RegionMatch
     text: Sought | None = None
 
 
@@ -482,23 +484,23 @@ def answer_in_blocks(
 
     asking = [functools.partial(of_text, text) for text in texts]
     asked, refused = answer_each(asking + [functools.partial(at_pixel, *pixel) for pixel in pixels])
-    chosen = chosen_in_blocks(field, [each.found for each in asked], threshold, by=by)
+    chosen = select_in_blocks(field, [each.found for each in asked], threshold, by=by)
     instead = [None if each.text is None else unheld(each.text, by, threshold) for each in asked]
     return [_answered(field, *each, several, outliers) for each in zip(asked, chosen, instead)], refused
 
 
 def _answered(
-    field: LanguageField, asked: _Asked, chosen: Chosen, instead: InParts | None, several: bool, outliers: bool
+    field: LanguageField, asked: _Asked, chosen: SparseSelection, instead: InParts | None, several: bool, outliers: bool
 ) -> Answer:
     if instead is not None:
         whole = jax.tree.map(np.asarray, instead.selection)
         rows = np.flatnonzero(whole.mask)
-        chosen = Chosen(rows, whole.similarity[rows], -1, float(whole.score))
+        chosen = SparseSelection(rows, whole.similarity[rows], -1, float(whole.score))
     count = len(chosen.gaussians)
     size = min(max(1 << max(count - 1, 0).bit_length(), _LEAST), field.gaussians.count)  # few sizes to compile for
     rows, similarity = np.zeros(size, np.int64), np.zeros(size, np.float32)
     rows[:count], similarity[:count] = chosen.gaussians, chosen.similarity
-    own, mask = field_of_rows(field, rows), np.arange(size) < count
+    own, mask = subset_field(field, rows), np.arange(size) < count
     told = asked.found.quantile if instead is None else instead.selection.quantile
     best = np.asarray(chosen.region, np.int32), np.asarray(chosen.score, np.float32)
     selection = Selection(mask, similarity, *best, np.asarray(told))

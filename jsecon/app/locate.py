@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.app.ask import Answer, ask_text
 from jsecon.errors import InputError
-from jsecon.language.shares import probability_inside
+from jsecon.language.membership import probability_inside
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import LanguageField
 

@@ -23,10 +23,10 @@ from jsecon.app.locate import digits, rounded, selected_centers
 from jsecon.app.viewer.static_page import NOWHERE, main_regions
 from jsecon.data.gaussian_files import save_gaussians
 from jsecon.files import atomic_write, write_text
-from jsecon.language.field import field_of_rows
-from jsecon.language.shares import probability_inside
+from jsecon.language.field import subset_field
+from jsecon.language.membership import probability_inside
 from jsecon.pipeline.progress import Listener
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Gaussians, LanguageField
 
@@ -62,7 +62,7 @@ def best_frames(field: LanguageField, answer: Answer, count: int) -> list[int]:
 
 def part_of(field: LanguageField, answer: Answer) -> LanguageField:
     """The field of the Gaussians that an answer speaks of: of all, but where `Answer.rows` names them."""
-    return field if answer.rows is None else field_of_rows(field, answer.rows)
+    return field if answer.rows is None else subset_field(field, answer.rows)
 
 
 def _figures(field: LanguageField, answer: Answer) -> dict[str, Any]:

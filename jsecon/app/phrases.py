@@ -14,11 +14,11 @@ import numpy as np
 from jsecon.app.ask import Answer, answer_of
 from jsecon.data.frames import Progress, spread
 from jsecon.errors import InputError
-from jsecon.language.shares import SHARE_THRESHOLD
+from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
 from jsecon.pipeline.sources import locate_sources
 from jsecon.query.anchored import query_region
-from jsecon.query.lift import lift
+from jsecon.query.outline import lift
 from jsecon.types import LanguageField
 
 Frames = Mapping[int, np.ndarray]

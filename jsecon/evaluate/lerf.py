@@ -17,7 +17,7 @@ import numpy as np
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
-from jsecon.query.masks import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
+from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.types import Camera, Gaussians, Selection
 
 LOCALISATION_WINDOW = 0.04

@@ -24,9 +24,9 @@ from jaxtyping import Float
 
 from jsecon.errors import InputError, require, require_shape
 from jsecon.files import atomic_write, map_npy, write_npy
-from jsecon.language.distill import LEAST_LABELLED, distill_votes
+from jsecon.language.distill import MIN_LABELLED, distill_votes
+from jsecon.language.membership import views_that_show, vote_blocks
 from jsecon.language.records import append, summed_columns
-from jsecon.language.shares import views_that_show, vote_blocks
 from jsecon.language.votes import at_centre, distinct_labels
 from jsecon.numerics import FULL_PRECISION, NEAR, require_labels
 from jsecon.splat.banded import listed, still_open
@@ -122,11 +122,11 @@ def codes_in_blocks(
     path: str | os.PathLike,
     reduce: str = "mode",
     *,
-    least_labelled: float = LEAST_LABELLED,
+    min_labelled: float = MIN_LABELLED,
 ) -> Float[np.ndarray, "n d"]:
     """`distill_votes` of mapped votes, block by block: the codes (N, d) as a memory map of the .npy `path`."""
     shape = (votes.regions.shape[0], region_codes.shape[1])
-    blocks = (distill_votes(own, region_codes, reduce, least_labelled=least_labelled) for own in vote_blocks(votes))
+    blocks = (distill_votes(own, region_codes, reduce, min_labelled=min_labelled) for own in vote_blocks(votes))
     with atomic_write(path) as temporary:
         write_npy(temporary, shape, np.float32, map(np.asarray, blocks))
     return map_npy(Path(path))

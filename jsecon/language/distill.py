@@ -30,7 +30,7 @@ _ROWS = 8192
 """Gaussians reduced at a time: (rows, K, d) is the largest array of a reduction, 134 MB at K = 8, d = 512"""
 _TIE = 1e-5
 """relative weight below which two halves of a median count as equal: float32 sums of K weights are no surer"""
-LEAST_LABELLED = 0.5
+MIN_LABELLED = 0.5
 """share of a Gaussian's weight: below, what no region holds has the majority. With masks of a few objects and nothing
 else, the walls around them would otherwise carry the objects' codes (demo, one-step mIoU 0.24)"""
 
@@ -40,7 +40,7 @@ def distill_votes(
     region_codes: Float[Array, "r d"],
     reduce: str = "mode",
     *,
-    least_labelled: float | Float[Array, ""] = LEAST_LABELLED,
+    min_labelled: float | Float[Array, ""] = MIN_LABELLED,
 ) -> Float[Array, "n d"]:
     """Unit codes (N, d) of the Gaussians from their strongest votes and the (R, d) codes of the regions.
 
@@ -49,7 +49,7 @@ def distill_votes(
     alone, and where a whole interval does takes what is closest to the mode; "mode", the code of the strongest region.
     Unknown, a zero code, are Gaussians without votes, with votes that are not finite, those of which at least half of
     the votes' weight is for regions that have no code themselves (zero rows), and those of which less than
-    `least_labelled` of all weight lies on labelled pixels (0 keeps them). Raises ValueError on shapes that disagree.
+    `min_labelled` of all weight lies on labelled pixels (0 keeps them). Raises ValueError on shapes that disagree.
     """
     require_one_of("reduce", reduce, _REDUCTIONS, "'mode' is the default.")
     expected = votes.num_regions, "d"
@@ -57,7 +57,7 @@ def distill_votes(
     if votes.num_regions == 0 or votes.regions.shape[1] == 0:
         return jnp.zeros((votes.regions.shape[0], region_codes.shape[1]), region_codes.dtype)
     codes = _distill_votes(votes.regions, votes.weights, jnp.asarray(region_codes), reduce)
-    return jnp.where((votes.labelled >= least_labelled * votes.total)[:, None], codes, 0.0)
+    return jnp.where((votes.labelled >= min_labelled * votes.total)[:, None], codes, 0.0)
 
 
 @functools.partial(jax.jit, static_argnames="reduce")
@@ -104,7 +104,7 @@ _REDUCTIONS = {"mean": _mean, "median": _median, "mode": _mode}
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Descent:
+class DistillState:
     """Where `distill_l1` stands: what a checkpoint holds."""
 
     features: Array
@@ -153,14 +153,16 @@ def distill_l1(
     """
     given = gaussians, cameras, labels, region_codes
     require_labels(labels, len(region_codes))
-    start = descent(*given, steps=steps, key=key, init=init)
+    start = start_distillation(*given, steps=steps, key=key, init=init)
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
     if plans is None and capacity is None and not is_traced((gaussians, cameras)):
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
-        state = descend(state, *given, until=stop, learning_rate=learning_rate, capacity=capacity, plans=plans)
+        state = continue_distillation(
+            state, *given, until=stop, learning_rate=learning_rate, capacity=capacity, plans=plans
+        )
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
@@ -176,7 +178,7 @@ def distill_l1(
     return codes, state.history
 
 
-def descent(
+def start_distillation(
     gaussians: Gaussians,
     cameras: Camera,
     labels: Int[Array, "t h w"],
@@ -185,7 +187,7 @@ def descent(
     steps: int,
     key: Key,
     init: str | Float[Array, "n d"] = "zero",
-) -> Descent:
+) -> DistillState:
     """The state before the first step of `distill_l1`; see there for the arguments."""
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
     expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
@@ -204,11 +206,13 @@ def descent(
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    return Descent(features, _optimizer(0.0).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
+    return DistillState(
+        features, _optimizer(0.0).init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32)
+    )
 
 
-def descend(
-    state: Descent,
+def continue_distillation(
+    state: DistillState,
     gaussians: Gaussians,
     cameras: Camera,
     labels: Int[Array, "t h w"],
@@ -218,7 +222,7 @@ def descend(
     capacity: int | None = None,
     learning_rate: float = 0.0025,
     plans: ViewPlan | None = None,
-) -> Descent:
+) -> DistillState:
     """Takes `state` on to `until` steps. In stretches or at once, with one compilation and one result.
 
     `plans` are those of `splat.plan.plan_views`; without them each step plans its view.
@@ -233,7 +237,7 @@ def _optimizer(learning_rate: Any) -> optax.GradientTransformation:
 
 
 @functools.partial(jax.jit, static_argnames="capacity")
-def _descend(state, gaussians, cameras, labels, region_codes, plans, until, learning_rate, capacity) -> Descent:
+def _descend(state, gaussians, cameras, labels, region_codes, plans, until, learning_rate, capacity) -> DistillState:
     optimizer = _optimizer(learning_rate)
     codes = normalize(region_codes)
     known = jnp.any(codes != 0, axis=-1)
@@ -255,6 +259,6 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, lear
         updates, moments = optimizer.update(gradient, state.moments)
         features: Any = optax.apply_updates(state.features, updates)
         history = state.history.at[index].set(jnp.where(overflow > 0, jnp.nan, value))
-        return Descent(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
+        return DistillState(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
 
     return jax.lax.fori_loop(state.step, until, step, state)

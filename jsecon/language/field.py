@@ -33,7 +33,7 @@ from jsecon.files import (
 )
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
-from jsecon.language.shares import votes_of_rows
+from jsecon.language.membership import votes_of_rows
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
@@ -110,7 +110,7 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
     return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
 
 
-def field_of_rows(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
+def subset_field(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
     """The field of some of its Gaussians (M,), their columns NumPy's; of mapped ones no others are read."""
     take = lambda a: np.asarray(a)[rows]
     parts = None if field.parts is None else dataclasses.replace(field.parts, part=take(field.parts.part))

@@ -14,7 +14,7 @@ from jsecon.parallel import map_over_processes
 from jsecon.types import Array, Parts, Regions
 
 ALIKE_THRESHOLD = 0.9
-"""on the cosine of what sets two regions apart from the scene (`apart_from_mean`): above it they are one thing seen
+"""on the cosine of what sets two regions apart from the scene (`mean_residuals`): above it they are one thing seen
 twice, such as a track that broke. Over all pairs of simulated CLIP (medium and high noise, errors that views share) and
 of colours, all that it joins are one object. On real words (ConSE, replica_apartment_0) it joins 0.008 of the pairs, of
 which 0.36 are of one class, where a cosine of 0.95 of the embeddings themselves joins 0.027, of which 0.25 are"""
@@ -48,7 +48,7 @@ def region_embeddings(
     return pooled(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
 
 
-def given_embeddings(
+def embeddings_of_masks(
     labels: Int[np.ndarray, "t h w"], masks: Int[np.ndarray, "_ _ _"], embeddings: Float[np.ndarray, "m e"], **how: Any
 ) -> Regions:
     """Embeddings of the regions of a labelled sequence, from those that masks of its frames have already.
@@ -105,7 +105,7 @@ def pooled(
     return Regions(embeddings=unit.astype(np.float32), pixels=pixels)
 
 
-def apart_from_mean(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
+def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
     """What sets each of R regions apart from the others (R, E), and which regions have an embedding (R,); 0 elsewhere.
 
         e_r - n / (n + 1) mean_q e_q

@@ -127,7 +127,7 @@ def _regions_at_once(count: int, regions: int) -> int:
     return max(1, min(max(regions, 1), _DENSE_BYTES // max(4 * count, 1)))
 
 
-def bytes_of_votes(count: int, views: int, regions: int) -> int:
+def votes_memory(count: int, views: int, regions: int) -> int:
     """What `region_votes` with `by_view` takes in memory beside what it is given, about: the views' totals, a copy of
     the Gaussians with one band of colour, and the dense block of each lane that is worked on and of their sum."""
     dense = 4 * count * _regions_at_once(count, regions)

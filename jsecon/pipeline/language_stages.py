@@ -35,7 +35,7 @@ def regions(work: RunContext) -> Stage:
 
     def read(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.data.langsplat_files import load_features
-        from jsecon.language.regions import given_embeddings
+        from jsecon.language.regions import embeddings_of_masks
 
         capture, labels = results["load"], results["masklets"]
         assert options.features is not None
@@ -46,7 +46,9 @@ def regions(work: RunContext) -> Stage:
             there = f"no mask of level {options.level} in any frame"
             remedy = "Take another --level, or write the files again."
             raise InputError(options.features, there, "masks with their embeddings", remedy)
-        found = given_embeddings(labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress)
+        found = embeddings_of_masks(
+            labels, given.labels, given.embeddings, weighting=options.weighting, progress=progress
+        )
         bare = int((~found.embeddings.any(1)).sum())
         notes = (f"{len(given.embeddings)} embeddings in the files",)
         return StageResult(found, notes=(*notes, f"{bare} regions lie on no mask with one") if bare else notes)
@@ -146,13 +148,13 @@ def votes(work: RunContext) -> Stage:
 
     def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
         from jsecon.language.blocks import region_votes_in_blocks
-        from jsecon.language.votes import bytes_of_votes, region_votes
+        from jsecon.language.votes import region_votes, votes_memory
         from jsecon.process import memory_budget
 
         capture, scene, labels = results["load"], results["gaussians"], results["masklets"]
         cameras = capture.cameras[training_frames(capture)]
         count, how, notes = int(labels.max()) + 1, work.key_options("top", "centre"), ()
-        needed, room = bytes_of_votes(scene.count, len(labels), count), memory_budget()
+        needed, room = votes_memory(scene.count, len(labels), count), memory_budget()
         if needed > room and jax.process_count() == 1:  # several processes cast them together, each its own views
             shutil.rmtree(record.folder, ignore_errors=True)  # what a stopped run left
             how |= {"folder": record.folder}
@@ -195,7 +197,7 @@ def distil(work: RunContext) -> Stage:
 
 def field_of(results: Results, embedder: Any, provenance: str) -> LanguageField:
     """The field: everything that a query needs. It knows all views; in those held out, no region has any pixels."""
-    from jsecon.language.shares import finish_votes
+    from jsecon.language.membership import finish_votes
     from jsecon.vision.reference_words import reference_of
 
     capture, found = results["load"], results["regions"]

@@ -19,7 +19,7 @@ its own room, behind splat/render the engine:
     codes       language/codes
     votes       language/votes, splat/plan, splat/render
     distil      language/distill
-    field       language/shares, language/field, vision/reference_words
+    field       language/membership, language/field, vision/reference_words
 """
 
 import dataclasses

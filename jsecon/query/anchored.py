@@ -14,11 +14,10 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require_one_of, require_shape
 from jsecon.language.codes import CODE_THRESHOLD
+from jsecon.language.membership import SHARE_THRESHOLD, share_of, vote_blocks
 from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.language.shares import SHARE_THRESHOLD, share_of, vote_blocks
-from jsecon.query.direct import Number, UnitCodes, as_codes, similarities
-from jsecon.query.retrieval import (
-    PIECE_NEARNESS,
+from jsecon.query.match import (
+    PIECE_THRESHOLD,
     QUANTILE,
     RETRIEVALS,
     Refusal,
@@ -30,13 +29,14 @@ from jsecon.query.retrieval import (
     unrelated_similarities,
     words_of,
 )
+from jsecon.query.similarity import Number, UnitCodes, as_codes, similarities
 from jsecon.types import Array, LanguageField, Selection
 from jsecon.vision.protocols import Logits
 
 THRESHOLDS = {"votes": SHARE_THRESHOLD, "code": CODE_THRESHOLD}
 
 
-class Found(NamedTuple):
+class RegionMatch(NamedTuple):
     """What a question found among R regions."""
 
     chosen: Bool[Array, " r"]
@@ -49,7 +49,7 @@ class Found(NamedTuple):
     """share of unrelated words that are less similar to their best region; NaN where there are no such words."""
 
 
-NOTHING = Found(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
+NOTHING = RegionMatch(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
 """of a field without regions"""
 
 
@@ -63,7 +63,7 @@ def query_anchored(
     by: str = "votes",
     retrieval: str = RETRIEVALS[0],
     alike_threshold: Number | None = ALIKE_THRESHOLD,
-    piece_nearness: Number | None = PIECE_NEARNESS,
+    piece_threshold: Number | None = PIECE_THRESHOLD,
     codes: UnitCodes | None = None,
     logits: Logits | None = None,
 ) -> Selection:
@@ -81,7 +81,7 @@ def query_anchored(
     cosine, 0.01 for a probability. Membership, `by`:
     "votes": the share of the region and of those that are the same thing as the text sees it, an estimate of the
         probability that a pixel of the Gaussian belongs to them (`share_of`); default threshold 0.5. The same thing
-        are regions alike, by `alike_threshold`, and pieces, by `piece_nearness` where the votes know which regions
+        are regions alike, by `alike_threshold`, and pieces, by `piece_threshold` where the votes know which regions
         overlap (`regions_of_text` has the rule); None for none.
     "code": cosine of the Gaussian's code with the region's (the paper); default threshold 0.9. It joins no regions, as
         those that are alike have codes that are. `codes`, the result of `unit_codes(field.codes)`, spares many queries
@@ -92,10 +92,10 @@ def query_anchored(
     """
     require_one_of("query_anchored", by, THRESHOLDS, "'votes' is the default.")
     require_retrieval("query_anchored", retrieval)
-    how = {"alike_threshold": alike_threshold, "piece_nearness": piece_nearness, "logits": logits}
+    how = {"alike_threshold": alike_threshold, "piece_threshold": piece_threshold, "logits": logits}
     how |= {"quantile": quantile, "retrieval_threshold": retrieval_threshold}
     found = found_of(field, text_embedding, retrieval=retrieval, **how)
-    return members(field, found, similarity_threshold, by=by, codes=codes)
+    return select_gaussians(field, found, similarity_threshold, by=by, codes=codes)
 
 
 def found_of(
@@ -106,9 +106,9 @@ def found_of(
     retrieval_threshold: Number | None = None,
     retrieval: str = RETRIEVALS[0],
     alike_threshold: Number | None = ALIKE_THRESHOLD,
-    piece_nearness: Number | None = PIECE_NEARNESS,
+    piece_threshold: Number | None = PIECE_THRESHOLD,
     logits: Logits | None = None,
-) -> Found:
+) -> RegionMatch:
     """The regions of a field that answer a text's embedding (E,), by the rules of `query_anchored`, whose errors it
     raises."""
     size = field.regions.embeddings.shape[1]
@@ -120,7 +120,7 @@ def found_of(
     given = field.regions.embeddings, text_embedding, field.canonical, field.regions.pixels, field.votes.overlap
     refusal = Refusal(retrieval_threshold, quantile, logits)
     words, retrieval = words_of(field, retrieval)
-    return _retrieve(*jax.tree.map(jnp.asarray, given), words, refusal, alike_threshold, piece_nearness, retrieval)
+    return _retrieve(*jax.tree.map(jnp.asarray, given), words, refusal, alike_threshold, piece_threshold, retrieval)
 
 
 def query_region(
@@ -130,7 +130,7 @@ def query_region(
     similarity_threshold: Number | None = None,
     by: str = "votes",
     alike_threshold: Number | None = None,
-    piece_nearness: Number | None = None,
+    piece_threshold: Number | None = None,
 ) -> Selection:
     """The Gaussians of region `region`, as found by `region_at`: `query_anchored` without the text; score 1.
 
@@ -140,8 +140,8 @@ def query_region(
     Nothing for region -1 (or any other id that the field does not have): Selection.region is then -1 and its score 0.
     """
     require_one_of("query_region", by, THRESHOLDS, "'votes' is the default.")
-    found = found_region(field, region, alike_threshold=alike_threshold, piece_nearness=piece_nearness)
-    return members(field, found, similarity_threshold, by=by)
+    found = found_region(field, region, alike_threshold=alike_threshold, piece_threshold=piece_threshold)
+    return select_gaussians(field, found, similarity_threshold, by=by)
 
 
 def found_region(
@@ -149,24 +149,29 @@ def found_region(
     region: int | Int[Array, ""],
     *,
     alike_threshold: Number | None = None,
-    piece_nearness: Number | None = None,
-) -> Found:
+    piece_threshold: Number | None = None,
+) -> RegionMatch:
     """Region `region` and what is joined to it, by the rules of `query_region`."""
     if field.regions.count == 0:
         return NOTHING
     known = jnp.asarray(field.regions.embeddings), field.votes.overlap
-    return _found_region(*known, jnp.asarray(region), alike_threshold, piece_nearness)
+    return _found_region(*known, jnp.asarray(region), alike_threshold, piece_threshold)
 
 
-def members(
-    field: LanguageField, found: Found, threshold: Number | None, *, by: str = "votes", codes: UnitCodes | None = None
+def select_gaussians(
+    field: LanguageField,
+    found: RegionMatch,
+    threshold: Number | None,
+    *,
+    by: str = "votes",
+    codes: UnitCodes | None = None,
 ) -> Selection:
     """The Gaussians of the regions found: "votes", of all that were chosen, or "code", of the best of them."""
     if field.regions.count == 0:
         return _nothing(field)
     threshold = THRESHOLDS[by] if threshold is None else threshold
     if isinstance(field.votes.regions, np.memmap) and codes is None:
-        parts = [jax.tree.map(np.asarray, part) for part in members_by_block(field, [found], threshold, by=by)]
+        parts = [jax.tree.map(np.asarray, part) for part in select_by_block(field, [found], threshold, by=by)]
         mask, similarity = (np.concatenate([getattr(p[0], name) for p in parts]) for name in ("mask", "similarity"))
         return Selection(mask, similarity, found.region.astype(jnp.int32), found.score, jnp.asarray(found.quantile))
     if by == "votes":
@@ -175,8 +180,8 @@ def members(
     return _by_code(as_codes(field.codes if codes is None else codes), table, seen, found, threshold)
 
 
-def members_by_block(
-    field: LanguageField, several: Sequence[Found], threshold: Number | None, *, by: str = "votes"
+def select_by_block(
+    field: LanguageField, several: Sequence[RegionMatch], threshold: Number | None, *, by: str = "votes"
 ) -> Iterator[list[Selection]]:
     """`members` of one question after the other, for each block of Gaussians: the columns are read once."""
     threshold = THRESHOLDS[by] if threshold is None else threshold
@@ -197,16 +202,18 @@ def _nothing(field: LanguageField) -> Selection:
     return Selection(jnp.zeros(count, bool), jnp.zeros(count, dtype), jnp.asarray(-1, jnp.int32), jnp.zeros((), dtype))
 
 
-# Apart from the members, so that fields of any number of Gaussians share the one, and a text and a pixel the other.
-def _retrieve_body(embeddings, text, canonical, pixels, overlap, words, refusal, alike, nearness, retrieval) -> Found:
+# Apart from the choice of Gaussians, so that fields of any size share the one, and a text and a pixel the other.
+def _retrieve_body(
+    embeddings, text, canonical, pixels, overlap, words, refusal, alike, nearness, retrieval
+) -> RegionMatch:
     similar = None if words is None else unrelated_similarities(embeddings, words, canonical, pixels, retrieval)
     found = measured(embeddings, text, canonical, pixels, words, similar, refusal, retrieval)
     rule = {"standing": found.standing, "accepted": found.accepted}
-    rule |= {"alike_threshold": alike, "piece_nearness": nearness}
+    rule |= {"alike_threshold": alike, "piece_threshold": nearness}
     chosen = regions_of_text(embeddings, found.similarity, found.known, overlap, several=False, **rule)
     best, known = found.anchor, found.known[found.anchor]
     score, quantile = jnp.where(known, found.similarity[best], 0.0), jnp.where(known, found.quantile, jnp.nan)
-    return Found(chosen, jnp.where(chosen[best], best, -1), score, quantile)
+    return RegionMatch(chosen, jnp.where(chosen[best], best, -1), score, quantile)
 
 
 _retrieve = jax.jit(_retrieve_body, static_argnames="retrieval")
@@ -215,7 +222,7 @@ _retrieve = jax.jit(_retrieve_body, static_argnames="retrieval")
 @jax.jit
 def _found_region(
     embeddings: Array, overlap: Array | None, region: Array, alike_threshold: Number | None, nearness: Number | None
-) -> Found:
+) -> RegionMatch:
     valid = (region >= 0) & (region < embeddings.shape[0])
     chosen = jnp.arange(embeddings.shape[0]) == region
     if nearness is not None and overlap is not None:
@@ -223,18 +230,18 @@ def _found_region(
         chosen |= is_piece(cosines, known, chosen, overlap, nearness=nearness)
     if alike_threshold is not None:
         chosen |= is_alike(embeddings, jnp.maximum(region, 0), alike_threshold)
-    return Found(chosen & valid, jnp.where(valid, region, -1), valid.astype(embeddings.dtype))
+    return RegionMatch(chosen & valid, jnp.where(valid, region, -1), valid.astype(embeddings.dtype))
 
 
 @jax.jit
-def _by_share(votes, found: Found, threshold: Number) -> Selection:
+def _by_share(votes, found: RegionMatch, threshold: Number) -> Selection:
     share, known = share_of(votes, found.chosen)
     mask = known & (share >= threshold) & (found.region >= 0)
     return Selection(mask, share, found.region.astype(jnp.int32), found.score, found.quantile)
 
 
 @jax.jit
-def _by_code(codes, region_codes, seen, found: Found, threshold: Number) -> Selection:
+def _by_code(codes, region_codes, seen, found: RegionMatch, threshold: Number) -> Selection:
     similarity, known = similarities(codes, region_codes[jnp.maximum(found.region, 0)])
     known &= seen & (found.region >= 0)
     mask = known & (similarity >= threshold)

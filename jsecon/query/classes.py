@@ -8,22 +8,22 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from jsecon.errors import require
-from jsecon.language.shares import SHARE_THRESHOLD, ratio, share_of, vote_columns
+from jsecon.language.membership import SHARE_THRESHOLD, ratio, share_of, vote_columns
 from jsecon.numerics import safe_norm
-from jsecon.query.direct import Number
-from jsecon.query.retrieval import (
+from jsecon.query.match import (
     QUANTILE,
     RETRIEVALS,
     Refusal,
     answers,
-    apart_from_scene,
     evidence,
     fixed_threshold,
     presence,
     require_retrieval,
+    scene_residuals,
     unrelated_similarities,
     words_of,
 )
+from jsecon.query.similarity import Number
 from jsecon.types import Array, LanguageField
 from jsecon.vision.protocols import Logits
 
@@ -44,8 +44,8 @@ def query_classes(
         sum_r p_nr l_r s_rq / sum_r p_nr l_r
 
     with s the similarities of regions and texts, `retrieval` as in `query_anchored`, p_nr the region's share of the
-    Gaussian (`jsecon.language.shares`), and l_r the length of what sets the region apart from the scene
-    (`apart_from_scene`) for "contrast", 1 for the others. With `standardise` s are in standard deviations of each
+    Gaussian (`jsecon.language.membership`), and l_r the length of what sets the region apart from the scene
+    (`scene_residuals`) for "contrast", 1 for the others. With `standardise` s are in standard deviations of each
     text's similarities from their mean over the regions, weighted by `evidence`: some texts are more similar to all
     regions than others are to their own. A region is of the class of its best text, and of none, such as the wall
     behind, where fewer than `quantile` of the unrelated words are less similar to the region than that text; those are
@@ -83,7 +83,7 @@ def _classes_body(embeddings, texts, canonical, pixels, votes, words, refusal, r
     table = _standardised(plain, known, pixels) if standardise else plain
     clear = jnp.ones(len(embeddings), table.dtype)
     if retrieval == "contrast":
-        clear = safe_norm(apart_from_scene(embeddings, pixels)[0])
+        clear = safe_norm(scene_residuals(embeddings, pixels)[0])
     of_asked = jnp.where(asked, table, -jnp.inf)
     best = jnp.argmax(of_asked, axis=1)
     of_best = lambda table: jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]

@@ -20,7 +20,7 @@ EPS_SPACINGS = 6.0
 the gaps that weakly textured parts leave between splats, far below the distance between objects"""
 MIN_SAMPLES = 10
 """neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings"""
-FAIR_SHARE = 0.1
+MIN_CLUSTER_SUPPORT = 0.1
 """of the weight of the heaviest cluster: a cluster with so much of it is a piece of the thing, not an outlier"""
 KEEP = ("largest", "supported", "all")
 """which clusters stay: the one with most Gaussians (the paper), those that the views support, or every one"""
@@ -33,22 +33,22 @@ _REMEMBERED = 256
 """selections, of a byte a selected Gaussian: texts in other words often select the same"""
 
 
-class Cleaned(NamedTuple):
+class OutlierResult(NamedTuple):
     """A selection without its outliers, and what became of its clusters."""
 
     mask: Bool[np.ndarray, " n"]
     """the Gaussians that stay."""
-    unneeded: str
+    skipped: str
     """why DBSCAN was not needed; "" where it was."""
     clusters_kept: int
     clusters_dropped: int
 
 
 class _Kept(NamedTuple):
-    """`Cleaned` of M selected points."""
+    """`OutlierResult` of M selected points."""
 
     inside: Bool[np.ndarray, " m"]
-    unneeded: str
+    skipped: str
     kept: int
     dropped: int
 
@@ -78,8 +78,8 @@ def remove_outliers(
       eps: Radius, world units; None takes `default_eps` of the selection, which follows its scale.
       min_samples: Points within eps, itself included, that make a core point.
       keep: "largest" keeps the cluster with most Gaussians (the paper). "supported" keeps each cluster that has at
-        least FAIR_SHARE of the weight of the heaviest: a mask may show one thing in several pieces. "all" keeps every
-        cluster.
+        least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask may show one thing in several pieces. "all"
+        keeps every cluster.
       weight: With keep="supported", how much the views' masks show of each Gaussian, such as share * votes.total, in
         pixels; None counts each as 1.
 
@@ -89,10 +89,10 @@ def remove_outliers(
     Raises:
       ValueError: An option is out of range.
     """
-    return clean(means, mask, eps=eps, min_samples=min_samples, keep=keep, weight=weight).mask
+    return split_outliers(means, mask, eps=eps, min_samples=min_samples, keep=keep, weight=weight).mask
 
 
-def clean(
+def split_outliers(
     means: Float[Array, "n 3"],
     mask: Bool[Array, " n"],
     *,
@@ -100,7 +100,7 @@ def clean(
     min_samples: int = MIN_SAMPLES,
     keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
-) -> Cleaned:
+) -> OutlierResult:
     """`remove_outliers`, with how many clusters it kept and dropped."""
     require_one_of("remove_outliers", keep, KEEP, "Use 'all' to keep several objects.")
     positive, found = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
@@ -115,7 +115,7 @@ def clean(
     mask[chosen[~finite]] = False
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < min_samples:
-        return Cleaned(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
+        return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
     own = np.ones(len(chosen)) if weight is None or keep != "supported" else np.asarray(weight, np.float64)[chosen]
     key = hashlib.blake2b(f"{eps} {min_samples} {keep}".encode() + points.tobytes() + own.tobytes()).digest()
     if key not in _known:
@@ -123,9 +123,9 @@ def clean(
         if len(_known) >= _REMEMBERED:
             _known.clear()
         _known[key] = found
-    inside, unneeded, kept, dropped = _known[key]
+    inside, skipped, kept, dropped = _known[key]
     mask[chosen[~inside]] = False
-    return Cleaned(mask, unneeded, kept, dropped)
+    return OutlierResult(mask, skipped, kept, dropped)
 
 
 def _kept_of(points: np.ndarray, eps: float, min_samples: int, keep: str, weight: np.ndarray) -> _Kept:
@@ -142,7 +142,7 @@ def _kept_of(points: np.ndarray, eps: float, min_samples: int, keep: str, weight
         stays = np.arange(len(sizes)) == sizes.argmax()
     elif keep == "supported":
         support = np.bincount(labels[clustered], np.nan_to_num(weight[clustered], posinf=0.0))
-        stays = support >= FAIR_SHARE * support.max()
+        stays = support >= MIN_CLUSTER_SUPPORT * support.max()
     else:
         stays = np.ones(len(sizes), bool)
     return _Kept(clustered & stays[labels], "", int(stays.sum()), int((~stays).sum()))

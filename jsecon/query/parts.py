@@ -17,13 +17,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.language.shares import SHARE_THRESHOLD
+from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.numerics import normalize
-from jsecon.query.direct import Number
-from jsecon.query.outliers import MIN_SAMPLES, dbscan, default_eps
-from jsecon.query.retrieval import (
-    NEARNESS,
-    PIECE_NEARNESS,
+from jsecon.query.match import (
+    KIND_THRESHOLD,
+    PIECE_THRESHOLD,
     QUANTILE,
     Refusal,
     contrasts,
@@ -33,6 +31,8 @@ from jsecon.query.retrieval import (
     unrelated_similarities,
     words_of,
 )
+from jsecon.query.outliers import MIN_SAMPLES, dbscan, default_eps
+from jsecon.query.similarity import Number
 from jsecon.types import Array, LanguageField, Parts, Selection
 from jsecon.vision.protocols import Logits
 
@@ -156,8 +156,8 @@ def answering_parts(
     nearness: Float[Array, " n"],
     means: Float[Array, "n 3"],
     *,
-    least: float = PIECE_NEARNESS,
-    of_kind: float = NEARNESS,
+    least: float = PIECE_THRESHOLD,
+    of_kind: float = KIND_THRESHOLD,
 ) -> Bool[np.ndarray, " n"]:
     """What of a selection `mask` answers the text by `part_nearness`, with two thresholds: the parts that are at least
     `least` near, in clusters (DBSCAN on the centres, `SPACINGS`) of which the upper quarter is at least `of_kind` near.

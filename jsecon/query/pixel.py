@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.language.shares import ROWS, vote_shares, votes_of_rows
+from jsecon.language.membership import ROWS, vote_shares, votes_of_rows
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.project import project
 from jsecon.types import Array, Camera, Gaussians, LanguageField

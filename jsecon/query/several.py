@@ -7,12 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jsecon.errors import InputError, require
-from jsecon.language.shares import SHARE_THRESHOLD
-from jsecon.query.anchored import NOTHING, Found, members
-from jsecon.query.direct import Number
-from jsecon.query.retrieval import (
-    NEARNESS,
-    PIECE_NEARNESS,
+from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.query.anchored import NOTHING, RegionMatch, select_gaussians
+from jsecon.query.match import (
+    KIND_THRESHOLD,
+    PIECE_THRESHOLD,
     QUANTILE,
     RETRIEVALS,
     Refusal,
@@ -22,6 +21,7 @@ from jsecon.query.retrieval import (
     unrelated_similarities,
     words_of,
 )
+from jsecon.query.similarity import Number
 from jsecon.types import Array, LanguageField, Selection
 from jsecon.vision.protocols import Logits
 
@@ -40,8 +40,8 @@ def query_several(
     unwanted: Float[Array, "u e"] | None = None,
     *,
     several: bool = True,
-    nearness: Number = NEARNESS,
-    piece_nearness: Number = PIECE_NEARNESS,
+    kind_threshold: Number = KIND_THRESHOLD,
+    piece_threshold: Number = PIECE_THRESHOLD,
     retrieval: str = RETRIEVALS[0],
     quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
@@ -57,10 +57,15 @@ def query_several(
     `similarity_threshold`. Selection.region is the best of the chosen, -1 where there is none; Selection.score its
     similarity. Pure: jit it or vmap it over texts. Raises ValueError on texts of another size.
     """
-    how = {"nearness": nearness, "piece_nearness": piece_nearness, "retrieval": retrieval, "logits": logits}
+    how = {
+        "kind_threshold": kind_threshold,
+        "piece_threshold": piece_threshold,
+        "retrieval": retrieval,
+        "logits": logits,
+    }
     how |= {"quantile": quantile, "retrieval_threshold": retrieval_threshold}
     found = found_of_several(field, wanted, unwanted, several=several, **how)
-    return members(field, found, similarity_threshold)
+    return select_gaussians(field, found, similarity_threshold)
 
 
 def found_of_several(
@@ -69,13 +74,13 @@ def found_of_several(
     unwanted: Float[Array, "u e"] | None = None,
     *,
     several: bool = True,
-    nearness: Number = NEARNESS,
-    piece_nearness: Number = PIECE_NEARNESS,
+    kind_threshold: Number = KIND_THRESHOLD,
+    piece_threshold: Number = PIECE_THRESHOLD,
     retrieval: str = RETRIEVALS[0],
     quantile: Number = QUANTILE,
     retrieval_threshold: Number | None = None,
     logits: Logits | None = None,
-) -> Found:
+) -> RegionMatch:
     """The regions of a field that answer any of the wanted texts and none of the unwanted, by the rules of
     `query_several`, whose errors it raises."""
     size = field.regions.embeddings.shape[1]
@@ -89,12 +94,12 @@ def found_of_several(
     known = field.regions.embeddings, field.canonical, field.regions.pixels, field.votes.overlap
     given = jax.tree.map(jnp.asarray, (*known, wanted, unwanted))
     refusal, (words, retrieval) = Refusal(retrieval_threshold, quantile, logits), words_of(field, retrieval)
-    return _retrieve(*given, words, refusal, nearness, piece_nearness, several, retrieval)
+    return _retrieve(*given, words, refusal, kind_threshold, piece_threshold, several, retrieval)
 
 
 def _retrieve_body(
-    embeddings, canonical, pixels, overlap, wanted, unwanted, words, refusal, nearness, pieces, several, retrieval
-) -> Found:
+    embeddings, canonical, pixels, overlap, wanted, unwanted, words, refusal, kind_threshold, pieces, several, retrieval
+) -> RegionMatch:
     count, dtype = embeddings.shape[0], embeddings.dtype
     similar = None if words is None else unrelated_similarities(embeddings, words, canonical, pixels, retrieval)
 
@@ -102,7 +107,7 @@ def _retrieve_body(
         chosen, closeness, quantile = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, dtype), jnp.asarray(jnp.nan)
         for text in texts:
             found = measured(embeddings, text, canonical, pixels, words, similar, refusal, retrieval)
-            rule = {"several": several, "nearness": nearness, "piece_nearness": pieces}
+            rule = {"several": several, "kind_threshold": kind_threshold, "piece_threshold": pieces}
             rule |= {"standing": found.standing, "accepted": found.accepted}
             own = regions_of_text(embeddings, found.similarity, found.known, overlap, **rule)
             chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, found.similarity, -jnp.inf))
@@ -113,7 +118,7 @@ def _retrieve_body(
     refused, against, _ = answering(unwanted)
     chosen &= ~(refused & (against >= closeness - ROUNDING))
     best, found = jnp.argmax(jnp.where(chosen, closeness, -jnp.inf)), jnp.any(chosen)
-    return Found(chosen, jnp.where(found, best, -1), jnp.where(found, closeness[best], 0.0), quantile)
+    return RegionMatch(chosen, jnp.where(found, best, -1), jnp.where(found, closeness[best], 0.0), quantile)
 
 
 _retrieve = jax.jit(_retrieve_body, static_argnames=("several", "retrieval"))

@@ -1,6 +1,6 @@
 """Which Gaussians to take so that, rendered alone, they cover what the views say is the thing, and nothing else.
 
-A Gaussian's share (`jsecon.language.shares`) says what it is part of; a silhouette is made by many. A splat that is
+A Gaussian's share (`jsecon.language.membership`) says what it is part of; a silhouette is made by many. A splat that is
 half the thing's is needed in a hole of it and spills at its rim: here each is taken or left by what the outline of the
 whole gains, in expectation, over the views.
 """
@@ -17,17 +17,17 @@ from jaxtyping import Bool, Float
 
 from jsecon.errors import require_shape
 from jsecon.fit.schedule import resize_cameras
-from jsecon.language.shares import SHARE_THRESHOLD
+from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.process import cores
-from jsecon.query.masks import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
+from jsecon.query.render import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import pixel_alphas, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
-OUTLINES = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}
+SILHOUETTE_WEIGHTS = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}
 """weights of the expected IoU at ALPHA_THRESHOLD, of what is opaque, and at VALA_THRESHOLD, of all that is there"""
-WEIGHTS = OUTLINES["silhouette"]
-LEAST_SHARE = 0.1
+WEIGHTS = SILHOUETTE_WEIGHTS["silhouette"]
+MIN_CANDIDATE_SHARE = 0.1
 """of a Gaussian that may be taken"""
 SWEEPS = 3
 VIEWS, LONG_SIDE = 12, 192
@@ -58,7 +58,7 @@ class Footprints(NamedTuple):
     """what Gaussians absorb that are taken for certain."""
 
 
-def silhouette_members(
+def fit_silhouette(
     gaussians: Gaussians,
     cameras: Camera,
     share: Float[Array, " n"],
@@ -74,15 +74,15 @@ def silhouette_members(
         mean_v (a E_v(0.7) + b E_v(10 / 255)),  E_v(t) = sum_p pi c / (sum_p pi + sum_p (1 - pi) c),  c = 1[alpha_S > t]
 
     with `weights` (a, b); (0, 1) is for who must not touch a thing, (1, 0) for its solid core. E is the expected IoU
-    but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > LEAST_SHARE are taken in or left
-    out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a batch of views of the
-    scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most, in float32. Host code around
+    but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > MIN_CANDIDATE_SHARE are taken or
+    left out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a batch of views of
+    the scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most, in float32. Host code around
     compiled parts; not differentiable. Raises ValueError on a share of another length.
     """
-    require_shape("silhouette_members", share, (gaussians.count,), "Give one share per Gaussian.")
+    require_shape("fit_silhouette", share, (gaussians.count,), "Give one share per Gaussian.")
     share = np.asarray(share, np.float32)
     chosen = share >= threshold
-    open_to = np.flatnonzero(share > LEAST_SHARE)
+    open_to = np.flatnonzero(share > MIN_CANDIDATE_SHARE)
     if not chosen.any() or not len(open_to):
         return jnp.asarray(chosen)
     open_to = open_to[np.argsort(np.abs(share[open_to] - threshold), kind="stable")[:MOST]]
@@ -194,7 +194,7 @@ def ascend(
     weights: Float[Array, " 2"] | tuple[float, float] = WEIGHTS,
 ) -> Bool[Array, " c"]:
     """Which of C Gaussians are taken after SWEEPS sweeps over the first `count` from `taken` (C,), see
-    `silhouette_members`. Pure."""
+    `fit_silhouette`. Pure."""
     found = jax.tree.map(jnp.asarray, found)
     levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], found.absorbed.dtype)
     worth = jnp.asarray(weights, levels.dtype)

@@ -13,7 +13,7 @@ from jsecon.vision.colours import ColourEmbedder
 
 @pytest.fixture
 def capture():
-    names = tuple(json.loads(bonsai_outlines.OUTLINES.read_text())["frames"])
+    names = tuple(json.loads(bonsai_outlines.SILHOUETTE_WEIGHTS.read_text())["frames"])
     count = len(names)
     poses, ones = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), np.ones(count, np.float32)
     return seen_by(Camera(poses, ones, ones, ones, ones, 400, 266), names)

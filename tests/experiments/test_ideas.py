@@ -19,8 +19,8 @@ from experiments.ideas.state import State, agree, point_miou
 from experiments.ideas.straddlers import across, split
 from experiments.simulated_vision.embeddings import made_text_space
 from experiments.simulated_vision.masks import SimulatedMasks
-from jsecon.query.masks import render_selection
-from jsecon.query.silhouette import LEAST_SHARE
+from jsecon.query.render import render_selection
+from jsecon.query.silhouette import MIN_CANDIDATE_SHARE
 from jsecon.types import Gaussians
 
 
@@ -244,7 +244,7 @@ def test_a_cover_grows_from_the_core_and_spills_little():
     share = np.clip(0.5 + (0.29 - away) / 0.1 + noise, 0, 1).astype(np.float32)
     found = np.asarray(core_and_cover(gaussians, cameras, share))
     assert found[share >= CORE].all()
-    assert not found[share <= LEAST_SHARE].any()
+    assert not found[share <= MIN_CANDIDATE_SHARE].any()
     assert found.sum() > (share >= CORE).sum()
     nobody = np.asarray(core_and_cover(gaussians, cameras, np.minimum(share, 0.5)))
     assert not nobody.any()  # no core to grow from

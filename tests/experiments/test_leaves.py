@@ -6,7 +6,7 @@ import numpy as np
 from balls import ring_of_balls
 
 from experiments.rivals.leaves import silhouette_overlaps
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.splat.plan import plan_view
 
 GROUPS, SLOTS = 8, 4

@@ -12,8 +12,8 @@ from experiments.words.absent import absent_names, halves
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse, cut_out
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError
-from jsecon.query.direct import relevancies
-from jsecon.query.retrieval import contrasts
+from jsecon.query.baselines import relevancies
+from jsecon.query.match import contrasts
 from jsecon.vision.protocols import CANONICAL, Embedder
 
 SIDE = 8

@@ -29,7 +29,7 @@ from experiments.tables.rows import TRAINED
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, linear, make_room
 from jsecon.errors import InputError
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 
 TABLE = 7
 """the label after four objects, wall, floor and ceiling"""

@@ -18,7 +18,7 @@ from jsecon.data.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import field_embedder
-from jsecon.query.masks import selection_mask
+from jsecon.query.render import selection_mask
 from jsecon.types import LanguageField
 
 KEPT = 64

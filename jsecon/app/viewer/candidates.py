@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.app.ask import with_phrases
 from jsecon.app.pictures import Renderer
 from jsecon.app.viewer.static_page import main_regions
-from jsecon.query.direct import similarities
-from jsecon.query.masks import HIDDEN_LOGIT
+from jsecon.query.match import RETRIEVALS, answers, evidence, scene_residuals, words_of
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
-from jsecon.query.retrieval import RETRIEVALS, answers, apart_from_scene, evidence, words_of
+from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.query.several import ROUNDING, parts_of_question
+from jsecon.query.similarity import similarities
 from jsecon.types import Camera, LanguageField
 
 SIDE = 1025
@@ -69,7 +69,7 @@ _answers, _evidence = jax.jit(answers, static_argnames="retrieval"), jax.jit(evi
 
 @jax.jit
 def _likeness(embeddings, pixels, region):
-    apart, known = apart_from_scene(embeddings, pixels)
+    apart, known = scene_residuals(embeddings, pixels)
     found, measured = similarities(apart, apart[region])
     return jnp.where(measured, found, 0.0), known & measured
 

@@ -14,8 +14,8 @@ from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import PAINTS, ViewState, tints
 from jsecon.errors import InputError
-from jsecon.language.shares import probability_inside
-from jsecon.query.retrieval import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, QUANTILE
+from jsecon.language.membership import probability_inside
+from jsecon.query.match import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, QUANTILE
 from jsecon.types import LanguageField
 
 THUMBNAIL = 88

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.app.ask import Answer
 from jsecon.files import write_text
-from jsecon.language.shares import SHARE_THRESHOLD, vote_blocks, vote_shares
+from jsecon.language.membership import SHARE_THRESHOLD, vote_blocks, vote_shares
 from jsecon.numerics import sigmoid
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField

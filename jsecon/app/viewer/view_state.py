@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError, describe_error
-from jsecon.language.shares import SHARE_THRESHOLD
-from jsecon.query.retrieval import PIECE_NEARNESS
+from jsecon.language.membership import SHARE_THRESHOLD
+from jsecon.query.match import PIECE_THRESHOLD
 
 Paint: TypeAlias = Literal["photo", "code", "region", "score"]
 PAINTS: tuple[Paint, ...] = get_args(Paint)
@@ -35,7 +35,7 @@ class Ask:
     """a text, or a region."""
     threshold: float = SHARE_THRESHOLD
     """least share of a Gaussian."""
-    whole: float = 1 - PIECE_NEARNESS
+    whole: float = 1 - PIECE_THRESHOLD
     """0: a part alone, the best region; 1: all that overlaps it and is nearer to what was asked than most."""
     every: bool = False
     """all regions that answer, not only the best."""

@@ -197,7 +197,7 @@ class Viewer:
         self.panel.link(view_state.link_of(view_state.moved(self.history.state, camera=self._camera)))
 
     def _answer(self, ask: Ask) -> Answer | InputError:
-        how: dict[str, Any] = {"several": ask.every, "piece_nearness": 1 - ask.whole}
+        how: dict[str, Any] = {"several": ask.every, "piece_threshold": 1 - ask.whole}
         try:
             if isinstance(ask.thing, str):
                 return ask_text(self.field, self.embedder, ask.thing, threshold=ask.threshold, **how)

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.errors import require_one_of
-from jsecon.language.regions import ALIKE_THRESHOLD, apart_from_mean
+from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import cosine_matrix, normalize
-from jsecon.query.direct import Number, similarities
+from jsecon.query.similarity import Number, similarities
 from jsecon.types import Array, LanguageField, Regions
 from jsecon.vision.protocols import Logits
 
@@ -45,18 +45,18 @@ PRESENCE_THRESHOLD = 0.01
 the odds of the training, one true pair in a batch of 32,768 (SigLIP, arXiv 2303.15343): there 0.01 says that the pair
 is 300 times likelier true than at random. Half would refuse what is there: the example of
 google/siglip2-base-patch16-224 gives its true text 0.106. Not measured here: no trained weights could be had."""
-NEARNESS = 0.75
+KIND_THRESHOLD = 0.75
 """all of a kind: how far a region's similarity has come from that of the middle region to that of the best"""
-PIECE_NEARNESS = 0.5
+PIECE_THRESHOLD = 0.5
 """a piece: nearer to the best than to the middle region"""
 LOOKS, LOOK_PX = 2.0, 400.0
 """of a region, see `evidence`; a crop of 20 x 20 pixels shows an image encoder little"""
-PIECE_OVERLAP = 0.1
+MIN_PIECE_OVERLAP = 0.1
 """the least soft IoU of two regions' Gaussians where the two are pieces of one thing. In twins of two scenes (simulated
 vision, little to much noise) 106 of the 115 pieces that are near enough reach it, and 4 of 58 other regions"""
 
 
-def apart_from_scene(
+def scene_residuals(
     embeddings: Float[Array, "r e"], pixels: Shaped[Array, "r t"]
 ) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
     """What sets each of R regions apart from the scene (R, E), and which regions have an embedding (R,); 0 elsewhere.
@@ -77,7 +77,7 @@ def apart_from_scene(
     return jnp.where(known[:, None], units - count / (count + 1) * mean, 0.0), known
 
 
-def across_phrases(texts: Float[Array, "*batch e"], canonical: Float[Array, "c e"]) -> Float[Array, "*batch e"]:
+def phrase_residuals(texts: Float[Array, "*batch e"], canonical: Float[Array, "c e"]) -> Float[Array, "*batch e"]:
     """What sets unit texts (..., E) apart from the canonical phrases (C, E): t - (t . c) c, c the direction of their
     mean; 0 for a text along it."""
     phrases = normalize(canonical)
@@ -101,13 +101,13 @@ def contrasts(
 
         cos(e_r - n / (n + 1) sum_q p_q e_q / sum_q p_q,  t - (t . c) c)
 
-    with the first as in `apart_from_scene`, t the unit text and c the direction of the mean canonical phrase (C, E),
+    with the first as in `scene_residuals`, t the unit text and c the direction of the mean canonical phrase (C, E),
     each of unit length; phrases that are zero or not finite are left out, and without any c is zero. Removing what two
     sets of embeddings have in common before they are compared is an old remedy for hubs and for the modality gap;
     experiments/retrieval.py measures it here against the cosine and LERF's relevancy. A text along c is like no region.
     """
-    apart, known = apart_from_scene(embeddings, pixels)
-    found, measured = similarities(apart, across_phrases(text, canonical))
+    apart, known = scene_residuals(embeddings, pixels)
+    found, measured = similarities(apart, phrase_residuals(text, canonical))
     known &= measured
     return jnp.where(known, found, 0.0), known
 
@@ -120,7 +120,7 @@ def direction(
     if retrieval == "apart":
         assert words is not None
         return normalize(text) - jnp.mean(normalize(words.astype(text.dtype)), axis=0)
-    return across_phrases(text, canonical) if retrieval == "contrast" else normalize(text)
+    return phrase_residuals(text, canonical) if retrieval == "contrast" else normalize(text)
 
 
 def unrelated_similarities(
@@ -133,7 +133,7 @@ def unrelated_similarities(
     """The similarity of each of W unrelated words with each region (W, R), as `answers` has that of a text; NaN where
     it means nothing."""
     words = words.astype(embeddings.dtype)
-    rows = apart_from_scene(embeddings, pixels)[0] if retrieval == "contrast" else embeddings
+    rows = scene_residuals(embeddings, pixels)[0] if retrieval == "contrast" else embeddings
     words = direction(words, canonical, words, retrieval)
     # As one product of matrices: W queries of their own would walk all regions W times.
     known = jnp.any(words != 0, axis=1)[:, None] & jnp.any(rows != 0, axis=1)
@@ -286,9 +286,9 @@ def regions_of_text(
     overlap: Float[Array, "r r"] | None = None,
     *,
     several: bool = True,
-    nearness: Number = NEARNESS,
+    kind_threshold: Number = KIND_THRESHOLD,
     alike_threshold: Number | None = ALIKE_THRESHOLD,
-    piece_nearness: Number | None = PIECE_NEARNESS,
+    piece_threshold: Number | None = PIECE_THRESHOLD,
     standing: Float[Array, " r"] | None = None,
     accepted: Bool[Array, ""] | bool = True,
 ) -> Bool[Array, " r"]:
@@ -297,20 +297,20 @@ def regions_of_text(
     a is the region with the largest s_r, times `standing` (R,) where that is given (`evidence`). None where the text is
     not `accepted` (`measured`). Else a and every r with one of, b the region with the largest s_r itself,
 
-        s_r >= m + nearness (s_b - m)              with `several`: of the same kind (`is_near`)
-        s_r >= m + piece_nearness (s_b - m), o_rc >= PIECE_OVERLAP     with c = a or of its kind: a piece (`is_piece`)
+        s_r >= m + kind_threshold (s_b - m)        with `several`: of the same kind (`is_near`)
+        s_r >= m + piece_threshold (s_b - m), o_rc >= MIN_PIECE_OVERLAP     c = a or of its kind: a piece (`is_piece`)
         cos(d_r, d_a) >= alike_threshold           the same thing seen twice (`is_alike`)
 
     with m the median of the known s, o the soft IoU of two regions' Gaussians, `overlap` (R, R), and d what sets an
-    embedding (R, E) apart from the others. No pieces where `overlap` or `piece_nearness` is None, none alike where
+    embedding (R, E) apart from the others. No pieces where `overlap` or `piece_threshold` is None, none alike where
     `alike_threshold` is.
     """
     anchor = anchor_of(similarity, known, standing)
     chosen = jnp.arange(embeddings.shape[0]) == anchor
     if several:
-        chosen |= is_near(similarity, known, nearness)
-    if overlap is not None and piece_nearness is not None:
-        chosen |= is_piece(similarity, known, chosen, overlap, nearness=piece_nearness)
+        chosen |= is_near(similarity, known, kind_threshold)
+    if overlap is not None and piece_threshold is not None:
+        chosen |= is_piece(similarity, known, chosen, overlap, nearness=piece_threshold)
     if alike_threshold is not None:
         chosen |= is_alike(embeddings, anchor, alike_threshold)
     return chosen & known & accepted
@@ -327,9 +327,9 @@ def anchor_of(
 def is_alike(
     embeddings: Float[Array, "r e"], region: Int[Array, ""], threshold: Number = ALIKE_THRESHOLD
 ) -> Bool[Array, " r"]:
-    """Which of R regions differ from the others as `region` does: what sets both apart (`apart_from_mean`) has a cosine
+    """Which of R regions differ from the others as `region` does: what sets both apart (`mean_residuals`) has a cosine
     of at least `threshold`."""
-    apart, known = apart_from_mean(embeddings)
+    apart, known = mean_residuals(embeddings)
     cosines, measured = similarities(apart, apart[region])
     return known & measured & (cosines >= threshold)
 
@@ -348,8 +348,8 @@ def is_piece(
     chosen: Bool[Array, " r"],
     overlap: Float[Array, "r r"],
     *,
-    nearness: Number = PIECE_NEARNESS,
-    least: Number = PIECE_OVERLAP,
+    nearness: Number = PIECE_THRESHOLD,
+    least: Number = MIN_PIECE_OVERLAP,
 ) -> Bool[Array, " r"]:
     """Which of R regions are pieces of the things that the `chosen` regions (R,) are of, as a text sees them: near to
     it (`is_near`), and o_rc >= `least` for some chosen c, o the overlap (R, R) of `with_overlap`. A second thing of the

@@ -16,7 +16,7 @@ from jsecon.types import Array
 NEIGHBOURS = 10
 
 
-def nearest(means: Float[Array, "n 3"], *, count: int = NEIGHBOURS) -> Int[np.ndarray, "n k"]:
+def nearest_neighbours(means: Float[Array, "n 3"], *, count: int = NEIGHBOURS) -> Int[np.ndarray, "n k"]:
     """(N, K) int32 the `count` Gaussians whose centres (N, 3) are nearest to each, itself left out; K = N - 1 where
     there are fewer. Centres that are not finite are nobody's neighbours, and have themselves as theirs. Host code."""
     require(count >= 1, "nearest", count, "at least 1", "10 is the default.")
@@ -34,6 +34,6 @@ def nearest(means: Float[Array, "n 3"], *, count: int = NEIGHBOURS) -> Int[np.nd
 
 
 @jax.jit
-def evened(similarity: Float[Array, " n"], near: Int[Array, "n k"]) -> Float[Array, " n"]:
+def smooth_over_neighbours(similarity: Float[Array, " n"], near: Int[Array, "n k"]) -> Float[Array, " n"]:
     """(N,) the mean of each Gaussian's similarity and its neighbours' mean, `near` (N, K) as of `nearest`. Pure."""
     return 0.5 * (similarity + jnp.mean(similarity[near], axis=1))

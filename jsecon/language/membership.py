@@ -23,7 +23,7 @@ from jax.scipy.special import betainc
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.language.regions import ALIKE_THRESHOLD, apart_from_mean
+from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, cosine_matrix
 from jsecon.types import Array, Regions, Votes
 
@@ -91,7 +91,7 @@ def with_shown(votes: Votes, regions: Regions, *, alike_threshold: float = ALIKE
 
 def views_that_show(regions: Regions, *, alike_threshold: float = ALIKE_THRESHOLD) -> Bool[Array, "r t"]:
     """(R, T) which views show a region, or one alike to it."""
-    apart, known = apart_from_mean(jnp.asarray(regions.embeddings))
+    apart, known = mean_residuals(jnp.asarray(regions.embeddings))
     alike = cosine_matrix(apart, apart) >= alike_threshold
     alike = (alike & known[:, None] & known[None]) | jnp.eye(regions.count, dtype=bool)
     return (alike.astype(jnp.float32) @ (jnp.asarray(regions.pixels) > 0).astype(jnp.float32)) > 0

@@ -1,5 +1,4 @@
-"""Queries that compare Gaussians with the text itself: one-step, by the cosine of codes (the paper's baseline), and
-canonical, by LERF's relevancy, the text's softmax share against each of a few canonical phrases."""
+"""Cosines of rows with one vector, as every query needs them: of Gaussians' codes or of regions' embeddings. Pure."""
 
 import dataclasses
 import functools
@@ -8,15 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from jsecon.errors import require, require_shape
 from jsecon.numerics import FULL_PRECISION, normalize, safe_scale
-from jsecon.types import Array, Leaf, Selection
+from jsecon.types import Array, Leaf
 
 NARROW = 32
 """codes of at most so many numbers are compared column by column"""
-TEMPERATURE = 10.0
-"""LERF's and LangSplat's factor on the cosines; not CLIP's own 100"""
-
 Number = float | int | Array
 """a threshold: a Python number, or () under a trace"""
 
@@ -50,57 +45,6 @@ def unit_codes(codes: Float[Array, "n d"]) -> UnitCodes:
     units = normalize(codes)
     known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
     return UnitCodes(jnp.where(known[:, None], units, 0.0), known)
-
-
-def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
-    """The Gaussians whose code has a cosine of at least `threshold` with the text's code.
-
-    codes (N, d), text_code (d,), any length. A zero code (unknown) or one that is not finite has similarity 0 and is
-    never selected; nothing is for a text code that is zero or not finite. `unit_codes(codes)` in place of the codes,
-    made once, spares many queries the lengths. Selection.score is the best similarity, 0 where nothing is known. Raises
-    ValueError on shapes that disagree.
-    """
-    require_shape("query_one_step", text_code, (codes.shape[1],), "Encode the text with the field's coder.")
-    return _one_step(as_codes(codes), jnp.asarray(text_code), threshold)
-
-
-@jax.jit
-def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> Selection:
-    return _selection(*similarities(codes, text_code), threshold)
-
-
-def query_canonical(
-    features: Codes, text: Float[Array, " d_text"], canonical: Float[Array, "c d_canonical"], threshold: Number
-) -> Selection:
-    """The Gaussians whose relevancy to the text is at least `threshold`.
-
-    features (N, d), text (d,) and canonical phrases (C, d), C >= 1, in one space: embeddings, or codes of the same
-    coder. Relevancy is the least, over the phrases c, of softmax(10 [cos(f, text), cos(f, c)])[0] (Kerr et al. 2023,
-    LERF), in (0, 1); above 0.5 the text is closer than every phrase. Unknown features (zero, or not
-    finite) have relevancy 0 and are never selected. Phrases that are zero or not finite make every relevancy unknown.
-    Raises ValueError on shapes that disagree.
-    """
-    size = features.shape[1]
-    fit = text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1
-    found, expected = f"text {text.shape}, canonical {canonical.shape}", f"({size},) and (C >= 1, {size})"
-    require(fit, "query_canonical", found, expected, "Embed or encode text and canonical phrases as the features are.")
-    return _canonical(as_codes(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
-
-
-@jax.jit
-def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number) -> Selection:
-    return _selection(*relevancies(features, text, canonical), threshold)
-
-
-def relevancies(features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
-    """LERF's relevancy (N,), and where it means something (N,); 0 elsewhere."""
-    positive, known = similarities(features, text)
-    # One phrase at a time: the sums stay multiply-and-sum, and no (N, C) array of products is made.
-    negative, known_too = jax.lax.map(lambda phrase: similarities(features, phrase), canonical)
-    known = known & jnp.all(known_too, axis=0)
-    # The softmax of two is a sigmoid of their difference, and its least is against the closest phrase.
-    share = jax.nn.sigmoid(TEMPERATURE * (positive - jnp.max(negative, axis=0)))
-    return jnp.where(known, share, 0.0), known
 
 
 def as_codes(codes: Array | UnitCodes) -> Array | UnitCodes:
@@ -147,10 +91,3 @@ def _by_row(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
     largest = jnp.max(jnp.abs(codes), axis=-1, initial=0.0)
     scaled = codes * jnp.where(jnp.isfinite(largest), safe_scale(largest), 0.0)[:, None]
     return largest, jnp.sum(scaled * unit[None], axis=-1), jnp.sum(scaled * scaled, axis=-1)
-
-
-def _selection(similarity: Array, known: Array, threshold: Number) -> Selection:
-    """Those known whose similarity is at least the threshold; the score is the best of all, 0 where none is known."""
-    mask, nothing = known & (similarity >= threshold), jnp.asarray(-1, jnp.int32)
-    best = jnp.where(jnp.any(known), jnp.max(jnp.where(known, similarity, -jnp.inf), initial=-jnp.inf), 0.0)
-    return Selection(mask, similarity, nothing, best)

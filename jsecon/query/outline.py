@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jsecon.errors import InputError, require
-from jsecon.language.shares import SHARE_THRESHOLD, share_of, vote_shares
+from jsecon.language.membership import SHARE_THRESHOLD, share_of, vote_shares
 from jsecon.language.votes import region_votes
 from jsecon.types import LanguageField, Selection
 
