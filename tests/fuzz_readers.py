@@ -1,4 +1,4 @@
-"""Every reader, with small files of the true format and what a result must be like: for tests/fuzz.py."""
+"""Every reader, with small files of the true format and what a result must be like: for test_fuzz.py."""
 
 import dataclasses
 import json

@@ -1,91 +1,80 @@
-"""The fuzz harness tells what is wrong, and finds nothing wrong in any reader for as long as CI may take."""
+"""Every reader on damaged files: it refuses each with an InputError, or returns a whole result.
 
+Longer, with other seeds:
+
+    FUZZ_MUTATIONS=10000 FUZZ_SEED=1 pytest -m long tests/test_fuzz.py
+"""
+
+import os
 import re
-import subprocess
-import sys
+import time
+import warnings
+import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fuzz_readers import READERS
+from mutations import damaged
 
-ROOT = Path(__file__).resolve().parent.parent
-pytestmark = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="counts memory as Linux tells it")
-
-ILL = """
-import os, sys, time, warnings
-from pathlib import Path
-sys.path[:0] = ["tests"]
-import numpy as np
-from tests import fuzz
 from jsecon.errors import InputError
 
-fuzz.SECONDS, fuzz.SILENCE = 0.2, 5.0
-
-def ill(act):
-    def cases(folder):
-        (folder / "a.bin").write_bytes(bytes(range(256)))
-
-        class Case:
-            files = [folder / "a.bin"]
-            def read(self):
-                return (folder / "a.bin").read_bytes() == bytes(range(256)) or act()
-            def whole(self, found):
-                assert found, "damage that was read"
-        yield Case()
-    return cases
-
-def refuse():
-    raise InputError("a.bin", "damage", "none", "Write it again.")
-
-def work():
-    until = time.process_time() + 0.3
-    while time.process_time() < until:
-        pass
-    refuse()
-
-readers = {
-    "fine": refuse,
-    "crash": lambda: os.kill(os.getpid(), 11),
-    "hang": lambda: time.sleep(60),
-    "slow": work,
-    "large": lambda: np.zeros(1 << 40, np.uint8),
-    "resident": lambda: (np.ones((3 << 29,), np.uint8), refuse()),
-    "warning": lambda: (warnings.warn("of mine"), refuse()),
-    "stderr": lambda: (os.write(2, b"libpng"), refuse()),
-    "value": lambda: int("x"),
-    "silent": lambda: False,
-    "copied": lambda: (_ for _ in ()).throw(InputError("a.bin", "x", "y" * 9000, "z")),
-}
-sys.exit(fuzz.fuzzed({name: ill(act) for name, act in readers.items()}, fuzz.parsed(["--mutations", "1"])))
-"""
-FOUND = {
-    "crash": "crash (signal 11)",
-    "hang": "no end",
-    "slow": "too long",
-    "large": "memory",
-    "resident": "memory",
-    "warning": "a warning",
-    "stderr": "said to stderr",
-    "value": "another exception",
-    "silent": "not whole",
-    "copied": "an unreadable message",
-}
+resource = pytest.importorskip("resource")
+SEED = int(os.environ.get("FUZZ_SEED", 0))
+MUTATIONS = int(os.environ.get("FUZZ_MUTATIONS", 200))
+SECONDS = 5.0
+"""CPU time that a reader may take for one file"""
+TIMES, MORE = 10, 1 << 30
+"""memory that a reader may take: a multiple of the file's size, plus bytes"""
+LONGEST_MESSAGE = 2500
+HIDDEN = ResourceWarning, DeprecationWarning, PendingDeprecationWarning, ImportWarning
 
 
-def test_each_kind_of_ill_is_told():
-    done = subprocess.run([sys.executable, "-c", ILL], capture_output=True, text=True, cwd=ROOT)
-    told = dict(re.findall(r"^(\w+): 1 mutations: 1 (.*?);", done.stdout, re.MULTILINE))
-    assert told == FOUND | {"fine": "refused"}, done.stdout + done.stderr
-    assert done.returncode == 0, "fuzzed says that not all was fine, which is 0 to exit"
+def virtual_bytes() -> int:
+    """Address space of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.parametrize(
-    "length", [("--mutations", "20"), pytest.param(("--seconds", "5", "--seed", "1"), marks=pytest.mark.long)]
-)
-def test_every_reader_stands_damage(length):
-    """Longer, and by other seeds: python -m tests.fuzz."""
-    done = subprocess.run([sys.executable, "-m", "tests.fuzz", *length], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stdout + done.stderr
-    counts = re.findall(r"^\w+: (\d+) mutations", done.stdout, re.MULTILINE)
-    assert len(counts) == len(READERS)
-    assert min(map(int, counts)) >= 20, done.stdout
+def read_and_check(case, size, capfd):
+    """Reads the files of a case within the limits of time and memory, without a warning or a line on stderr."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (virtual_bytes() + TIMES * size + MORE, hard))
+    began = time.process_time()
+    try:
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            for category in HIDDEN:
+                warnings.simplefilter("ignore", category)
+            case.whole(case.read())
+    except InputError as error:
+        text = str(error)
+        assert len(text) <= LONGEST_MESSAGE
+        assert not re.search("nsufficient memory|bad.alloc|MemoryError|nable to allocate", text), text
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert time.process_time() - began <= SECONDS
+    assert not warned, warned[0]
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the address space from /proc")
+@pytest.mark.parametrize("mutations", [4, pytest.param(MUTATIONS, marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files_are_refused_or_read_whole(name, mutations, tmp_path, capfd):
+    cases = list(READERS[name](tmp_path))
+    capfd.readouterr()
+    for case in cases:
+        read_and_check(case, MORE, capfd)
+    for number in range(mutations):
+        rng = np.random.default_rng([SEED, zlib.crc32(name.encode()), number])
+        case = cases[int(rng.integers(len(cases)))]
+        file = case.files[int(rng.integers(len(case.files)))]
+        intact = file.read_bytes()
+        way, data = damaged(rng, intact, file.suffix)
+        file.write_bytes(data)
+        try:
+            read_and_check(case, len(data), capfd)
+        except BaseException as error:
+            error.add_note(f"mutation {number} of seed {SEED}: {way} of {file.parent.name}/{file.name}")
+            raise
+        file.write_bytes(intact)

@@ -1,59 +1,100 @@
-"""A few of the runs that tests/kills.py stops, and that it tells what is wrong."""
+"""Runs that are stopped by SIGKILL or by a full disk end in the same field when the same command is started again.
 
+KILLS=30 DISKS=10 pytest -m long tests/test_kills.py
+"""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
-import kills
+import numpy as np
 import pytest
 
+pytestmark = pytest.mark.long
+HOME = Path(__file__).resolve().parent.parent
+KILLS, DISKS = int(os.environ.get("KILLS", 2)), int(os.environ.get("DISKS", 1))
+FREQUENT = """
+from jsecon.process import prepare_process
+prepare_process()
+from jsecon.__main__ import main
+from jsecon.pipeline import stages
+stages.CHECKPOINT_SECONDS = 0.5
+raise SystemExit(main())
+"""
+"""`jsecon` with frequent checkpoints"""
+LARGE_DISK = 64 << 20
+"""bytes that suffice for a run"""
 
-@pytest.mark.long
-def test_two_runs_killed_and_one_on_a_full_disk_end_in_the_same_field(room, tmp_path):
-    """Thirty and ten: python -m tests.kills."""
-    given = {"kills": 2, "cold": 0, "steps": 50, "seed": 1}
+
+def start(room, out, programs, kill_at=None):
+    """(exit code or None if killed, stderr without progress) of `jsecon run`, killed `kill_at` seconds after start."""
+    command = [sys.executable, "-c", FREQUENT, "run", str(room), "--out", str(out), "--steps", "50"]
+    environ = {**os.environ, "PYTHONPATH": str(HOME), "XDG_CACHE_HOME": str(programs)}
+    environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=environ, start_new_session=True, **pipes) as run:
+        try:
+            _, error = run.communicate(timeout=kill_at)
+            code = run.returncode
+        except subprocess.TimeoutExpired:
+            os.killpg(run.pid, signal.SIGKILL)
+            _, error = run.communicate()
+            code = None
+    return code, "\n".join(line for line in error.splitlines() if not line.startswith("  ")).strip()
+
+
+def check_resumed(room, out, programs, expected):
+    assert start(room, out, programs) == (0, "")
+    assert (out / "field.safetensors").read_bytes() == expected
+    assert not list(out.rglob("*.checkpoint*"))
+
+
+@pytest.fixture(scope="module")
+def straight(room, tmp_path_factory):
+    """(bytes of the field of a run that nothing stops, its seconds, the bytes of its folder, compiled programs)."""
+    base = tmp_path_factory.mktemp("straight")
+    assert start(room, base / "warm", base / "programs") == (0, "")
+    began = time.monotonic()
+    assert start(room, base / "out", base / "programs") == (0, "")
+    seconds = time.monotonic() - began
+    size = sum(-(-path.stat().st_size // 4096) * 4096 for path in (base / "out").rglob("*") if path.is_file())
+    return (base / "out" / "field.safetensors").read_bytes(), seconds, size, base / "programs"
+
+
+@pytest.mark.parametrize("number", range(KILLS))
+def test_a_killed_run_resumes_to_the_same_field(room, straight, tmp_path, number):
+    expected, seconds, _, programs = straight
+    moments = np.random.default_rng(number)
+    if cold := number % 10 == 1:  # killed while jax writes its compiled programs, too
+        programs = tmp_path / "programs"
+    code = 0
+    while code is not None:
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        code, _ = start(room, tmp_path / "out", programs, kill_at=moments.uniform(0, (1 + cold) * seconds))
+    check_resumed(room, tmp_path / "out", programs, expected)
+
+
+def mount(folder, options):
+    return subprocess.run(["mount", "-o", options, "-t", "tmpfs", "tmpfs", str(folder)], capture_output=True).returncode
+
+
+@pytest.mark.parametrize("number", range(DISKS))
+def test_a_run_on_a_full_disk_resumes_once_there_is_room(room, straight, tmp_path, number):
+    expected, _, size, programs = straight
+    size = int(np.random.default_rng(number).uniform(0, size)) // 4096 * 4096 + 4096
+    if mount(tmp_path, f"size={size}"):
+        pytest.skip("no disk can be mounted here")
     try:
-        found = list(kills.trials(room, tmp_path, disks=1, **given))
-    except kills.NoDisk as error:
-        pytest.skip(f"no disk can be mounted here: {error}")
-    assert [trial.how.split()[0].rstrip(",") for trial in found] == ["straight", "straight", "kill", "kill", "disk"]
-    assert [str(trial) for trial in found if trial.wrong] == []
-
-
-@pytest.mark.parametrize(
-    ("ends", "told"),
-    [
-        ("import sys; print('x', file=sys.stderr)", "then said: x"),
-        ("raise SystemExit(3)", "then exit code 3"),
-        ("open(out / 'field.safetensors', 'wb').write(b'other')", "ANOTHER FIELD"),
-        ("open(out / 'a.checkpoint.safetensors', 'wb')", "left ['a.checkpoint.safetensors']"),
-        ("pass", ""),
-    ],
-)
-def test_each_kind_of_ill_is_told(tmp_path, monkeypatch, ends, told):
-    """Of what goes on in place of a run."""
-    program = "import sys, pathlib; out = pathlib.Path(sys.argv[4]); "
-    program += f"open(out / 'field.safetensors', 'wb').write(b'same'); {ends}"
-    monkeypatch.setattr(kills, "OFTEN", program)
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "field.safetensors").write_bytes(b"same")
-    place = kills.Place(out, tmp_path, often=True)
-    wrong, _ = kills._went_on(tmp_path, place, 1, kills._digest(out))
-    assert wrong.startswith(told)
-    assert bool(wrong) == bool(told)
-
-
-def test_a_process_and_its_children_are_killed_at_the_moment_asked_for(tmp_path, monkeypatch):
-    program = (
-        "import subprocess, sys, time; child = subprocess.Popen(['sleep', '99']);"
-        "print('  load             done      0.1 s', flush=True);"
-        "print(child.pid, file=sys.stderr, flush=True); time.sleep(99)"
-    )
-    monkeypatch.setattr(kills, "OFTEN", program)
-    stopped = kills.ended(tmp_path, kills.Place(tmp_path, tmp_path, often=True), 1, kill_at=1.5)
-    assert (stopped.code, stopped.stage) == (None, "load")
-    assert 1.5 <= stopped.seconds < 30
-    until, state = time.monotonic() + 20, Path(f"/proc/{int(stopped.said)}/stat")
-    while state.exists() and state.read_text().split()[2] != "Z":
-        assert time.monotonic() < until, "a child that lives on"
-        time.sleep(0.05)
+        code, error = start(room, tmp_path / "out", programs)
+        assert code == 2
+        assert re.fullmatch("jsecon: .*No space left.*", error)
+        assert not list((tmp_path / "out").rglob("*.partial*"))
+        assert mount(tmp_path, f"remount,size={LARGE_DISK}") == 0
+        check_resumed(room, tmp_path / "out", programs, expected)
+    finally:
+        subprocess.run(["umount", "-l", str(tmp_path)], check=True)
