@@ -36,22 +36,13 @@ def capture(room, tmp_path):
 def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
     _, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
-    code = _run(
-        "run",
-        room,
-        "--out",
-        tmp_path / "out",
-        "--masks",
-        room / "masks",
-        "--holdout",
-        4,
-        "--steps",
-        150,
-        "--sh-degree",
-        2,
-    )
+    options = "--masks", room / "masks", "--holdout", 4, "--steps", 150, "--sh-degree", 2
+    line = "run", room, "--out", tmp_path / "out", *options
+    assert _run(*line, "--dry-run") == 0
+    plan = capsys.readouterr().out.partition("Nothing was written.")[0].splitlines()[1:]
+    assert _run(*line) == 0
     told = capsys.readouterr().out
-    assert code == 0
+    assert told.splitlines()[1 : len(plan) + 1] == plan
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["regions"] >= 10
     assert metrics["held_out_psnr"] > 10

@@ -33,18 +33,6 @@ def test_a_dry_run_lists_every_stage_and_writes_nothing(room, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dry_run_prints_the_lines_that_the_run_begins_with(room, room_run, tmp_path, capsys):
-    shutil.copytree(room_run[1] / "cache", tmp_path / "out" / "cache")
-    line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", "--holdout", 4, "--steps", 150]
-    for more in (["--dry-run"], []):
-        assert cli.main([*map(str, line), *more]) == 0
-    told = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    end = told.index("Nothing was written.")
-    assert told[1:end] == told[end + 2 :][: end - 1]
-    assert any("cached" in line for line in told[:end])
-    assert any("skipped" in line for line in told[:end])
-
-
 def test_bad_options_are_refused_as_in_a_run(room, tmp_path, capsys):
     line = ["run", str(room), "--out", str(tmp_path / "out"), "--steps", "0", "--dry-run", "--json"]
     assert cli.main(line) == 2

@@ -146,6 +146,7 @@ def table(place, processes):
     return told.stdout.splitlines()
 
 
+@pytest.mark.long
 def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
     file = tmp_path / "cells.jsonl"
     lines = table(tmp_path, 2)
@@ -167,6 +168,7 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
     assert read_cells(file).keys() == {*found, "of another table"}
 
 
+@pytest.mark.long
 def test_a_helper_goes_on_where_another_process_is_at_a_setting(tmp_path):
     (tmp_path / "other.here").touch()
     with alone(tmp_path / "a-1-medium.lock", wait=False) as free:  # longer than the helper lives

@@ -36,6 +36,7 @@ def test_the_solver_is_below_the_votes_it_starts_from(task):
     assert rows["votes, mode"]["anchored"] > 0.4
 
 
+@pytest.mark.long
 def test_a_stopped_descent_ends_as_a_whole_one(task, tmp_path, monkeypatch):
     monkeypatch.setattr(paths, "RESTS", 3)
     way = {"steps": 8, "looks": (0.5, 1.0)}
