@@ -40,7 +40,7 @@ def test_no_coder_where_embeddings_are_short():
     assert "left out" in reason
 
 
-@pytest.mark.parametrize(("regions", "latent"), [(0, 3), (1, 3), (2, 3), (5, 5), (5, 16)])
+@pytest.mark.parametrize(("regions", "latent"), [(0, 3), (2, 3), (5, 16)])
 def test_a_rotation_keeps_every_cosine(regions, latent):
     embeddings = unit_rows(np.random.default_rng(regions), regions, 512)
     codes, coder, reason = region_codes(embeddings, latent=latent, key=KEY)
@@ -71,7 +71,7 @@ def test_an_autoencoder_where_regions_do_not_fit():
         region_codes(np.full((3, 40), np.inf, np.float32), latent=3, key=KEY)
 
 
-@pytest.mark.parametrize(("count", "latent"), [(40, 3), (120, 4), (300, 6)])
+@pytest.mark.parametrize(("count", "latent"), [(40, 3), pytest.param(300, 6, marks=pytest.mark.long)])
 def test_spread_codes_keep_crowded_regions_apart_where_a_rotation_does_not(count, latent):
     units = crowded(count)
     assert confused_pairs(units, principal_rotation(units, latent).encode(units)) > count
