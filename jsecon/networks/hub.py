@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from jsecon.errors import InputError, why
+from jsecon.errors import InputError, describe_error
 
 Role = Literal["embedder", "segmenter", "tracker", "phrases"]
 Precision = Literal["fp32", "fp16", "int8"]
@@ -459,5 +459,5 @@ def _explain(model: HubModel, error: BaseException) -> tuple[str, str]:
     if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno == errno.EROFS):
         return f"no permission to write in {constants.HF_HUB_CACHE}", "Set HF_HOME to a folder of yours."
     if isinstance(error, OSError):
-        return why(error), again
+        return describe_error(error), again
     return "", ""
