@@ -177,6 +177,7 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     np.testing.assert_allclose(found.colours[train, :, :3], gains[train, None, None] * np.eye(3), atol=0.05)
 
 
+@pytest.mark.long
 def test_without_corrections_a_fit_is_what_it_was(capture, truth):
     """Rates of zero leave every frame at rest, and the scene as without."""
     off = RefineOptions(poses=False, exposure=False)
@@ -199,6 +200,7 @@ def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, tr
         fit_gaussians(capture, state=stopped, steps=30, **GIVEN)
 
 
+@pytest.mark.long
 def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_no_part_in_it(capture, truth):
     rng = np.random.default_rng(4)
     twists = np.concatenate([0.009 * rng.normal(size=(VIEWS, 3)), 0.02 * rng.normal(size=(VIEWS, 3))], axis=1)
@@ -257,6 +259,7 @@ def test_probes_that_take_too_long_or_have_nothing_to_be_tested_on_change_nothin
     assert same(dataclasses.replace(kept, notes=()), few)
 
 
+@pytest.mark.long
 def test_probes_end_when_the_poses_have_settled(capture, truth):
     """The last one still comes."""
     steps = []
@@ -276,7 +279,7 @@ def test_the_world_stays_where_it_was(capture):
     np.testing.assert_allclose(_rigid_drift(given @ np.linalg.inv(motion), given, 1.0), motion, atol=1e-6)
 
 
-@pytest.mark.parametrize("rate", [0.1, 10.0])
+@pytest.mark.parametrize("rate", [pytest.param(0.1, marks=pytest.mark.long), 10.0])
 def test_a_frame_ten_times_as_bright_or_dark_leaves_finite_numbers(capture, truth, rate):
     told = rough(capture, twists=np.zeros((VIEWS, 6)), gains=np.where(np.arange(VIEWS) == 3, rate, 1.0))
     depths = np.where(np.arange(32) < 9, np.nan, capture.depths).astype(np.float32)
@@ -294,6 +297,7 @@ def test_depth_that_is_not_known_teaches_nothing(capture, truth):
     assert same(a, b)
 
 
+@pytest.mark.long
 def test_three_frames_of_pure_rotation_are_fitted_or_refused(truth):
     """They have no extent: nothing moves but directions."""
     turned = photographed(truth, [look_at((0, -0.6, -2.2), (x, 0, 0)) for x in np.linspace(-0.3, 0.3, VIEWS)])

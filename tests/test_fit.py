@@ -205,6 +205,7 @@ def test_the_votes_are_the_weights_on_the_errors(capture, start):
     np.testing.assert_allclose(states[0].votes[: start.count], expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.long
 def test_a_fit_of_seconds_ends_about_then_and_says_how_far_it_is(capture, start):
     seen = []
     given = {"key": KEY, "start": start, "schedule": WHOLE, "chunk": 5}
@@ -213,6 +214,7 @@ def test_a_fit_of_seconds_ends_about_then_and_says_how_far_it_is(capture, start)
     assert seen[-1] == (1, 1)
 
 
+@pytest.mark.long
 def test_one_program_serves_a_size_and_a_number_of_rows(capture, start):
     """Two sizes, rows that suffice: two programs, whatever the number of steps."""
     programs = one_step.step_compiled[host_mesh() is not None]
@@ -285,7 +287,14 @@ def _odd(capture, start, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["one view", "black images", "two points", "all behind the cameras", "nothing but rotation"]
+    "kind",
+    [
+        "one view",
+        "black images",
+        pytest.param("two points", marks=pytest.mark.long),
+        "all behind the cameras",
+        "nothing but rotation",
+    ],
 )
 def test_odd_captures_are_fitted_without_a_number_that_is_none(capture, start, kind):
     capture, start = _odd(capture, start, kind)

@@ -102,6 +102,7 @@ def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
     assert listener.fresh == {}
 
 
+@pytest.mark.long
 def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     """Random weights track nothing in earnest; the run, its plan and its key are what is tested."""
     run, folder, _ = seen

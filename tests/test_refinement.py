@@ -75,6 +75,7 @@ def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, tmp_pa
     assert alike(again, better)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_small")
 def test_by_default_an_exact_capture_stays_as_its_files_say(capture, tmp_path):
     exact = write(capture, tmp_path / "exact")

@@ -53,9 +53,16 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     views = views_of(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
+
+
+@pytest.mark.long
+def test_each_weighting_fits_best_what_it_weighs(world):
+    gaussians, cameras, share = world
+    before = share >= 0.5
+    views = views_of(gaussians, cameras, before)
     fit = lambda weights: np.asarray(fit_silhouette(gaussians, cameras, share, weights=weights))
     found = {weights: fit(weights) for weights in SILHOUETTE_WEIGHTS.values()}
-    for weights in SILHOUETTE_WEIGHTS.values():  # each fits best what it is to fit
+    for weights in SILHOUETTE_WEIGHTS.values():
         value = {other: expected(gaussians, views, share, mask, weights) for other, mask in found.items()}
         assert value[weights] > max(value.values()) - 1e-3
         assert value[weights] > expected(gaussians, views, share, before, weights)
@@ -155,6 +162,7 @@ def test_shares_of_another_scene_are_refused(world):
         fit_silhouette(world[0], world[1], world[2][1:])
 
 
+@pytest.mark.long
 def test_float64_in_this_thread_alone_changes_nothing(world):
     gaussians, cameras, share = world
     found = fit_silhouette(gaussians, cameras, share)
