@@ -129,7 +129,8 @@ def test_the_key_decides_everything(trained):
     assert not np.allclose(other.encode(embeddings), coder.encode(embeddings), atol=1e-2)
 
 
-@pytest.mark.parametrize("regions", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("regions", [1, 2])
 def test_sound_for_few_regions(regions):
     embeddings = clustered(np.random.default_rng(regions), regions, 20)
     coder = train_autoencoder(embeddings, latent=2, key=KEY, epochs=400)
