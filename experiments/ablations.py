@@ -23,7 +23,7 @@ from experiments import results
 from experiments.ideas import scenes
 from experiments.ideas.scenes import rooms_of
 from experiments.ideas.state import State, tracked
-from jsecon.demo.demo import PLAIN, demo
+from jsecon.demo.demo import PLAIN_ROOM, run_demo
 from jsecon.evaluate.metrics import accuracy_at, mean_iou
 from jsecon.language.codes import encode, region_codes
 from jsecon.pipeline.progress import Listener
@@ -51,7 +51,7 @@ QUICK = Options(
     latent=8,
     out=str(results.HOME / "results" / "ablations_quick"),
 )
-QUICK_ROOM = PLAIN | {"views": 12, "width": 160, "height": 120, "points": 1200}
+QUICK_ROOM = PLAIN_ROOM | {"views": 12, "width": 160, "height": 120, "points": 1200}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +189,7 @@ def quick() -> dict:
     """The experiment on one small room, which is made first."""
     folder = Path(QUICK.demos) / "demo0"
     if not (folder / "field.safetensors").exists():
-        demo(folder, seed=0, steps=150, listener=Listener(), room=QUICK_ROOM)
+        run_demo(folder, seed=0, steps=150, listener=Listener(), room=QUICK_ROOM)
     return main(QUICK)
 
 

@@ -36,7 +36,7 @@ from experiments import replica_apartment_0, results
 from experiments.cells import append_cell, read_cells
 from jsecon.app.verbs import Demo
 from jsecon.data.capture import load_capture
-from jsecon.demo.demo import PLAIN, demo
+from jsecon.demo.demo import PLAIN_ROOM, run_demo
 from jsecon.language.field import load_field
 from jsecon.pipeline import cache
 from jsecon.pipeline.masklet_stages import associate_masks, frame_proposals
@@ -187,9 +187,9 @@ def connected_parts(capture: Capture, ids: np.ndarray, *, voxel: float = 0.1, le
 
 
 def demo_room(folder: Path, seed: int) -> Scene:
-    """The room of `seed` as `demo` with PLAIN leaves it."""
+    """The room of `seed` as `run_demo` with PLAIN_ROOM leaves it."""
     if not (folder / "field.safetensors").exists():
-        demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
+        run_demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN_ROOM)
     capture = load_capture(folder / "capture", holdout=8)
     files = [folder / "capture" / "masks" / f"{name}.png" for name in capture.names]
     truth = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]).astype(np.int32) - 1

@@ -22,7 +22,7 @@ from experiments import results
 from experiments.places import Options as Places, asked_for, fields_of, room_of
 from jsecon.app.ask import ask_outline, ask_text
 from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
-from jsecon.demo.raycast import trace
+from jsecon.demo.raycast import trace_rays
 from jsecon.demo.room import Room
 from jsecon.evaluate.metrics import iou
 from jsecon.pipeline.networks import field_embedder
@@ -60,7 +60,7 @@ def in_scene(gaussians: Gaussians, camera: Camera, mask: np.ndarray) -> np.ndarr
 def outline(room: Room, camera: Camera, name: str) -> np.ndarray:
     """(H, W) bool: the exact outline of the things of a name, nothing before them."""
     things = tuple(item for item in room.objects if item.name == name)
-    return trace(dataclasses.replace(room, objects=things, furniture=()), camera)[1] >= 0
+    return trace_rays(dataclasses.replace(room, objects=things, furniture=()), camera)[1] >= 0
 
 
 def judged(

@@ -3,8 +3,8 @@
     python -m experiments.places [ROOMS] [--seeds 0 1 2 3 4] [--crowded]
 
 ROOMS holds a folder <seed> for each room, made where it is missing: with --crowded as `jsecon demo` leaves it, else as
-`demo` with PLAIN does. Every thing is asked for by its name, which no other has. The true box is that of all its
-surface that any of the 30 views shows, by ray casting.
+`run_demo` with PLAIN_ROOM does. Every thing is asked for by its name, which no other has. The true box is that of all
+its surface that any of the 30 views shows, by ray casting.
 """
 
 import argparse
@@ -18,10 +18,9 @@ import numpy as np
 from experiments import results
 from jsecon.app.locate import locate
 from jsecon.app.verbs import Demo
-from jsecon.demo.crowd import crowded_room
-from jsecon.demo.demo import PLAIN, demo
-from jsecon.demo.raycast import trace
-from jsecon.demo.room import Room, make_room
+from jsecon.demo.demo import PLAIN_ROOM, run_demo
+from jsecon.demo.raycast import trace_rays
+from jsecon.demo.room import Room, crowded_room, make_room
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import field_embedder
@@ -46,7 +45,7 @@ def true_boxes(room: Room, cameras: Camera) -> dict[str, np.ndarray]:
     found: dict[str, list[np.ndarray]] = {}
     for t in range(len(np.asarray(cameras.fx))):
         camera = cameras[t]
-        depth, part = trace(room, camera)
+        depth, part = trace_rays(room, camera)
         rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
         x, y = (columns - float(camera.cx)) / float(camera.fx), (rows - float(camera.cy)) / float(camera.fy)
         pose = np.asarray(camera.world_to_camera, np.float64)
@@ -70,7 +69,9 @@ def fields_of(options: Options) -> Iterator[tuple[int, Path, LanguageField]]:
     for seed in options.seeds:
         folder = Path(options.rooms) / str(seed)
         if not (folder / "field.safetensors").exists():
-            demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=None if options.crowded else PLAIN)
+            run_demo(
+                folder, seed=seed, steps=Demo.steps, listener=Listener(), room=None if options.crowded else PLAIN_ROOM
+            )
         yield seed, folder, load_field(folder / "field.safetensors")
 
 

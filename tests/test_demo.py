@@ -38,7 +38,7 @@ def finished(tmp_path_factory):
     out, ears, began = tmp_path_factory.mktemp("demo"), Ears(), time.monotonic()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(film_of, "SECONDS", 2)
-        metrics = demo.demo(out, steps=150, listener=ears, room=ROOM)
+        metrics = demo.run_demo(out, steps=150, listener=ears, room=ROOM)
     assert any("jsecon view" in line for line in ears.said)
     return metrics, out, time.monotonic() - began
 
@@ -104,7 +104,7 @@ def test_the_pictures_show_the_room_and_turn_around_it(finished):
     image = cv2.imread(str(out / "demo.jpg"))
     assert image.shape == (120 + 26, 4 * 160 + 3 * 6, 3)
     with Image.open(out / "demo.webp") as film:
-        assert film.n_frames == 2 * film_of.PER_SECOND
+        assert film.n_frames == 2 * film_of.FRAMES_PER_SECOND
         assert film.size == (320, 240)
     assert (out / "demo.webp").stat().st_size < 2 * 2**20
 
@@ -113,7 +113,7 @@ def test_a_second_call_finds_it_all_done(finished, monkeypatch):
     monkeypatch.setattr(film_of, "SECONDS", 2)
     metrics, out, _ = finished
     before, ears = (out / "field.safetensors").read_bytes(), Ears()
-    again = demo.demo(out, steps=150, listener=ears, room=ROOM)
+    again = demo.run_demo(out, steps=150, listener=ears, room=ROOM)
     assert {name for name, fresh in ears.fresh.items() if fresh} == {"field"}
     assert (out / "field.safetensors").read_bytes() == before
     assert again["anchored"] == metrics["anchored"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from jsecon.demo.capture import captured, room_cameras
+from jsecon.demo.capture import render_capture, room_cameras
 from jsecon.demo.room import make_room
 from jsecon.errors import InputError
 from jsecon.fit.dense import dense_points, random_points
@@ -21,7 +21,7 @@ def room():
     made = make_room(0)
     cameras = room_cameras(made, views=45, width=200, height=150)[np.arange(6)]
     out = np.arange(6) == 2
-    return captured(made, cameras, tuple(map(str, range(6))), out, points=2000)[0]
+    return render_capture(made, cameras, tuple(map(str, range(6))), out, points=2000)[0]
 
 
 def without_depth(capture):

@@ -2,7 +2,6 @@
 
 import jax
 import numpy as np
-import pytest
 from conftest import look_at
 from PIL import Image
 from small_field import make_field, true_regions
@@ -23,46 +22,16 @@ def angles_of(cameras):
     return np.unwrap(np.arctan2(away[:, 1], away[:, 0])), away
 
 
-@pytest.mark.parametrize(("span", "whole"), [(2 * np.pi, True), (1.5, False)])
-def test_the_way_is_a_whole_turn_where_cameras_stand_all_around_and_else_stays_on_their_arc(span, whole):
-    given = np.linspace(0, span, 12, endpoint=not whole) + 2.0
-    path = film.orbit(ring(given), 60)
+def test_the_way_is_a_whole_turn_around_what_the_cameras_look_at():
+    path = film.orbit(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False) + 2.0), 60)
     turn, away = angles_of(path)
-    assert np.abs(np.abs(np.diff(turn)).sum() - (2 * np.pi * 59 / 60 if whole else 2 * span)) < 0.35
-    if not whole:
-        assert np.ptp(turn) <= span + 0.25
+    assert np.abs(np.abs(np.diff(turn)).sum() - 2 * np.pi * 59 / 60) < 0.35
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), np.linalg.norm(away[0]), rtol=0.1)
     rotations = np.asarray(path.world_to_camera)[:, :3, :3]
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-4)
     aim = np.einsum("tij,j->ti", rotations, np.array([0.1, 0, 0])) + np.asarray(path.world_to_camera)[:, :3, 3]
     assert (np.abs(aim[:, :2]) < 0.15 * aim[:, 2:]).all()
     assert (rotations[:, 1, 2] < 0).all()  # upright: the image's y goes down
-
-
-def turned(cameras, order):
-    return jax.tree.map(lambda a: a[np.asarray(order)], cameras)
-
-
-@pytest.mark.parametrize("count", [1, 2, 8])
-def test_cameras_on_the_axis_have_no_angle(count):
-    """One right above what the others look at, before them; several above each other; and all at one place."""
-    above = look_at((0.1, 0.0, 4.0), (0.1, 0.0, 0.0), up=(0, 1, 0))[None]
-    around = ring(np.linspace(0, 2 * np.pi, count, endpoint=False))
-    poses = np.concatenate([above, around.world_to_camera])
-    one = np.ones(count + 1, np.float32)
-    both = Camera(poses.astype(np.float32), 40 * one, 40 * one, 16 * one, 12 * one, 32, 24)
-    stacked = turned(both, [0] * (count + 1))
-    stacked.world_to_camera[:, 2, 3] += np.arange(count + 1)
-    upright = ring(np.zeros(count))
-    eye = np.array([0.1, 0.0, 0.5])
-    spun = upright.world_to_camera.copy()
-    spun[:, :3, 3] = -(spun[:, :3, :3] @ eye)
-    still = Camera(spun, upright.fx, upright.fy, upright.cx, upright.cy, 32, 24)
-    for cameras in (both, turned(both, [*range(1, count + 1), 0]), stacked, still):
-        path = film.orbit(cameras, 12)
-        rotations = np.asarray(path.world_to_camera)[:, :3, :3]
-        np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-4)
-        assert np.isfinite(np.asarray(path.world_to_camera)).all()
 
 
 def test_an_answer_is_dark_before_its_turn_and_bright_after(scene, cameras, tmp_path, monkeypatch):

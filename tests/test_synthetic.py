@@ -13,25 +13,34 @@ from jsecon.data.capture import load_capture
 from jsecon.data.lerf_labels import load_lerf_labels
 from jsecon.data.mask_files import load_labels
 from jsecon.demo import make_room, render_views, room_cameras, room_capture, write_room
-from jsecon.demo.crowd import ARCH, BEAM, CLUTTER, THINGS, TWICE, crowded_room
-from jsecon.demo.light import lamp_points, lamp_visibility
-from jsecon.demo.raycast import trace
-from jsecon.demo.room import PALETTE, TABLE_HALF, TABLE_HEIGHT, Part
-from jsecon.demo.shapes import SHAPES, reach
-from jsecon.demo.solids import (
-    blocks,
+from jsecon.demo.raycast import lamp_points, lamp_visibility, texture_pattern, trace_rays
+from jsecon.demo.room import (
+    ARCH_COLOUR,
+    BEAM_COLOUR,
+    CLUTTER_COLOURS,
+    CROWDED_OBJECTS,
+    PALETTE,
+    REPEATED_COLOUR,
+    TABLE_HALF,
+    TABLE_HEIGHT,
+    Part,
+    crowded_room,
+)
+from jsecon.demo.shapes import (
+    SHAPES,
+    blocks_segment,
     box,
     contains,
     cut,
     ellipsoid,
     first_hit,
     frustum,
-    interval,
     normals,
     place,
+    radius_about_axis,
+    ray_interval,
     rotation,
 )
-from jsecon.demo.surfaces import pattern
 from jsecon.errors import InputError
 from jsecon.types import Camera
 
@@ -59,7 +68,7 @@ def small():
 def depths():
     room = make_room(0)
     cameras = room_cameras(room, views=10, width=96, height=72)
-    return np.stack([trace(room, cameras[k])[0] for k in range(10)])
+    return np.stack([trace_rays(room, cameras[k])[0] for k in range(10)])
 
 
 # Solids against their own definitions, written out, sampled densely along random rays.
@@ -90,7 +99,7 @@ def test_interval_is_the_definition_along_a_ray(name, turned):
     direction = (centre[:, None] + rng.uniform(-0.3, 0.3, (3, rays)) - origin).astype(np.float32)
     direction[:, :40] = np.eye(3)[:, rng.integers(0, 3, 40)]  # along the axes: the degenerate cases of slabs and cones
     origin[:, :40] = rng.uniform(-0.3, 0.3, (3, 40)) + centre[:, None]
-    enter, leave = interval(place(solid, centre, axes), origin, direction)
+    enter, leave = ray_interval(place(solid, centre, axes), origin, direction)
     t = np.linspace(-1.0, 2.5, 1501)
     points = origin[..., None].astype(np.float64) + direction[..., None].astype(np.float64) * t
     local = np.einsum("ji,jrt->irt", np.asarray(axes, np.float64), points - centre[:, None, None])
@@ -122,7 +131,7 @@ def test_normals_point_out_of_the_solid(name):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_bounding_spheres_and_reach_hold_the_shape(shape):
     parts = SHAPES[shape](np.random.default_rng(4))
-    radius = max(reach(solid) for solid, _, _ in parts)
+    radius = max(radius_about_axis(solid) for solid, _, _ in parts)
     assert 0.04 < radius < 0.2
     grid = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 61)] * 2, np.linspace(-0.05, 0.4, 46))).reshape(3, -1)
     grid = grid.astype(np.float32)
@@ -138,7 +147,7 @@ def test_sphere_has_its_exact_depth_and_silhouette():
     eye = np.array([1.4, -0.3, 0.6])
     camera = pinhole(look_at(eye, centre, up=(0, 0, 1)))
     room = alone(place(ellipsoid(r, r, r), centre))
-    depth, index = trace(room, camera)
+    depth, index = trace_rays(room, camera)
     distance = np.linalg.norm(centre - eye)
     assert depth[40, 40] == pytest.approx(distance - r, abs=2e-6)
     y, x = np.mgrid[:81, :81] + 0.5
@@ -163,7 +172,7 @@ def test_room_walls_floor_and_ceiling_are_where_they_should_be():
         ((0.2, 0.1, -0.6), (1, 0, 0), TABLE_HEIGHT + 0.4),
         ((0.2, 0.1, 1.4), (1, 0, 0), room.ceiling - 0.4),
     ]:
-        depth, index = trace(room, pinhole(look_at(eye, target, up), focal=400.0))
+        depth, index = trace_rays(room, pinhole(look_at(eye, target, up), focal=400.0))
         assert (index == -1).all()
         np.testing.assert_allclose(depth, expected, atol=2e-6)
 
@@ -171,15 +180,17 @@ def test_room_walls_floor_and_ceiling_are_where_they_should_be():
 def test_a_hollow_is_seen_into_and_lit_from_above_only():
     outer, hollow = frustum(0.1, 0.1, 0.2), place(frustum(0.09, 0.09, 0.21), (0, 0, 0.01))
     down = pinhole(look_at((0.0, 0.0, 1.0), (0, 0, 0), up=(1, 0, 0)))
-    depth, _ = trace(alone(outer, hollow), down)
+    depth, _ = trace_rays(alone(outer, hollow), down)
     assert depth[40, 40] == pytest.approx(0.99, abs=2e-6)  # the cup's floor, not its rim
     side = pinhole(look_at((1.0, 0.0, 0.1), (0, 0, 0.1), up=(0, 0, 1)))
-    depth, _ = trace(alone(outer, hollow), side)
+    depth, _ = trace_rays(alone(outer, hollow), side)
     assert depth[40, 40] == pytest.approx(0.9, abs=2e-6)
     floor = np.array([[0.0], [0.0], [0.011]], np.float32)
-    assert not blocks(outer, hollow, floor, np.array([[0.0], [0.0], [1.0]], np.float32))[0]
-    assert blocks(outer, hollow, floor, np.array([[1.0], [0.0], [0.1]], np.float32))[0]
-    assert not blocks(outer, hollow, floor, np.array([[0.05], [0.0], [0.1]], np.float32))[0]  # ends before the wall
+    assert not blocks_segment(outer, hollow, floor, np.array([[0.0], [0.0], [1.0]], np.float32))[0]
+    assert blocks_segment(outer, hollow, floor, np.array([[1.0], [0.0], [0.1]], np.float32))[0]
+    assert not blocks_segment(outer, hollow, floor, np.array([[0.05], [0.0], [0.1]], np.float32))[
+        0
+    ]  # ends before the wall
     normal = normals(outer, hollow, np.array([[0.0, 0.09, 0.1], [0, 0, 0], [0.01, 0.1, 0.1]], np.float32))
     np.testing.assert_allclose(normal.T, [[0, 0, 1], [-1, 0, 0], [1, 0, 0]], atol=1e-5)
 
@@ -193,7 +204,7 @@ def test_lamp_visibility_equals_all_rays_to_all_parts():
     blocked = np.zeros((lamps.shape[1], 600), bool)
     for part in room.parts:
         for k in range(lamps.shape[1]):
-            blocked[k] |= blocks(part.solid, part.hollow, points, lamps[:, k, None] - points)
+            blocked[k] |= blocks_segment(part.solid, part.hollow, points, lamps[:, k, None] - points)
     seen = lamp_visibility(room, points, lamps=lamps)
     np.testing.assert_allclose(seen, 1 - blocked.mean(0), atol=1e-6)
     assert (seen == 0).any()
@@ -205,10 +216,10 @@ def test_patterns_stay_in_their_range_and_vary():
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (3, 4000)).astype(np.float32)
     texture = make_room(0).objects[0].texture
     for kind in ("checks", "stripes", "marble", "wood"):
-        value = pattern(dataclasses.replace(texture, kind=kind), points)
+        value = texture_pattern(dataclasses.replace(texture, kind=kind), points)
         assert np.abs(value).max() <= 1.0 + 1e-6
         assert value.std() > 0.3
-    assert not pattern(dataclasses.replace(texture, kind="plain"), points).any()
+    assert not texture_pattern(dataclasses.replace(texture, kind="plain"), points).any()
 
 
 # The room.
@@ -241,7 +252,7 @@ def test_every_object_is_seen_often(seed):
     owners = np.array([part.owner for part in room.parts] + [-1])
     pixels = np.zeros((30, 12), int)
     for view in range(30):
-        owner = owners[trace(room, cameras[view])[1]]
+        owner = owners[trace_rays(room, cameras[view])[1]]
         pixels[view] = np.bincount(owner[owner >= 0], minlength=12)
     often = pixels >= 15
     assert often.sum(0).min() >= 8
@@ -359,11 +370,11 @@ def test_a_crowded_room_holds_what_makes_it_hard():
     for seed in SEEDS:
         room = crowded_room(seed)
         counts = Counter(room.names)
-        assert counts.pop("") == len(CLUTTER)
+        assert counts.pop("") == len(CLUTTER_COLOURS)
         assert {name: count for name, count in counts.items() if count > 1} == {
-            next(name for name in counts if name.split()[0] == TWICE): 2
+            next(name for name in counts if name.split()[0] == REPEATED_COLOUR): 2
         }
-        assert {item.colour for item in room.objects} == {"", *THINGS, BEAM, ARCH}
+        assert {item.colour for item in room.objects} == {"", *CROWDED_OBJECTS, BEAM_COLOUR, ARCH_COLOUR}
         assert room.cloth
         lidded = [item for item in room.objects if item.shape in ("pot", "kettle")]
         assert len(lidded) == 2
@@ -381,12 +392,12 @@ def test_a_crowded_room_holds_what_makes_it_hard():
 def test_no_view_of_a_crowded_room_shows_all_of_the_beam(seed):
     room = crowded_room(seed)
     cameras = room_cameras(room, views=30, width=80, height=60)
-    k = [item.colour for item in room.objects].index(BEAM)
+    k = [item.colour for item in room.objects].index(BEAM_COLOUR)
     only = dataclasses.replace(room, objects=(room.objects[k],), furniture=())
     owners = np.array([part.owner for part in room.parts] + [-1])
     for view in range(30):
-        shown = (owners[trace(room, cameras[view])[1]] == k).sum()
-        assert shown < 0.95 * (trace(only, cameras[view])[1] >= 0).sum()
+        shown = (owners[trace_rays(room, cameras[view])[1]] == k).sum()
+        assert shown < 0.95 * (trace_rays(only, cameras[view])[1] >= 0).sum()
 
 
 def test_labels_of_a_crowded_room_join_two_of_a_kind_and_leave_out_what_has_no_name(tmp_path):

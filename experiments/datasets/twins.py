@@ -26,8 +26,8 @@ from experiments.datasets.scannet import CLASS_SETS, NYU40
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
-from jsecon.demo.capture import captured, labelled, look_at, room_cameras, write_ids
-from jsecon.demo.room import TABLE_WOOD, Part, Room, linear, make_room
+from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras, write_label_image
+from jsecon.demo.room import TABLE_WOOD, Part, Room, make_room, srgb_to_linear
 from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
 
@@ -82,7 +82,7 @@ def camouflaged(room: Room, share: float) -> Room:
     """The room with its objects' colours brought to the table's by a share of the way."""
 
     def painted(part: Part) -> Part:
-        return dataclasses.replace(part, albedo=(1 - share) * part.albedo + share * linear(TABLE_WOOD))
+        return dataclasses.replace(part, albedo=(1 - share) * part.albedo + share * srgb_to_linear(TABLE_WOOD))
 
     objects = (dataclasses.replace(item, parts=tuple(map(painted, item.parts))) for item in room.objects)
     return dataclasses.replace(room, objects=tuple(objects)) if share else room
@@ -227,7 +227,7 @@ def _scanned(
 ) -> tuple[Room, Capture, Int[np.ndarray, "t h w"], Mesh]:
     room = make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=len(names), width=width, height=height)
-    capture, instances = captured(room, cameras, names, np.zeros(len(names), bool), points=100)
+    capture, instances = render_capture(room, cameras, names, np.zeros(len(names), bool), points=100)
     points, owners = surfaces_of(room, capture, instances)
     return room, capture, owners, mesh_of(points, owners, capture.frames, num_objects, fine=fine, coarse=coarse)
 
@@ -254,9 +254,9 @@ def _labelled_capture(
     label_pixels: int,
 ) -> tuple[Capture, Int[np.ndarray, "t h w"], list[LabelledFrame]]:
     """The room seen by `cameras`, written for COLMAP; its instances, and the labels of the frames `out`."""
-    capture, instances = captured(room, cameras, names, out, points=200 * len(names))
+    capture, instances = render_capture(room, cameras, names, out, points=200 * len(names))
     write_colmap(capture, folder, image_format="jpg")
-    frames = [labelled(names[t], instances[t], room.names, label_pixels) for t in np.flatnonzero(out)]
+    frames = [label_frame(names[t], instances[t], room.names, label_pixels) for t in np.flatnonzero(out)]
     return capture, instances, frames
 
 
@@ -270,7 +270,7 @@ def _finish(
 ) -> None:
     """The truth of each pixel, and, last, what was written of the scene."""
     for name, image in zip(capture.names, owners):
-        write_ids(root / "truth" / scene / f"{name}.png", (image + 1).astype(np.uint8))
+        write_label_image(root / "truth" / scene / f"{name}.png", (image + 1).astype(np.uint8))
     file = root / TWIN_FILE
     scenes = json.loads(file.read_text())["scenes"] if file.exists() else {}
     told |= {"frames": [frame.name for frame in frames]}

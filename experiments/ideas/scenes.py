@@ -23,7 +23,7 @@ from experiments.simulated_vision.embeddings import SimulatedEmbedder, TextSpace
 from experiments.simulated_vision.masks import LEVELS, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import world_of
 from jsecon.app.verbs import Demo
-from jsecon.demo.demo import PLAIN, demo
+from jsecon.demo.demo import PLAIN_ROOM, run_demo
 from jsecon.language.field import load_field
 from jsecon.language.votes import region_votes
 from jsecon.pipeline.progress import Listener
@@ -35,7 +35,7 @@ class Rooms:
     """The demo rooms that an experiment takes, and the texts that it asks: options that such experiments share."""
 
     demos: str = str(results.HOME.parent / "demos")
-    """holds demo0 .. demo4, as `demo(demoK, seed=K, room=PLAIN)` leaves them; made where missing."""
+    """holds demo0 .. demo4, as `run_demo(demoK, seed=K, room=PLAIN_ROOM)` leaves them; made where missing."""
     texts: str = str(results.CAPTURES.parent / "text")
     """CLIP's vectors of the LVIS classes; where they are not there, made ones."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -101,9 +101,9 @@ class Sight:
 
 
 def demo_scene(folder: Path, seed: int) -> Scene:
-    """The demo room of `seed`, as `demo` with PLAIN leaves it in FOLDER; made where it is missing."""
+    """The demo room of `seed`, as `run_demo` with PLAIN_ROOM leaves it in FOLDER; made where it is missing."""
     if not (folder / "field.safetensors").exists():
-        demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN)
+        run_demo(folder, seed=seed, steps=Demo.steps, listener=Listener(), room=PLAIN_ROOM)
     field = load_field(folder / "field.safetensors")
     told = json.loads((folder / "capture" / "scene.json").read_text())
     voting = np.array([name not in told["held_out"] for name in field.names])

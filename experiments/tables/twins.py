@@ -34,7 +34,7 @@ from experiments.simulated_vision.embeddings import (
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
 from jsecon.data.mask_files import LEVELS
-from jsecon.demo.raycast import trace
+from jsecon.demo.raycast import trace_rays
 from jsecon.demo.room import make_room
 from jsecon.files import write_text
 from jsecon.vision.protocols import CANONICAL
@@ -120,7 +120,7 @@ def sight(bench: Benchmark, root: Path, level: str, seed: int) -> Sight:
     seen = Seen(truth, truth, np.arange(len(told["objects"])))
     if world.parts or world.groups or world.shadow or world.levels:
         room = make_room(told["seed"], num_objects=len(told["objects"]) - len(SURROUNDINGS))
-        depths = np.stack([trace(room, cameras[t])[0] for t in range(len(shown))])
+        depths = np.stack([trace_rays(room, cameras[t])[0] for t in range(len(shown))])
         points, _ = surfaces_of(room, dataclasses.replace(bench.capture, cameras=cameras, depths=depths), truth)
         table = len(room.objects) + SURROUNDINGS.index("table")
         seen = seen_in(world, truth, points, room, table, seed=seed)

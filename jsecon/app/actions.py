@@ -20,9 +20,9 @@ _RUN_FILES = ("field.safetensors", "report.html", "metrics.json")
 
 def _demo(verb: Demo, console: Console) -> VerbResult:
     with console.progress("start"):
-        from jsecon.demo.demo import demo
+        from jsecon.demo.demo import run_demo
 
-    result = demo(verb.out, seed=verb.seed, steps=verb.steps, listener=console)
+    result = run_demo(verb.out, seed=verb.seed, steps=verb.steps, listener=console)
     return {"written": [verb.out / name for name in (*_RUN_FILES, "queries", "demo.jpg", "demo.webp")]} | result
 
 

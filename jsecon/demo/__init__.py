@@ -1,4 +1,4 @@
-"""`jsecon demo`: a made-up room with ground truth, and what the demo writes of it."""
+"""A made-up room with ray-traced ground truth, and `jsecon demo`, which builds and measures a field of it."""
 
 from jsecon.demo.capture import room_cameras, room_capture, write_room
 from jsecon.demo.raycast import render_views

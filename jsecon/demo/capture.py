@@ -1,10 +1,10 @@
-"""The demo room as a capture, in memory or on disk as an ordinary COLMAP folder with instance masks and LERF labels."""
+"""Made-up rooms as captures: in memory, or as a COLMAP folder with instance masks and LERF labels."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,19 +14,28 @@ from jaxtyping import Bool, Int16, UInt
 from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_options, held_out
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
-from jsecon.demo.crowd import crowded_room
 from jsecon.demo.raycast import render_views
-from jsecon.demo.room import Room, make_room
+from jsecon.demo.room import Room, crowded_room, make_room
 from jsecon.errors import require
 from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
 
-LABEL_PIXELS = 40
-"""visible ones from which `write_room` labels an object in a frame"""
+MIN_LABEL_PIXELS = 40
+"""Visible pixels from which `write_room` labels an object in a frame."""
 
 
 def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int = 240) -> Camera:
-    """`views` cameras on a walk once around the table, at changing height, looking at it; 60 degrees across."""
+    """Cameras on a walk around the table.
+
+    Args:
+      room: The room, whose seed also decides the walk.
+      views: Number of cameras T.
+      width: Width of the images, px.
+      height: Height of the images, px.
+
+    Returns:
+      T cameras that look at the table from changing heights, 60 degrees across.
+    """
     draw = np.random.default_rng([room.seed, 5])
     turn = 2 * np.pi * (np.arange(views) / views) + draw.uniform(0, 2 * np.pi) + draw.normal(0, 0.03, views)
     wave = np.sin(3 * turn + draw.uniform(0, 2 * np.pi))
@@ -41,7 +50,7 @@ def room_cameras(room: Room, *, views: int = 30, width: int = 320, height: int =
 
 
 def look_at(centre, target, up=(0, 0, 1)):
-    """(4, 4) float32 world-to-camera of a camera at `centre` that looks at `target`, upright."""
+    """(4, 4) float32 world-to-camera matrix of an upright camera at `centre` that looks at `target`."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
@@ -63,42 +72,67 @@ def room_capture(
     crowded: bool | int = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Capture, Int16[np.ndarray, "t h w"], tuple[str, ...]]:
-    """The room of `seed` as a capture, its instances (index into the names, -1 = background) and the objects' names.
+    """Makes the capture of a room.
 
-    `crowded`: that of `crowded_room`, in which a name may be there twice, or "", instead of `num_objects`.
-    Every `holdout`-th frame from the first on is held out (0: none); the sparse points come from the others alone.
-    Raises InputError or ValueError on options that leave fewer than two frames.
+    Args:
+      seed: Seed of the room.
+      views: Number of frames T.
+      width: Width of the frames, px.
+      height: Height of the frames, px.
+      holdout: Every `holdout`-th frame from the first on is held out; 0 holds out no frame.
+      points: Number of sparse points. They come from frames that are not held out.
+      num_objects: Number of objects of a plain room.
+      crowded: Use `crowded_room`, in which names can repeat or be "", and ignore `num_objects`.
+      progress: Called with the number of finished frames and T.
+
+    Returns:
+      The capture, its instances (index into the names, -1 = background) and the names of the objects.
+
+    Raises:
+      InputError: The options of the frames are invalid.
+      ValueError: Fewer than two frames are not held out.
     """
     check_options(None, views, holdout)
-    out = held_out(views, holdout)
+    is_held_out = held_out(views, holdout)
     got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
-    require(int((~out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
+    require(int((~is_held_out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
     room = crowded_room(seed) if crowded else make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=views, width=width, height=height)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
-    capture, instances = captured(room, cameras, names, out, points=points, progress=progress)
+    capture, instances = render_capture(room, cameras, names, is_held_out, points=points, progress=progress)
     return dataclasses.replace(capture, depths=None), instances, room.names
 
 
-def captured(
+def render_capture(
     room: Room,
     cameras: Camera,
     names: tuple[str, ...],
-    out: Bool[np.ndarray, " t"],
+    is_held_out: Bool[np.ndarray, " t"],
     *,
     points: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Capture, Int16[np.ndarray, "t h w"]]:
-    """A room seen by `cameras` as a capture with depth, frames `out` held out, and its instances (-1 = background)."""
+    """Makes the capture of a room from chosen cameras.
+
+    Args:
+      room: The room.
+      cameras: T cameras inside the room.
+      names: T names of the frames.
+      is_held_out: (T,) frames that the sparse points are not taken from.
+      points: Number of sparse points.
+      progress: Called with the number of finished frames and T.
+
+    Returns:
+      The capture with depth, and its instances (index of the object, -1 = background).
+    """
     frames, instances, depths = render_views(room, cameras, progress=progress)
-    cloud, colours = _sparse_points(np.random.default_rng([room.seed, 7]), frames, depths, cameras, out, points)
-    return Capture(frames, cameras, cloud, colours, out, depths, np.eye(4, dtype=np.float32), names), instances
+    cloud, colours = _sparse_points(np.random.default_rng([room.seed, 7]), frames, depths, cameras, is_held_out, points)
+    return Capture(frames, cameras, cloud, colours, is_held_out, depths, np.eye(4, dtype=np.float32), names), instances
 
 
-def _sparse_points(draw, frames, depths, cameras, out, count):
-    """Points as structure from motion would leave them: on corners and texture first, in at least two of the views that
-    are not held out, off by the 0.4 px of a matched feature."""
-    kept = np.flatnonzero(~out)
+def _sparse_points(draw, frames, depths, cameras, is_held_out, count):
+    """Points like those of structure from motion: on texture, seen by two training views, with errors of 0.4 px."""
+    kept = np.flatnonzero(~is_held_out)
     width = frames.shape[2]
     focal, middle = float(cameras.fx[0]), (float(cameras.cx[0]), float(cameras.cy[0]))
     clouds, colours = [], []
@@ -124,7 +158,7 @@ def _sparse_points(draw, frames, depths, cameras, out, count):
 
 
 def _sees(pose, depth, focal, middle, world):
-    """Whether the view sees each point: inside of the picture, and at the depth of its pixel's surface."""
+    """Whether a view sees each point: inside the image and at the depth of the surface at its pixel."""
     height, width = depth.shape
     local = world @ pose[:3, :3].T + pose[:3, 3]
     z = np.maximum(local[:, 2], 1e-6)
@@ -143,21 +177,33 @@ def write_room(
     progress: Callable[[int, int], None] | None = None,
     **options: int,
 ) -> Path:
-    """Writes the room of `seed` to `folder` as a COLMAP capture (images/, sparse/0/), and its ground truth beside it.
+    """Writes a room as a COLMAP capture (images/, sparse/0/) with its ground truth beside it.
 
-    `options` as for `room_capture`. masks/<frame>.png: 8-bit integers, 0 = none, else the object's id from 1.
-    label/<frame>.json: LangSplat's layout of LERF labels, for the held-out frames, of the objects with at least
-    LABEL_PIXELS visible pixels there. scene.json, written last: seed, options, objects by id. Returns the folder;
-    raises InputError where it cannot be written.
+    masks/<frame>.png holds 8-bit ids of the objects from 1 on; 0 is background. label/<frame>.json holds LERF labels in
+    LangSplat's layout: held-out frames, objects with at least MIN_LABEL_PIXELS visible pixels. scene.json is written
+    last and holds seed, options and the names by id.
+
+    Args:
+      folder: Where to write. Files of an earlier room there are replaced.
+      seed: Seed of the room.
+      holdout: Every `holdout`-th frame is held out.
+      progress: Called with the number of finished frames and of all.
+      **options: Further options of `room_capture`.
+
+    Returns:
+      The folder.
+
+    Raises:
+      InputError: The folder cannot be written.
     """
     folder = Path(folder)
     _clear(folder)
     capture, instances, names = room_capture(seed, holdout=holdout, progress=progress, **options)
     write_colmap(capture, folder)
     for name, instance in zip(capture.names, instances):
-        write_ids(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
-    held = np.flatnonzero(capture.held_out)
-    labels = [labelled(capture.names[t], instances[t], names, LABEL_PIXELS) for t in held]
+        write_label_image(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
+    test_frames = np.flatnonzero(capture.held_out)
+    labels = [label_frame(capture.names[t], instances[t], names, MIN_LABEL_PIXELS) for t in test_frames]
     write_lerf_labels(folder / "label", labels)
     scene = {
         "seed": seed,
@@ -166,7 +212,7 @@ def write_room(
         "height": capture.cameras.height,
         "holdout": holdout,
         "points": len(capture.points),
-        "held_out": [capture.names[t] for t in held],
+        "held_out": [capture.names[t] for t in test_frames],
         "objects": {str(k + 1): name for k, name in enumerate(names)},
     }
     write_text(folder / "scene.json", json.dumps(scene, indent=2) + "\n")
@@ -174,20 +220,30 @@ def write_room(
 
 
 def _clear(folder):
-    """Removes what an earlier room in `folder` may have more of than this one; its other files are written over."""
+    """Removes the files of an earlier room whose number depends on its options."""
     if (folder / "scene.json").is_file():
         for pattern in ("scene.json", "label/frame_*.json", "masks/frame_*.png", "images/frame_*.png"):
             for file in list(folder.glob(pattern)):
                 file.unlink()
 
 
-def labelled(frame, instance, names, label_pixels):
-    """The label of a frame: masks and boxes by name, those of a name together; without a name, none."""
+def label_frame(frame: str, instance: Int16[np.ndarray, "h w"], names: Sequence[str], min_pixels: int) -> LabelledFrame:
+    """Labels the objects of a frame by name. Objects without a name get no label.
+
+    Args:
+      frame: Name of the frame.
+      instance: (H, W) index into `names`, -1 = background.
+      names: Names of the objects; those of one name share a label.
+      min_pixels: Visible pixels that a label needs.
+
+    Returns:
+      Masks and boxes by name.
+    """
     objects = {}
     for name in dict.fromkeys(filter(None, names)):
-        each = [mask for mask in (instance == k for k, own in enumerate(names) if own == name) if mask.any()]
-        if sum(mask.sum() for mask in each) >= label_pixels:
-            objects[name] = np.any(each, axis=0), np.concatenate([_box(mask) for mask in each])
+        masks = [mask for mask in (instance == k for k, other in enumerate(names) if other == name) if mask.any()]
+        if sum(mask.sum() for mask in masks) >= min_pixels:
+            objects[name] = np.any(masks, axis=0), np.concatenate([_box(mask) for mask in masks])
     return LabelledFrame(frame, instance.shape[1], instance.shape[0], objects)
 
 
@@ -196,7 +252,7 @@ def _box(mask):
     return np.array([[columns[0], rows[0], columns[-1], rows[-1]]], np.float32)
 
 
-def write_ids(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:
-    """Writes a label image as a grey PNG, whole or not at all."""
+def write_label_image(path: Path, ids: UInt[np.ndarray, "h w"]) -> None:
+    """Writes a label image as a grey PNG, atomically."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", ids)[1].tobytes())

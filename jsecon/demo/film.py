@@ -1,4 +1,4 @@
-"""A short film of a field: once around the scene, in which the answers to texts light up one after the other."""
+"""A short film of a field: one turn around the scene in which the answers to texts light up one after the other."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,47 +15,61 @@ from jsecon.fit.schedule import resize_cameras
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, LanguageField
 
-SECONDS, PER_SECOND = 15, 8
-WIDE_GAP = np.radians(60)
-"""between two neighbouring cameras, seen from what they look at: from there on nobody has been behind the scene"""
-DIM, SHINE = 0.35, 0.12
-"""what is left of the grey of what no text has lit, and the part of white in what one has"""
-FAR = 0.75
-"""part of the cameras that stand nearer"""
-PARALLEL = 1e-6
-"""part of a length below which what is left of it across a direction is rounding"""
-STEEPEST = 0.1
-"""radius of the way by its height over what it looks at, at least: from straight above nothing is upright"""
-WIDE, QUALITY = 480, 70
-"""px of its longer side, at most twice that of the frames"""
+SECONDS = 15
+"""Length of the film, s."""
+FRAMES_PER_SECOND = 8
+"""Frame rate of the film, Hz."""
+DIM = 0.35
+"""Share of grey that remains of Gaussians that no text has lit."""
+SHINE = 0.12
+"""Share of white in Gaussians that a text lights."""
+DISTANCE_QUANTILE = 0.75
+"""Share of the cameras that stand nearer to the scene than the film's."""
+LONG_SIDE_PX = 480
+"""Longer side of the film, at most twice that of the frames, px."""
+WEBP_QUALITY = 70
+"""Quality of the WebP, 0 to 100."""
 
 
 def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> int:
-    """Writes the film as an animated WebP of SECONDS; returns its bytes."""
-    count = SECONDS * PER_SECOND
-    around, long = orbit(field.cameras, count), max(field.cameras.width, field.cameras.height)
-    renderer = Renderer(field.gaussians, resize_cameras(around, min(WIDE / long, 2.0)))
-    own = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh, np.float32)[:, 0], 0, 1)
-    dark = np.repeat(DIM * own.mean(1, keepdims=True), 3, axis=1)
-    frames, every = [], count / (len(answers) + 1)
+    """Writes the film as an animated WebP.
+
+    Args:
+      field: The field, whose cameras stand around its scene.
+      answers: Answers in the order in which they light up.
+      file: Where to write.
+
+    Returns:
+      Size of the file, bytes.
+    """
+    count = SECONDS * FRAMES_PER_SECOND
+    long_side = max(field.cameras.width, field.cameras.height)
+    cameras = resize_cameras(orbit(field.cameras, count), min(LONG_SIDE_PX / long_side, 2.0))
+    renderer = Renderer(field.gaussians, cameras)
+    colours = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh, np.float32)[:, 0], 0, 1)
+    dark = np.repeat(DIM * colours.mean(1, keepdims=True), 3, axis=1)
+    frames_per_answer = count / (len(answers) + 1)
+    frames = []
     for t in range(count):
-        began = t / every - 1  # answers lit so far
-        rgb = own + min(t / every, 1.0) * (dark - own)
+        lit_answers = t / frames_per_answer - 1
+        rgb = colours + min(t / frames_per_answer, 1.0) * (dark - colours)
         for n, answer in enumerate(answers):
-            lit, bright = min(max(2 * (began - n), 0.0), 1.0), SHINE + (1 - SHINE) * own[answer.mask]
+            lit = min(max(2 * (lit_answers - n), 0.0), 1.0)
+            bright = SHINE + (1 - SHINE) * colours[answer.mask]
             rgb[answer.mask] += lit * (bright - rgb[answer.mask])
-        image, latest = renderer.colours(t, rgb), int(np.floor(began))
+        image, latest = renderer.colours(t, rgb), int(np.floor(lit_answers))
         if 0 <= latest < len(answers):
             image = _captioned(image, answers[latest].question)
         frames.append(Image.fromarray(image))
     first, *rest = frames
-    how = {"duration": 1000 // PER_SECOND, "loop": 0, "quality": QUALITY, "method": 2}
+    options = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0, "quality": WEBP_QUALITY, "method": 2}
     with atomic_write(file) as temporary:
-        first.save(temporary, format="WEBP", save_all=True, append_images=rest, **how)
+        first.save(temporary, format="WEBP", save_all=True, append_images=rest, **options)
     return file.stat().st_size
 
 
 def _captioned(image: np.ndarray, text: str) -> np.ndarray:
+    """The image with a text in its lower left corner."""
     image, at = np.ascontiguousarray(image), (10, image.shape[0] - 14)
     for grey, thickness in ((0, 4), (255, 1)):
         cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.7, (grey,) * 3, thickness, cv2.LINE_AA)
@@ -63,37 +77,33 @@ def _captioned(image: np.ndarray, text: str) -> np.ndarray:
 
 
 def orbit(cameras: Camera, count: int) -> Camera:
-    """`count` cameras around the point that the given ones look at, farther from it than most of them, at their middle
-    height: a whole turn where they stand on all sides of it, else there and back along their arc."""
+    """Cameras on one turn around the point that a ring of cameras looks at.
+
+    Args:
+      cameras: Cameras that stand around a scene.
+      count: Number of cameras T of the turn.
+
+    Returns:
+      T cameras at the median height of the ring, farther from the scene than most of its cameras.
+    """
     poses = np.asarray(cameras.world_to_camera, np.float64)
-    eyes, forward = -np.einsum("tij,ti->tj", poses[:, :3, :3], poses[:, :3, 3]), poses[:, 2, :3]
+    centres = -np.einsum("tij,ti->tj", poses[:, :3, :3], poses[:, :3, 3])
+    forward = poses[:, 2, :3]
     up = -poses[:, 1, :3].mean(0)
-    if np.linalg.norm(up) < PARALLEL:  # the cameras are rolled all ways
-        up = -poses[0, 1, :3]
     up /= np.linalg.norm(up)
     across = np.eye(3) - forward[:, :, None] * forward[:, None]
-    target = np.linalg.lstsq(across.sum(0), (across @ eyes[..., None]).sum(0)[:, 0])[0]
-    away = eyes - target
-    lift = away @ up
-    flat = away - lift[:, None] * up
-    radii = np.linalg.norm(flat, axis=1)
-    # Cameras on the axis stand at no angle around it.
-    aside = flat[radii > PARALLEL * np.linalg.norm(away, axis=1)]
-    if not len(aside):
-        aside = np.eye(3)[[np.abs(up).argmin()]]
-        aside = aside - (aside @ up)[:, None] * up
-    first = aside[0] / np.linalg.norm(aside[0])
+    target = np.linalg.lstsq(across.sum(0), (across @ centres[..., None]).sum(0)[:, 0])[0]
+    offsets = centres - target
+    heights = offsets @ up
+    horizontal = offsets - heights[:, None] * up
+    first = horizontal[0] / np.linalg.norm(horizontal[0])
     second = np.cross(up, first)
-    angles = np.sort(np.arctan2(aside @ second, aside @ first))
+    angles = np.sort(np.arctan2(horizontal @ second, horizontal @ first))
     gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
-    widest, part = int(gaps.argmax()), np.arange(count) / count
-    if gaps[widest] > WIDE_GAP:
-        part = (2 * np.pi - gaps[widest]) / (2 * np.pi) * (0.5 - 0.5 * np.cos(2 * np.pi * part))
-    turn = angles[(widest + 1) % len(angles)] + 2 * np.pi * part
-    out = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
-    radius, height = np.quantile(radii, FAR), np.median(lift)
-    radius = max(radius, STEEPEST * abs(height)) or 1.0  # cameras that look around from one place have no distance
-    places = target + radius * out + height * up
-    placed = np.stack([look_at(eye, target, up) for eye in places])
+    start = angles[(int(gaps.argmax()) + 1) % len(angles)]
+    turn = start + 2 * np.pi * np.arange(count) / count
+    radius = np.quantile(np.linalg.norm(horizontal, axis=1), DISTANCE_QUANTILE)
+    directions = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+    turned = np.stack([look_at(c, target, up) for c in target + radius * directions + np.median(heights) * up])
     lens = (np.full(count, np.asarray(a)[0], np.float32) for a in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
-    return Camera(placed, *lens, width=cameras.width, height=cameras.height)
+    return Camera(turned, *lens, width=cameras.width, height=cameras.height)

@@ -1,6 +1,7 @@
-"""What the demo room holds: which objects, of which shapes and colours, with which textures, stand where.
+"""Contents of the made-up rooms: objects with shapes, colours and textures, the table and the walls.
 
-Everything follows from the seed. World: metres, z up, the origin in the middle of the table's top.
+`make_room` puts one object of each colour on a bare table. `crowded_room` is harder: it adds what makes kinds of query
+differ. A room is a function of its seed. World: metres, z up, origin in the middle of the table's top.
 """
 
 from __future__ import annotations
@@ -11,8 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jsecon.demo.shapes import SHAPES, Body, reach
-from jsecon.demo.solids import Solid, box, place, rotation
+from jsecon.demo.shapes import SHAPES, Body, Solid, box, place, radius_about_axis, rotation
 from jsecon.errors import require
 
 PALETTE = {
@@ -29,9 +29,9 @@ PALETTE = {
     "white": (236, 236, 236),
     "black": (30, 29, 32),
 }
-"""sRGB of each colour name; the first four are the two pairs of one hue and two lightnesses"""
+"""sRGB of each colour name. The first four are two hues in two lightnesses each."""
 
-_SUITABLE = {
+_SHAPES_BY_COLOUR = {
     "dark green": ("bottle", "bottle", "book", "ball", "mug"),
     "light green": ("cup", "ball", "mug", "box", "bowl"),
     "dark blue": ("book", "mug", "ball", "box", "vase"),
@@ -45,39 +45,44 @@ _SUITABLE = {
     "white": ("plate", "bowl", "vase", "mug"),
     "black": ("lamp", "lamp", "toy car", "box"),
 }
+"""Shapes that an object of each colour can have; repeated shapes are more likely."""
 
 TABLE_HALF = (0.68, 0.56)
+"""Half the width and depth of the table top, m."""
 TABLE_HEIGHT = 0.74
+"""Height of the table top above the floor, m."""
 TABLE_THICKNESS = 0.045
+"""Thickness of the table top, m."""
 TABLE_WOOD = (155, 146, 132)
-GAP = 0.025
-"""least free space between two objects' footprints, and to the table's edge, m"""
+"""sRGB of the table."""
+OBJECT_GAP_M = 0.025
+"""Least distance between the footprints of two objects, and to the edge of the table, m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Texture:
-    """A pattern that makes an albedo lighter and darker: albedo * (1 + depth * s(p)), s in [-1, 1]."""
+    """A pattern that modulates an albedo: albedo * (1 + depth * s(p)), s in [-1, 1]."""
 
     kind: str
     """"checks", "stripes", "marble", "wood" or "plain"."""
     scale: float
-    """period, m."""
+    """Period, m."""
     depth: float
-    """amplitude, 0 to 1."""
+    """Amplitude, 0 to 1."""
     phase: np.ndarray
-    """(3,) shift, m."""
+    """(3,) Shift, m."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One solid (less a hollow) of an object, in the world."""
+    """One solid of an object, optionally less a hollow, in world coordinates."""
 
     solid: Solid
     hollow: Solid | None
     owner: int
-    """index of its object; -1 = furniture."""
+    """Index of the object; -1 for furniture."""
     albedo: np.ndarray
-    """(3,) linear RGB."""
+    """(3,) Linear RGB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,15 +90,15 @@ class RoomObject:
     """One named object."""
 
     name: str
-    """colour + shape: "dark green bottle"; unique in `make_room`'s rooms; "" for what no text asks for."""
+    """Colour and shape, such as "dark green bottle". Unique in rooms of `make_room`; "" for clutter."""
     colour: str
     shape: str
     centre: np.ndarray
-    """(3,) where it touches the table, world."""
+    """(3,) Point on the table under the object, world."""
     axes: np.ndarray
-    """(3, 3) columns are its axes in the world."""
+    """(3, 3) Columns are the axes of the object in the world."""
     radius: float
-    """of a circle around its footprint, m."""
+    """Radius of a circle around the footprint, m."""
     texture: Texture
     parts: tuple[Part, ...]
 
@@ -104,39 +109,48 @@ class Room:
 
     objects: tuple[RoomObject, ...]
     furniture: tuple[Part, ...]
-    """the table's top first, then its legs."""
+    """The table top first, then the legs."""
     half: np.ndarray
-    """(2,) half the room's width and depth, m; walls at +-half."""
+    """(2,) Half the width and depth of the room, m; walls at +-half."""
     ceiling: float
-    """z of the ceiling; the floor is at -TABLE_HEIGHT."""
+    """z of the ceiling, m; the floor is at -TABLE_HEIGHT."""
     light: np.ndarray
-    """(3,) centre of the square lamp under the ceiling."""
+    """(3,) Centre of the square lamp under the ceiling."""
     light_half: float
-    """half the lamp's side, m."""
+    """Half the side of the lamp, m."""
     seed: int
     cloth: bool = False
-    """whether a chequered cloth lies on the table."""
+    """Whether a chequered cloth lies on the table."""
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the objects, in order."""
         return tuple(item.name for item in self.objects)
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """All parts, the furniture's first."""
+        """All parts, those of the furniture first."""
         return self.furniture + tuple(part for item in self.objects for part in item.parts)
 
 
-def linear(srgb) -> np.ndarray:
-    """sRGB in 0..255 to linear RGB in 0..1 (IEC 61966-2-1)."""
+def srgb_to_linear(srgb) -> np.ndarray:
+    """Converts sRGB in 0..255 to linear RGB in 0..1 (IEC 61966-2-1)."""
     c = np.asarray(srgb, np.float32) / np.float32(255)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def make_room(seed: int, *, num_objects: int = 12) -> Room:
-    """A room with `num_objects` (2 to 12) named objects on its table, none touching another; a function of the seed.
+    """Builds a room with one object of each of the first colours of PALETTE on a bare table.
 
-    Raises ValueError where `num_objects` is out of range.
+    Args:
+      seed: Seed of the room.
+      num_objects: Number of objects, 2 to 12. They do not touch each other.
+
+    Returns:
+      The room.
+
+    Raises:
+      ValueError: `num_objects` is out of range.
     """
     fits = 2 <= num_objects <= len(PALETTE)
     require(fits, "num_objects", num_objects, f"2 to {len(PALETTE)}", "There is one object per colour name.")
@@ -144,15 +158,15 @@ def make_room(seed: int, *, num_objects: int = 12) -> Room:
     colours = list(PALETTE)[:num_objects]
     shapes = _draw_shapes(draw, colours)
     bodies = [SHAPES[shape](draw) for shape in shapes]
-    radii = [radius_of(body) for body in bodies]
-    spots = scatter(draw, radii)
+    radii = [footprint_radius(body) for body in bodies]
+    spots = scatter_circles(draw, radii)
     rows = zip(colours, shapes, map(PALETTE.__getitem__, colours), bodies, radii, spots)
-    objects = tuple(stand(draw, k, *row) for k, row in enumerate(rows))
-    return around(draw, objects, seed)
+    objects = tuple(place_object(draw, k, *row) for k, row in enumerate(rows))
+    return build_room(draw, objects, seed)
 
 
-def around(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed: int, *, cloth: bool = False) -> Room:
-    """The room that the objects' table stands in."""
+def build_room(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed: int, *, cloth: bool = False) -> Room:
+    """Puts walls, a lamp and a table around the objects."""
     half = np.array([draw.uniform(2.25, 2.5), draw.uniform(2.1, 2.35)], np.float32)
     aside, turn = draw.uniform(0.8, 1.1), draw.uniform(0, 2 * np.pi)
     light = np.array([aside * np.cos(turn), aside * np.sin(turn), 1.85], np.float32)
@@ -160,29 +174,38 @@ def around(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed: int
 
 
 def _draw_shapes(draw, colours):
-    """A shape for each colour: several objects alike in shape, no shape more than three times."""
+    """Draws a shape for each colour. Some shapes occur twice or three times, none more often."""
     while True:
-        shapes = [str(draw.choice(_SUITABLE[colour])) for colour in colours]
+        shapes = [str(draw.choice(_SHAPES_BY_COLOUR[colour])) for colour in colours]
         counts = sorted(Counter(shapes).values(), reverse=True)
         alike = sum(count >= 2 for count in counts)
         if counts[0] <= 3 and min(3, len(colours) // 4) <= alike <= 3:
             return shapes
 
 
-def radius_of(body: Body) -> float:
-    """Of a circle around a shape's footprint, m."""
-    return max(reach(solid) for solid, _, _ in body)
+def footprint_radius(body: Body) -> float:
+    """Radius of a circle around the footprint of a shape, m."""
+    return max(radius_about_axis(solid) for solid, _, _ in body)
 
 
-def scatter(
+def scatter_circles(
     draw: np.random.Generator,
     radii: Sequence[float],
     taken: Sequence[tuple[np.ndarray, float]] = (),
     *,
-    gap: float = GAP,
+    gap: float = OBJECT_GAP_M,
 ) -> np.ndarray:
-    """(K, 2) float32 places on the table, footprints `gap` apart, and from the circles `taken` (centre, radius): the
-    largest first, anew when one finds no room."""
+    """Draws places for circles on the table, the largest first, and starts again when one does not fit.
+
+    Args:
+      draw: Random source.
+      radii: K radii of footprints, m.
+      taken: Circles (centre, radius) that are kept free, m.
+      gap: Least distance between circles, m.
+
+    Returns:
+      (K, 2) float32 centres, m.
+    """
     half = np.array(TABLE_HALF) - gap
     while True:
         spots: dict[int, np.ndarray] = {}
@@ -198,7 +221,7 @@ def scatter(
             return np.array([spots[k] for k in range(len(radii))], np.float32)
 
 
-def stand(
+def place_object(
     draw: np.random.Generator,
     index: int,
     colour: str,
@@ -209,10 +232,10 @@ def stand(
     spot: Sequence[float] | np.ndarray,
     yaw: float | None = None,
 ) -> RoomObject:
-    """The object `index` of a room at `spot`, x y of the table or x y z, turned by `yaw` (default: anyhow)."""
+    """Makes object `index` of a room at `spot` (x, y or x, y, z; m), rotated by `yaw` radians (default: random)."""
     axes = rotation(yaw=draw.uniform(0, 2 * np.pi) if yaw is None else yaw)
     centre = np.array([*spot, 0.0][:3], np.float32)
-    albedo = linear(srgb) * np.float32(draw.uniform(0.94, 1.0))
+    albedo = srgb_to_linear(srgb) * np.float32(draw.uniform(0.94, 1.0))
     # Stripes across many small parts would hide what the object is.
     kinds = ["plain", "marble"] if len(body) > 4 else ["plain", "stripes", "checks", "marble", "marble"]
     kind, scale, depth = str(draw.choice(kinds)), draw.uniform(0.03, 0.05), draw.uniform(0.12, 0.2)
@@ -227,7 +250,7 @@ def stand(
 
 
 def _table():
-    wood = linear(TABLE_WOOD)
+    wood = srgb_to_linear(TABLE_WOOD)
     (x, y), t = TABLE_HALF, TABLE_THICKNESS
     parts = [Part(place(box(2 * x, 2 * y, t), (0, 0, -t)), None, -1, wood)]
     for sx in (-1, 1):
@@ -235,3 +258,76 @@ def _table():
             leg = place(box(0.06, 0.06, TABLE_HEIGHT - t), (sx * (x - 0.06), sy * (y - 0.06), -TABLE_HEIGHT))
             parts.append(Part(leg, None, -1, wood))
     return tuple(parts)
+
+
+REPEATED_COLOUR = "red"
+"""Colour of two objects that share one name."""
+PLATE_COLOUR, ON_PLATE_COLOUR = "white", "orange"
+"""Colours of the plate and of the object that stands on it."""
+BEAM_COLOUR, ARCH_COLOUR = "turquoise", "brown"
+"""Colours of a beam that no view shows whole, and of the arch above it."""
+CROWDED_OBJECTS = {
+    "dark green": ((18, 92, 42), ("bottle", "vase")),
+    "green": ((46, 156, 66), ("pot",)),
+    "light green": ((150, 222, 140), ("cup", "bowl")),
+    "dark blue": ((24, 44, 140), ("vase", "mug")),
+    "light blue": ((132, 192, 240), ("kettle",)),
+    REPEATED_COLOUR: ((208, 28, 38), ("mug", "cup")),
+    PLATE_COLOUR: ((236, 236, 236), ("plate",)),
+    ON_PLATE_COLOUR: ((247, 130, 18), ("ball",)),
+    "dark orange": ((206, 98, 14), ("bowl", "box", "vase")),
+    "light brown": ((158, 112, 72), ("teddy", "box")),
+    "purple": ((124, 48, 158), ("bottle", "vase")),
+}
+"""sRGB and possible shapes of each colour."""
+CLUTTER_COLOURS = ((96, 96, 98), (150, 140, 120), (112, 114, 60), (70, 60, 56), (206, 150, 140), (120, 150, 160))
+"""sRGB of small objects without a name."""
+
+
+def crowded_room(seed: int) -> Room:
+    """Builds a room in which kinds of query differ.
+
+    Objects have lids and handles of another colour, two share a name, colours lie near each other, one object stands
+    on another, no view shows the whole beam, and clutter lies on a chequered cloth.
+
+    Args:
+      seed: Seed of the room.
+
+    Returns:
+      The room. Clutter has the name "".
+    """
+    draw = np.random.default_rng([seed, 11])
+    colours = [*CROWDED_OBJECTS, REPEATED_COLOUR]
+    shapes = {colour: str(draw.choice(shapes)) for colour, (_, shapes) in CROWDED_OBJECTS.items()}
+    bodies = [SHAPES[shapes[colour]](draw) for colour in colours] + [_clutter(draw) for _ in CLUTTER_COLOURS]
+    radii = [footprint_radius(body) for body in bodies]
+    long, turn = draw.uniform(0.62, 0.72), draw.uniform(-0.35, 0.35)
+    middle = draw.uniform(-0.12, 0.12, 2)
+    along = np.array([np.cos(turn), np.sin(turn)])
+    taken = [(middle + step * along, 0.07) for step in np.linspace(-long / 2, long / 2, 8)] + [(middle, 0.11)]
+    on_table = [k for k in range(len(bodies)) if k != colours.index(ON_PLATE_COLOUR)]
+    spots = dict(zip(on_table, scatter_circles(draw, [radii[k] for k in on_table], taken, gap=0.01)))
+    spots[colours.index(ON_PLATE_COLOUR)] = np.array([*spots[colours.index(PLATE_COLOUR)], 0.008])
+    objects = []
+    for k, body in enumerate(bodies):
+        colour = colours[k] if k < len(colours) else ""
+        srgb = CROWDED_OBJECTS[colour][0] if colour else CLUTTER_COLOURS[k - len(colours)]
+        objects.append(place_object(draw, k, colour, shapes.get(colour, ""), srgb, body, radii[k], spots[k]))
+    beam, arch = (BEAM_COLOUR, "beam", (54, 190, 182), _beam(long)), (ARCH_COLOUR, "arch", (122, 72, 38), _arch())
+    for colour, shape, srgb, body in (beam, arch):
+        objects.append(
+            place_object(draw, len(objects), colour, shape, srgb, body, footprint_radius(body), middle, turn)
+        )
+    return build_room(draw, tuple(objects), seed, cloth=True)
+
+
+def _clutter(draw: np.random.Generator) -> Body:
+    return [(box(*draw.uniform(0.03, 0.06, 3)), None, 1.0)]
+
+
+def _beam(long: float) -> Body:
+    return [(box(long, 0.06, 0.05), None, 1.0)]
+
+
+def _arch() -> Body:
+    return [(box(0.06, 0.2, 0.15), place(box(0.1, 0.1, 0.11), (0, 0, -0.01)), 1.0)]

@@ -1,25 +1,218 @@
-"""The shapes of the demo room's objects, each put together from a few convex solids.
+"""Solids of the made-up room and the objects that are assembled from them.
 
-A shape takes a random source and gives [(solid, hollow or None, tone)]: tone scales the named colour (1.4 lighter, 0.5
-darker). An object stands on z = 0 around the z axis of its own frame; lengths in metres.
+A solid is {p : quadric(p) <= 0 and normal_k . p <= offset_k for all k}. It is convex, so a ray meets it in one
+interval, which is computed exactly. A part is a solid, optionally less one convex hollow (a mug, a bowl). Vectors are
+(3, n) float32 with coordinates first, which NumPy traverses about twice as fast as (n, 3).
+
+An object stands on z = 0 around the z axis of its own frame. Lengths are in metres.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from jsecon.demo.solids import Solid, box, contains, cut, ellipsoid, frustum, place, rotation
+_NEVER = np.float32(1e30)
+"""Ray parameter of a surface that is never met."""
+_TINY = np.float32(1e-20)
+"""Smallest divisor, against division by zero."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Solid:
+    """One convex solid with its pose."""
+
+    quadric: np.ndarray
+    """(5,) q, l, g of q0 x^2 + q1 y^2 + q2 z^2 + 2 l z + g <= 0 in the solid's frame; q = 0, g < 0 if absent."""
+    planes: np.ndarray
+    """(k, 4) outward unit normals and offsets in the solid's frame: inside where n . p <= offset."""
+    axes: np.ndarray
+    """(3, 3) columns are the solid's axes in the parent frame: a rotation."""
+    centre: np.ndarray
+    """(3,) origin of the solid's frame in the parent frame."""
+    bound: np.ndarray
+    """(4,) centre (parent frame) and radius of a sphere around the solid."""
+    nappe: float = 0.0
+    """dr/dz of a cone, to exclude its mirror image beyond the apex; 0 for other solids."""
+
+
+def _solid(quadric, planes, radius: float, middle=(0.0, 0.0, 0.0), nappe: float = 0.0) -> Solid:
+    """A solid at the origin whose bounding sphere has this radius and middle."""
+    bound = np.array([*middle, radius], np.float32)
+    return Solid(
+        np.asarray(quadric, np.float32),
+        np.asarray(planes, np.float32).reshape(-1, 4),
+        np.eye(3, dtype=np.float32),
+        np.zeros(3, np.float32),
+        bound,
+        float(nappe),
+    )
+
+
+def ellipsoid(rx: float, ry: float, rz: float, *, below: float | None = None, above: float | None = None) -> Solid:
+    """Ellipsoid of radii rx, ry, rz about the origin, optionally cut to z <= `below` and z >= `above`."""
+    planes = [] if below is None else [(0, 0, 1, below)]
+    planes += [] if above is None else [(0, 0, -1, -above)]
+    return _solid((rx**-2, ry**-2, rz**-2, 0.0, -1.0), planes, max(rx, ry, rz))
+
+
+def frustum(bottom: float, top: float, height: float) -> Solid:
+    """Upright cone section, radius `bottom` at z = 0 and `top` at z = `height`; a cylinder where they agree."""
+    slope = (top - bottom) / height
+    planes = [(0, 0, 1, height), (0, 0, -1, 0.0)]
+    quadric = (1.0, 1.0, -(slope**2), -bottom * slope, -(bottom**2))
+    radius = float(np.hypot(height / 2, max(bottom, top)))
+    return _solid(quadric, planes, radius, (0, 0, height / 2), slope)
+
+
+def box(width: float, depth: float, height: float) -> Solid:
+    """Upright box standing on z = 0, centred in x and y."""
+    sides = [(1, 0, 0, width / 2), (-1, 0, 0, width / 2), (0, 1, 0, depth / 2), (0, -1, 0, depth / 2)]
+    planes = [*sides, (0, 0, 1, height), (0, 0, -1, 0.0)]
+    radius = 0.5 * float(np.sqrt(width**2 + depth**2 + height**2))
+    return _solid((0, 0, 0, 0, -1.0), planes, radius, (0, 0, height / 2))
+
+
+def cut(solid: Solid, normal: tuple[float, float, float], offset: float) -> Solid:
+    """The part of a solid with normal . p <= offset, in the solid's frame; `normal` has unit length."""
+    plane = np.array([[*normal, offset]], np.float32)
+    return dataclasses.replace(solid, planes=np.concatenate([solid.planes, plane]))
+
+
+def place(solid: Solid, centre, axes=None) -> Solid:
+    """A solid whose parent frame is rotated by `axes` (3, 3) and then shifted by `centre` (3,), metres."""
+    turn = np.eye(3, dtype=np.float32) if axes is None else np.asarray(axes, np.float32)
+    shift = np.asarray(centre, np.float32)
+    bound = np.concatenate([turn @ solid.bound[:3] + shift, solid.bound[3:]])
+    return dataclasses.replace(solid, axes=turn @ solid.axes, centre=turn @ solid.centre + shift, bound=bound)
+
+
+def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Float[np.ndarray, "3 3"]:
+    """Rotation about z by `yaw` after y by `pitch` after x by `roll`, radians."""
+    (cz, sz), (cy, sy), (cx, sx) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    return (about_z @ about_y @ about_x).astype(np.float32)
+
+
+def contains(solid: Solid, points: Float[np.ndarray, "3 n"], *, margin: float = 0.0) -> Bool[np.ndarray, " n"]:
+    """Whether each point lies in the solid, or (to first order) within `margin` metres of it."""
+    return _nearest_surface(solid, points)[0] <= margin
+
+
+def ray_interval(
+    solid: Solid, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Ray parameters between which origin + t direction lies in the solid; enter >= leave where it misses."""
+    d = solid.axes.T @ direction
+    o = solid.axes.T @ (origin - solid.centre[:, None])
+    # Start where the ray passes the solid's origin, so that the terms of the quadratic have the size of the solid.
+    start = -(o * d).sum(0) / np.maximum((d * d).sum(0), _TINY)
+    o = o + start * d
+    enter, leave = np.full(d.shape[1], -_NEVER), np.full(d.shape[1], _NEVER)
+    if solid.quadric[:3].any():
+        enter, leave = _quadric_interval(solid, o, d)
+    for plane in solid.planes:
+        axis = np.flatnonzero(plane[:3])
+        if len(axis) == 1:
+            along, room = plane[axis[0]] * d[axis[0]], plane[3] - plane[axis[0]] * o[axis[0]]
+        else:
+            along, room = plane[:3] @ d, plane[3] - plane[:3] @ o
+        along = np.where(np.abs(along) < _TINY, _TINY, along)
+        with np.errstate(over="ignore"):
+            at = room / along
+        enter = np.where(along < 0, np.maximum(enter, at), enter)
+        leave = np.where(along > 0, np.minimum(leave, at), leave)
+    return enter + start, leave + start
+
+
+def _quadric_interval(solid, o, d):
+    """Ray parameters between which o + t d, in the solid's frame, lies inside of its quadric."""
+    q, slant, constant = solid.quadric[:3, None], solid.quadric[3], solid.quadric[4]
+    qd = q * d
+    a, b = (qd * d).sum(0), (qd * o).sum(0) + slant * d[2]
+    c = (q * o * o).sum(0) + 2 * slant * o[2] + constant
+    a = np.where(np.abs(a) < 1e-9, np.float32(1e-9), a)
+    discriminant = b * b - a * c
+    root = np.sqrt(np.maximum(discriminant, 0))
+    # The stable form: no subtraction of nearly equal numbers when the ray runs along a cone's side.
+    s = -(b + np.copysign(root, b))
+    first, second = s / a, c / np.where(np.abs(s) < _TINY, _TINY, s)
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    # a > 0: inside between the roots. a < 0: a ray within the opening angle of a cone is inside beyond the roots, and
+    # only one of these half-lines is in the nappe that exists (towards growing radius).
+    outward = solid.nappe * d[2] > 0
+    enter = np.where(a > 0, low, np.where(outward, high, -_NEVER))
+    leave = np.where(a > 0, high, np.where(outward, _NEVER, low))
+    missed = (discriminant < 0) & (a > 0)
+    return np.where(missed, _NEVER, enter), np.where(missed, -_NEVER, leave)
+
+
+def first_hit(
+    solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
+) -> Float[np.ndarray, " n"]:
+    """Ray parameter of the first surface of `solid` less `hollow`; inf where missed. The origin must lie outside."""
+    enter, leave = ray_interval(solid, origin, direction)
+    hit = (enter < leave) & (enter > 0)
+    if hollow is not None:
+        inner_enter, inner_leave = ray_interval(hollow, origin, direction)
+        open_here = (inner_enter <= enter) & (enter < inner_leave)
+        hit &= ~open_here | (inner_leave < leave)
+        enter = np.where(open_here, inner_leave, enter)
+    return np.where(hit, enter, np.float32(np.inf))
+
+
+def blocks_segment(
+    solid: Solid, hollow: Solid | None, origin: Float[np.ndarray, "3 _"], direction: Float[np.ndarray, "3 n"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether `solid` less `hollow` meets the segment from origin to origin + direction."""
+    enter, leave = ray_interval(solid, origin, direction)
+    enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)
+    blocked = enter < leave
+    if hollow is not None and blocked.any():
+        inner_enter, inner_leave = ray_interval(hollow, origin, direction)
+        blocked &= ~((inner_enter <= enter) & (inner_leave >= leave))
+    return blocked
+
+
+def _nearest_surface(solid, points):
+    """Signed distance to the nearest surface of the solid (to first order) and the outward normal of that surface."""
+    p = solid.axes.T @ (points - solid.centre[:, None])
+    distance, normal = np.full(p.shape[1], -_NEVER), np.zeros_like(p)
+    if solid.quadric[:3].any():
+        q, slant, constant = solid.quadric[:3, None], solid.quadric[3], solid.quadric[4]
+        gradient = q * p
+        value = (gradient * p).sum(0) + 2 * slant * p[2] + constant
+        gradient[2] += slant
+        length = np.maximum(np.sqrt((gradient * gradient).sum(0)), _TINY)
+        distance, normal = value / (2 * length), gradient / length
+    for plane in solid.planes:
+        beyond = plane[:3] @ p - plane[3]
+        normal = np.where(beyond > distance, plane[:3, None], normal)
+        distance = np.maximum(distance, beyond)
+    return distance, solid.axes @ normal
+
+
+def normals(solid: Solid, hollow: Solid | None, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+    """Unit normals that point out of the material, at points on the surface of `solid` less `hollow`."""
+    distance, normal = _nearest_surface(solid, points)
+    if hollow is None:
+        return normal
+    inner_distance, inner_normal = _nearest_surface(hollow, points)
+    return np.where(np.abs(inner_distance) < np.abs(distance), -inner_normal, normal)
+
 
 Body: TypeAlias = Sequence[tuple[Solid, Solid | None, float]]
-"""solids, what is hollow of each, and its tone"""
+"""(solid, hollow or None, tone) of each part. The tone scales the named colour: 1.4 is lighter, 0.5 darker."""
 
 
-def reach(solid: Solid) -> float:
-    """Radius about the z axis that holds the solid, m: from a grid over its bounding sphere, up to a cell too large."""
+def radius_about_axis(solid: Solid) -> float:
+    """Radius of the smallest cylinder about z around the solid, m. A grid makes it too large by up to one cell."""
     steps, cell = np.linspace(-1, 1, 25, dtype=np.float32), solid.bound[3] / 12
     grid = np.stack(np.meshgrid(steps, steps, steps)).reshape(3, -1)
     points = solid.bound[:3, None] + solid.bound[3] * grid
@@ -48,7 +241,7 @@ def _book(draw):
 
 
 def _vessel(bottom, top, height, wall):
-    """Outer and hollow of an open cup whose wall and floor are `wall` thick; the hollow comes out above the rim."""
+    """Solid and hollow of an open cup with walls and floor of thickness `wall`. The hollow ends above the rim."""
     slope = (top - bottom) / height
     over = 0.01
     inner = frustum(bottom - wall + slope * wall, top - wall + slope * over, height - wall + over)
@@ -62,7 +255,7 @@ def _mug(draw):
 
 
 def _handle(ring, away, up, turned):
-    """A ring standing upright `away` from the axis, on the side of `turned`; its half towards the axis is cut away."""
+    """Half of an upright ring at distance `away` from the axis, height `up` and azimuth `turned`."""
     eye, turn = 0.016, rotation(yaw=turned) @ rotation(roll=np.pi / 2) @ rotation(yaw=np.pi)
     half = cut(_about_middle(frustum(ring, ring, 0.022), 0.011), (1.0, 0.0, 0.0), 0.004)
     hole = _about_middle(frustum(ring - eye, ring - eye, 0.06), 0.03)
@@ -95,7 +288,7 @@ def _knob():
 
 
 def _about_middle(solid: Solid, down: float) -> Solid:
-    """The solid with its own frame's origin moved up by `down`, so that planes and turns are about its middle."""
+    """The solid with the origin of its frame moved up by `down`, so that cuts and rotations are about its middle."""
     planes = solid.planes.copy()
     planes[:, 3] -= planes[:, 2] * np.float32(down)
     q = solid.quadric.copy()
@@ -216,7 +409,7 @@ def _toy_car(draw):
     ]
 
 
-SHAPES = {
+SHAPES: dict[str, Callable[[np.random.Generator], Body]] = {
     "ball": _ball,
     "box": _box,
     "book": _book,

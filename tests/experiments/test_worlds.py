@@ -27,7 +27,7 @@ from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
 from jsecon.data.lerf_labels import LabelledFrame
-from jsecon.demo.room import TABLE_WOOD, linear, make_room
+from jsecon.demo.room import TABLE_WOOD, make_room, srgb_to_linear
 from jsecon.errors import InputError
 from jsecon.query.render import selection_mask
 
@@ -251,7 +251,7 @@ def test_things_of_a_kind_are_one_answer_and_camouflage_takes_their_colours():
     assert camouflaged(room, 0) is room
     for item in camouflaged(room, 1.0).objects:
         for part in item.parts:
-            np.testing.assert_allclose(part.albedo, linear(TABLE_WOOD), rtol=1e-6)
+            np.testing.assert_allclose(part.albedo, srgb_to_linear(TABLE_WOOD), rtol=1e-6)
 
 
 def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
