@@ -5,7 +5,7 @@
 The Gaussians are the ground-truth points, one each, never densified; each gets the class that fits it best, or none,
 which is a miss. Without --root: twins of the eight scenes, three seeds, and `classes` are the shapes of their objects
 and the table. With it NICE-SLAM's rendering with the original semantics, and the ten classes are ours: the paper does
-not name its own. ScanNet's 19, 15 and 10 classes go through the same code (`twins.Data("scannet", ...)`).
+not name its own.
 """
 
 import dataclasses

@@ -24,7 +24,6 @@ import numpy as np
 from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
 from experiments.fair import ahead
-from experiments.points import without_evidence
 from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import associated
@@ -43,6 +42,8 @@ from jsecon.types import LanguageField
 AS_IT_IS = "as it is"
 NO_REFUSAL = -1.0
 """below every similarity"""
+FULL_PX = 1000
+"""Factor on the pixels of a region that gives it full evidence."""
 LEAST = 5
 """points of an object that is judged"""
 QUANTILES = (0.8, 0.9, 0.95, 0.98)
@@ -100,6 +101,11 @@ def anchored(change: Callable[[LanguageField], LanguageField] = lambda field: fi
     """A field that is changed, asked with other options `query` of `query_anchored`."""
     options = {"retrieval_threshold": NO_REFUSAL, **query}
     return lambda setting, field, k: query_anchored(change(field), jnp.asarray(setting.texts[k]), **options)
+
+
+def without_evidence(field: LanguageField) -> LanguageField:
+    """A field whose regions have full evidence in each view that shows them."""
+    return dataclasses.replace(field, regions=dataclasses.replace(field.regions, pixels=FULL_PX * field.regions.pixels))
 
 
 def every_region(setting: Setting, field: LanguageField, k: int) -> Any:

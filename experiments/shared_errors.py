@@ -22,7 +22,6 @@ import numpy as np
 
 from experiments import lerf, results
 from experiments.datasets.benchmark import Benchmark
-from experiments.ideas.state import unit
 from experiments.simulated_vision.worlds import SHARED_STRENGTH
 from experiments.tables import twins
 from jsecon.query.match import evidence
@@ -47,6 +46,11 @@ REAL = {
     "present above absent, by what sets it apart from words": "",
 }
 """what is measured, and the real embedder's figures where they are known"""
+
+
+def unit(rows: np.ndarray) -> np.ndarray:
+    """Rows of unit length; zero rows stay zero."""
+    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
 
 
 @dataclasses.dataclass(frozen=True)

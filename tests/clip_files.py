@@ -15,7 +15,7 @@ from jsecon.networks.tokenizer import ClipTokenizer
 
 @functools.cache
 def fixture() -> dict:
-    """Merges, and [text, ids] by open_clip on them: written by experiments/clip_tokenizer.py."""
+    """Merges, and [text, ids] by open_clip 3.3.0 on them."""
     return json.loads((Path(__file__).parent / "clip_tokens.json").read_text())
 
 

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_field import make_field
 
-from experiments.places import box_iou
 from jsecon.app.ask import Answer
 from jsecon.app.locate import locate_answer
 from jsecon.errors import InputError
@@ -65,10 +64,3 @@ def test_what_selects_nothing_has_no_place(answer):
     field, asked, *_ = answer
     with pytest.raises(InputError, match="nothing selected"):
         locate_answer(field, dataclasses.replace(asked, mask=np.zeros(64, bool)))
-
-
-def test_boxes_overlap_as_they_should():
-    unit = np.array([[0.0, 0, 0], [1, 1, 1]])
-    assert box_iou(unit, unit) == 1
-    assert box_iou(unit, unit + np.array([0.5, 0, 0])) == pytest.approx(1 / 3)
-    assert box_iou(unit, unit + 2) == 0

@@ -1,1 +1,1 @@
-"""LERF, 3D-OVS, Replica and ScanNet: loaders, and twins of them in their own layouts."""
+"""Loaders of LERF, 3D-OVS and Replica, and writers of made-up scenes in their layouts."""

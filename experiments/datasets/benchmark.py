@@ -1,6 +1,6 @@
 """A scene of a benchmark as every dataset's loader returns it: one pytree, whatever its files look like.
 
-LERF and 3D-OVS have their truth in pixels (`frames`), Replica and ScanNet in points (`point_classes`).
+LERF and 3D-OVS have their truth in pixels (`frames`), Replica in points (`point_classes`).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Benchmark:
     name: str = _static()
     """of the scene."""
     dataset: str = _static()
-    """lerf, ovs3d, replica or scannet."""
+    """lerf, ovs3d or replica."""
     queries: tuple[str, ...] = _static()
     """the texts."""
     pairs: int = _static()

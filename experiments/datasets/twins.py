@@ -1,4 +1,4 @@
-"""Twins: made-up rooms written in the exact layouts of LERF-OVS, 3D-OVS, Replica and ScanNet.
+"""Twins: made-up rooms written in the exact layouts of LERF-OVS, 3D-OVS and Replica.
 
 What the real datasets can't be had for is run on these: the loader, the protocol and the table see files of the true
 form. ROOT/twin.json says of each scene what the generator put there; ROOT/truth/<scene>/<frame>.png is the object of
@@ -19,10 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from experiments.datasets.benchmark import TWIN_FILE
-from experiments.datasets.mesh import CEILING, SURROUNDINGS, Mesh, mesh_of, surfaces_of
+from experiments.datasets.mesh import SURROUNDINGS, Mesh, mesh_of, surfaces_of
 from experiments.datasets.mesh_files import write_mesh
 from experiments.datasets.ovs3d import write_poses_bounds, write_segmentations
-from experiments.datasets.scannet import CLASS_SETS, NYU40
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
 from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
@@ -30,9 +29,6 @@ from jsecon.demo.capture import label_frame, look_at, render_capture, room_camer
 from jsecon.demo.room import TABLE_WOOD, Part, Room, make_room, srgb_to_linear
 from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
-
-FURNISHINGS = (5, 3, 8, 11, 10, 14, 12, 24, 34, 33, 36, 16)
-"""NYU40 ids that the objects of a ScanNet twin take in turn"""
 
 
 def write_lerf_twin(
@@ -171,51 +167,6 @@ def write_replica_twin(
     return root
 
 
-def write_scannet_twin(
-    root: Path,
-    scene: str,
-    seed: int,
-    *,
-    views: int = 30,
-    width: int = 320,
-    height: int = 240,
-    num_objects: int = 12,
-    fine_m: float = 0.012,
-    coarse_m: float = 0.05,
-    lost: Sequence[int] = (),
-) -> Path:
-    """A room as a scan of ScanNet, its objects under NYU40 ids in turn; frames `lost` have infinite poses."""
-    numbers = tuple(map(str, range(views)))
-    room, capture, owners, mesh = _scanned(seed, numbers, width, height, num_objects, fine_m, coarse_m)
-    surroundings = {"wall": 1, "floor": 2, "table": 7, CEILING: 22}
-    of_objects = [FURNISHINGS[k % len(FURNISHINGS)] for k in range(len(room.objects))]
-    ids = np.array(of_objects + [surroundings[name] for name in SURROUNDINGS])
-    poses = np.linalg.inv(np.asarray(capture.cameras.world_to_camera, np.float64))
-    poses[list(lost)] = -np.inf
-    focal = float(capture.cameras.fx[0])
-    matrix = np.diag([focal, focal, 1.0, 1.0])
-    matrix[:2, 2] = width / 2 - 0.5, height / 2 - 0.5
-    folder = root / scene
-    _write_matrix(folder / "intrinsic" / "intrinsic_color.txt", matrix)
-    for t in range(views):
-        write_image(folder / "color" / f"{t}.jpg", capture.frames[t])
-        _write_matrix(folder / "pose" / f"{t}.txt", poses[t])
-    write_mesh(folder / f"{scene}_vh_clean_2.ply", mesh.vertices, mesh.faces)
-    names = ("x", "y", "z", "red", "green", "blue")
-    kinds = [(name, mesh.vertices.dtype[name].str) for name in names] + [("label", "<u2")]
-    vertices = np.zeros(len(mesh.vertices), np.dtype(kinds))
-    for name in names:
-        vertices[name] = mesh.vertices[name]
-    vertices["label"] = ids[mesh.vertex_owners]
-    write_mesh(folder / f"{scene}_vh_clean_2.labels.ply", vertices, mesh.faces)
-    present = set(np.unique(vertices["label"]).tolist())
-    pairs = {str(size): len(present & set(chosen)) for size, chosen in CLASS_SETS.items()}
-    objects = [NYU40.get(number, CEILING) for number in ids]
-    queries = list(NYU40.values())
-    _finish(root, scene, capture, owners, seed=seed, pairs=pairs, queries=queries, objects=objects)
-    return root
-
-
 def _scanned(
     seed: int,
     names: tuple[str, ...],
@@ -280,7 +231,3 @@ def _finish(
 def _write_png16(path: Path, values: np.ndarray) -> None:
     with atomic_write(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", values.astype(np.uint16))[1].tobytes())
-
-
-def _write_matrix(path: Path, matrix: np.ndarray) -> None:
-    write_text(path, "".join(" ".join(map(repr, map(float, row))) + "\n" for row in matrix))

@@ -1,5 +1,4 @@
-"""Masks of single frames brought together over the frames: by a tracker's ids from disk, by the paper's Algorithm 1, or
-by consensus of the views."""
+"""Regions from the masks of single frames: by the ids of a tracker from disk, or by consensus of the views."""
 
 import dataclasses
 import time
@@ -11,11 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.rivals.evidence import Evidence
-from jsecon.association.algorithm1 import clean_masklets, masklets
+from jsecon.association.algorithm1 import clean_masklets
 from jsecon.association.consensus import consensus_masklets
-from jsecon.association.tracker import GeometricTracker
 from jsecon.association.views import SceneViews
-from jsecon.types import Camera, Gaussians
 
 ROWS = 64
 """regions are counted in multiples of this, the last without pixels and embedding: scenes share compiled programs"""
@@ -66,20 +63,9 @@ def by_consensus(
     """jsecon's own association, without tracks: the pixels of each frame go to groups of Gaussians that lie in one mask
     in most views; `silent` as for `mask_signatures`, `centre` as for `SceneViews`, `how` as for
     `consensus_masklets`."""
-    scene = SceneViews(*_scene(levels), lambda t: proposals(levels, t), centre=centre)
+    given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
+    scene = SceneViews(*given, lambda t: proposals(levels, t), centre=centre)
     return associated(levels, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed, **how)))
-
-
-def by_algorithm1(levels: Sequence[Evidence], frames: np.ndarray, *, kappa: float) -> Association:
-    """The paper's Algorithm 1 over the masks of the frames, followed through the Gaussians; kappa: `masklets`'
-    iou_threshold."""
-    track = GeometricTracker(*_scene(levels), lambda t: proposals(levels, t))
-    labels = masklets(frames, lambda _, t: proposals(levels, t), track, iou_threshold=kappa)
-    return associated(levels, labels)
-
-
-def _scene(levels: Sequence[Evidence]) -> tuple[Gaussians, Camera]:
-    return jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
 
 
 def proposals(levels: Sequence[Evidence], t: int) -> np.ndarray:

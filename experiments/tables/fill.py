@@ -16,7 +16,7 @@ from experiments.datasets.benchmark import Benchmark
 from experiments.protocols.points import evaluate_points
 from experiments.tables import twins
 from experiments.tables.answers import Answers, Method, Steps
-from experiments.tables.setting import Fitted, Setting, prepare
+from experiments.tables.setting import Setting, prepare
 from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
 from jsecon.process import clear_programs, cores, peak_memory_mib
 
@@ -33,7 +33,6 @@ class Plan:
     methods: tuple[str, ...]
     steps: Steps = dataclasses.field(default_factory=Steps)
     fit_steps: int = 700
-    fitted: Fitted = "short"
     level: str = "medium"
     """of the twins' simulated vision; unused for real data."""
     sweep: tuple[str, ...] = ("perfect", "low", "medium", "high")
@@ -118,7 +117,7 @@ def _complete(plan: Plan, methods: Mapping[str, Method], where: tuple, keys: dic
         if not missing:
             return
         clear_programs()
-        setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps, fitted=plan.fitted)
+        setting = prepare(plan.data, scene, seed, level, fit_steps=plan.fit_steps)
         for name in missing:
             began = time.perf_counter()
             cell = measure(setting, methods[name](setting, plan.steps))
@@ -145,7 +144,6 @@ def _key(plan: Plan, scene: str, seed: int, level: str, method: str) -> str:
         plan.fit_steps,
         dataclasses.asdict(plan.steps),
     ]
-    given += [] if plan.fitted == "short" else [plan.fitted]
     digest = hashlib.sha1(json.dumps([*given, scene, seed, level, method], default=str).encode()).hexdigest()[:12]
     return f"{scene}-{seed}-{level}-{digest}"
 

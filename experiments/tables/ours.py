@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.rivals.evidence import with_room
 from experiments.tables.answers import Answers, Method, Steps, by_selection
-from experiments.tables.association import Association, associated, by_algorithm1, by_consensus, proposals
+from experiments.tables.association import Association, associated, by_consensus, proposals
 from experiments.tables.memberships import by_lead, of_all_views
 from experiments.tables.setting import Setting
 from jsecon.association.consensus import pieces_on_masks
@@ -44,16 +44,13 @@ def association(
     centre: float = 0.0,
     agreement: float = AGREEMENT,
 ) -> Association:
-    """The regions of a setting: by "tracks", "kappa K" (the paper's Algorithm 1), "consensus" ("outspoken": in which a
-    view speaks on what lies in none of its masks), or any other name with its `labels`. `centre` and `agreement` are
+    """The regions of a setting: by "tracks", "consensus" ("outspoken": in which a view speaks on what lies in none of
+    its masks), or any other name with its `labels`. `centre` and `agreement` are
     those of a consensus."""
     if by == "tracks":
         return setting.tracked
     if labels is not None:
         return setting.shared.get(by, lambda: associated(setting.levels, labels))
-    if by.startswith("kappa "):
-        kappa = float(by.split()[1])
-        return setting.shared.get(by, lambda: by_algorithm1(setting.levels, setting.frames, kappa=kappa))
     how = {"silent": by != "outspoken", "centre": centre, "agreement": agreement}
     make = lambda: by_consensus(setting.levels, setting.frames, seed=setting.seed, **how)
     return setting.shared.get((by, centre, agreement), make)

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,6 @@ from jsecon.data.ply import load_ply, save_ply
 from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points, starting_gaussians
-from jsecon.pipeline.options import Options
 from jsecon.types import Camera, Gaussians
 
 
@@ -58,14 +57,9 @@ FIT: Any = {
     "rates": LearningRates(means=2e-3, means_last=2e-5),
 }
 """of the scenes without Gaussians: few steps, one Gaussian for each point of the start"""
-Fitted = Literal["short", "default", "default, twice"]
-"""how Gaussians are fitted where a scene has none: shortly (FIT), as `jsecon fit` does but to the number of its start,
-or with growth to twice that number"""
 
 
-def prepare(
-    data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: int, fitted: Fitted = "short"
-) -> Setting:
+def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: int) -> Setting:
     """Loads a scene with its masks, tracks and texts; fits its Gaussians where neither the dataset has them (points, or
     <scene>/point_cloud.ply) nor an earlier run."""
     root = data.place(scene, seed, level)
@@ -76,7 +70,7 @@ def prepare(
     masks = load_features(folder / "language_features", names, size)
     tracks = load_labels(folder / "masks", names, size, shared=True).labels.astype(np.int32)
     texts, canonical = load_text_features(folder / "text_features.json", bench.queries)
-    gaussians = gaussians_of(bench, folder, data.kept(root, scene), fit_steps, fitted)
+    gaussians = gaussians_of(bench, folder, data.kept(root, scene), fit_steps)
     cameras = jax.tree.map(jnp.asarray, capture.cameras)
     evidence = Evidence(gaussians, cameras[shown], masks.labels, masks.embeddings, masks.frame, tracks)
     levels = levels_of(evidence, folder, names)
@@ -108,7 +102,7 @@ def levels_of(evidence: Evidence, folder: Path, names: tuple[str, ...]) -> tuple
     return tuple(found)
 
 
-def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int, fitted: Fitted = "short") -> Gaussians:
+def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int) -> Gaussians:
     """The scene's Gaussians: its points, one each and in order; or those of <folder>/point_cloud.ply; or fitted, and
     left in `kept` under a name that says to what: levels of noise share the frames, and so the fit."""
     if len(bench.points):
@@ -119,16 +113,9 @@ def gaussians_of(bench: Benchmark, folder: Path, kept: Path, steps: int, fitted:
     if given.exists():
         return load_ply(given)
     seen = hashlib.sha1(np.ascontiguousarray(bench.capture.frames).tobytes()).hexdigest()[:12]
-    file = kept / f"{bench.name}_{seen}_{steps}{'' if fitted == 'short' else '_' + fitted.replace(', ', '_')}.ply"
+    file = kept / f"{bench.name}_{seen}_{steps}.ply"
     if not file.exists():
-        start, _ = starting_gaussians(bench.capture, sh_degree=0 if fitted == "short" else Options.sh_degree)
-        way: Any = FIT
-        if fitted != "short":
-            way = {
-                "schedule": Schedule(
-                    growth="votes", max_gaussians=start.count * (2 if fitted == "default, twice" else 1)
-                )
-            }
-        gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **way)
+        start, _ = starting_gaussians(bench.capture, sh_degree=0)
+        gaussians, _ = fit_gaussians(bench.capture, steps=steps, key=jax.random.key(0), start=start, **FIT)
         save_ply(file, gaussians)
     return load_ply(file)

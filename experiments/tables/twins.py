@@ -23,7 +23,6 @@ from experiments.datasets.lerf_ovs import load_lerf_ovs
 from experiments.datasets.mesh import SURROUNDINGS, surfaces_of
 from experiments.datasets.ovs3d import load_ovs3d
 from experiments.datasets.replica import load_replica
-from experiments.datasets.scannet import load_scannet
 from experiments.simulated_vision.embeddings import (
     SimulatedEmbedder,
     TextSpace,
@@ -34,6 +33,7 @@ from experiments.simulated_vision.embeddings import (
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
 from jsecon.data.mask_files import LEVELS
+from jsecon.demo.capture import write_label_image
 from jsecon.demo.raycast import trace_rays
 from jsecon.demo.room import make_room
 from jsecon.files import write_text
@@ -47,7 +47,6 @@ WRITERS = {
     "lerf": twins.write_lerf_twin,
     "ovs3d": twins.write_ovs3d_twin,
     "replica": twins.write_replica_twin,
-    "scannet": twins.write_scannet_twin,
 }
 
 
@@ -64,14 +63,12 @@ def faults_of(level: str) -> Faults:
 
 
 def load(dataset: str, root: Path, scene: str, *, every: int = 1, downscale: float | None = None) -> Benchmark:
-    """A scene of any of the four datasets, real or twin; `every` and `downscale` are for long, large captures."""
+    """A scene of any of the datasets, real or twin; `every` and `downscale` are for long, large captures."""
     if dataset == "lerf":
         return load_lerf_ovs(root, scene, downscale=downscale)
     if dataset == "ovs3d":
         return load_ovs3d(root, scene, downscale=downscale)
-    if dataset == "replica":
-        return load_replica(root, scene, every=every, downscale=downscale)
-    return load_scannet(root, scene, every=every, downscale=downscale)
+    return load_replica(root, scene, every=every, downscale=downscale)
 
 
 def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict) -> Path:
@@ -150,7 +147,7 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
                 rows.append(embedder.embed_regions(frame, image[None] == here[:, None, None]))
             found.append(first[id(level)])
         write_features(folder / "language_features", name, np.stack(found), np.concatenate(rows))
-        twins.write_ids(folder / "masks" / f"{name}.png", (masks.labels[t] + 1).astype(np.uint16))
+        write_label_image(folder / "masks" / f"{name}.png", (masks.labels[t] + 1).astype(np.uint16))
     vectors = np.concatenate([embedder.embed_text(list(bench.queries)), embedder.canonical])
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
 
@@ -192,7 +189,7 @@ class Data:
     size: tuple[tuple[str, int | float], ...] = ()
     """of the twins: options of their writer."""
     every: int = 10
-    """frames of a real scan of which one is taken (Replica and ScanNet have thousands)."""
+    """frames of a real scan of which one is taken (Replica has thousands)."""
     downscale: float | None = None
     """of real frames."""
 

@@ -23,11 +23,11 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from experiments import apc_bin, bonsai_outlines, results
+from experiments import apc_bin, results
+from experiments.datasets import bonsai_outlines
 from experiments.datasets.depth_points import labels_of_points
-from experiments.default_vision import connected_parts
+from experiments.datasets.named_objects import CLASSES, NEAR_M, connected_parts, names_of_objects
 from experiments.replica_apartment_0 import Options as Scan, load_replica, points_as_gaussians
-from experiments.replica_classes import CLASSES, NEAR_M, names_of_objects
 from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
 from experiments.words.conse import WORDS, Conse

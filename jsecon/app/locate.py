@@ -59,7 +59,7 @@ def locate(field: LanguageField, text: str, embedder: Any = None, **how: Any) ->
 
     `embedder`: that of the field, opened where it is not given. In five rooms of the demo, of whose things that no
     other shares a name with it finds 59 of 60, `center` is off by 6 mm in the median and the box along the
-    world's axes has an IoU of 0.69 with the true one (experiments/places.py). Raises InputError where nothing answers
+    world's axes has an IoU of 0.69 with the true one in made-up rooms. Raises InputError where nothing answers
     the text.
     """
     if embedder is None:

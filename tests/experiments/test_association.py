@@ -8,7 +8,7 @@ import pytest
 from balls import ring_of_balls
 
 from experiments.rivals.evidence import Evidence, evidence_of_tracks
-from experiments.tables.association import ROWS, Shared, associated, by_algorithm1, by_consensus, overlaps, unit
+from experiments.tables.association import ROWS, Shared, associated, by_consensus, overlaps, unit
 from jsecon.types import Camera
 
 
@@ -48,17 +48,17 @@ def test_a_region_is_the_mean_of_its_masks_by_pixels_or_by_views(scene):
     assert not both.embeddings[1].any()  # two of ten pixels of the two levels
 
 
-def test_consensus_and_algorithm_1_find_the_balls_that_no_tracker_followed():
+def test_consensus_finds_the_balls_that_no_tracker_followed():
     gaussians, cameras, frames, truth, _ = ring_of_balls()
     views = np.arange(0, 24, 3)
     units = np.eye(4, 8, dtype=np.float32)
     evidence = evidence_of_tracks(gaussians, cameras[views], truth[views], np.tile(units, (len(views), 1, 1)))
     shuffled = dataclasses.replace(evidence, tracks=np.full_like(evidence.tracks, -1))
-    for found in (by_consensus([shuffled], frames[views], seed=0), by_algorithm1([shuffled], frames[views], kappa=0.5)):
-        for ball in (1, 2, 3):
-            region = int((found.embeddings @ units[ball]).argmax())
-            own, true = found.labels == region, truth[views] == ball
-            assert (own & true).sum() > 0.8 * (own | true).sum()
+    regions = by_consensus([shuffled], frames[views], seed=0)
+    for ball in (1, 2, 3):
+        own = regions.labels == int((regions.embeddings @ units[ball]).argmax())
+        true = truth[views] == ball
+        assert (own & true).sum() > 0.8 * (own | true).sum()
 
 
 def test_shared_work_is_done_once_and_charged_to_each_that_asks():

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
 
-from experiments import default_fit, fair, lerf, shared_errors
+from experiments import fair, lerf, shared_errors
 from experiments.rivals.lifting import smoothed
 from experiments.tables import fill
 from experiments.tables.readings import as_share
 from experiments.tables.rows import rows_of
-from experiments.tables.setting import prepare
 
 
 def test_a_share_is_one_half_where_the_readout_cuts():
@@ -140,23 +139,3 @@ def test_readings_are_named_without_the_constants_of_methods():
     named = {fair.reading_of(row) for points in (False, True) for row in rows_of(points)}
     assert "contrast, threshold" in named
     assert not any("roots" in name or "codebook" in name or "0." in name for name in named)
-
-
-def test_a_table_on_another_fit_keeps_its_own_cells_and_takes_those_of_the_table():
-    asked = dataclasses.replace(lerf.PLAN, out="elsewhere")
-    key = lambda plan: fill._key(plan, "ramen", 0, "medium", "VALA")
-    plans = {fitted: default_fit.plan_of(lerf.PLAN, asked, fitted) for fitted in default_fit.FITS}
-    assert key(plans["short"]) == key(lerf.PLAN)
-    assert plans["short"].out == lerf.PLAN.out
-    assert len({key(plan) for plan in plans.values()}) == 3
-    assert plans["default"].cells == "elsewhere/cells.jsonl"
-
-
-@pytest.mark.long
-def test_a_default_fit_has_as_many_gaussians_as_its_start_or_more(folder):  # noqa: F811
-    data = dataclasses.replace(lerf.QUICK.data, twins=str(folder / "grown"))
-    counts = [
-        prepare(data, "figurines", 0, "medium", fit_steps=120, fitted=fitted).evidence.gaussians.count
-        for fitted in default_fit.FITS
-    ]
-    assert counts[1] <= counts[0] < counts[2] <= 2 * counts[0]

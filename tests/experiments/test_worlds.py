@@ -1,18 +1,13 @@
 """Hard worlds: each switch does what it says, alike in all views, and nothing where it is off."""
 
 import dataclasses
-import json
-from types import SimpleNamespace
 
-import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiments.test_simulated import NONE, frames, space  # noqa: F401
 from hypothesis import given, settings, strategies as st
 
-from experiments import kinds, worlds
+from experiments import worlds
 from experiments.datasets.twins import by_kind, camouflaged
 from experiments.simulated_vision.embeddings import (
     CONFUSED,
@@ -29,7 +24,6 @@ from experiments.tables.rows import TRAINED
 from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, make_room, srgb_to_linear
 from jsecon.errors import InputError
-from jsecon.query.render import selection_mask
 
 TABLE = 7
 """the label after four objects, wall, floor and ceiling"""
@@ -277,25 +271,3 @@ def test_every_fault_has_its_worlds_and_methods_are_read_as_suits_them_there():
     text = worlds.layout({("none", 0.0): told, ("kinds", 1.0): told | {"VALA": {"miou": 0.99, "miou_vala": 0.0}}})
     assert "| kinds 1 | 0.990 | 0.900 | -0.090 |" in text
     assert "behind in: kinds 1 (VALA, by 0.090)" in text
-
-
-def test_things_are_counted_one_by_one(scene, cameras, tmp_path):
-    """The answer covers one mug and one book; a second mug lies beside it."""
-    every = jnp.ones(scene.count, bool)
-    answer = np.asarray(selection_mask(scene, jax.tree.map(jnp.asarray, cameras[0]), every))
-    truth = np.where(answer, (np.arange(40) >= 20)[:, None], 2).astype(np.uint8)
-    assert np.bincount(truth.ravel()).min() >= 40
-    folder = tmp_path / "truth" / "room"
-    folder.mkdir(parents=True)
-    cv2.imwrite(str(folder / "frame.png"), truth + 1)
-    told = {"scenes": {"room": {"objects": ["mug", "book", "mug", "table"]}}}
-    (tmp_path / "twin.json").write_text(json.dumps(told))
-    frame = SimpleNamespace(name="frame", objects={"mug": None, "book": None})
-    bench = SimpleNamespace(name="room", frames=[frame], queries=("mug", "book"))
-    evidence = SimpleNamespace(gaussians=scene)
-    setting = SimpleNamespace(bench=bench, evidence=evidence, cameras={"frame": cameras[0]}, folder=tmp_path / "room")
-    selection = SimpleNamespace(mask=every)
-    found = kinds.things(setting, lambda k: selection)
-    assert found == {"found": pytest.approx(2 / 3), "right": pytest.approx(2 / 4)}
-    found = kinds.things(setting, lambda k: selection if k == 0 else None)
-    assert found == {"found": pytest.approx(1 / 3), "right": pytest.approx(1 / 2)}

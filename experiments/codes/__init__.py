@@ -1,1 +1,0 @@
-"""The paths to the Gaussians' codes that `experiments.distillation` compares."""

@@ -1,0 +1,64 @@
+"""Truth on real captures: connected parts of instance ids, and outlines drawn by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments.datasets import bonsai_outlines, named_objects
+from jsecon.types import Camera, Capture
+
+
+@pytest.fixture
+def flat_capture():
+    """Two views, one beside the other, of a plane at 1 m; no depth in a corner of the first."""
+    poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    poses[1, 1, 3] = 0.02
+    lens = [np.full(2, number, np.float32) for number in (40, 40, 20, 20)]
+    depths = np.ones((2, 40, 40), np.float32)
+    depths[0, 36:, 36:] = 0
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    frames = np.zeros((2, 40, 40, 3), np.uint8)
+    cameras = Camera(poses, *lens, width=40, height=40)
+    return Capture(frames, cameras, *nothing, np.zeros(2, bool), depths, np.eye(4), ("a", "b"))
+
+
+def test_an_id_in_two_places_is_two_objects(flat_capture):
+    ids = np.zeros((2, 40, 40), np.int16)
+    ids[:, :, :10] = ids[:, :, 30:] = 1
+    ids[0, 20, 12] = 1  # a speck: of the part next to it
+    ids[1, 5, 5] = -1
+    parts = named_objects.connected_parts(flat_capture, ids, voxel=0.1)
+    assert len(np.unique(parts[parts >= 0])) == 3
+    assert parts[1, 5, 5] == parts[0, 39, 39] == -1  # no id, no depth
+    for t in range(2):
+        left, middle, right = parts[t, 20, 3], parts[t, 20, 20], parts[t, 20, 35]
+        np.testing.assert_array_equal(parts[t][2:35, :10][ids[t][2:35, :10] == 1], left)
+        np.testing.assert_array_equal(parts[t][:, 13:30], middle)
+        np.testing.assert_array_equal(parts[t][:30, 30:], right)
+    assert parts[0, 20, 12] == parts[1, 20, 3]
+
+
+@pytest.fixture
+def capture():
+    names = tuple(json.loads(bonsai_outlines.OUTLINES.read_text())["frames"])
+    count = len(names)
+    poses, ones = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), np.ones(count, np.float32)
+    return seen_by(Camera(poses, ones, ones, ones, ones, 400, 266), names)
+
+
+def seen_by(cameras, names):
+    frames = np.zeros((len(names), cameras.height, cameras.width, 3), np.uint8)
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return Capture(frames, cameras, *nothing, np.ones(len(names), bool), None, np.eye(4), names)
+
+
+def test_outlines_do_not_overlap_and_are_many(capture):
+    things = bonsai_outlines.outlines(capture)
+    assert len([thing for thing, frames in things.items() if len(frames) >= 2]) >= 6
+    for t in range(8):
+        here = np.stack([frames[t] for frames in things.values() if t in frames])
+        assert here.any((1, 2)).all()
+        assert here.sum(0).max() == 1
+    assert len(things["purple cloth"]) == 8
+    assert min(mask.mean() for mask in things["purple cloth"].values()) > 0.1
