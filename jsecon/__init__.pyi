@@ -5,8 +5,8 @@ from .app.notebook import show as show, to_html as to_html, to_png as to_png
 from .association.algorithm1 import masklets as masklets
 from .backend import check_backend as check_backend
 from .data.capture import load_capture as load_capture
-from .data.gaussian_files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
-from .data.ply import load_ply as load_ply, save_ply as save_ply
+from .data.gaussians.files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
+from .data.gaussians.ply import load_ply as load_ply, save_ply as save_ply
 from .errors import InputError as InputError
 from .evaluate.metrics import (
     accuracy_at as accuracy_at,

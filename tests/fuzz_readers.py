@@ -23,14 +23,16 @@ from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from jsecon.app import ask
-from jsecon.data import images, mask_files, motion, proposal_files, video
+from jsecon.data import images, sfm, video
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.gaussian_files import read_gaussians
-from jsecon.data.gltf import save_glb
-from jsecon.data.langsplat_files import feature_size, load_features
-from jsecon.data.lerf_labels import load_lerf_labels
-from jsecon.data.ply import load_ply, load_points_ply, save_ply
+from jsecon.data.gaussians.files import read_gaussians
+from jsecon.data.gaussians.gltf import save_glb
+from jsecon.data.gaussians.ply import load_ply, load_point_cloud, save_ply
+from jsecon.data.labels import load_lerf_labels
+from jsecon.data.langsplat import embedding_size, load_features
+from jsecon.data.masks import load_labels
+from jsecon.data.proposals import load_proposals
 from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
@@ -148,7 +150,7 @@ def points(folder: Path) -> Iterator[Case]:
             colours = {c: rng.random(30) * 200 for c in ("red", "green", "blue")} if kind else {}
             columns = xyz | {name: array.astype(kind) for name, array in colours.items()}
             file = _write_ply(folder / f"{form}{len(list(folder.iterdir()))}.ply", columns, form)
-            yield Case([file], lambda file=file: load_points_ply(file), _whole_points)
+            yield Case([file], lambda file=file: load_point_cloud(file), _whole_points)
 
 
 def _whole_capture(found) -> None:
@@ -275,7 +277,7 @@ def image(folder: Path) -> Iterator[Case]:
 
     def read(file: Path):
         found = images.read_image(file)
-        return found, images.image_size(file), motion._lenses([file], [images.image_size(file)])
+        return found, images.image_size(file), sfm._lenses([file], [images.image_size(file)])
 
     def whole(found) -> None:
         (picture, _), (width, height), groups = found
@@ -321,22 +323,20 @@ def masks(folder: Path) -> Iterator[Case]:
         for name, image in zip(names, ids):
             (folder / kind / f"{name}.png").write_bytes(write(image))
         files = sorted((folder / kind).iterdir())
-        yield Case(files, lambda kind=kind: mask_files.load_labels(folder / kind, names, (24, 36)), whole)
+        yield Case(files, lambda kind=kind: load_labels(folder / kind, names, (24, 36)), whole)
     for object in ("001", "002"):
         (folder / "objects" / object).mkdir(parents=True)
         for name, image in zip(names, ids):
             (folder / "objects" / object / f"{name}.png").write_bytes(kinds["grey"]((image == int(object)) * 255))
     yield Case(
         sorted((folder / "objects").rglob("*.png")),
-        lambda: mask_files.load_labels(folder / "objects", names, (24, 36)),
+        lambda: load_labels(folder / "objects", names, (24, 36)),
         whole,
     )
     (folder / "levels").mkdir()
     for name, image in zip(names, ids):
         np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, 24, 36)).astype(np.float32))
-    yield Case(
-        sorted((folder / "levels").iterdir()), lambda: mask_files.load_labels(folder / "levels", names, (24, 36)), whole
-    )
+    yield Case(sorted((folder / "levels").iterdir()), lambda: load_labels(folder / "levels", names, (24, 36)), whole)
     field = dataclasses.replace(_field(), cameras=Camera(np.eye(4)[None], *np.ones((4, 1)), 36, 24))
 
     def whole_outline(found: np.ndarray) -> None:
@@ -362,7 +362,7 @@ def langsplat(folder: Path) -> Iterator[Case]:
         _finite(masks.embeddings)
         assert -1 <= masks.labels.min() <= masks.labels.max() < max(len(masks.frame), 1)
 
-    read = lambda: (load_features(folder, ["a", "b"], (12, 16)), feature_size(folder))
+    read = lambda: (load_features(folder, ["a", "b"], (12, 16)), embedding_size(folder))
     yield Case(sorted(folder.iterdir()), read, whole)
 
 
@@ -389,7 +389,7 @@ def proposals(folder: Path) -> Iterator[Case]:
     np.save(folder / "f.npy", boxes)
 
     def read():
-        of_frame, _ = proposal_files.proposals_from_disk(folder, tuple("abcdef"), (20, 30))
+        of_frame, _ = load_proposals(folder, tuple("abcdef"), (20, 30))
         return [of_frame(n) for n in range(6)]
 
     def whole(found) -> None:

@@ -9,7 +9,7 @@ from test_gltf import read_glb
 
 from jsecon.app import cli
 from jsecon.app.viewer.static_page import NOWHERE, main_regions
-from jsecon.data.gaussian_files import load_gaussians
+from jsecon.data.gaussians.files import load_gaussians
 from jsecon.language.field import save_field
 
 

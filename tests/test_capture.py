@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 
 from jsecon.data.capture import check_views_overlap, load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.frames import held_out, spread
+from jsecon.data.frames import evenly_spaced, holdout_mask
 from jsecon.data.poses import camera_jumps
 from jsecon.types import Camera
 
@@ -82,7 +82,7 @@ def test_options_and_progress(tmp_path):
 @pytest.mark.parametrize("count", [1, 2, 7, 50])
 @pytest.mark.parametrize("wanted", [1, 2, 3, 7, 49, 100, None])
 def test_spread(count, wanted):
-    chosen = spread(count, wanted)
+    chosen = evenly_spaced(count, wanted)
     assert len(chosen) == min(count, wanted or count)
     assert chosen[0] == 0
     assert len(chosen) == 1 or chosen[-1] == count - 1
@@ -91,8 +91,8 @@ def test_spread(count, wanted):
 
 
 def test_held_out_follows_the_custom():
-    np.testing.assert_array_equal(np.flatnonzero(held_out(20, 8)), [0, 8, 16])
-    assert not held_out(20, 0).any()
+    np.testing.assert_array_equal(np.flatnonzero(holdout_mask(20, 8)), [0, 8, 16])
+    assert not holdout_mask(20, 0).any()
 
 
 def with_cameras(poses, **more):

@@ -12,7 +12,7 @@ import pytest
 
 from jsecon.app import cli, verbs
 from jsecon.app.ask import BY_VOTES, METHODS
-from jsecon.data.ply import load_ply
+from jsecon.data.gaussians.ply import load_ply
 from jsecon.pipeline import pipeline, progress
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console

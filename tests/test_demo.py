@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from jsecon.app import pictures
-from jsecon.data.ply import load_ply
+from jsecon.data.gaussians.ply import load_ply
 from jsecon.demo import demo, film as film_of
 from jsecon.language.field import load_field
 from jsecon.pipeline.progress import Listener

@@ -10,8 +10,8 @@ import pytest
 
 from jsecon.app import cli
 from jsecon.data.capture import capture_extent, load_capture
-from jsecon.data.frames import Extent
-from jsecon.data.video import size_of
+from jsecon.data.frames import CaptureExtent
+from jsecon.data.video import video_size
 
 STAGES = ["load", "gaussians", "masklets", "regions", "codes", "votes", "distil", "held_out"]
 
@@ -43,7 +43,7 @@ def test_bad_options_are_refused_as_in_a_run(room, tmp_path, capsys):
 def test_the_extent_is_that_of_the_loaded_capture(room, given):
     capture, extent = load_capture(room, **given), capture_extent(room, **given)
     size = capture.cameras.width, capture.cameras.height
-    assert extent == Extent(len(capture.names), size, capture.names, capture.files)
+    assert extent == CaptureExtent(len(capture.names), size, capture.names, capture.files)
 
 
 def test_photographs_without_poses_are_listed_too(room, tmp_path, capsys):
@@ -58,7 +58,7 @@ def test_a_video_is_listed_with_the_frames_that_are_taken_of_it(tmp_path, capsys
     for _ in range(5):
         writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
-    assert size_of(tmp_path / "walk.avi") == (64, 48)
+    assert video_size(tmp_path / "walk.avi") == (64, 48)
     _, stages = _dry(capsys, "run", tmp_path / "walk.avi", "--out", tmp_path / "out")
     assert "150 sharpest frames" in stages["poses"]["why"]
 

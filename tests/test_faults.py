@@ -14,8 +14,8 @@ from capture_files import refused, small_capture, write_images, write_text_model
 from fuzz_readers import _field
 
 from jsecon.data import frames
+from jsecon.data.gaussians.ply import save_ply
 from jsecon.data.images import write_image
-from jsecon.data.ply import save_ply
 from jsecon.files import exclusive_lock, write_text
 from jsecon.language.field import save_field
 from jsecon.pipeline import cache, pipeline
@@ -77,8 +77,8 @@ def test_frames_that_lie_on_a_full_disk_are_told(no_room, monkeypatch):
     """They are mapped: a page without a place on the disk would end the process."""
     monkeypatch.setattr(frames, "IN_MEMORY", 500)
     with refused("for 0.0 GiB of frames", "TMPDIR"):
-        frames.room_for((2, 20, 30, 3))
-    assert frames.room_for((1, 10, 30, 3)).shape == (1, 10, 30, 3)
+        frames.allocate_frames((2, 20, 30, 3))
+    assert frames.allocate_frames((1, 10, 30, 3)).shape == (1, 10, 30, 3)
 
 
 class Meddler(Listener):

@@ -13,9 +13,9 @@ from capture_files import refused
 from scipy.spatial.transform import Rotation
 from splat_files import RUB, opacity, scene
 
-from jsecon.data import gaussian_files
-from jsecon.data.gaussian_files import load_gaussians, save_gaussians
-from jsecon.data.ply import save_ply
+from jsecon.data.gaussians import files as gaussian_files
+from jsecon.data.gaussians.files import load_gaussians, save_gaussians
+from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.splat import transform
 from jsecon.splat.render import render_rgb

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from splat_files import C0, opacity, scene
 from test_gaussian_files import gaussians, image
 
-from jsecon.data import gltf
-from jsecon.data.gaussian_files import load_gaussians
-from jsecon.data.gltf import load_glb, save_glb
+from jsecon.data.gaussians import gltf
+from jsecon.data.gaussians.files import load_gaussians
+from jsecon.data.gaussians.gltf import load_glb, save_glb
 from jsecon.errors import InputError
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians

@@ -11,8 +11,8 @@ import PIL.ImageOps
 import pytest
 from capture_files import png, refused
 
-from jsecon.data.images import image_size, read_depth, read_ids, read_image, turned, write_image
-from jsecon.data.lens import Lens, distort, undistorted, undistortion_maps
+from jsecon.data.images import apply_orientation, image_size, read_depth, read_image, read_label_image, write_image
+from jsecon.data.lens import Lens, distort, undistorted_pinhole, undistortion_maps
 from jsecon.errors import InputError
 
 RNG = np.random.default_rng(3)
@@ -107,7 +107,7 @@ def test_images_come_upright(tmp_path, ending, orientation):
     read, _ = read_image(file)
     assert np.abs(read.astype(int) - image).mean() < (6 if ending == ".jpg" else 0.1)
     stored, _ = read_image(file, upright=False)
-    np.testing.assert_array_equal(turned(stored, orientation), read)
+    np.testing.assert_array_equal(apply_orientation(stored, orientation), read)
     assert stored.shape[:2] == ((48, 32) if orientation > 4 else (32, 48))
 
 
@@ -138,7 +138,7 @@ def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
     (tmp_path / "big.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", bytes(99)) + chunk(b"IEND", b""))
     with refused("big.png", "16000x9000", "134 million", "Shrink"):
         read_image(tmp_path / "big.png")
-    monkeypatch.setattr("jsecon.data.images.MOST_PIXELS", 101 * 61)
+    monkeypatch.setattr("jsecon.data.images.MAX_PIXELS", 101 * 61)
     PIL.Image.fromarray(corners(201, 121)).save(tmp_path / "big.jpg", quality=95)
     assert image_size(tmp_path / "big.jpg") == (101, 61)
     image, _ = read_image(tmp_path / "big.jpg")
@@ -208,29 +208,29 @@ def test_damaged_png_missing_file_and_no_image(tmp_path):
 def test_label_bits(tmp_path, bits):
     ids = RNG.integers(0, 2**bits, (9, 11))
     (tmp_path / "grey.png").write_bytes(png(ids, bits=bits, colour_type=0))
-    read, coloured = read_ids(tmp_path / "grey.png")
+    read, coloured = read_label_image(tmp_path / "grey.png")
     np.testing.assert_array_equal(read, ids)
     assert not coloured
     if bits <= 8:
         palette = RNG.integers(0, 256, 3 * 2**bits, np.uint8).tobytes()
         (tmp_path / "palette.png").write_bytes(png(ids, bits=bits, colour_type=3, palette=palette))
-        np.testing.assert_array_equal(read_ids(tmp_path / "palette.png")[0], ids)
+        np.testing.assert_array_equal(read_label_image(tmp_path / "palette.png")[0], ids)
 
 
 def test_label_colours_and_refusals(tmp_path):
     write_image(tmp_path / "a.png", FRAME)
-    ids, coloured = read_ids(tmp_path / "a.png")
+    ids, coloured = read_label_image(tmp_path / "a.png")
     assert coloured
     np.testing.assert_array_equal(ids, FRAME.astype(int) @ [65536, 256, 1])
     cv2.imwrite(str(tmp_path / "four.png"), np.dstack([FRAME, FRAME[..., 0]]))
     with refused("four.png", "half transparent"):
-        read_ids(tmp_path / "four.png")
+        read_label_image(tmp_path / "four.png")
     cv2.imwrite(str(tmp_path / "deep.png"), FRAME.astype(np.uint16) * 257)
     with refused("deep.png", "16 bits", "3 channels"):
-        read_ids(tmp_path / "deep.png")
+        read_label_image(tmp_path / "deep.png")
     write_image(tmp_path / "a.jpg", FRAME)
     with refused("a.jpg", "no PNG"):
-        read_ids(tmp_path / "a.jpg")
+        read_label_image(tmp_path / "a.jpg")
 
 
 def test_label_transparency(tmp_path):
@@ -238,11 +238,11 @@ def test_label_transparency(tmp_path):
     opaque = np.where(np.arange(17) < 5, 0, 255).astype(np.uint8) * np.ones((13, 1), np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), np.dstack([FRAME[..., ::-1], opaque]))
     expected = np.where(opaque > 0, FRAME.astype(int) @ [65536, 256, 1], 0)
-    np.testing.assert_array_equal(read_ids(tmp_path / "a.png")[0], expected)
+    np.testing.assert_array_equal(read_label_image(tmp_path / "a.png")[0], expected)
     cv2.imwrite(str(tmp_path / "b.png"), np.dstack([FRAME * 0, opaque]))
-    np.testing.assert_array_equal(read_ids(tmp_path / "b.png")[0], opaque > 0)
+    np.testing.assert_array_equal(read_label_image(tmp_path / "b.png")[0], opaque > 0)
     PIL.Image.fromarray(np.stack([FRAME[..., 0], opaque], -1), "LA").save(tmp_path / "c.png")
-    np.testing.assert_array_equal(read_ids(tmp_path / "c.png")[0], np.where(opaque > 0, FRAME[..., 0], 0))
+    np.testing.assert_array_equal(read_label_image(tmp_path / "c.png")[0], np.where(opaque > 0, FRAME[..., 0], 0))
 
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32, np.int64, np.float32])
@@ -250,11 +250,11 @@ def test_label_arrays(tmp_path, dtype):
     ids = RNG.integers(0, 2 if dtype is bool else 200, (9, 11)).astype(dtype)
     for shape in (ids, ids[None], ids[..., None]):
         np.save(tmp_path / "a.npy", shape)
-        np.testing.assert_array_equal(read_ids(tmp_path / "a.npy")[0], ids)
+        np.testing.assert_array_equal(read_label_image(tmp_path / "a.npy")[0], ids)
     for wrong, words in ((np.zeros((3, 9, 11)), "stack"), (ids + 0.5, "no ids"), (ids[0], "shape")):
         np.save(tmp_path / "a.npy", wrong)
         with refused("a.npy", words):
-            read_ids(tmp_path / "a.npy")
+            read_label_image(tmp_path / "a.npy")
 
 
 def test_depth(tmp_path):
@@ -297,7 +297,7 @@ def test_undistortion(lens, model):
     """Distorting is the model; the maps lead each pinhole pixel to where the model puts it; none lies outside."""
     points = RNG.uniform(-0.5, 0.5, (200, 2))
     np.testing.assert_allclose(distort(lens, points), np.stack(model(lens, *points.T), -1), atol=1e-6)
-    pinhole = undistorted(lens, "here")
+    pinhole = undistorted_pinhole(lens, "here")
     assert not pinhole.distorted
     map_x, map_y = undistortion_maps(lens, pinhole)
     v, u = np.mgrid[: lens.height, : lens.width] + 0.5
@@ -312,11 +312,11 @@ def test_undistortion(lens, model):
 
 def test_lenses_that_cannot_be_undone():
     with refused("here", "no undistorted image"):
-        undistorted(Lens(160, 120, 130.0, 130.0, 300.0, 60.0, (0.1,)), "here")
+        undistorted_pinhole(Lens(160, 120, 130.0, 130.0, 300.0, 60.0, (0.1,)), "here")
     with pytest.raises(InputError):
-        undistorted(Lens(160, 120, 1.0, 1.0, 80.0, 60.0, (-5000.0,)), "here")
+        undistorted_pinhole(Lens(160, 120, 1.0, 1.0, 80.0, 60.0, (-5000.0,)), "here")
     plain = Lens(160, 120, 130.0, 130.0, 80.0, 60.0, (0.0, 0.0, 0.0, 0.0))
-    assert undistorted(plain, "here") == Lens(160, 120, 130.0, 130.0, 80.0, 60.0)
+    assert undistorted_pinhole(plain, "here") == Lens(160, 120, 130.0, 130.0, 80.0, 60.0)
 
 
 def test_heic_comes_back_nearly_and_damage_and_absence_are_told(tmp_path, monkeypatch):

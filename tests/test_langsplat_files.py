@@ -7,8 +7,8 @@ import pytest
 from capture_files import refused
 
 from experiments.datasets.feature_files import load_text_features, write_features, write_text_features
-from jsecon.data.langsplat_files import (
-    feature_size,
+from jsecon.data.langsplat import (
+    embedding_size,
     load_features,
 )
 from jsecon.vision.protocols import CANONICAL
@@ -49,7 +49,7 @@ def test_what_is_missing_or_disagrees_is_told(written):
 
 def test_frames_of_two_models_are_refused(written):
     folder, _, rows = written
-    assert feature_size(folder) == 5
+    assert embedding_size(folder) == 5
     np.save(folder / "frame_1_f.npy", rows[1][:, :4])
     with refused("frame_1_f.npy", "rows of 4 numbers"):
         load_features(folder, ["frame_0", "frame_1"], (12, 16))
@@ -57,10 +57,10 @@ def test_frames_of_two_models_are_refused(written):
 
 def test_a_folder_without_embeddings_is_refused(tmp_path):
     with refused(tmp_path, "no _f.npy"):
-        feature_size(tmp_path)
+        embedding_size(tmp_path)
     (tmp_path / "a_f.npy").write_bytes(b"no array")
     with refused("a_f.npy", "nothing readable"):
-        feature_size(tmp_path)
+        embedding_size(tmp_path)
 
 
 def test_texts(tmp_path):

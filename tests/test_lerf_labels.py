@@ -9,7 +9,7 @@ import pytest
 from capture_files import refused
 from hypothesis import given, settings, strategies as st
 
-from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels, mask_polygons, polygon_mask, write_lerf_labels
+from jsecon.data.labels import LabelledFrame, load_lerf_labels, mask_polygons, polygon_mask, write_lerf_labels
 from jsecon.errors import InputError
 
 SQUARE = [[2.9, 3.0], [8.0, 3.0], [8.0, 6.7], [2.0, 6.0]]

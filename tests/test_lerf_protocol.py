@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.datasets.lerf_ovs import LERF_PAIRS
-from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import (
     VALA_THRESHOLD,

@@ -6,7 +6,7 @@ import pytest
 from capture_files import png, refused
 
 from jsecon.data.images import write_image
-from jsecon.data.mask_files import LEVELS, load_labels
+from jsecon.data.masks import LEVELS, load_labels
 from jsecon.errors import InputError
 
 NAMES = ("b", "a", "c")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from capture_files import refused
 
-from jsecon.data.langsplat_files import load_features
-from jsecon.data.mask_files import load_labels
-from jsecon.data.proposal_files import proposals_from_disk
+from jsecon.data.langsplat import load_features
+from jsecon.data.masks import load_labels
+from jsecon.data.proposals import load_proposals
 from jsecon.errors import InputError
 from jsecon.types import ImageFile
 
@@ -56,7 +56,7 @@ def test_folders_like_those_of_the_images_are_cameras(tmp_path, folders, alike, 
     np.testing.assert_array_equal(labels, expected(*images))
     assert ids == (1, 2, 3, 4)
     assert any("cameras" in note for note in notes)
-    read, _ = proposals_from_disk(tmp_path, tuple(files), SIZE, files=files)
+    read, _ = load_proposals(tmp_path, tuple(files), SIZE, files=files)
     for t, image in enumerate(images):
         np.testing.assert_array_equal(read(t), [image == id for id in range(1, 5)])
 
@@ -92,7 +92,7 @@ def test_other_folders_of_black_and_white_masks_are_objects(tmp_path, paths, pat
     assert ids == (0, 1)
     np.testing.assert_array_equal(labels, np.where(masks[0] > 0, 0, np.where(masks[1] > 0, 1, -1)))
     assert any("objects" in note for note in notes)
-    read, _ = proposals_from_disk(tmp_path, tuple(files), SIZE, files=files)
+    read, _ = load_proposals(tmp_path, tuple(files), SIZE, files=files)
     np.testing.assert_array_equal(read(1), masks[:, 1] > 0)
 
 
@@ -243,7 +243,7 @@ def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
     labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, files=files)
     np.testing.assert_array_equal(labels, expected(*upright))
     assert any("2 masks were of the stored pixels" in note for note in notes)
-    read, _ = proposals_from_disk(tmp_path, tuple("abc"), SIZE, files=files)
+    read, _ = load_proposals(tmp_path, tuple("abc"), SIZE, files=files)
     np.testing.assert_array_equal(read(0), [upright[0] == id for id in range(1, 5)])
     np.testing.assert_array_equal(read(1), [upright[1] == id for id in range(1, 5)])
 
@@ -294,7 +294,7 @@ def filled(*boxes):
 )
 def test_polygons_are_filled(tmp_path, polygons, boxes):
     (tmp_path / "a.json").write_text(json.dumps([{"segmentation": polygons}, {"segmentation": [APART]}]))
-    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    read, _ = load_proposals(tmp_path, ("a",), SIZE)
     np.testing.assert_array_equal(read(0), [filled(*boxes), filled((True, APART))])
 
 
@@ -302,7 +302,7 @@ def test_one_coco_file_of_all_frames(tmp_path):
     content = coco(("a", "b", "other"), (24, 32), [[[SQUARE], [APART]], [], [[SQUARE]]])
     (tmp_path / "instances.json").write_text(json.dumps(content))
     for place in (tmp_path, tmp_path / "instances.json"):
-        read, notes = proposals_from_disk(place, ("a", "b", "c"), SIZE)
+        read, notes = load_proposals(place, ("a", "b", "c"), SIZE)
         assert read(0).shape == (2, *SIZE)
         mask = np.zeros((24, 32), np.uint8)
         cv2.fillPoly(mask, [np.array(SQUARE).reshape(-1, 2)], 1)
@@ -310,11 +310,11 @@ def test_one_coco_file_of_all_frames(tmp_path):
         assert read(1).shape == read(2).shape == (0, *SIZE)
         assert notes == ("1 of 3 frames have no masks (the first: c).",)
     with refused("instances.json", "none of its 3 images"):
-        proposals_from_disk(tmp_path, ("x",), SIZE)
+        load_proposals(tmp_path, ("x",), SIZE)
     del content["annotations"][0]["image_id"]
     (tmp_path / "instances.json").write_text(json.dumps(content))
     with refused("instances.json", "'image_id' is missing"):
-        proposals_from_disk(tmp_path, ("a",), SIZE)
+        load_proposals(tmp_path, ("a",), SIZE)
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_one_coco_file_of_all_frames(tmp_path):
 )
 def test_wrong_masks_in_json_are_told_in_words(tmp_path, segmentation, words):
     (tmp_path / "a.json").write_text(json.dumps([{"segmentation": segmentation}]))
-    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    read, _ = load_proposals(tmp_path, ("a",), SIZE)
     with pytest.raises(InputError) as caught:
         read(0)
     assert "a.json, mask 0" in str(caught.value)
@@ -344,10 +344,10 @@ def test_wrong_masks_in_json_are_told_in_words(tmp_path, segmentation, words):
 def test_stacks_of_masks_are_proposals(tmp_path):
     masks = RNG.random((5, *SIZE)) < 0.3
     np.save(tmp_path / "a.npy", masks)
-    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    read, _ = load_proposals(tmp_path, ("a",), SIZE)
     np.testing.assert_array_equal(read(0), masks)
     np.save(tmp_path / "a.npy", masks * 3)
-    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    read, _ = load_proposals(tmp_path, ("a",), SIZE)
     with refused("a.npy", "0 and 1"):
         read(0)
 

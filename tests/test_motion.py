@@ -18,10 +18,10 @@ from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.app import cli
-from jsecon.data import motion, motion_steps
+from jsecon.data import motion_steps, sfm
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_image
-from jsecon.data.motion import find_poses, photographs
+from jsecon.data.sfm import find_poses, list_photographs
 from jsecon.pipeline import pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
@@ -45,7 +45,7 @@ def found(photos, tmp_path_factory):
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("no pycolmap")
     work, told = tmp_path_factory.mktemp("work"), []
-    motion_found, capture = find_poses(photographs(photos[0]), work, progress=lambda *at: told.append(at))
+    motion_found, capture = find_poses(list_photographs(photos[0]), work, progress=lambda *at: told.append(at))
     return motion_found, capture, work, told
 
 
@@ -98,7 +98,7 @@ def test_what_was_stopped_goes_on_with_what_was_found(photos, found, tmp_path):
     told = []
     (tmp_path / "work" / "found.json").unlink()
     seconds = found[0].seconds
-    more, _ = find_poses(photographs(photos[0]), tmp_path / "work", progress=lambda *at: told.append(at))
+    more, _ = find_poses(list_photographs(photos[0]), tmp_path / "work", progress=lambda *at: told.append(at))
     assert {total for _, total in told} <= {COUNT, motion_steps.AT_ONCE_STEPS + 1}  # no pairs, only registrations
     steps = [done for done, total in told if total != COUNT]
     assert 2 <= len(steps) <= motion_steps.AT_ONCE_STEPS + 1
@@ -109,24 +109,24 @@ def test_what_was_stopped_goes_on_with_what_was_found(photos, found, tmp_path):
 
 
 def test_photographs_are_those_of_images_or_of_the_folder_itself(tmp_path):
-    assert photographs(tmp_path / "nowhere") == []
+    assert list_photographs(tmp_path / "nowhere") == []
     for name in ("b.JPG", "a.png", ".hidden.png", "notes.txt"):
         (tmp_path / name).touch()
-    assert [path.name for path in photographs(tmp_path)] == ["a.png", "b.JPG"]
+    assert [path.name for path in list_photographs(tmp_path)] == ["a.png", "b.JPG"]
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "c.webp").touch()
-    assert [path.name for path in photographs(tmp_path)] == ["c.webp"]
+    assert [path.name for path in list_photographs(tmp_path)] == ["c.webp"]
 
 
 def test_one_lens_for_the_photographs_of_one_camera_and_focal_length(photos, tmp_path):
     for number, focal in enumerate((35, 35, 50, None)):
         exif = Image.Exif()
         if focal is not None:
-            exif[motion._MODEL], exif.get_ifd(motion._EXIF)[motion._FOCAL] = "camera", float(focal)
+            exif[sfm._MODEL], exif.get_ifd(sfm._EXIF)[sfm._FOCAL] = "camera", float(focal)
         Image.new("RGB", (32, 24)).save(tmp_path / f"{number}.jpg", exif=exif)
-    assert motion._lenses(photographs(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
-    assert motion._lenses(photographs(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
-    assert motion._lenses(photographs(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
+    assert sfm._lenses(list_photographs(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
+    assert sfm._lenses(list_photographs(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
+    assert sfm._lenses(list_photographs(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
 
 
 def test_pairs_are_the_neighbours_and_the_frames_that_look_alike(monkeypatch, tmp_path):
@@ -168,7 +168,7 @@ def test_a_photograph_whose_matches_become_no_points_is_in_a_wrong_place(tmp_pat
 def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with refused("pip install 'jsecon[sfm]'", "walk"):
-        find_poses(photographs(photos[0]), tmp_path, where=photos[0])
+        find_poses(list_photographs(photos[0]), tmp_path, where=photos[0])
     assert cli.main(["run", str(photos[0]), "--out", str(tmp_path / "out")]) == 2
     told = capsys.readouterr()
     assert "poses            run       found by structure from motion (pycolmap) for 8 photographs" in told.out
@@ -188,18 +188,18 @@ def test_photographs_that_are_damaged_or_called_the_same_are_refused(photos, tmp
     folder = shutil.copytree(photos[0], tmp_path / "walk")
     spoil(folder / "photo 03.png")
     with refused("photo 03.png", says):
-        find_poses(photographs(folder), tmp_path / "work")
+        find_poses(list_photographs(folder), tmp_path / "work")
 
 
 def test_photographs_in_subfolders_with_names_that_are_no_utf8(photos, found, tmp_path):
     """Two folders, photographs of the same names in each, one folder's name in Latin-1."""
     folders = [tmp_path / "walk" / name for name in ("cam 0", os.fsdecode(b"c\xe9 #1"))]
-    for number, photo in enumerate(photographs(photos[0])):
+    for number, photo in enumerate(list_photographs(photos[0])):
         folder = folders[number // 4]
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(photo, folder / f"{number % 4}.png")
     shutil.copytree(found[2], tmp_path / "work", symlinks=True)  # features and matches are there
-    told, capture = find_poses(photographs(tmp_path / "walk"), tmp_path / "work")
+    told, capture = find_poses(list_photographs(tmp_path / "walk"), tmp_path / "work")
     assert told.registered == tuple(f"{folder.name}/{n}.png" for folder in folders for n in range(4))
     loaded_capture = load_capture(capture, holdout=0)
     assert loaded_capture.names == tuple(f"{folder.name}_{n}" for folder in folders for n in range(4))
@@ -215,7 +215,7 @@ def test_photographs_in_subfolders_are_told_from_masks_and_from_output(photos, t
     ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
-    assert [str(p.relative_to(tmp_path)) for p in photographs(tmp_path)] == [
+    assert [str(p.relative_to(tmp_path)) for p in list_photographs(tmp_path)] == [
         *("cam0/i0.jpg", "cam0/i1.JPG", "cam1/deep/i0.png")
     ]
     with refused("3 photographs without poses", "jsecon run"):
@@ -253,17 +253,17 @@ def test_an_output_folder_among_the_photographs_is_no_input(photos, tmp_path):
 
 def test_photographs_that_show_nothing_in_common_are_refused(photos, tmp_path):
     with refused("2 photographs", "walk"):
-        find_poses(photographs(photos[0])[:2], tmp_path / "work", where=photos[0])
+        find_poses(list_photographs(photos[0])[:2], tmp_path / "work", where=photos[0])
     for number in range(3):
         Image.new("RGB", (64, 48), (80 * number, 9, 9)).save(tmp_path / f"{number}.png")
     with refused("brought together"):
-        find_poses(photographs(tmp_path), tmp_path / "work")
+        find_poses(list_photographs(tmp_path), tmp_path / "work")
 
 
 def test_an_end_of_colmap_of_its_own_is_told_with_its_log(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(motion_steps, "__name__", "jsecon.data.no_such_module")
     with refused("code 1", "log.txt", "no_such_module"):
-        find_poses(photographs(photos[0]), tmp_path)
+        find_poses(list_photographs(photos[0]), tmp_path)
 
 
 class Loaded(Exception):
@@ -294,7 +294,7 @@ def at_once(found, monkeypatch):
         asked.append(where)
         return found[0], Path(shutil.copytree(found[1], work / "capture", symlinks=True))
 
-    monkeypatch.setattr(motion, "find_poses", copied)
+    monkeypatch.setattr(sfm, "find_poses", copied)
     return asked
 
 
@@ -344,11 +344,11 @@ def test_only_captures_without_poses_have_the_stage(photos, room, found, tmp_pat
 def test_colmap_is_given_a_png_for_a_heic(photos, tmp_path):
     import pillow_heif
 
-    image = read_image(photographs(photos[0])[0])[0]
+    image = read_image(list_photographs(photos[0])[0])[0]
     shape = image.shape[1::-1]
     pillow_heif.from_bytes("RGB", shape, image.tobytes()).save(tmp_path / "IMG_1.HEIC", quality=95)
-    assert photographs(tmp_path) == [tmp_path / "IMG_1.HEIC"]
-    motion._link(tmp_path / "IMG_1.HEIC", tmp_path / "links" / "000000.png", upright_copy=True)
+    assert list_photographs(tmp_path) == [tmp_path / "IMG_1.HEIC"]
+    sfm._link(tmp_path / "IMG_1.HEIC", tmp_path / "links" / "000000.png", upright_copy=True)
     np.testing.assert_array_equal(
         cv2.imread(tmp_path / "links" / "000000.png")[..., ::-1], read_image(tmp_path / "IMG_1.HEIC")[0]
     )
@@ -365,7 +365,7 @@ def test_a_stage_on_files_has_a_folder_until_its_result_is_kept(tmp_path):
 @pytest.mark.long
 def test_the_bonsai_is_found_as_its_poses_are_given(shared, tmp_path):
     capture = shared / "captures" / "bonsai"
-    told, folder = find_poses(photographs(capture), tmp_path)
+    told, folder = find_poses(list_photographs(capture), tmp_path)
     assert len(told.registered) == 125
     assert told.error_px < 0.4
     ours, theirs = (load_capture(path, holdout=0, long_side=32).cameras.world_to_camera for path in (folder, capture))

@@ -14,7 +14,7 @@ from jsecon.app.cli import main
 from jsecon.app.outputs import file_stem, write_answer
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
-from jsecon.data.ply import load_ply
+from jsecon.data.gaussians.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.files import path_within
 from jsecon.language.field import load_field, save_field

@@ -16,7 +16,7 @@ from test_pipeline import Recorder
 from experiments.datasets.feature_files import write_features
 from jsecon.app import cli
 from jsecon.data.capture import load_capture
-from jsecon.data.ply import load_ply, save_ply
+from jsecon.data.gaussians.ply import load_ply, save_ply
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field

@@ -15,8 +15,8 @@ import pytest
 
 from jsecon.app import cli
 from jsecon.data import capture as captures
-from jsecon.data.motion import photographs
-from jsecon.data.ply import load_ply, save_ply
+from jsecon.data.gaussians.ply import load_ply, save_ply
+from jsecon.data.sfm import list_photographs
 from jsecon.pipeline.cache import files_digest
 
 HOME = Path(__file__).resolve().parent.parent
@@ -128,6 +128,6 @@ def test_a_hundred_thousand_frames_are_listed_in_seconds(tmp_path):
         assert found.names == expected
         assert spent < 60, f"{file.name}: {spent:.0f} s"
     began = time.process_time()
-    assert len(photographs(tmp_path)) == MANY
+    assert len(list_photographs(tmp_path)) == MANY
     assert len(files_digest([tmp_path])) == 16
     assert time.process_time() - began < 60

@@ -13,7 +13,7 @@ from sam3_files import write_sam3
 
 from jsecon.app import cli
 from jsecon.app.phrases import capture_of, frames_of, lifted
-from jsecon.data.ply import load_ply
+from jsecon.data.gaussians.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.networks.sam3 import PhraseMasks

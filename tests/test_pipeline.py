@@ -18,7 +18,7 @@ from capture_files import transforms
 import jsecon
 from jsecon.app import cli
 from jsecon.association.algorithm1 import iou_matrix
-from jsecon.data.ply import save_ply
+from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.files import write_arrays
 from jsecon.language import autoencoder, field as field_file

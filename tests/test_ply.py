@@ -8,7 +8,7 @@ import pytest
 from capture_files import refused
 
 from experiments.datasets.mesh_files import read_faces, write_mesh
-from jsecon.data.ply import SH_DC, load_ply, load_points_ply, save_ply
+from jsecon.data.gaussians.ply import SH_DC, load_ply, load_point_cloud, save_ply
 from jsecon.errors import InputError
 from jsecon.types import Gaussians
 
@@ -241,20 +241,20 @@ def test_plain_points(tmp_path, kind, values):
         **dict.fromkeys(("red", "green", "blue"), np.array(values)),
     }
     write(tmp_path / "p.ply", given, types={**dict.fromkeys(("red", "green", "blue"), kind), "x": "double"})
-    points, colours = load_points_ply(tmp_path / "p.ply")
+    points, colours = load_point_cloud(tmp_path / "p.ply")
     np.testing.assert_array_equal(points, np.stack([given[axis] for axis in "xyz"], -1).astype(np.float32))
     np.testing.assert_array_equal(colours, np.repeat([[0], [51], [255]], 3, 1))
 
 
 def test_points_without_colour_or_place(tmp_path):
     write(tmp_path / "p.ply", {axis: np.zeros(2) for axis in "xyz"})
-    np.testing.assert_array_equal(load_points_ply(tmp_path / "p.ply")[1], 128)
+    np.testing.assert_array_equal(load_point_cloud(tmp_path / "p.ply")[1], 128)
     write(tmp_path / "p.ply", {axis: np.zeros(2) for axis in "xy"})
     with refused("p.ply", "no z"):
-        load_points_ply(tmp_path / "p.ply")
+        load_point_cloud(tmp_path / "p.ply")
     write(tmp_path / "p.ply", {axis: np.full(2, np.nan) for axis in "xyz"})
     with refused("p.ply", "NaN"):
-        load_points_ply(tmp_path / "p.ply")
+        load_point_cloud(tmp_path / "p.ply")
 
 
 def test_faces_round_trip_and_damage(tmp_path):
@@ -267,7 +267,7 @@ def test_faces_round_trip_and_damage(tmp_path):
         found, properties = read_faces(tmp_path / "mesh.ply")
         np.testing.assert_array_equal(found, faces)
         np.testing.assert_array_equal(properties["object_id"], owners)
-        np.testing.assert_array_equal(load_points_ply(tmp_path / "mesh.ply")[0][:, 1], vertices["y"])
+        np.testing.assert_array_equal(load_point_cloud(tmp_path / "mesh.ply")[0][:, 1], vertices["y"])
     data = (tmp_path / "mesh.ply").read_bytes()
     (tmp_path / "cut.ply").write_bytes(data[:-3])
     with refused("fewer than 5 faces"):
@@ -282,7 +282,7 @@ def test_faces_round_trip_and_damage(tmp_path):
 
 def test_blocks_of_rows_and_another_world(tmp_path, monkeypatch):
     """A scene of several blocks is the file of one, each block is carried along, and read back alone."""
-    from jsecon.data import ply
+    from jsecon.data.gaussians import ply
     from jsecon.splat import transform
 
     scene, turn = random_gaussians(40), np.diag([-2.0, -2.0, 2.0, 1.0])

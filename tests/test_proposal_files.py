@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.data.proposal_files import decode_rle, proposals_from_disk
+from jsecon.data.proposals import decode_rle, load_proposals
 from jsecon.errors import InputError
 
 SIZE = (20, 30)
@@ -35,7 +35,7 @@ def records(masks, scores=None):
 def test_json_of_sams_generator_may_overlap_and_is_ordered_by_score(tmp_path, masks):
     (tmp_path / "a.json").write_text(json.dumps(records(masks, [0.8, 0.95, 0.9])))
     (tmp_path / "b.json").write_text(json.dumps({"image": {"image_id": 1}, "annotations": records(masks)}))
-    read, notes = proposals_from_disk(tmp_path, ("a", "b", "c"), SIZE)
+    read, notes = load_proposals(tmp_path, ("a", "b", "c"), SIZE)
     np.testing.assert_array_equal(read(0), masks[[1, 2, 0]])
     np.testing.assert_array_equal(read(1), masks)
     assert read(2).shape == (0, *SIZE)
@@ -49,20 +49,20 @@ def test_png_and_langsplat_files_hold_one_layer(tmp_path, masks):
     levels = np.full((4, *SIZE), -1, np.float32)
     levels[3][masks[2]], levels[1][masks[1]] = 4, 0
     np.save(tmp_path / "b_s.npy", levels)
-    read, notes = proposals_from_disk(tmp_path, ("a", "b.extra"), SIZE)
+    read, notes = load_proposals(tmp_path, ("a", "b.extra"), SIZE)
     np.testing.assert_array_equal(read(0), masks[[0, 2]])
     np.testing.assert_array_equal(read(1), masks[[2]])
     assert notes == ()
-    read, _ = proposals_from_disk(tmp_path, ("a", "b"), SIZE, level="s")
+    read, _ = load_proposals(tmp_path, ("a", "b"), SIZE, level="s")
     np.testing.assert_array_equal(read(1), masks[[1]])
 
 
 def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):
     large = masks.repeat(2, 1).repeat(2, 2)
     (tmp_path / "a.json").write_text(json.dumps(records(large)))
-    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    read, _ = load_proposals(tmp_path, ("a",), SIZE)
     np.testing.assert_array_equal(read(0), masks)
-    read, _ = proposals_from_disk(tmp_path, ("a",), (20, 20))
+    read, _ = load_proposals(tmp_path, ("a",), (20, 20))
     with pytest.raises(InputError, match="60x40"):
         read(0)
 
@@ -79,7 +79,7 @@ def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):
 )
 def test_damaged_json_is_named(tmp_path, content, words):
     (tmp_path / "a.json").write_text(content)
-    read, _ = proposals_from_disk(tmp_path, ("a",), SIZE)
+    read, _ = load_proposals(tmp_path, ("a",), SIZE)
     with pytest.raises(InputError, match=words) as caught:
         read(0)
     assert caught.value.where.startswith(str(tmp_path / "a.json"))
@@ -87,9 +87,9 @@ def test_damaged_json_is_named(tmp_path, content, words):
 
 def test_folders_without_masks_are_refused(tmp_path):
     with pytest.raises(InputError, match="it holds 0 masks"):
-        proposals_from_disk(tmp_path, ("a",), SIZE)
+        load_proposals(tmp_path, ("a",), SIZE)
     with pytest.raises(InputError, match="no such folder"):
-        proposals_from_disk(tmp_path / "nowhere", ("a",), SIZE)
+        load_proposals(tmp_path / "nowhere", ("a",), SIZE)
 
 
 def runs_of(mask) -> list[int]:

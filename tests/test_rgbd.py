@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_depth
-from jsecon.data.lens import Lens, seen_through
+from jsecon.data.lens import Lens, resample_depth
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import capture_stages
@@ -172,7 +172,7 @@ def test_a_depth_camera_of_its_own_is_seen_through_the_colour_camera(tmp_path):
     seen = np.where((columns >= 0) & (columns < 40), np.floor(columns) / 10 + 1, 0)
     np.testing.assert_allclose(found.depths[0, 8], seen, atol=1e-5)
     same = Lens(24, 16, *K)
-    np.testing.assert_array_equal(seen_through(CAPTURE.depths[0], same, same), CAPTURE.depths[0])
+    np.testing.assert_array_equal(resample_depth(CAPTURE.depths[0], same, same), CAPTURE.depths[0])
 
 
 @pytest.mark.parametrize(("camera", "fx", "bent"), [("freiburg1", 517.3, True), ("fr3", 535.4, False)])

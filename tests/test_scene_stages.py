@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from splat_files import scene
 from test_gaussian_files import gaussians
 
-from jsecon.data.gaussian_files import load_gaussians, save_gaussians
+from jsecon.data.gaussians.files import load_gaussians, save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.scene_stages import gaussians as stage_of

@@ -10,8 +10,8 @@ import pytest
 from conftest import look_at
 
 from jsecon.data.capture import load_capture
-from jsecon.data.lerf_labels import load_lerf_labels
-from jsecon.data.mask_files import load_labels
+from jsecon.data.labels import load_lerf_labels
+from jsecon.data.masks import load_labels
 from jsecon.demo import make_room, render_views, room_cameras, room_capture, write_room
 from jsecon.demo.raycast import lamp_points, lamp_visibility, texture_pattern, trace_rays
 from jsecon.demo.room import (

@@ -23,7 +23,7 @@ from jsecon.app.cli import main
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.app.viewer.window import Viewer, open_viewer
-from jsecon.data.ply import load_ply
+from jsecon.data.gaussians.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.language.membership import with_overlap

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.types import Array, Capture
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from experiments.datasets.benchmark import Benchmark, hold_out, no_points, require_count, twin_of
 from jsecon.data.capture import load_capture
-from jsecon.data.lerf_labels import load_lerf_labels
+from jsecon.data.labels import load_lerf_labels
 from jsecon.errors import InputError
 
 LERF_PAIRS = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from experiments.datasets.benchmark import Benchmark, hold_out, no_points, require_count, twin_of
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import find_model
-from jsecon.data.frames import Posed, Shot, assemble
-from jsecon.data.images import IMAGE_ENDINGS, image_size, read_image, write_image
+from jsecon.data.frames import PosedImage, PosedImages, build_capture
+from jsecon.data.images import IMAGE_SUFFIXES, image_size, read_image, write_image
+from jsecon.data.labels import LabelledFrame
 from jsecon.data.lens import Lens
-from jsecon.data.lerf_labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, write_text
 from jsecon.types import Capture
@@ -61,7 +61,7 @@ def load_ovs3d(root: str | Path, scene: str, *, downscale: float | int | None = 
 
 def image_files(folder: Path) -> list[Path]:
     """The images of a scene in the order that the numbers of `segmentations` count. Raises InputError for none."""
-    files = sorted(file for file in folder.glob("*") if file.suffix in IMAGE_ENDINGS)
+    files = sorted(file for file in folder.glob("*") if file.suffix in IMAGE_SUFFIXES)
     if not files:
         raise InputError(folder, "no image", "the scene's frames", "Check the path.")
     return files
@@ -185,6 +185,6 @@ def _from_poses(folder: Path, files: list[Path], downscale: float | int | None) 
     shots = []
     for file, pose, (height, width, focal) in zip(files, poses, sizes):
         lens = Lens(int(width), int(height), focal, focal, width / 2, height / 2)
-        shots.append(Shot(file.name, file, lens.resized(*image_size(file)), pose))
+        shots.append(PosedImage(file.name, file, lens.resized(*image_size(file)), pose))
     note = "Poses are those of poses_bounds.npy: one focal length, the principal point in the middle, no points."
-    return assemble(Posed(shots, folder, notes=(note,)), downscale=downscale, holdout=0)
+    return build_capture(PosedImages(shots, folder, notes=(note,)), downscale=downscale, holdout=0)

@@ -20,9 +20,9 @@ from jaxtyping import Float, Int, UInt8
 
 from experiments.datasets.benchmark import Benchmark, require_count, twin_of
 from experiments.datasets.mesh_files import read_faces
-from jsecon.data.frames import Posed, Shot, assemble
+from jsecon.data.frames import PosedImage, PosedImages, build_capture
+from jsecon.data.gaussians.ply import load_point_cloud
 from jsecon.data.lens import Lens
-from jsecon.data.ply import load_points_ply
 from jsecon.errors import InputError
 from jsecon.types import Capture
 
@@ -110,8 +110,8 @@ def load_frames(root: Path, scene: str, *, every: int, downscale: float | int | 
                 "frame, depth and pose of one number",
                 "Copy the rendering again.",
             )
-        shots.append(Shot(image.name, image, lens, poses[int(number)], depth, 1.0 / camera["scale"]))
-    return assemble(Posed(shots, root / scene), downscale=downscale, holdout=0)
+        shots.append(PosedImage(image.name, image, lens, poses[int(number)], depth, 1.0 / camera["scale"]))
+    return build_capture(PosedImages(shots, root / scene), downscale=downscale, holdout=0)
 
 
 def load_semantics(
@@ -120,7 +120,7 @@ def load_semantics(
     """Vertices in order, their colours, class ids (-1 = undefined), and the names of the classes."""
     ready = root / f"semantic_labels_{scene}.txt"
     if ready.is_file():
-        points, colors = load_points_ply(root / f"{scene}_mesh.ply")
+        points, colors = load_point_cloud(root / f"{scene}_mesh.ply")
         try:
             ids = np.loadtxt(ready, dtype=np.int64, ndmin=1)
         except ValueError as error:
@@ -129,7 +129,7 @@ def load_semantics(
         return points, colors, ids, _names(root / "replica_class_id_to_names.txt")
     habitat = root / re.sub(r"(\D)(\d+)$", r"\1_\2", scene) / "habitat"
     mesh = habitat / "mesh_semantic.ply"
-    points, colors = load_points_ply(mesh)
+    points, colors = load_point_cloud(mesh)
     faces, properties = read_faces(mesh)
     if "object_id" not in properties:
         raise InputError(mesh, "faces without object_id", "Replica's habitat mesh", "Use that.")

@@ -24,7 +24,7 @@ from experiments.datasets.mesh_files import write_mesh
 from experiments.datasets.ovs3d import write_poses_bounds, write_segmentations
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
-from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
+from jsecon.data.labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras, write_label_image
 from jsecon.demo.room import TABLE_WOOD, Part, Room, make_room, srgb_to_linear
 from jsecon.files import atomic_write, write_text

@@ -32,7 +32,7 @@ from experiments.simulated_vision.embeddings import (
 )
 from experiments.simulated_vision.masks import LEVELS as NOISE, Faults, SimulatedMasks, simulated_masks
 from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
-from jsecon.data.mask_files import LEVELS
+from jsecon.data.masks import LEVELS
 from jsecon.demo.capture import write_label_image
 from jsecon.demo.raycast import trace_rays
 from jsecon.demo.room import make_room

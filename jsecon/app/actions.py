@@ -52,9 +52,9 @@ def _run(verb: Run, console: Console) -> VerbResult:
 def _fit(verb: Fit, console: Console) -> VerbResult:
     with console.progress("start"):
         from jsecon.app.run_report import write_scene
-        from jsecon.data.gaussian_files import require_written
+        from jsecon.data.gaussians.files import require_writable_format
         from jsecon.pipeline import pipeline
-    require_written(verb.out)
+    require_writable_format(verb.out)
 
     folder = verb.out.with_suffix("")
     if verb.dry_run:
@@ -80,10 +80,10 @@ def _query(verb: Query, console: Console) -> VerbResult:
     with console.progress("field"):
         from jsecon.app import ask
         from jsecon.app.outputs import write_answers
-        from jsecon.data.gaussian_files import require_written
+        from jsecon.data.gaussians.files import require_writable_format
         from jsecon.language.field import check_field, load_field
 
-        require_written(verb.out / f"answer.{verb.format}")
+        require_writable_format(verb.out / f"answer.{verb.format}")
         if large := ask.larger_than_memory(verb.field):
             outlined = bool(verb.mask or boxes or verb.phrases)
             ask.require_blocks(verb.field, by=verb.by, even=verb.even, outlined=outlined)
@@ -146,10 +146,10 @@ def _phrases(field: Any, verb: Query, console: Console) -> tuple[list[Any], list
 def _export(verb: Export, console: Console) -> VerbResult:
     with console.progress("field"):
         from jsecon.app.outputs import save_scene
-        from jsecon.data.gaussian_files import require_written
+        from jsecon.data.gaussians.files import require_writable_format
         from jsecon.language.field import check_field, load_field
 
-        require_written(verb.out)
+        require_writable_format(verb.out)
         check_field(verb.field)
         field = load_field(verb.field, mapped=True)
         save_scene(field, verb.out)

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jsecon.data.images import read_stored
-from jsecon.data.mask_files import resize_nearest
+from jsecon.data.images import read_pixels
+from jsecon.data.masks import resize_nearest
 from jsecon.errors import InputError, require
 from jsecon.language.field import subset_field
 from jsecon.language.membership import SHARE_THRESHOLD
@@ -418,7 +418,7 @@ def answer_each(questions: Sequence[Callable[[], _T]]) -> tuple[list[_T], list[I
 def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
     """(H, W) bool of an image file, at the size of the field's frames: what is not black. Raises InputError where it is
     no image, or one of another shape."""
-    image, size = read_stored(Path(file)), (field.cameras.width, field.cameras.height)
+    image, size = read_pixels(Path(file)), (field.cameras.width, field.cameras.height)
     mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
     if abs(mask.shape[1] * size[1] - mask.shape[0] * size[0]) > max(size) + max(mask.shape):
         found, wanted = (

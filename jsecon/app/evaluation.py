@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jsecon.app import ask
-from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
+from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text

@@ -21,7 +21,7 @@ from jsecon.app import pictures, report
 from jsecon.app.ask import Answer, quantile_message
 from jsecon.app.locate import digits, rounded, selected_centers
 from jsecon.app.viewer.static_page import NOWHERE, main_regions
-from jsecon.data.gaussian_files import save_gaussians
+from jsecon.data.gaussians.files import save_gaussians
 from jsecon.files import atomic_write, write_text
 from jsecon.language.field import subset_field
 from jsecon.language.membership import probability_inside

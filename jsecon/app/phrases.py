@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from jsecon.app.ask import Answer, answer_of
-from jsecon.data.frames import Progress, spread
+from jsecon.data.frames import Progress, evenly_spaced
 from jsecon.errors import InputError
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
@@ -32,7 +32,7 @@ def frames_of(field: LanguageField, capture: Path, count: int) -> dict[int, np.n
 
     if count < 1:
         raise InputError("--looks", str(count), "at least 1", "8 is the default.")
-    chosen = [int(t) for t in spread(len(field.names), count)]
+    chosen = [int(t) for t in evenly_spaced(len(field.names), count)]
     names = [field.names[t] for t in chosen]
     found = load_capture(capture, long_side=IMAGE_SIDE, holdout=None, only=names)
     (height, width), own = found.frames.shape[1:3], (field.cameras.width, field.cameras.height)

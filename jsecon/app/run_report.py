@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jsecon.app import pictures, report
-from jsecon.data.gaussian_files import save_gaussians
+from jsecon.data.gaussians.files import save_gaussians
 from jsecon.files import write_text
 from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener

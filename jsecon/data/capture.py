@@ -8,10 +8,17 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jsecon.data.colmap import find_models, read_colmap
-from jsecon.data.frames import Extent, Posed, Progress, assemble, check_options, extent_of
-from jsecon.data.motion import photographs
+from jsecon.data.frames import (
+    CaptureExtent,
+    PosedImages,
+    Progress,
+    build_capture,
+    check_capture_options,
+    planned_extent,
+)
 from jsecon.data.nerfstudio import read_nerfstudio
 from jsecon.data.rgbd import find_rgbd
+from jsecon.data.sfm import list_photographs
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder
 from jsecon.types import Camera, Capture
@@ -39,17 +46,17 @@ def load_capture(
     points. `progress(done, total)` counts frames.
     Raises InputError where the path holds neither, or what it holds is damaged.
     """
-    check_options(downscale, frames, holdout, long_side)
+    check_capture_options(downscale, frames, holdout, long_side)
     how = {"downscale": downscale, "long_side": long_side, "frames": frames, "holdout": holdout, "only": only}
-    return assemble(_posed(Path(path)), **how, progress=progress)
+    return build_capture(_posed(Path(path)), **how, progress=progress)
 
 
 def capture_extent(
     path: str | Path, *, downscale: float | None = None, long_side: int | None = None, frames: int | None = None
-) -> Extent:
+) -> CaptureExtent:
     """How much `load_capture` would load; of the images, only the headers are read."""
-    check_options(downscale, frames, None, long_side)
-    return extent_of(_posed(Path(path)), downscale, long_side, frames)
+    check_capture_options(downscale, frames, None, long_side)
+    return planned_extent(_posed(Path(path)), downscale, long_side, frames)
 
 
 def has_poses(path: Path) -> bool:
@@ -69,7 +76,7 @@ def may_have_depth(path: Path) -> bool:
     return find_rgbd(path) is not None
 
 
-def _posed(path: Path) -> Posed:
+def _posed(path: Path) -> PosedImages:
     if path.is_dir() and (models := find_models(path)):
         return read_colmap(path, models)
     file = path / "transforms.json" if path.is_dir() else path
@@ -80,11 +87,11 @@ def _posed(path: Path) -> Posed:
     raise _no_capture(path)
 
 
-def bare_photographs(path: Path) -> list[Path]:
+def unposed_photographs(path: Path) -> list[Path]:
     """Lists the photographs of a folder that has no poses; those of subfolders only where none is a capture itself."""
     if not path.is_dir() or has_poses(path):
         return []
-    photos = photographs(path)
+    photos = list_photographs(path)
     nested = bool(photos) and photos[0].parent not in (path, path / "images")
     return [] if nested and _inner_captures(path) else photos
 
@@ -102,7 +109,7 @@ def _no_capture(path: Path) -> InputError:
     if not path.is_dir():
         remedy = "Give the folder of the capture, its transforms file (.json), or the video."
         return InputError(path, f"a file that ends in {path.suffix or 'nothing'}", expected, remedy)
-    if photos := bare_photographs(path):
+    if photos := unposed_photographs(path):
         remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/poses as a capture."
         return InputError(path, f"{len(photos)} photographs without poses", "a capture with poses", remedy)
     entries = sorted(child for child in path.iterdir() if not child.name.startswith("."))

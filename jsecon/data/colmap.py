@@ -22,9 +22,9 @@ from jsecon.data.colmap_model import (
     read_images,
     read_points,
 )
-from jsecon.data.frames import Posed, Shot
-from jsecon.data.images import existing_image, write_image
-from jsecon.data.worlds import moved_poses
+from jsecon.data.coordinates import transform_poses
+from jsecon.data.frames import PosedImage, PosedImages
+from jsecon.data.images import find_image, write_image
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, path_within
 from jsecon.splat.transform import quaternion_from_matrix
@@ -60,7 +60,7 @@ def find_model(path: str | Path) -> Path | None:
     return next(iter(find_models(path)), None)
 
 
-def read_colmap(path: Path, models: Sequence[Path]) -> Posed:
+def read_colmap(path: Path, models: Sequence[Path]) -> PosedImages:
     """Reads a COLMAP capture: the first of `models` and the images in `path`/images, or beside each other in `path`.
 
     Every camera model is read but EQUIRECTANGULAR. The notes tell which models were left out. Raises InputError on a
@@ -79,7 +79,7 @@ def read_colmap(path: Path, models: Sequence[Path]) -> Posed:
         if camera not in lenses:
             found = f"image {name} of camera {camera}, which is not in the cameras file"
             raise InputError(model, found, "cameras and images of one model", REMEDY)
-        shots.append(Shot(name, files[name], lenses[camera], pose))
+        shots.append(PosedImage(name, files[name], lenses[camera], pose))
     notes = []
     if len(models) > 1:
         others = ", ".join(f"{place.relative_to(path)} with {count_images(place)}" for place in models[1:])
@@ -89,8 +89,8 @@ def read_colmap(path: Path, models: Sequence[Path]) -> Posed:
         remedy = "Join them (colmap model_merger), or take photographs between them, to use all images."
         notes.append(f"{told}; left out: {others}. {remedy}")
     if model_file(model, "points3D") is None:
-        return Posed(shots, model, notes=(*notes, "The model has no points3D file: there are no sparse points."))
-    return Posed(shots, model, *read_points(model), notes=tuple(notes))
+        return PosedImages(shots, model, notes=(*notes, "The model has no points3D file: there are no sparse points."))
+    return PosedImages(shots, model, *read_points(model), notes=tuple(notes))
 
 
 def _image_files(path: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -99,7 +99,7 @@ def _image_files(path: Path, names: Sequence[str]) -> dict[str, Path]:
         path_within(path / "images", name)  # a name from a file is no path to elsewhere
     found: dict[str, Path] = {}
     for folder in (path / "images", path, path / "input"):
-        files = {name: file for name in names if (file := existing_image(folder, name)) is not None}
+        files = {name: file for name in names if (file := find_image(folder, name)) is not None}
         if len(files) == len(set(names)):
             return files
         found = found or files
@@ -128,7 +128,7 @@ def write_colmap(capture: Capture, path: str | Path, *, image_format: str = "png
     ]
     image_bytes = [struct.pack("<Q", len(files))]
     from_world = np.eye(4) if capture.to_poses is None else np.asarray(capture.to_poses, np.float64)
-    poses = moved_poses(np.asarray(cameras.world_to_camera, np.float64), from_world)
+    poses = transform_poses(np.asarray(cameras.world_to_camera, np.float64), from_world)
     for n, (file, pose, camera) in enumerate(zip(files, poses, which.ravel()), start=1):
         quaternion = quaternion_from_matrix(pose[:3, :3])
         numbers = itertools.chain(-quaternion if quaternion[0] < 0 else quaternion, pose[:3, 3])

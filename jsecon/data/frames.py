@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jsecon.data.images import TRANSPOSED, ImageHeader, image_header, read_depth, read_image, turned
-from jsecon.data.lens import Lens, distort, seen_through, undistorted, undistortion_maps
-from jsecon.data.poses import camera_jumps, rigid
-from jsecon.data.worlds import moved_poses, ordinary_world
+from jsecon.data.coordinates import normalizing_transform, transform_poses
+from jsecon.data.images import TRANSPOSED, ImageHeader, apply_orientation, image_header, read_depth, read_image
+from jsecon.data.lens import Lens, distort, resample_depth, undistorted_pinhole, undistortion_maps
+from jsecon.data.poses import camera_jumps, make_rigid
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.types import Camera, Capture, ImageFile
@@ -41,7 +41,7 @@ IN_MEMORY = 1 << 30
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
+class PosedImage:
     """One image file and where it was taken."""
 
     name: str
@@ -59,10 +59,10 @@ class Shot:
 
 
 @dataclasses.dataclass(frozen=True)
-class Posed:
-    """A capture before any pixel is read: what every format's reader gives to `assemble`."""
+class PosedImages:
+    """A capture before any pixel is read: what every format's reader gives to `build_capture`."""
 
-    shots: Sequence[Shot]
+    shots: Sequence[PosedImage]
     where: object
     """names the capture in errors."""
     points: Float[np.ndarray, "p 3"] = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
@@ -73,7 +73,7 @@ class Posed:
     notes: tuple[str, ...] = ()
 
 
-def check_options(
+def check_capture_options(
     downscale: float | int | None, frames: int | None, holdout: int | None, long_side: int | None = None
 ) -> None:
     """Raises InputError on options that no capture can be loaded with."""
@@ -88,14 +88,14 @@ def check_options(
         raise InputError("holdout", str(holdout), expected, remedy)
 
 
-def spread(count: int, wanted: int | None) -> np.ndarray:
+def evenly_spaced(count: int, wanted: int | None) -> np.ndarray:
     """Indices of at most `wanted` of `count` frames, evenly spaced, the first and the last among them."""
     if wanted is None or wanted >= count:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, wanted).round().astype(int))
 
 
-def held_out(count: int, every: int | None) -> Bool[np.ndarray, " t"]:
+def holdout_mask(count: int, every: int | None) -> Bool[np.ndarray, " t"]:
     """The frames 0, k, 2k, ... in name order, as in Mip-NeRF 360 and INRIA's split; none for 0 or None."""
     return np.arange(count) % every == 0 if every else np.zeros(count, bool)
 
@@ -121,7 +121,7 @@ def _without_ending(path: PurePosixPath) -> PurePosixPath:
     return path if path.suffix[1:].isdecimal() else path.with_suffix("")
 
 
-def _as_read(shots: Sequence[Shot], posed: Posed | None = None) -> tuple[list[Lens], list[int], list[str]]:
+def _as_read(shots: Sequence[PosedImage], posed: PosedImages | None = None) -> tuple[list[Lens], list[int], list[str]]:
     """How each shot's image is read: the lens at the size that it really has (a folder of smaller images is common),
     the EXIF orientation that is applied to its pixels, 1 where they are taken as stored; and notes.
 
@@ -158,7 +158,7 @@ def _belongs(lens: Lens, header: ImageHeader) -> str:
     return {(True, True): "either", (True, False): "stored", (False, True): "upright"}.get((stored, upright), "")
 
 
-def _exif_ignored(posed: Posed) -> bool:
+def _exif_ignored(posed: PosedImages) -> bool:
     """Whether the poses of a capture belong to stored pixels, by its images whose aspect tells, else by the colours of
     its points."""
     belongs = [_belongs(shot.lens, image_header(shot.image)) for shot in posed.shots]
@@ -173,7 +173,7 @@ def _fits(lens: Lens, width: int, height: int) -> bool:
     return min(abs(lens.width * height / lens.height - width), abs(width * lens.height / height - lens.width)) <= 1
 
 
-def _stored_explains(shots: Sequence[Shot], points: np.ndarray, colours: np.ndarray) -> bool:
+def _stored_explains(shots: Sequence[PosedImage], points: np.ndarray, colours: np.ndarray) -> bool:
     """Whether the colours of the sparse points agree better with the stored pixels than with the upright images, in
     most of EXIF_LOOKS shots; False where there are no colours to compare."""
     if not len(colours) or (colours == colours[0]).all():
@@ -185,7 +185,7 @@ def _stored_explains(shots: Sequence[Shot], points: np.ndarray, colours: np.ndar
     return better > 0
 
 
-def _colour_error(shot: Shot, points: np.ndarray, colours: np.ndarray, *, upright: bool) -> float:
+def _colour_error(shot: PosedImage, points: np.ndarray, colours: np.ndarray, *, upright: bool) -> float:
     """Mean absolute difference between the points' colours and the pixels that they are seen at; 255 of none."""
     image, _ = read_image(shot.image, upright=upright)
     seen = np.asarray(points, np.float64) @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
@@ -201,7 +201,7 @@ def _colour_error(shot: Shot, points: np.ndarray, colours: np.ndarray, *, uprigh
     return float(np.abs(shown - colours[front][near][inside]).mean())
 
 
-def _true_lens(shot: Shot, width: int, height: int) -> Lens:
+def _true_lens(shot: PosedImage, width: int, height: int) -> Lens:
     """The lens of a shot at the size that its image is read at."""
     lens = shot.lens
     if (
@@ -220,10 +220,10 @@ def _true_lens(shot: Shot, width: int, height: int) -> Lens:
     return lens.resized(width, height)
 
 
-def _some_depths(posed: Posed, shots: Sequence[Shot]) -> list[np.ndarray]:
+def _some_depths(posed: PosedImages, shots: Sequence[PosedImage]) -> list[np.ndarray]:
     """A few depth maps, where there are no points to tell how far things are."""
     deep = [shot for shot in shots if shot.depth is not None and not len(posed.points)]
-    chosen = [deep[index] for index in spread(len(deep), DEPTHS_SEEN)] if deep else []
+    chosen = [deep[index] for index in evenly_spaced(len(deep), DEPTHS_SEEN)] if deep else []
     return [read_depth(shot.depth, shot.depth_unit) for shot in chosen if shot.depth is not None]
 
 
@@ -234,7 +234,7 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
-def room_for(shape: tuple[int, ...]) -> np.ndarray:
+def allocate_frames(shape: tuple[int, ...]) -> np.ndarray:
     """Uninitialised uint8; from IN_MEMORY on in a file without a name, from which the system holds what is in use.
     Raises InputError where the disk has no room for it."""
     if (size := math.prod(shape)) < IN_MEMORY:
@@ -250,7 +250,7 @@ def room_for(shape: tuple[int, ...]) -> np.ndarray:
             raise InputError(tempfile.gettempdir(), found, "room on the disk of temporary files", remedy) from error
 
 
-class Extent(NamedTuple):
+class CaptureExtent(NamedTuple):
     """Number, size and names of a capture's frames.
 
     Attributes:
@@ -266,31 +266,33 @@ class Extent(NamedTuple):
     files: tuple[ImageFile, ...] = ()
 
 
-def extent_of(posed: Posed, downscale: float | int | None, long_side: int | None, frames: int | None) -> Extent:
-    """What `assemble` would make of it; of the images, only the headers are read.
+def planned_extent(
+    posed: PosedImages, downscale: float | int | None, long_side: int | None, frames: int | None
+) -> CaptureExtent:
+    """What `build_capture` would make of it; of the images, only the headers are read.
 
-    Raises InputError where `assemble` would, but for what only the images' pixels tell.
+    Raises InputError where `build_capture` would, but for what only the images' pixels tell.
     """
     shots, _, names = _in_order(posed)
-    chosen = spread(len(shots), frames)
+    chosen = evenly_spaced(len(shots), frames)
     shots = [shots[i] for i in chosen]
     lenses, orientations, _ = _as_read(shots)
     for lens in set(lenses):
-        undistorted(lens, posed.where)
+        undistorted_pinhole(lens, posed.where)
     files = tuple(
         ImageFile(shot.name, lens.width, lens.height, orientation)
         for shot, lens, orientation in zip(shots, lenses, orientations)
     )
-    size = shrunk(_commonest(lenses), downscale, long_side)
-    return Extent(len(shots), size, tuple(names[i] for i in chosen), files)
+    size = downscaled_size(_commonest(lenses), downscale, long_side)
+    return CaptureExtent(len(shots), size, tuple(names[i] for i in chosen), files)
 
 
-def _in_order(posed: Posed) -> tuple[list[Shot], np.ndarray, tuple[str, ...]]:
+def _in_order(posed: PosedImages) -> tuple[list[PosedImage], np.ndarray, tuple[str, ...]]:
     """The shots in name order, their poses (t, 4, 4) made exactly rigid, and the frames' names."""
     if not posed.shots:
         raise InputError(posed.where, "no frame", "at least one posed image", "Estimate the poses again.")
     shots = sorted(posed.shots, key=lambda shot: re.sub(r"\d+", lambda number: number[0].zfill(20), shot.name))
-    poses = np.stack([rigid(shot.world_to_camera, posed.where, shot.name) for shot in shots])
+    poses = np.stack([make_rigid(shot.world_to_camera, posed.where, shot.name) for shot in shots])
     return shots, poses, frame_names([shot.name for shot in shots], posed.where)
 
 
@@ -298,15 +300,15 @@ def _commonest(lenses: Sequence[Lens]) -> tuple[int, int]:
     return collections.Counter((lens.width, lens.height) for lens in lenses).most_common(1)[0][0]
 
 
-def shrunk(size: tuple[int, int], downscale: float | int | None, long_side: int | None) -> tuple[int, int]:
-    """(width, height) of the frames made of images of `size`, see `assemble`."""
+def downscaled_size(size: tuple[int, int], downscale: float | int | None, long_side: int | None) -> tuple[int, int]:
+    """(width, height) of the frames made of images of `size`, see `build_capture`."""
     if downscale is None:
         downscale = max(max(size) / long_side, 1.0) if long_side is not None else 1.0
     return max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale))
 
 
-def assemble(
-    posed: Posed,
+def build_capture(
+    posed: PosedImages,
     *,
     downscale: float | int | None = None,
     long_side: int | None = None,
@@ -320,15 +322,15 @@ def assemble(
     Distorted images are resampled (bilinear) to the widest pinhole lens without empty pixels, then shrunk by
     `downscale` (area average), or where that is None so that the longer side is at most `long_side`. Where the sizes
     differ, the commonest is taken and the others are resized to it, focal lengths with them. `only`: frames of these
-    names alone. Large coordinates and units far from metres are changed in float64 (`ordinary_world`), by the same for
-    any choice of frames; `Capture.to_source` leads back. Raises InputError on images that are missing, damaged or
-    of another aspect, and on poses that are not finite and rigid.
+    names alone. Large coordinates and units far from metres are changed in float64 (`normalizing_transform`), by the
+    same for any choice of frames; `Capture.to_source` leads back. Raises InputError on images that are missing, damaged
+    or of another aspect, and on poses that are not finite and rigid.
     """
-    check_options(downscale, frames, holdout, long_side)
+    check_capture_options(downscale, frames, holdout, long_side)
     where = posed.where
     shots, poses, names = _in_order(posed)
-    world, changed = ordinary_world(poses, posed.points, _some_depths(posed, shots))  # of all, whatever is taken
-    poses, from_world = moved_poses(poses, world), np.linalg.inv(world)
+    world, changed = normalizing_transform(poses, posed.points, _some_depths(posed, shots))  # of all, whatever is taken
+    poses, from_world = transform_poses(poses, world), np.linalg.inv(world)
     if only is not None:
         missing = sorted(set(only) - set(names))
         if missing or not only:
@@ -337,7 +339,7 @@ def assemble(
         kept = [i for i, name in enumerate(names) if name in only]
         shots, poses, names = [shots[i] for i in kept], poses[kept], tuple(names[i] for i in kept)
     notes = [*posed.notes, *changed, *camera_jumps(poses, names)]
-    chosen = spread(len(shots), frames)
+    chosen = evenly_spaced(len(shots), frames)
     if len(chosen) < len(shots):
         notes.append(f"{len(chosen)} of {len(shots)} frames were taken, evenly spaced.")
     shots, poses, names = [shots[i] for i in chosen], poses[chosen], tuple(names[i] for i in chosen)
@@ -349,7 +351,7 @@ def assemble(
     )
     if rescaled:
         notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
-    pinholes = {lens: undistorted(lens, where) for lens in set(lenses)}
+    pinholes = {lens: undistorted_pinhole(lens, where) for lens in set(lenses)}
     bent = sum(lens.distorted for lens in lenses)
     if bent:
         notes.append(f"{bent} images were undistorted; masks and labels must be of the undistorted images.")
@@ -358,10 +360,10 @@ def assemble(
     odd = sum((lens.width, lens.height) != (width, height) for lens in lenses)
     if odd:
         notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
-    width, height = shrunk((width, height), downscale, long_side)
+    width, height = downscaled_size((width, height), downscale, long_side)
     final = [pinholes[lens].resized(width, height) for lens in lenses]
 
-    result = room_for((len(shots), height, width, 3))
+    result = allocate_frames((len(shots), height, width, 3))
     depths = np.zeros((len(shots), height, width), np.float32) if any(shot.depth for shot in shots) else None
     maps = functools.lru_cache(maxsize=4)(undistortion_maps)
 
@@ -374,9 +376,9 @@ def assemble(
         if shot.depth is not None and depths is not None:
             depth = read_depth(shot.depth, shot.depth_unit * world[0, 0])
             if shot.depth_lens is not None:
-                depth = seen_through(depth, shot.depth_lens, lens)
+                depth = resample_depth(depth, shot.depth_lens, lens)
             elif not _fits(lens, *depth.shape[1::-1]) and orientations[index] in TRANSPOSED:
-                depth = turned(depth, orientations[index])  # measured like the stored pixels
+                depth = apply_orientation(depth, orientations[index])  # measured like the stored pixels
             if abs(depth.shape[1] * lens.height / depth.shape[0] - lens.width) > 1:
                 problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
                 wanted = f"the aspect of its image, {lens.width}x{lens.height}"
@@ -400,7 +402,7 @@ def assemble(
             raise
     if transparent:
         notes.append(f"{transparent} images have transparent pixels; they were laid over black.")
-    out = held_out(len(shots), holdout)
+    out = holdout_mask(len(shots), holdout)
     if out.all():
         out[:] = False
         notes.append("No frame was held out, since there is only one.")

@@ -29,7 +29,7 @@ from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, atomic_write, map_npy
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
-IMAGE_ENDINGS = (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))
+IMAGE_SUFFIXES = (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))
 """endings tried, in this order, where a capture names an image without one"""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
@@ -47,7 +47,7 @@ _NUMBERS = ("I;16", "I;16B", "I", "F")
 """modes of more than 8 bits, which are kept"""
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """of a PNG, by its colour type"""
-MOST_PIXELS = 1 << 27
+MAX_PIXELS = 1 << 27
 """of an image: 134 million"""
 _SHRINKS = (1, 2, 4, 8)
 """by which a JPEG can be shrunk while it is decoded"""
@@ -125,10 +125,10 @@ def _opened(path: Path, data: bytes) -> tuple[Image.Image, int]:
         raise _unreadable(path, f"its {len(data)} bytes are no image ({describe_error(error)})") from error
     shrink = _shrink(*image.size) if isinstance(image, JpegImageFile) else 1
     width, height = (-(-side // shrink) for side in image.size)
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         problem = f"the image has {width}x{height} pixels ({width * height / 1e6:.0f} million)"
         remedy = "Shrink it, for instance to half its width and height."
-        raise InputError(path, problem, f"at most {MOST_PIXELS // 10**6} million", remedy)
+        raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
     return image, _orientation(block)
 
 
@@ -155,8 +155,8 @@ def _heic_class(path: Path) -> type[ImageFile]:
 
 
 def _shrink(width: int, height: int) -> int:
-    """The least number by which a JPEG is shrunk on decoding so that MOST_PIXELS hold it, else 1."""
-    return next((n for n in _SHRINKS if -(-width // n) * -(-height // n) <= MOST_PIXELS), 1)
+    """The least number by which a JPEG is shrunk on decoding so that MAX_PIXELS hold it, else 1."""
+    return next((n for n in _SHRINKS if -(-width // n) * -(-height // n) <= MAX_PIXELS), 1)
 
 
 def _orientation(block: bytes) -> int:
@@ -173,7 +173,7 @@ def _orientation(block: bytes) -> int:
     return 1
 
 
-def turned(image: np.ndarray, orientation: int) -> np.ndarray:
+def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
     """The upright image (H, W, ...) of stored pixels with this EXIF orientation."""
     if orientation in TRANSPOSED:
         image = image.swapaxes(0, 1)
@@ -202,7 +202,7 @@ def _decoded(path: Path, image: Image.Image, *, native: bool = False) -> np.ndar
         raise _unreadable(path, f"the image cannot be decoded ({describe_error(error)})") from error
 
 
-def existing_image(folder: Path, name: str) -> Path | None:
+def find_image(folder: Path, name: str) -> Path | None:
     """Returns the image file that a capture names, or None.
 
     Tried are the name itself, with "\\" as a separator (where a Windows program wrote it), with its ending in upper or
@@ -210,7 +210,7 @@ def existing_image(folder: Path, name: str) -> Path | None:
     """
     for base in dict.fromkeys((name, name.replace("\\", "/"))):
         stem, ending = os.path.splitext(base)
-        added = () if ending.lower() in IMAGE_ENDINGS else IMAGE_ENDINGS  # a.jpg.png is a mask of a.jpg
+        added = () if ending.lower() in IMAGE_SUFFIXES else IMAGE_SUFFIXES  # a.jpg.png is a mask of a.jpg
         for candidate in (base, stem + ending.lower(), stem + ending.upper(), *(base + end for end in added)):
             if os.path.isfile(folder / candidate):  # False also for a name that no file can have
                 return folder / candidate
@@ -263,7 +263,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     return image_header(path).upright
 
 
-def read_stored(path: Path, *, upright: bool = True) -> np.ndarray:
+def read_pixels(path: Path, *, upright: bool = True) -> np.ndarray:
     """Reads the values of an image file as they are stored.
 
     Args:
@@ -281,13 +281,13 @@ def read_stored(path: Path, *, upright: bool = True) -> np.ndarray:
     pixels = _decoded(path, image)
     if orientation == 1 or (data[:4] in _TIFF) == upright:
         return pixels
-    return turned(pixels, orientation if upright else {6: 8, 8: 6}.get(orientation, orientation))
+    return apply_orientation(pixels, orientation if upright else {6: 8, 8: 6}.get(orientation, orientation))
 
 
 def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
     """RGB, and whether any pixel was transparent: such pixels are laid over black, as in a render of nothing.
 
-    Grey becomes RGB, 16 bits become 8. A JPEG of more than MOST_PIXELS is read at a half, a quarter or an eighth of its
+    Grey becomes RGB, 16 bits become 8. A JPEG of more than MAX_PIXELS is read at a half, a quarter or an eighth of its
     size.
 
     Args:
@@ -298,7 +298,7 @@ def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndar
       InputError: The file is missing, empty, cut short, too large, or no image.
     """
     path = Path(path)
-    image = read_stored(path, upright=upright)
+    image = read_pixels(path, upright=upright)
     if image.dtype == np.uint16:
         image = cv2.convertScaleAbs(image, alpha=255 / 65535)  # rounded to the nearest
     if image.dtype != np.uint8:
@@ -326,7 +326,7 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
         temporary.write_bytes(data.tobytes())
 
 
-def read_ids(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
+def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
     """A label image as integers (H, W), and whether they are colours.
 
     PNG: grey of 1 to 16 bits has its values; a palette the indices into it, never its colours; RGB of 8 bits
@@ -345,7 +345,7 @@ def read_ids(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
         raise InputError(path, "the mask is no PNG", expected, ID_REMEDY)
     opened, orientation = _opened(path, data)
     bits, colour_type = data[24], data[25]
-    image = turned(_decoded(path, opened, native=True), orientation)
+    image = apply_orientation(_decoded(path, opened, native=True), orientation)
     if colour_type in (0, 3):
         ids = image.astype(np.int32)
         return ids // (255 // (2**bits - 1)) if opened.mode == "L" else ids, False  # Pillow stretches 2 and 4 bits
@@ -407,7 +407,7 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         if depth.ndim != 2 or not depth.size:
             raise InputError(path, f"the depth map has shape {depth.shape}", expected, remedy)
     else:
-        depth = read_stored(path)
+        depth = read_pixels(path)
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise InputError(path, f"the depth map has shape {depth.shape} of {depth.dtype}", expected, remedy)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite is unknown

@@ -180,7 +180,7 @@ def _covered(lens: Lens, zoom: float) -> bool:
     return bool(inside and (np.diff(radius, axis=1) > 0).all())
 
 
-def undistorted(lens: Lens, where: object) -> Lens:
+def undistorted_pinhole(lens: Lens, where: object) -> Lens:
     """The widest pinhole lens, same size and principal point, each of whose pixels the distorted image holds.
 
     No empty border is made, since nothing could tell it from black things. `where` names the file in the InputError
@@ -216,7 +216,7 @@ def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray
     return make(matrix, coefficients, np.eye(3), target, (pinhole.width, pinhole.height), cv2.CV_32FC1)
 
 
-def seen_through(depth: Float[np.ndarray, "h w"], lens: Lens, other: Lens) -> Float[np.ndarray, "p q"]:
+def resample_depth(depth: Float[np.ndarray, "h w"], lens: Lens, other: Lens) -> Float[np.ndarray, "p q"]:
     """The depth map of the pinhole `lens` as `other` sees it from the same place: the nearest pixel, 0 outside."""
     columns = np.floor((np.arange(other.width) + 0.5 - other.cx) / other.fx * lens.fx + lens.cx).astype(int)
     rows = np.floor((np.arange(other.height) + 0.5 - other.cy) / other.fy * lens.fy + lens.cy).astype(int)

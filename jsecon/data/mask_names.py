@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from jsecon.data.images import IMAGE_ENDINGS
+from jsecon.data.images import IMAGE_SUFFIXES
 from jsecon.errors import InputError
 from jsecon.files import is_output_folder
 from jsecon.types import ImageFile
@@ -27,7 +27,7 @@ LOOKED_AT = 64
 _WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
 _AFFIX = re.compile(rf"(?:(?:{_WORD})[_.-])?(.+?)(?:[_.-](?:{_WORD}))?", re.IGNORECASE)
 """a frame's name within a mask's"""
-_LOWER_ENDINGS = frozenset(ending.lower() for ending in IMAGE_ENDINGS)
+_LOWER_ENDINGS = frozenset(ending.lower() for ending in IMAGE_SUFFIXES)
 _OTHERS = (*sorted(_LOWER_ENDINGS), ".npz", ".gif", ".exr")
 """endings of files that may be meant as masks and are not read as such"""
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.frames import Posed, Shot
-from jsecon.data.images import existing_image, image_header
+from jsecon.data.frames import PosedImage, PosedImages
+from jsecon.data.gaussians.ply import load_point_cloud
+from jsecon.data.images import find_image, image_header
 from jsecon.data.lens import Lens
-from jsecon.data.ply import load_points_ply
-from jsecon.data.poses import inverse_pose, rigid
+from jsecon.data.poses import invert_pose, make_rigid
 from jsecon.errors import InputError
 from jsecon.files import read_json
 from jsecon.numerics import is_finite_and_bounded
@@ -31,7 +31,7 @@ _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
-def read_nerfstudio(file: Path) -> Posed:
+def read_nerfstudio(file: Path) -> PosedImages:
     """The capture of a transforms.json.
 
     Entries whose image is not there are left out and counted in the notes. Depth maps (depth_file_path) and sparse
@@ -49,7 +49,7 @@ def read_nerfstudio(file: Path) -> Posed:
         name = _key(file, entry, "file_path", where, str)
         rows = _key(file, entry, "transform_matrix", f"{where} ({name})", list)
         pose = _matrix(file, rows, f"transform_matrix of {name}")
-        if (image := existing_image(file.parent, name)) is None:
+        if (image := find_image(file.parent, name)) is None:
             missing.append(name)
             continue
         deep = entry.get("depth_file_path") is not None
@@ -57,8 +57,8 @@ def read_nerfstudio(file: Path) -> Posed:
         if depth is not None and not os.path.isfile(depth):
             raise _bad(depth, "no such depth map", f"the depth_file_path of {name}")
         unit = _number(file, scene, "depth_unit_scale_factor", MILLIMETRE) * scale
-        lens, world_to_camera = _lens(file, scene, entry, name, image), inverse_pose(pose * [1, -1, -1, 1], file, name)
-        shots.append(Shot(_order_name(name, image), image, lens, world_to_camera, depth, unit))
+        lens, world_to_camera = _lens(file, scene, entry, name, image), invert_pose(pose * [1, -1, -1, 1], file, name)
+        shots.append(PosedImage(_order_name(name, image), image, lens, world_to_camera, depth, unit))
     first = f" (the first: {missing[0]})" if missing else ""
     if missing:
         left_out = f"{len(missing)} of {len(entries)} frames of {file.name} were left out"
@@ -73,8 +73,8 @@ def read_nerfstudio(file: Path) -> Posed:
         cloud = file.parent / _key(file, scene, "ply_file_path", "the file", str)
         if not os.path.isfile(cloud):  # False also for a name that no file can have
             raise _bad(cloud, "no such file", "the ply_file_path of transforms.json", "Check the path.")
-        points = load_points_ply(cloud)
-    return Posed(shots, file, *points, to_source=to_source, notes=tuple(notes))
+        points = load_point_cloud(cloud)
+    return PosedImages(shots, file, *points, to_source=to_source, notes=tuple(notes))
 
 
 def trained_to_source(file: Path) -> Float[np.ndarray, "4 4"]:
@@ -88,7 +88,7 @@ def trained_to_source(file: Path) -> Float[np.ndarray, "4 4"]:
     scale = _number(file, told, "scale", 1.0)
     if not scale > 0:
         raise _bad(file, f"scale = {scale}", "a number above 0", "Copy it again from the folder of the training.")
-    return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ rigid(matrix, file, "the trained world"))
+    return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ make_rigid(matrix, file, "the trained world"))
 
 
 def _bad(file: Path, found: str, expected: str, remedy: str = _REMEDY) -> InputError:

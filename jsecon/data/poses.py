@@ -15,7 +15,7 @@ JUMP = 10.0
 was wrong in five places had 11 to 20 there; when right, its largest was 2.2, and that of a walk with one cut 9.9."""
 
 
-def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
+def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
     """The pose with its rotation made exactly orthonormal; InputError where it is not finite or not rigid at all."""
     pose = np.asarray(pose, np.float64)
     remedy = "Estimate the poses again, or take this frame out of the capture."
@@ -33,9 +33,9 @@ def rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.
     return result
 
 
-def inverse_pose(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
+def invert_pose(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Float[np.ndarray, "4 4"]:
     """World to camera of camera to world, and back. Raises InputError as `rigid` does."""
-    pose = rigid(pose, where, name)
+    pose = make_rigid(pose, where, name)
     result = np.eye(4)
     result[:3, :3] = pose[:3, :3].T
     result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]

@@ -16,10 +16,10 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.frames import LEAST_FOCAL, Posed, Shot
-from jsecon.data.images import MOST_PIXELS, image_header, image_size
+from jsecon.data.frames import LEAST_FOCAL, PosedImage, PosedImages
+from jsecon.data.images import MAX_PIXELS, image_header, image_size
 from jsecon.data.lens import Lens
-from jsecon.data.poses import inverse_pose
+from jsecon.data.poses import invert_pose
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, parse_json, read_text
 from jsecon.numerics import is_finite_and_bounded
@@ -36,13 +36,13 @@ _TOGETHER = 0.02
 _PHONE = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def find_rgbd(path: Path) -> Callable[[Path], Posed] | None:
+def find_rgbd(path: Path) -> Callable[[Path], PosedImages] | None:
     """What reads the folder, where it is one of these. It raises InputError on what is damaged, and leaves out frames
     without a pose, which it tells in the notes."""
     fits = lambda marks: all((path / mark).exists() for mark in marks)
     found = next((read for marks, read in _FOLDERS.items() if fits(marks)), None)
 
-    def read(path: Path) -> Posed:
+    def read(path: Path) -> PosedImages:
         assert found is not None
         with _reading(path), np.errstate(invalid="ignore", over="ignore"):
             return found(path)
@@ -97,8 +97,8 @@ def _lens(width: Any, height: Any, *numbers: Any) -> Lens:
     centre lies outside of it: the numbers are then those of another size."""
     fx, fy, cx, cy = map(float, numbers)
     if not (
-        1 <= width <= MOST_PIXELS
-        and 1 <= height <= MOST_PIXELS
+        1 <= width <= MAX_PIXELS
+        and 1 <= height <= MAX_PIXELS
         and is_finite_and_bounded(numbers)
         and min(fx, fy) >= LEAST_FOCAL
     ):
@@ -108,18 +108,18 @@ def _lens(width: Any, height: Any, *numbers: Any) -> Lens:
     return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
-def _shot(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> Shot:
+def _shot(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
     seen = None if depth is None or not depth.is_file() else depth
-    return Shot(image.name, image, lens, inverse_pose(camera_to_world, image, image.name), seen)
+    return PosedImage(image.name, image, lens, invert_pose(camera_to_world, image, image.name), seen)
 
 
-def _posed(path: Path, shots: list[Shot], count: int, *notes: str) -> Posed:
+def _posed(path: Path, shots: list[PosedImage], count: int, *notes: str) -> PosedImages:
     lost = count - len(shots)
     told = (f"{lost} of {count} frames were left out, since they have no pose.",) if lost else ()
-    return Posed(shots, path, notes=(*told, *notes))
+    return PosedImages(shots, path, notes=(*told, *notes))
 
 
-def _scannet(path: Path) -> Posed:
+def _scannet(path: Path) -> PosedImages:
     images, lenses = _images(path / "color"), {}
     for kind in ("color", "depth"):
         file = path / "intrinsic" / f"intrinsic_{kind}.txt"
@@ -153,7 +153,7 @@ def _together(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.where(gap <= _TOGETHER, index, -1)
 
 
-def _tum(path: Path) -> Posed:
+def _tum(path: Path) -> PosedImages:
     (times, images), poses = _listed(path / "rgb.txt"), _rows(path / "groundtruth.txt", 8)
     file = path / "intrinsics.txt"
     known = re.search(r"(?:freiburg|fr)([123])", path.resolve().name)
@@ -177,7 +177,7 @@ def _tum(path: Path) -> Posed:
     return _posed(path, shots, len(images))
 
 
-def _arkitscenes(path: Path) -> Posed:
+def _arkitscenes(path: Path) -> PosedImages:
     images, rows = _images(path / "lowres_wide"), _rows(path / "lowres_wide.traj", 7)
     files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
     with _reading(path / "lowres_wide"):
@@ -194,7 +194,7 @@ def _arkitscenes(path: Path) -> Posed:
     return _posed(path, shots, len(images))
 
 
-def _polycam(path: Path) -> Posed:
+def _polycam(path: Path) -> PosedImages:
     frames = path / "keyframes"
     corrected = all((frames / f"corrected_{kind}").is_dir() for kind in ("images", "cameras"))
     kind = "corrected_" if corrected else ""
@@ -225,7 +225,7 @@ def _polycam_size(told: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
     return (width, height) if abs(width * own[1] - height * own[0]) <= max(width, height) else own
 
 
-def _record3d(path: Path) -> Posed:
+def _record3d(path: Path) -> PosedImages:
     unpacked = (path / "rgbd").is_dir()  # a .r3d is an archive
     images, shots = _images(path / ("rgbd" if unpacked else "rgb")), []
     file = path / ("metadata" if unpacked else "metadata.json")
@@ -243,7 +243,7 @@ def _record3d(path: Path) -> Posed:
     return _posed(path, shots, len(images), "Record3D's depth was not read: it has a compression of its own.")
 
 
-_FOLDERS: dict[tuple[str, ...], Callable[[Path], Posed]] = {
+_FOLDERS: dict[tuple[str, ...], Callable[[Path], PosedImages]] = {
     ("color", "pose", "intrinsic/intrinsic_color.txt"): _scannet,
     ("rgb.txt", "groundtruth.txt"): _tum,
     ("lowres_wide", "lowres_wide.traj"): _arkitscenes,

@@ -14,18 +14,18 @@ from jaxtyping import UInt8
 from jsecon.errors import InputError
 from jsecon.files import atomic_write
 
-VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
-VIDEO_FRAMES = 150
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
+DEFAULT_VIDEO_FRAMES = 150
 """taken where the caller names no number: two or three rounds about a table top"""
 JUDGED = 640
 """px of the longer side at which sharpness is measured: motion blurs it there too, and noise counts less"""
 
 
 def is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_ENDINGS and path.is_file()
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
-def size_of(path: Path) -> tuple[int, int]:
+def video_size(path: Path) -> tuple[int, int]:
     """(width, height) of a video's frames, px, as its header says."""
     reader = cv2.VideoCapture(os.fspath(path))
     try:
@@ -34,7 +34,7 @@ def size_of(path: Path) -> tuple[int, int]:
         reader.release()
 
 
-def sharpest(sharpness: list[float], wanted: int) -> list[int]:
+def sharpest_frames(sharpness: list[float], wanted: int) -> list[int]:
     """The number of the sharpest frame in each of at most `wanted` stretches of equal length."""
     edges = np.linspace(0, len(sharpness), min(wanted, len(sharpness)) + 1).round().astype(int)
     return [int(a + np.argmax(sharpness[a:b])) for a, b in itertools.pairwise(edges)]
@@ -61,7 +61,7 @@ def write_frames(
     if not sharpness:
         remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
         raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
-    chosen, written = set(sharpest(sharpness, frames or VIDEO_FRAMES)), []
+    chosen, written = set(sharpest_frames(sharpness, frames or DEFAULT_VIDEO_FRAMES)), []
     for number, (image, _) in enumerate(_decoded(video)):
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")

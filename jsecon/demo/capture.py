@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Int16, UInt
 
 from jsecon.data.colmap import write_colmap
-from jsecon.data.frames import check_options, held_out
-from jsecon.data.lerf_labels import LabelledFrame, write_lerf_labels
+from jsecon.data.frames import check_capture_options, holdout_mask
+from jsecon.data.labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import Room, crowded_room, make_room
 from jsecon.errors import require
@@ -92,8 +92,8 @@ def room_capture(
       InputError: The options of the frames are invalid.
       ValueError: Fewer than two frames are not held out.
     """
-    check_options(None, views, holdout)
-    is_held_out = held_out(views, holdout)
+    check_capture_options(None, views, holdout)
+    is_held_out = holdout_mask(views, holdout)
     got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
     require(int((~is_held_out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
     room = crowded_room(seed) if crowded else make_room(seed, num_objects=num_objects)

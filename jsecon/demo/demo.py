@@ -15,7 +15,7 @@ import numpy as np
 
 from jsecon.app import ask, evaluation, pictures, report, run_report
 from jsecon.app.outputs import answer_masks, write_answer
-from jsecon.data.lerf_labels import LabelledFrame, load_lerf_labels
+from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.demo import write_room
 from jsecon.demo.film import write_film
 from jsecon.evaluate.lerf import Row

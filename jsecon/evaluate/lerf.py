@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection

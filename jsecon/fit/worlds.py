@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.frames import spread
+from jsecon.data.frames import evenly_spaced
 from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.schedule import resize_cameras, resize_frame
 from jsecon.splat.render import render_rgb
@@ -55,7 +55,7 @@ class PhotoSimilarity(NamedTuple):
 def photo_similarity(gaussians: Gaussians, capture: Capture) -> PhotoSimilarity:
     """How much Gaussians in the capture's world look like its training frames."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    views = train[spread(len(train), VIEWS)]
+    views = train[evenly_spaced(len(train), VIEWS)]
     cameras = resize_cameras(
         capture.cameras, min(1.0, QUICK_LONG_SIDE / max(capture.cameras.width, capture.cameras.height))
     )

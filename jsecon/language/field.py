@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jsecon.data.images import MOST_PIXELS
+from jsecon.data.images import MAX_PIXELS
 from jsecon.errors import InputError, describe_error, require
 from jsecon.files import (
     READ_ERRORS,
@@ -223,7 +223,7 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
     texts = (*field.names, field.embedder, field.provenance)
     if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
         return "names, embedder or provenance that are no texts, or no JSON object"
-    if not 0 < field.cameras.width * field.cameras.height <= MOST_PIXELS:
+    if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
         return f"views of {field.cameras.width}x{field.cameras.height} px"
     if field.autoencoder is not None:
         try:

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from jsecon.data.capture import capture_extent
-from jsecon.data.frames import Extent, frame_names, held_out, shrunk, spread
+from jsecon.data.frames import CaptureExtent, downscaled_size, evenly_spaced, frame_names, holdout_mask
 from jsecon.data.images import image_size
-from jsecon.data.motion import check_photographs, photographs, require_motion
-from jsecon.data.video import VIDEO_FRAMES, is_video, size_of
+from jsecon.data.sfm import check_photographs, list_photographs, require_pycolmap
+from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
 from jsecon.errors import InputError
 from jsecon.pipeline import cache
 from jsecon.pipeline.options import Options
@@ -38,12 +38,12 @@ def check_inputs(work: RunContext, running: Collection[str], results: Mapping[st
     options = work.options
     require_place(work.out)
     if "poses" in running:
-        require_motion(options.capture)
-        if is_video(options.capture) and min(size_of(options.capture)) < 1:
+        require_pycolmap(options.capture)
+        if is_video(options.capture) and min(video_size(options.capture)) < 1:
             remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
             raise InputError(options.capture, "no frame that OpenCV can read", "a video", remedy)
     extent = _extent(work, running, results)
-    train = np.flatnonzero(~held_out(extent.frames, options.holdout))
+    train = np.flatnonzero(~holdout_mask(extent.frames, options.holdout))
     require_training(len(train) if extent.frames > 1 else extent.frames, extent.frames)
     if options.gaussians is not None and "gaussians" in running:
         from jsecon.pipeline.scene_stages import given_gaussians
@@ -70,7 +70,7 @@ def require_place(folder: Path) -> None:
         raise InputError(folder, f"{parent} cannot be written", "a folder that can be written", remedy)
 
 
-def _extent(work: RunContext, running: Collection[str], results: Mapping[str, Path]) -> Extent:
+def _extent(work: RunContext, running: Collection[str], results: Mapping[str, Path]) -> CaptureExtent:
     """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
     options = work.options
     size_options = {name: getattr(options, name) for name in ("downscale", "long_side", "frames")}
@@ -78,39 +78,39 @@ def _extent(work: RunContext, running: Collection[str], results: Mapping[str, Pa
         with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
             capture = cache.load(results["load"]).value
             size = capture.cameras.width, capture.cameras.height
-            return Extent(len(capture.names), size, capture.names, capture.files)
+            return CaptureExtent(len(capture.names), size, capture.names, capture.files)
     if "poses" not in results:
         return capture_extent(options.capture, **size_options)
     if "poses" not in running:
         return capture_extent(work.out / "poses", **size_options)
     if is_video(options.capture):
-        size = shrunk(size_of(options.capture), options.downscale, options.long_side)
-        return Extent(options.frames or VIDEO_FRAMES, size)
-    photos = photographs(options.capture)
+        size = downscaled_size(video_size(options.capture), options.downscale, options.long_side)
+        return CaptureExtent(options.frames or DEFAULT_VIDEO_FRAMES, size)
+    photos = list_photographs(options.capture)
     paths = check_photographs(photos, options.capture)
     names = frame_names(paths, options.capture)
     sizes = [image_size(photo) for photo in photos]
-    chosen = spread(len(photos), options.frames)
-    size = shrunk(max(set(sizes), key=sizes.count), options.downscale, options.long_side)
+    chosen = evenly_spaced(len(photos), options.frames)
+    size = downscaled_size(max(set(sizes), key=sizes.count), options.downscale, options.long_side)
     files = tuple(ImageFile(paths[i], *sizes[i]) for i in chosen)
-    return Extent(len(chosen), size, tuple(names[i] for i in chosen), files)
+    return CaptureExtent(len(chosen), size, tuple(names[i] for i in chosen), files)
 
 
-def _check_masks(options: Options, running: Collection[str], extent: Extent, train_names: list[str]) -> None:
+def _check_masks(options: Options, running: Collection[str], extent: CaptureExtent, train_names: list[str]) -> None:
     """Checks that files of masks, proposals and features belong to the frames."""
     width, height = extent.size
     files = dict(zip(extent.names, extent.files))
     layout = {"level": options.level, "order": extent.names, "files": files}
     if options.masks is not None and "masklets" in running:
-        from jsecon.data.mask_files import check_labels
+        from jsecon.data.masks import check_labels
 
         check_labels(options.masks, train_names, (height, width), **layout)
     if options.proposals is not None and "masklets" in running:
-        from jsecon.data.proposal_files import proposals_from_disk
+        from jsecon.data.proposals import load_proposals
 
-        read, _ = proposals_from_disk(options.proposals, train_names, (height, width), **layout)
+        read, _ = load_proposals(options.proposals, train_names, (height, width), **layout)
         read(0)
     if options.features is not None and "regions" in running:
-        from jsecon.data.langsplat_files import load_features
+        from jsecon.data.langsplat import load_features
 
         load_features(options.features, train_names[:1], (height, width), **layout)

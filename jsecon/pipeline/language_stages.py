@@ -34,7 +34,7 @@ def regions(work: RunContext) -> Stage:
         return StageResult(found)
 
     def read(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
-        from jsecon.data.langsplat_files import load_features
+        from jsecon.data.langsplat import load_features
         from jsecon.language.regions import embeddings_of_masks
 
         capture, labels = results["load"], results["masklets"]
@@ -107,7 +107,7 @@ def _masks_of(work: RunContext, results: Results) -> tuple[Callable[[int], np.nd
     frames = np.asarray(capture.frames)[training_frames(capture)]
     by_model: Embed = lambda t, masks: work.networks.embedder.embed_regions(frames[t], masks)
     if options.features is not None:
-        from jsecon.data.langsplat_files import load_features
+        from jsecon.data.langsplat import load_features
 
         names = [capture.names[t] for t in training_frames(capture)]
         how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}

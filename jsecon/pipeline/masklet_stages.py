@@ -29,7 +29,7 @@ def _read(work: RunContext) -> Stage:
     assert folder is not None
 
     def compute(results: Results, progress: Progress, record: Checkpoint) -> StageResult:
-        from jsecon.data.mask_files import load_labels
+        from jsecon.data.masks import load_labels
 
         capture = results["load"]
         names, size = [capture.names[t] for t in training_frames(capture)], capture.frames.shape[1:3]
@@ -92,11 +92,11 @@ def frame_proposals(
     options, train = work.options, training_frames(capture)
     frames = np.asarray(capture.frames)[train]
     if options.proposals is not None:
-        from jsecon.data.proposal_files import proposals_from_disk
+        from jsecon.data.proposals import load_proposals
 
         names = [capture.names[t] for t in train]
         how = {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
-        return proposals_from_disk(options.proposals, names, frames.shape[1:3], **how)
+        return load_proposals(options.proposals, names, frames.shape[1:3], **how)
     segmenter = work.networks.segmenter
     if segmenter is not None:  # which keeps what it finds on disk
         alone = threading.Lock()  # a network takes all cores for one frame

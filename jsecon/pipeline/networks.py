@@ -66,9 +66,9 @@ def open_networks(options: Options, store: Path) -> Networks:
         tracker = Sam2Tracker(options.tracker)
     given = None
     if options.features is not None:
-        from jsecon.data.langsplat_files import feature_size
+        from jsecon.data.langsplat import embedding_size
 
-        given = ExternalSpace(feature_size(options.features))
+        given = ExternalSpace(embedding_size(options.features))
         if options.embedder is None:
             return Networks(given, segmenter, tracker)
     name = None if given is None else given.name

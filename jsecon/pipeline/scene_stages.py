@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.data.worlds import moved_poses
+from jsecon.data.coordinates import transform_poses
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.pipeline.options import SceneOptions
@@ -40,9 +40,9 @@ def capture_stages(work: RunContext) -> list[Stage]:
 def _bare(capture: Path) -> bool:
     """Whether it is a video, or a folder of photographs without a file of poses."""
     if capture.is_dir():
-        from jsecon.data.capture import bare_photographs
+        from jsecon.data.capture import unposed_photographs
 
-        return len(bare_photographs(capture)) > 0
+        return len(unposed_photographs(capture)) > 0
     from jsecon.data.video import is_video
 
     return is_video(capture)
@@ -50,8 +50,8 @@ def _bare(capture: Path) -> bool:
 
 def poses(work: RunContext) -> Stage:
     """The poses of bare photographs or of a video's frames, as a COLMAP capture in OUT/poses."""
-    from jsecon.data.motion import find_poses, photographs
-    from jsecon.data.video import VIDEO_FRAMES, is_video, write_frames
+    from jsecon.data.sfm import find_poses, list_photographs
+    from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 
     capture, out, video = work.options.capture, work.out / "poses", is_video(work.options.capture)
 
@@ -60,7 +60,7 @@ def poses(work: RunContext) -> Stage:
         if video:
             photos = write_frames(capture, folder / "frames", frames=work.options.frames, progress=progress)
         else:
-            photos = photographs(capture)
+            photos = list_photographs(capture)
         found, posed = find_poses(photos, folder, where=capture, progress=progress)
         if video:
             shutil.rmtree(posed / "images")
@@ -71,16 +71,18 @@ def poses(work: RunContext) -> Stage:
         return StageResult(found, notes=(*found.notes(), f"The poses are in {out}: COLMAP opens them."))
 
     if video:
-        what = f"the {work.options.frames or VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
+        what = f"the {work.options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
     else:
-        what = f"{len(photographs(capture))} photographs, which have none"
+        what = f"{len(list_photographs(capture))} photographs, which have none"
     how = f"found by structure from motion (pycolmap) for {what}"
     if video:
         return Stage(
             "poses", how, compute, "data", key_options=work.key_options("frames"), files=capture, output_dir=out
         )
-    given = {"names": [photo.relative_to(capture).as_posix() for photo in photographs(capture)]}
-    return Stage("poses", how, compute, "data", key_options=given, files=lambda: photographs(capture), output_dir=out)
+    given = {"names": [photo.relative_to(capture).as_posix() for photo in list_photographs(capture)]}
+    return Stage(
+        "poses", how, compute, "data", key_options=given, files=lambda: list_photographs(capture), output_dir=out
+    )
 
 
 STEP_SECONDS = 0.024, 0.2
@@ -220,7 +222,7 @@ def _read(work: RunContext) -> Stage:
 
 def given_gaussians(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     """A file's Gaussians (NumPy), and what its reader has to say of them. Raises InputError where there is none."""
-    from jsecon.data.gaussian_files import read_gaussians
+    from jsecon.data.gaussians.files import read_gaussians
 
     found, notes = read_gaussians(path)
     if not found.count:
@@ -243,7 +245,7 @@ def _in_the_captures_world(
     The file does not tell its world, so a few frames are rendered in each that it may be: the one that `trained` leads
     back from, the capture files', the poses', those of known trainings. The one that looks like the frames is taken.
     """
-    from jsecon.data.worlds import trained_worlds
+    from jsecon.data.coordinates import training_worlds
     from jsecon.fit.worlds import photo_similarity
     from jsecon.splat.transform import transform_gaussians_float64
 
@@ -273,9 +275,9 @@ def _in_the_captures_world(
         if other[2].correlation > best[2].correlation + _LEAD:
             best = other
     if not best[2].explained:
-        cameras = np.linalg.inv(moved_poses(np.asarray(capture.cameras.world_to_camera, np.float64), to_poses))
+        cameras = np.linalg.inv(transform_poses(np.asarray(capture.cameras.world_to_camera, np.float64), to_poses))
         points = np.asarray(capture.points, np.float64) @ to_poses[:3, :3].T + to_poses[:3, 3]
-        for name, world in trained_worlds(cameras, points):
+        for name, world in training_worlds(cameras, points):
             scene, seen = seen_in(to_source @ np.linalg.inv(world @ to_poses))
             if seen.explained and seen.correlation > best[2].correlation + _LEAD:
                 best = f"the training, normalised as by {name}", scene, seen
@@ -295,12 +297,12 @@ def _in_the_captures_world(
 
 def _rounded_note(gaussians: Gaussians, path: Path) -> tuple[str, ...]:
     """Where a file's float32 has rounded the places of its Gaussians: nothing brings them back."""
-    from jsecon.data.ply import ROUNDED_READ
+    from jsecon.data.gaussians.ply import MAX_READ_ROUNDING
 
     if gaussians.means.dtype != np.float32:
         return ()
     steps = np.spacing(np.abs(gaussians.means).max(axis=1))
-    if np.median(steps / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))) < 2 * ROUNDED_READ:
+    if np.median(steps / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))) < 2 * MAX_READ_ROUNDING:
         return ()
     told = f"{path.name} holds positions in float32, which rounds them to {np.median(steps):.2g} units out there."
     return (f"{WARNING}{told} Export them in double precision, or nearer to the origin.",)

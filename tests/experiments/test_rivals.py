@@ -16,7 +16,7 @@ from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_
 from experiments.rivals.langsplat import train_langsplat
 from experiments.rivals.opengaussian import Schedule, train_instances, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
-from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import evaluate_point_level_rendered
 from jsecon.splat.plan import plan_view

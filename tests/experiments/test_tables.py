@@ -24,9 +24,9 @@ from experiments.datasets.replica import REPLICA_SCENES
 from experiments.tables import fill, layout, published, twins
 from experiments.tables.methods import METHODS, RECOMMENDED
 from experiments.tables.setting import levels_of, prepare
-from jsecon.data.langsplat_files import load_features
-from jsecon.data.mask_files import LEVELS
-from jsecon.data.ply import load_ply, save_ply
+from jsecon.data.gaussians.ply import load_ply, save_ply
+from jsecon.data.langsplat import load_features
+from jsecon.data.masks import LEVELS
 from jsecon.fit.start import gaussians_from_points
 
 TRACKED = "ours, tracks"

@@ -21,7 +21,7 @@ from experiments.simulated_vision.masks import LEVELS
 from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
-from jsecon.data.lerf_labels import LabelledFrame
+from jsecon.data.labels import LabelledFrame
 from jsecon.demo.room import TABLE_WOOD, make_room, srgb_to_linear
 from jsecon.errors import InputError
 

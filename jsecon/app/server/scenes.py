@@ -14,7 +14,7 @@ import numpy as np
 from jsecon.app.ask import Answer, ask_pixel, ask_text
 from jsecon.app.locate import locate_answer
 from jsecon.app.outputs import best_frames, selected
-from jsecon.data.ply import save_ply
+from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
 from jsecon.pipeline.networks import field_embedder

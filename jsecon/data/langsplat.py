@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jsecon.data.mask_files import Fit, compact, read_level
 from jsecon.data.mask_names import find_masks
+from jsecon.data.masks import Fit, compact, read_level
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, map_npy
 from jsecon.numerics import is_finite_and_bounded
@@ -43,7 +43,7 @@ def load_features(
 ) -> FrameMasks:
     """Reads one level of the masks of the frames `names`, at `size` (H, W), with their embeddings.
 
-    Files are found by name as by `jsecon.data.mask_files.load_labels`, which says what `order` and `files` are. Masks
+    Files are found by name as by `jsecon.data.masks.load_labels`, which says what `order` and `files` are. Masks
     that vanish at the size asked for are left out. Raises InputError where a frame has no file, where the two files of
     a frame disagree, and on embeddings that are not finite.
     """
@@ -87,7 +87,7 @@ def _is_object(path: Path) -> bool:
     return False
 
 
-def feature_size(folder: Path) -> int:
+def embedding_size(folder: Path) -> int:
     """E of the embeddings in `folder`. Raises InputError where it holds no `_f.npy`, or the first is damaged."""
     files = sorted(folder.rglob("*_f.npy"))
     if not files:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.ply import SH_DC, sound
-from jsecon.data.ply_file import bad_ply, read_elements
+from jsecon.data.gaussians.ply import SH_DC, drawable_gaussians
+from jsecon.data.gaussians.ply_file import ply_error, read_elements
 from jsecon.types import Gaussians
 
 _CHUNK = 256
@@ -36,21 +36,23 @@ def load_compressed_ply(path: Path) -> Gaussians:
     """
     header, tables = read_elements(path)
     if header.form == "ascii":
-        raise bad_ply(path, "its format is ascii", "a binary compressed .ply", _REMEDY)
+        raise ply_error(path, "its format is ascii", "a binary compressed .ply", _REMEDY)
     empty = np.zeros(0, [])
     chunks, vertices, rest = (tables.get(name, empty) for name in ("chunk", "vertex", "sh"))
     bounds, packed = chunks.dtype.names or (), vertices.dtype.names or ()
     with_colours = any(name in bounds for name in _COLOURS)
     missing = [name for name in (*_BOUNDS, *(_COLOURS if with_colours else ())) if name not in bounds]
     if missing := [*missing, *(name for name in _PACKED if name not in packed)]:
-        raise bad_ply(path, f"it has no properties {', '.join(missing)}", _WANTED, _REMEDY)
+        raise ply_error(path, f"it has no properties {', '.join(missing)}", _WANTED, _REMEDY)
     if wrong := [
         name for name in _PACKED if vertices.dtype[name].kind not in "iu" or vertices.dtype[name].itemsize != 4
     ]:
-        raise bad_ply(path, f"{wrong[0]} is of type {vertices.dtype[wrong[0]].name}", "uint", _REMEDY)
+        raise ply_error(path, f"{wrong[0]} is of type {vertices.dtype[wrong[0]].name}", "uint", _REMEDY)
     count = len(vertices)
     if len(chunks) * _CHUNK < count:
-        raise bad_ply(path, f"it has {len(chunks)} chunks for {count} Gaussians", f"a chunk for each {_CHUNK}", _REMEDY)
+        raise ply_error(
+            path, f"it has {len(chunks)} chunks for {count} Gaussians", f"a chunk for each {_CHUNK}", _REMEDY
+        )
     position, rotation, scale, colour = (vertices[name].astype(np.uint32) for name in _PACKED)
 
     def between(kinds: str | tuple[str, ...], share: np.ndarray) -> np.ndarray:
@@ -72,7 +74,9 @@ def load_compressed_ply(path: Path) -> Gaussians:
             "opacity_logits": np.log(alpha / (1 - alpha)),
             "sh": np.concatenate([constant, _harmonics(path, rest, count)], axis=1),
         }
-        return sound(path, {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()})
+        return drawable_gaussians(
+            path, {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+        )
 
 
 def _shares(words: np.ndarray, *fields: tuple[int, int]) -> np.ndarray:
@@ -97,11 +101,11 @@ def _harmonics(path: Path, rest: np.ndarray, count: int) -> np.ndarray:
     names = rest.dtype.names or ()
     if len(names) not in (0, 9, 24, 45) or any(f"f_rest_{index}" not in names for index in range(len(names))):
         found = f"its element sh has {len(names)} properties"
-        raise bad_ply(path, found, "0, 9, 24 or 45 of them, f_rest_0 and on", _REMEDY)
+        raise ply_error(path, found, "0, 9, 24 or 45 of them, f_rest_0 and on", _REMEDY)
     if not names:
         return np.zeros((count, 0, 3))
     if len(rest) != count:
-        raise bad_ply(path, f"it has {len(rest)} rows of sh for {count} Gaussians", "one for each", _REMEDY)
+        raise ply_error(path, f"it has {len(rest)} rows of sh for {count} Gaussians", "one for each", _REMEDY)
     numbers = np.stack([rest[f"f_rest_{index}"].astype(np.float64) for index in range(len(names))], axis=1)
     share = np.where(numbers <= 0, 0.0, np.where(numbers >= 255, 1.0, (numbers + 0.5) / 256))
     return ((share - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(0, 2, 1)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Real
 
-from jsecon.data.images import MOST_PIXELS
+from jsecon.data.images import MAX_PIXELS
 from jsecon.errors import InputError, require
 from jsecon.files import path_within, read_json, write_text
 
@@ -68,8 +68,8 @@ def _read(file: Path) -> LabelledFrame:
     info = _get(file, content, "info", dict, "the file")
     name = Path(_get(file, info, "name", str, "info")).stem
     width, height = (int(_get(file, info, key, int, "info")) for key in ("width", "height"))
-    if min(width, height) < 1 or width * height > MOST_PIXELS:
-        raise _bad(file, f"the image is {width}x{height}", f"a positive size, at most {MOST_PIXELS} pixels")
+    if min(width, height) < 1 or width * height > MAX_PIXELS:
+        raise _bad(file, f"the image is {width}x{height}", f"a positive size, at most {MAX_PIXELS} pixels")
     objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for index, entry in enumerate(_get(file, content, "objects", list, "the file")):
         where = f"object {index}"

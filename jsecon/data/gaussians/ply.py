@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jsecon.data.ply_file import bad_ply, property_types, read_vertices, vertex_blocks
+from jsecon.data.gaussians.ply_file import ply_error, property_types, read_vertices, vertex_blocks
 from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write
 from jsecon.numerics import is_finite_and_bounded
@@ -30,7 +30,7 @@ _FILTERS = ("filter_3D", "filter_3d")
 """standard deviation of Mip-Splatting's 3D filter, world units: of its own training, and of other programs"""
 _ROWS = 1 << 18
 """Gaussians read at a time"""
-ROUNDED_WRITTEN, ROUNDED_READ = 0.02, 0.25
+ROUNDED_WRITTEN, MAX_READ_ROUNDING = 0.02, 0.25
 """of a Gaussian's largest standard deviation, by which float32 may round its place: on writing, else it is written in
 float64, and on reading"""
 _COARSE = ("i1", "u1", "i2", "u2", "f2", "f4")
@@ -91,13 +91,13 @@ def read_ply(path: Path) -> Gaussians:
     colours = _RGB if not any(name in names for name in _DC) and all(name in names for name in _RGB) else _DC
     if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
         remedy = "A plain point cloud won't do: export the trained Gaussians as an uncompressed .ply."
-        raise bad_ply(path, f"its vertices have no {', '.join(missing)}", _WANTED, remedy)
+        raise ply_error(path, f"its vertices have no {', '.join(missing)}", _WANTED, remedy)
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in _REST_COUNTS or any(name not in names for name in rest_names):
         wanted = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
         remedy = "Export the file again, with harmonics of degree 3 or less."
-        raise bad_ply(path, f"its vertices have {rest} properties f_rest", wanted, remedy)
+        raise ply_error(path, f"its vertices have {rest} properties f_rest", wanted, remedy)
     filters = [name for name in _FILTERS if name in names][:1]
     types = property_types(path)
     fine = any(types[name] not in _COARSE for name in _POSITION)
@@ -121,7 +121,7 @@ def read_ply(path: Path) -> Gaussians:
             unit = max(unit, _unit(vertices))
     if colours == _RGB:
         arrays["sh"][:, 0] = (arrays["sh"][:, 0].astype(np.float64) / unit - 0.5) / SH_DC
-    return sound(path, arrays)
+    return drawable_gaussians(path, arrays)
 
 
 def _unit(vertices: np.ndarray) -> float:
@@ -137,7 +137,7 @@ def _fuse(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> N
     """Widens Gaussians, in place, by a filter of the given standard deviations (M,): sizes become sqrt(s^2 + f^2),
     opacities shrink by the ratio of the volumes (Mip-Splatting, get_opacity_with_3D_filter)."""
     if not (np.isfinite(deviation) & (deviation >= 0)).all():
-        raise bad_ply(path, "numbers of filter_3D are negative or not finite", "standard deviations", "Train again.")
+        raise ply_error(path, "numbers of filter_3D are negative or not finite", "standard deviations", "Train again.")
     before = arrays["log_scales"].astype(np.float64)
     after = 0.5 * np.logaddexp(2 * before, 2 * np.log(deviation.astype(np.float64))[:, None])
     shrink = np.exp(np.where(after == before, 0.0, before - after).sum(axis=1))
@@ -146,7 +146,7 @@ def _fuse(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> N
     arrays["opacity_logits"][:] = np.log(opacity) - np.log1p(-opacity)
 
 
-def sound(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
+def drawable_gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     """The Gaussians of a file's arrays (NumPy), by their fields. Raises InputError where one of them cannot be drawn:
     see `unusable_rows`."""
     _require_usable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
@@ -159,11 +159,11 @@ def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"]
     if similarity is not None:
         gaussians = transform_gaussians_float64(gaussians, similarity)
     rounded = float32_rounding(gaussians)
-    if len(rounded) and np.median(rounded) > ROUNDED_READ:
+    if len(rounded) and np.median(rounded) > MAX_READ_ROUNDING:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
         found = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
         remedy = "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.to_source)."
-        raise bad_ply(path, found, "coordinates nearer to 0", remedy)
+        raise ply_error(path, found, "coordinates nearer to 0", remedy)
     return jax.tree.map(jnp.asarray, gaussians)
 
 
@@ -249,7 +249,7 @@ def _table(part: Gaussians, sh: np.ndarray, double: bool) -> np.ndarray:
     return rows
 
 
-def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
+def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     """Points (float64) and colours of a plain point cloud (nerfstudio's ply_file_path).
 
     Colours are red green blue in 8 or 16 bits, or in float (0..1, or 0..255 where any is above 1); mid grey where there
@@ -259,10 +259,10 @@ def load_points_ply(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[n
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
     if missing := [name for name in _POSITION if name not in names]:
-        raise bad_ply(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
+        raise ply_error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION, np.float64)
     if not is_finite_and_bounded(points):
-        raise bad_ply(path, "its points have NaN, infinite or absurd coordinates", "finite points")
+        raise ply_error(path, "its points have NaN, infinite or absurd coordinates", "finite points")
     if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), GREY, np.uint8)
     colours = np.stack([vertices[name] for name in _RGB], axis=-1)

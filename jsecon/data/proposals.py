@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.data.images import MOST_PIXELS, read_ids
-from jsecon.data.mask_files import Fit, black_and_white, read_level
+from jsecon.data.images import MAX_PIXELS, read_label_image
 from jsecon.data.mask_names import Masks, Names, find_masks
+from jsecon.data.masks import Fit, black_and_white, read_level
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, map_npy, read_json
 from jsecon.types import ImageFile
@@ -44,8 +44,8 @@ def decode_rle(rle: Any, where: str | Path) -> Bool[np.ndarray, "h w"]:
         runs = np.asarray(_numbers(counts) if isinstance(counts, str) else counts, np.int64)
     except (TypeError, KeyError, ValueError, IndexError, OverflowError) as error:
         raise InputError(where, f"the mask cannot be read: {describe_error(error)}", *_RLE) from error
-    fits = runs.ndim == 1 and ((runs >= 0) & (runs <= MOST_PIXELS)).all() and min(height, width) > 0
-    if not fits or height * width > MOST_PIXELS or runs.sum() != height * width:
+    fits = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all() and min(height, width) > 0
+    if not fits or height * width > MAX_PIXELS or runs.sum() != height * width:
         raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", *_RLE)
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
@@ -110,7 +110,7 @@ def _filled(polygons: list[np.ndarray], width: int, height: int) -> np.ndarray:
     return canvas.astype(bool)
 
 
-def proposals_from_disk(
+def load_proposals(
     folder: str | Path,
     names: Sequence[str],
     size: tuple[int, int],
@@ -121,7 +121,7 @@ def proposals_from_disk(
 ) -> tuple[Callable[[int], Bool[np.ndarray, "m h w"]], tuple[str, ...]]:
     """Finds the masks of single frames in `folder`.
 
-    Files are named, and their subfolders read, as by `jsecon.data.mask_files.load_labels`. Masks are best first where
+    Files are named, and their subfolders read, as by `jsecon.data.masks.load_labels`. Masks are best first where
     the file holds scores (SAM's stability times predicted IoU), else as they are in it; of another size they are
     resized (nearest) where the aspect agrees. A frame without a file has none.
 
@@ -195,7 +195,7 @@ def _read(path: Path, level: str, frame: tuple[int, int]) -> list[np.ndarray]:
     elif ending.endswith(".npy") and (stack := _stack(path)) is not None:
         return stack
     else:
-        image, none = read_ids(path)[0], 0
+        image, none = read_label_image(path)[0], 0
     return [image == id for id in np.unique(image) if id != none and id >= 0]
 
 
@@ -204,7 +204,7 @@ def _stack(path: Path) -> list[np.ndarray] | None:
     try:
         masks = map_npy(path)
     except READ_ERRORS:
-        return None  # `read_ids` tells
+        return None  # `read_label_image` tells
     if masks.ndim != 3 or 1 in (masks.shape[0], masks.shape[2]):
         return None
     if not np.isin(masks, (0, 1)).all():
@@ -262,7 +262,7 @@ def _size(image: Any) -> tuple[int, int] | None:
         width, height = int(image["width"]), int(image["height"])
     except (TypeError, KeyError, ValueError, OverflowError):
         return None
-    return (width, height) if 0 < width * height <= MOST_PIXELS and width > 0 else None
+    return (width, height) if 0 < width * height <= MAX_PIXELS and width > 0 else None
 
 
 def _dataset(folder: Path, known: Names) -> tuple[Path, Any] | None:
@@ -277,7 +277,7 @@ def _dataset(folder: Path, known: Names) -> tuple[Path, Any] | None:
 def _of_dataset(
     file: Path, content: Any, known: Names, names: Sequence[str], size: tuple[int, int], files: Mapping[str, ImageFile]
 ) -> tuple[Callable[[int], Bool[np.ndarray, "m h w"]], tuple[str, ...]]:
-    """`proposals_from_disk` of one COCO file."""
+    """`load_proposals` of one COCO file."""
     try:
         images = {image["id"]: image for image in content["images"]}
         by_image: dict[Any, list[Any]] = {number: [] for number in images}

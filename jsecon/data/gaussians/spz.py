@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.data.ply import sound, usable_blocks
+from jsecon.data.gaussians.ply import drawable_gaussians, usable_blocks
 from jsecon.errors import InputError, describe_error
 from jsecon.files import atomic_write
 from jsecon.splat.project import check_gaussians
@@ -185,7 +185,7 @@ def load_spz(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
         raise InputError(path, "the file is damaged or cut short", _WANTED, _AGAIN) from error
     if head.flags & _ANTIALIASED:
         notes = (*notes, f"{path.name} was trained with antialiasing (Mip-Splatting), and is drawn without it.")
-    gaussians = sound(path, _unpacked(head, columns))
+    gaussians = drawable_gaussians(path, _unpacked(head, columns))
     return transform_axes(gaussians, axes), notes
 
 

@@ -31,7 +31,7 @@ _CONE = 1.0
 """largest |x| / z and |y| / z of a point that counts as in view"""
 
 
-def ordinary_world(
+def normalizing_transform(
     poses: Float[np.ndarray, "t 4 4"],
     points: Float[np.ndarray, "p 3"],
     depths: Sequence[Float[np.ndarray, "h w"]] = (),
@@ -74,8 +74,10 @@ def ordinary_world(
     return result, tuple(notes)
 
 
-def moved_poses(poses: Float[np.ndarray, "... 4 4"], world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "... 4 4"]:
-    """World-to-camera poses in the world that `ordinary_world` leads to; the cameras see the same."""
+def transform_poses(
+    poses: Float[np.ndarray, "... 4 4"], world: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "... 4 4"]:
+    """World-to-camera poses in the world that `normalizing_transform` leads to; the cameras see the same."""
     if np.array_equal(world, np.eye(4)):
         return poses
     factor = world[0, 0]
@@ -85,7 +87,7 @@ def moved_poses(poses: Float[np.ndarray, "... 4 4"], world: Float[np.ndarray, "4
     return moved
 
 
-def trained_worlds(
+def training_worlds(
     cameras_to_world: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"]
 ) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
     """The worlds that programs bring a capture into before they train, as far as its cameras and points tell.

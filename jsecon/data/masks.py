@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int16
 
 from jsecon.data.frames import Progress
-from jsecon.data.images import TRANSPOSED, read_ids, turned
+from jsecon.data.images import TRANSPOSED, apply_orientation, read_label_image
 from jsecon.data.mask_names import Masks, find_masks, object_ids
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, map_npy
@@ -146,7 +146,7 @@ def _masks_of(
 
 def black_and_white(path: Path) -> bool:
     """Whether a mask has no value but 0 and 1, or 0 and the largest of its kind."""
-    image, coloured = read_ids(path)
+    image, coloured = read_label_image(path)
     values = np.unique(image)
     values = values // GREY if coloured and not (values % GREY).any() else values
     return len(values) <= 2 and set(values.tolist()) <= {0, int(values.max())} and values.max() in (0, 1, 255, 65535)
@@ -173,7 +173,7 @@ class _Reader:
         """The ids (H, W) of a file."""
         if self.found.ending == _SUFFIX:
             return read_level(path, self.level)
-        image, self.coloured[path] = read_ids(path)
+        image, self.coloured[path] = read_label_image(path)
         self.negative |= bool(image.min() < 0)
         return image
 
@@ -192,7 +192,7 @@ class _Reader:
         shown = []
         for index, folder in reversed(list(enumerate(self.folders))):
             if folder in masks:
-                image = self.fit(masks[folder], read_ids(masks[folder])[0], name)
+                image = self.fit(masks[folder], read_label_image(masks[folder])[0], name)
                 self._require_one_object(masks[folder], image)
                 labels[image > 0] = index
         shown = np.unique(labels[labels >= 0]).astype(np.int64)
@@ -336,7 +336,7 @@ class Fit:
         stored = upright[::-1] if turn in TRANSPOSED else upright
         rows, columns = image.shape
         if turn != 1 and _alike(rows, columns, *stored) and (self.stored or not _alike(rows, columns, *upright)):
-            image = turned(image, turn)
+            image = apply_orientation(image, turn)
             self.count["turned"] += 1
         elif not _alike(rows, columns, *upright) and not _alike(rows, columns, self.width, self.height):
             remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.data.compressed_ply import load_compressed_ply
-from jsecon.data.gltf import read_glb, save_glb
-from jsecon.data.ply import SH_DC, in_float32, read_ply, save_ply, sound
-from jsecon.data.ply_file import header_of, is_compressed
-from jsecon.data.spz import load_spz, save_spz
+from jsecon.data.gaussians.compressed import load_compressed_ply
+from jsecon.data.gaussians.gltf import read_glb, save_glb
+from jsecon.data.gaussians.ply import SH_DC, drawable_gaussians, in_float32, read_ply, save_ply
+from jsecon.data.gaussians.ply_file import header_of, is_compressed
+from jsecon.data.gaussians.spz import load_spz, save_spz
 from jsecon.errors import InputError, describe_error
 from jsecon.files import parse_json
 from jsecon.types import Array, Gaussians
@@ -79,7 +79,9 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
         found = "it is a folder" if path.is_dir() else "No such file or directory"
         raise InputError(path, found, _READ, "Check the path.")
     arrays, notes = _read_splat(path) if kind == ".splat" else _read_sog(path)
-    return sound(path, {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}), notes
+    return drawable_gaussians(
+        path, {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+    ), notes
 
 
 def _antialiased(comment: str) -> bool:
@@ -108,11 +110,11 @@ def save_gaussians(
     and colours in 8 bits, turns in 32.
 
     Raises ValueError where shapes disagree. Raises InputError where `load_gaussians` would refuse what is written or,
-    of a .spz, where places or sizes lie outside of what it holds; where `require_written` does, and where the folder
-    cannot be written.
+    of a .spz, where places or sizes lie outside of what it holds; where
+    `require_writable_format` does, and where the folder cannot be written.
     """
     path = Path(path)
-    require_written(path)
+    require_writable_format(path)
     kind = path.suffix.lower()
     if kind == ".glb":
         save_glb(path, gaussians, codes=codes, regions=regions, similarity=similarity)
@@ -122,7 +124,7 @@ def save_gaussians(
         save_ply(path, gaussians, similarity=similarity)
 
 
-def require_written(path: Path) -> None:
+def require_writable_format(path: Path) -> None:
     """Raises InputError where a file of this ending cannot be written here."""
     if path.suffix.lower() not in WRITTEN:
         remedy = f"For example: {path.stem}.ply; npx @playcanvas/splat-transform makes other formats of it."

@@ -68,7 +68,7 @@ class Header:
     """offset of the first byte behind the header."""
 
 
-def bad_ply(
+def ply_error(
     path: Path, found: str, expected: str = "a whole .ply file", remedy: str = "Export the file again."
 ) -> InputError:
     return InputError(path, found, expected, remedy)
@@ -78,7 +78,7 @@ def _header(path: Path, data: bytes) -> Header:
     end = _END.search(data)
     if not data.startswith(b"ply") or end is None:
         found = "it has no .ply header" if data else "the file is empty"
-        raise bad_ply(path, found, "a file that starts with 'ply' and a header")
+        raise ply_error(path, found, "a file that starts with 'ply' and a header")
     form, elements, comments = "", [], []
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
@@ -101,16 +101,16 @@ def _header(path: Path, data: bytes) -> Header:
             else:
                 raise ValueError(words[0])
         except (IndexError, KeyError, ValueError) as error:
-            raise bad_ply(path, f"the header line {line.strip()!r} is not valid", "a valid .ply header") from error
+            raise ply_error(path, f"the header line {line.strip()!r} is not valid", "a valid .ply header") from error
     if form not in ORDERS:
-        raise bad_ply(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
+        raise ply_error(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
     for element in elements:
         if len({name for name, _ in element.fields}) < len(element.fields):
-            raise bad_ply(path, f"a property of its element {element.name} is there twice", "distinct names")
+            raise ply_error(path, f"a property of its element {element.name} is there twice", "distinct names")
     return Header(form, elements, tuple(comments), end.end())
 
 
-def opened(path: Path) -> tuple[bytes, Header]:
+def read_ply_file(path: Path) -> tuple[bytes, Header]:
     """The whole file, and its header."""
     with _reading(path) as file:
         data = file.read()
@@ -132,7 +132,7 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             yield file
     except OSError as error:
-        raise bad_ply(path, describe_error(error), "a .ply file", "Check the path.") from error
+        raise ply_error(path, describe_error(error), "a .ply file", "Check the path.") from error
 
 
 def property_types(path: Path) -> dict[str, str]:
@@ -163,13 +163,13 @@ def vertex_blocks(path: Path, rows: int) -> tuple[int, tuple[str, ...], Iterator
     header = header_of(path)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
-        raise bad_ply(path, f"its elements are {', '.join(names) or 'none'}", "an element vertex")
+        raise ply_error(path, f"its elements are {', '.join(names) or 'none'}", "an element vertex")
     vertex = header.elements[names.index("vertex")]
     if is_compressed(header):
         remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
-        raise bad_ply(path, "it is compressed (SuperSplat's packed chunks)", "an uncompressed .ply", remedy)
+        raise ply_error(path, "it is compressed (SuperSplat's packed chunks)", "an uncompressed .ply", remedy)
     if not vertex.names:
-        raise bad_ply(path, "its element vertex has no properties", "x y z and more")
+        raise ply_error(path, "its element vertex has no properties", "x y z and more")
     before = header.elements[: names.index("vertex")]
     plain = header.form != "ascii" and all(element.fixed for element in [*before, vertex])
     if not plain:
@@ -190,7 +190,7 @@ def is_compressed(header: Header) -> bool:
 
 def read_elements(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
     """All elements of a binary .ply as structured arrays, lists left out. Raises InputError as `vertex_blocks` does."""
-    data, header = opened(path)
+    data, header = read_ply_file(path)
     tables, offset = {}, header.start
     for element in header.elements:
         tables[element.name], offset = _rows(path, data, offset, element, ORDERS[header.form])
@@ -199,7 +199,7 @@ def read_elements(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
 
 def _vertices_of_any_rows(path: Path, before: list[Element], vertex: Element) -> np.ndarray:
     """The vertices of a file that holds text, or lists before its vertices or in them."""
-    data, header = opened(path)
+    data, header = read_ply_file(path)
     if header.form == "ascii":
         return _ascii_vertices(path, data[header.start :], sum(element.count for element in before), vertex)
     offset = header.start
@@ -228,7 +228,7 @@ def _rows(path: Path, data: bytes, offset: int, element: Element, order: str) ->
                     raise _cut(path, row, element.count, element.name)
                 count = int(np.frombuffer(data, length, 1, offset)[0])
                 if count < 0:
-                    raise bad_ply(path, f"a list of its element {element.name} has a length of {count}")
+                    raise ply_error(path, f"a list of its element {element.name} has a length of {count}")
                 size = length.itemsize + count * number.itemsize
             offset += size
             if offset > len(data):
@@ -238,7 +238,7 @@ def _rows(path: Path, data: bytes, offset: int, element: Element, order: str) ->
 
 def _cut(path: Path, there: int, count: int, name: str = "vertex") -> InputError:
     what = "vertices" if name == "vertex" else f"rows of its element {name}"
-    return bad_ply(path, f"the file is cut short: it holds {max(there, 0)} of {count} {what}")
+    return ply_error(path, f"the file is cut short: it holds {max(there, 0)} of {count} {what}")
 
 
 def _binary_vertices(path: Path, offset: int, dtype: np.dtype, count: int, rows: int) -> Iterator[np.ndarray]:
@@ -261,7 +261,7 @@ def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: Element) -> np.n
         numbers = np.array(rows, np.float64).reshape(len(rows), len(vertex.names))
     except (ValueError, IndexError) as error:
         found = f"its vertex lines have not {len(vertex.names)} numbers each, or the file is cut short"
-        raise bad_ply(path, found) from error
+        raise ply_error(path, found) from error
     if len(lines) < vertex.count:
         raise _cut(path, len(lines), vertex.count)
     result = np.empty(vertex.count, vertex.dtype("="))
@@ -270,7 +270,7 @@ def _ascii_vertices(path: Path, body: bytes, skip: int, vertex: Element) -> np.n
         with np.errstate(over="ignore", invalid="ignore"):  # infinite: for the caller to refuse; integers: refused here
             result[name] = numbers[:, column]
         if kind.kind != "f" and (result[name] != numbers[:, column]).any():
-            raise bad_ply(path, f"numbers of {name} do not fit its type {kind.name}")
+            raise ply_error(path, f"numbers of {name} do not fit its type {kind.name}")
     return result
 
 

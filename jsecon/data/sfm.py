@@ -25,7 +25,7 @@ from PIL import Image
 
 from jsecon.data import motion_steps
 from jsecon.data.frames import frame_names
-from jsecon.data.images import IMAGE_ENDINGS, image_header, read_image, write_image
+from jsecon.data.images import IMAGE_SUFFIXES, image_header, read_image, write_image
 from jsecon.data.motion_steps import FEWEST
 from jsecon.errors import InputError
 from jsecon.files import list_files, write_text
@@ -37,7 +37,7 @@ _NO_PHOTOGRAPHS = re.compile(r"mask|depth|segmentation|proposal|label|confidence
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
+class SfmResult:
     """What structure from motion found."""
 
     registered: tuple[str, ...]
@@ -67,7 +67,7 @@ class Motion:
         return tuple(notes)
 
 
-def photographs(path: Path) -> list[Path]:
+def list_photographs(path: Path) -> list[Path]:
     """Lists the photographs of a folder, of its images/ where that has some, in name order.
 
     Where none lies in the folder itself, those of its subfolders are taken (cam0/, cam1/), but not what lies in folders
@@ -90,10 +90,10 @@ def photographs(path: Path) -> list[Path]:
 
 
 def _is_image(file: Path) -> bool:
-    return file.suffix.lower() in IMAGE_ENDINGS and not file.name.startswith(".")
+    return file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
 
 
-def require_motion(where: object) -> None:
+def require_pycolmap(where: object) -> None:
     """Raises InputError, at `where`, where pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         remedy = "Run: pip install 'jsecon[sfm]' (or give poses: sparse/0 of COLMAP, or transforms.json)."
@@ -120,7 +120,7 @@ def find_poses(
     *,
     where: object = "photographs",
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Motion, Path]:
+) -> tuple[SfmResult, Path]:
     """Finds the poses of photographs; what was found, and the capture's folder, of COLMAP's layout, below `work`.
 
     The lens is COLMAP's OPENCV (two focal lengths, four coefficients), shared by all photographs whose EXIF names the
@@ -131,7 +131,7 @@ def find_poses(
     in any order: another run may differ in the last digits. Raises InputError where pycolmap is not installed, on too
     few or damaged photographs, where two differ in nothing but their endings, and where no model can be made.
     """
-    require_motion(where)
+    require_pycolmap(where)
     own_names = check_photographs(photos, where)
     sizes = _sizes(photos)
     groups = _lenses(photos, sizes)
@@ -156,7 +156,7 @@ def find_poses(
             _link(photo, capture / "images" / own)
     registered = tuple(own for name, own in zip(names, own_names) if name in told["registered"])
     others = tuple(own for name, own in zip(names, own_names) if name not in told["registered"])
-    return Motion(registered, others, told["models"], told["points"], told["error_px"], told["seconds"]), capture
+    return SfmResult(registered, others, told["models"], told["points"], told["error_px"], told["seconds"]), capture
 
 
 def _sizes(photos: Sequence[Path]) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.ply import in_float32, needs_float64, sound, usable_blocks
+from jsecon.data.gaussians.ply import drawable_gaussians, in_float32, needs_float64, usable_blocks
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, atomic_write, parse_json
 from jsecon.splat.project import check_gaussians
@@ -182,7 +182,7 @@ def read_glb(path: Path) -> Gaussians:
                 count += len(arrays["means"])
                 if 12 * count > length:
                     raise InputError(path, f"{count} Gaussians do not fit into {length} bytes", _WANTED, _REMEDY)
-                found.append(transform_gaussians_float64(sound(path, arrays), _AXES @ matrix))
+                found.append(transform_gaussians_float64(drawable_gaussians(path, arrays), _AXES @ matrix))
     except InputError:
         raise
     except OSError as error:
