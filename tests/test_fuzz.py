@@ -58,7 +58,7 @@ def read_and_check(case, size, capfd):
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads the address space from /proc")
-@pytest.mark.parametrize("mutations", [4, pytest.param(MUTATIONS, marks=pytest.mark.long)])
+@pytest.mark.parametrize("mutations", [10, pytest.param(MUTATIONS, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_refused_or_read_whole(name, mutations, tmp_path, capfd):
     cases = list(READERS[name](tmp_path))

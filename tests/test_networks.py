@@ -102,7 +102,6 @@ def test_a_damaged_model_is_said_before_any_work(seen, models, tmp_path):
     assert listener.fresh == {}
 
 
-@pytest.mark.long
 def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     """Random weights track nothing in earnest; the run, its plan and its key are what is tested."""
     run, folder, _ = seen
@@ -116,6 +115,7 @@ def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     assert not np.array_equal(followed.labels, run.labels)
 
 
+@pytest.mark.long
 def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, splat, tmp_path, monkeypatch):
     options = Options(room, gaussians=splat, holdout=4, tracker=write_sam2(tmp_path / "sam2"), granularity="coarse")
     monkeypatch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)

@@ -78,7 +78,7 @@ def test_what_is_asked_is_answered_there(ran, capsys):
     assert (base / "Export 輸出.glb").read_bytes()[:4] == b"glTF"
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("encoding", [pytest.param("utf-8", marks=pytest.mark.long), "latin-1"])
 def test_a_server_starts_there_and_answers(ran, encoding):
     """Also where a terminal lacks some of the letters: they are then told by number."""
     _, file, names = ran

@@ -175,6 +175,7 @@ def test_a_taken_port_and_a_missing_extra_are_told(viewer, monkeypatch):
 QUIET = ".mantine-Notifications-root { display: none }"
 
 
+@pytest.mark.long
 def test_the_command_says_where_it_listens(viewer, tmp_path):
     file, port = tmp_path / "run" / "field.safetensors", free_port()
     file.parent.mkdir()
