@@ -127,7 +127,7 @@ def test_two_runs_in_one_folder_are_told_apart(capture, tmp_path):
         pass
 
 
-@pytest.mark.parametrize("moment", ["load ", "gaussians: "])
+@pytest.mark.parametrize("moment", ["load ", pytest.param("gaussians: ", marks=pytest.mark.long)])
 def test_a_program_that_is_told_to_end_says_how_to_go_on(tmp_path, moment):
     """At its first word; and amid the fit, that jax compiles and computes in threads of its own."""
     capture, folder, out = small_capture(), tmp_path / "Fotos aus Köln 日本 #1 %20", tmp_path / "Ausgabe für Ä"

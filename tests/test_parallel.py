@@ -88,7 +88,7 @@ def test_one_process_counts_every_view_once():
     assert told[-1] == (5, 5)
 
 
-@pytest.mark.parametrize("count", [5, 1])
+@pytest.mark.parametrize("count", [5, pytest.param(1, marks=pytest.mark.long)])
 def test_two_processes_end_with_what_one_does_and_both_keep_their_programs(count, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -42,7 +42,7 @@ def test_a_home_that_cannot_be_written_leaves_out_the_compiled_programs(tmp_path
     assert "JAX_COMPILATION_CACHE_DIR" not in settings({"XDG_CACHE_HOME": str(tmp_path / "file" / "x")}, 1, frozenset())
 
 
-@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("kept", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
     program = (
         "from jsecon.process import prepare_process\n"
@@ -56,6 +56,7 @@ def test_a_prepared_process_has_a_device_a_core(tmp_path, kept):
     assert done.stdout.split() == [str(len(os.sched_getaffinity(0))), str(kept)]
 
 
+@pytest.mark.long
 def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_a_word(tmp_path):
     """As a full disk leaves it, or a stop while jax writes it."""
     program = (
