@@ -23,7 +23,7 @@ from test_rgbd import FORMATS as RGBD
 
 from experiments.datasets.feature_files import write_features
 from jsecon.app import ask
-from jsecon.data import images, sfm, video
+from jsecon.data import images, video
 from jsecon.data.capture import load_capture
 from jsecon.data.colmap import write_colmap
 from jsecon.data.gaussians.files import read_gaussians
@@ -277,14 +277,13 @@ def image(folder: Path) -> Iterator[Case]:
 
     def read(file: Path):
         found = images.read_image(file)
-        return found, images.image_size(file), sfm._lenses([file], [images.image_size(file)])
+        return found, images.image_size(file)
 
     def whole(found) -> None:
-        (picture, _), (width, height), groups = found
+        (picture, _), (width, height) = found
         assert picture.dtype == np.uint8
         assert picture.shape == (height, width, 3)
         assert min(width, height) > 0
-        assert groups == [[0]]
 
     for file in sorted(folder.iterdir()):
         yield Case([file], lambda file=file: read(file), whole)
@@ -701,22 +700,7 @@ def videos(folder: Path) -> Iterator[Case]:
 READERS: dict[str, Callable[[Path], Iterator[Case]]] = {
     own.__name__: own
     for own in (
-        *(
-            ply,
-            splats,
-            points,
-            colmap,
-            colmap_text,
-            nerfstudio,
-            rgbd,
-            image,
-            masks,
-            langsplat,
-            proposals,
-            labels,
-            field,
-            kept,
-        ),
-        *(tokenizer, clip, siglip, sam, sam2, sam3, videos),
+        *(ply, splats, points, colmap, colmap_text, nerfstudio, rgbd, image, masks, langsplat, proposals, labels),
+        *(field, kept, tokenizer, clip, siglip, sam, sam2, sam3, videos),
     )
 }

@@ -9,7 +9,7 @@ from jsecon.parallel import host_mesh
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.reference import project_reference, weights_reference
 from jsecon.splat.render import render, render_depth
-from jsecon.splat.walk import _exp2, cumulative
+from jsecon.splat.walk import cumulative
 
 
 def features_of(count: int, channels: int) -> jax.Array:
@@ -76,11 +76,6 @@ def test_several_devices_give_the_image_and_the_gradients_of_one(scene, camera, 
     by_one, by_two = gradients(scene, features, None), gradients(scene, features, mesh)
     for a, b in zip(jax.tree.leaves(by_one), jax.tree.leaves(by_two), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-
-
-def test_powers_of_two_over_their_range():
-    exponents = np.linspace(-9, 1, 100_001, dtype=np.float32)
-    np.testing.assert_allclose(jax.jit(_exp2)(exponents), np.exp2(exponents.astype(np.float64)), rtol=3e-7)
 
 
 def test_running_products_and_sums():
