@@ -107,7 +107,7 @@ def pytest_runtest_protocol(item, nextitem):
     compiling.choose(shipped=marked["as_shipped"], loops=not marked["few_steps"])
     done = yield
     if nextitem is None or nextitem.path != item.path:
-        clear_programs()
+        clear_programs(above=40_000)
     return done
 
 

@@ -36,12 +36,24 @@ def labels_of(scene, cameras, members):
     return np.stack(labels).astype(np.int16)
 
 
+_made = {}
+
+
 def make_field(scene, cameras, *, dim=12, latent=8):
+    """(field, (T, H, W) labels), made once per process for each scene and size."""
+    key = id(scene), id(cameras), dim, latent
+    if key not in _made:
+        _made[key] = scene, cameras, *_make_field(scene, cameras, dim, latent)  # the scene keeps its id
+    return _made[key][2], _made[key][3].copy()
+
+
+def _make_field(scene, cameras, dim, latent):
     rng = np.random.default_rng(5)
     scene, cameras = jax.tree.map(jnp.asarray, (scene, cameras))
     labels = labels_of(scene, cameras, true_regions(scene))
     votes = region_votes(scene, cameras, jnp.asarray(labels), REGIONS, top=3)
     embeddings = unit_rows(rng, REGIONS, dim)
+    embeddings.flags.writeable = False  # several tests share it
     table, coder, _ = region_codes(jnp.asarray(embeddings), latent=latent, key=jax.random.key(0))
     pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
     field = LanguageField(

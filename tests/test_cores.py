@@ -17,7 +17,7 @@ from jsecon.vision.colours import ColourEmbedder
 
 pytestmark = pytest.mark.few_steps
 TESTS = Path(__file__).resolve().parent
-PARTS = {3: ("votes", "image"), 6: ("votes", "fit", "query")}
+PARTS = {3: ("image", "fit"), 6: ("votes", "query")}
 """number of devices -> what a process with so many computes"""
 VOTES = "regions", "weights", "labelled", "total", "peak", "views", "by_view"
 VIEWS, HEIGHT, WIDTH = 5, 43, 50

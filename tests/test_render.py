@@ -142,6 +142,7 @@ def test_the_gradient_of_features_alone_is_that_of_everything(scene, camera):
     np.testing.assert_allclose(along, expected, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera):
     rounded = jnp.asarray(random_features(scene.count, 3)).astype(jnp.bfloat16)
     draw = jax.jit(lambda f: render(scene, camera, f).features)
@@ -153,6 +154,7 @@ def test_features_in_bfloat16_are_rounded_and_nothing_else(scene, camera):
     np.testing.assert_allclose(gradient.astype(jnp.float32), whole, rtol=2**-7, atol=1e-3)
 
 
+@pytest.mark.long
 def test_vmapped_gradients_equal_a_loop(scene, cameras):
     features = jnp.asarray(random_features(scene.count, 3))
     batched = jax.jit(jax.vmap(jax.grad(squares), in_axes=(None, None, 0)))(features, scene, cameras)
