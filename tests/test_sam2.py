@@ -233,6 +233,7 @@ def test_the_name_follows_the_content_and_the_graphs_can_be_dropped(tmp_path):
         tracker.check()
 
 
+@pytest.mark.long
 def test_four_hundred_frames_hold_no_more_than_a_hundred(folder, tmp_path):
     sam2, peaks = open_sam2(folder), []
     for count in (100, 400):

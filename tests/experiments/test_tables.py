@@ -14,12 +14,10 @@ from experiments import (
     ablation_query,
     lerf,
     ovs3d,
-    qualitative,
     replica,
     threshold_sweep,
     two_protocols,
 )
-from experiments.cells import read_cells
 from experiments.datasets.replica import REPLICA_SCENES
 from experiments.tables import fill, layout, published, twins
 from experiments.tables.methods import METHODS, RECOMMENDED
@@ -87,25 +85,6 @@ def test_table_1_and_its_resumption(folder, monkeypatch):
     assert strip(again["cells"]) == strip(metrics["cells"])
 
 
-@pytest.mark.long  # .ci/run makes the whole quick table
-def test_table_2(folder):
-    plan = with_gaussians(small(ovs3d.QUICK, folder, "ovs3d", methods=(TRACKED,)))
-    ovs3d.main(plan)
-    assert not (folder / "twins" / "fitted").exists()
-    metrics, text = read(folder, "ovs3d")
-    assert all(c["pairs"] == 8 for c in metrics["cells"])  # 2 labelled frames of 4 classes
-    assert "| seconGS (the paper) | 70.58 / - |" in text
-
-
-@pytest.mark.long  # .ci/run makes the whole quick table
-def test_table_3(folder):
-    replica.main(small(replica.QUICK, folder, "replica", methods=(TRACKED,)))
-    metrics, text = read(folder, "replica")
-    found = {c["method"]: c for c in metrics["cells"]}
-    assert all(0 < c["miou"] <= c["macc"] <= 1 for c in found.values())
-    assert "mean recall" in text
-
-
 @pytest.mark.long
 def test_scannet_goes_through_the_same_code(folder):
     size = (("views", 6), ("width", 64), ("height", 48), ("num_objects", 4), ("fine_m", 0.03), ("coarse_m", 0.2))
@@ -125,35 +104,6 @@ def test_levels_of_noise_share_a_fit(folder):
         np.testing.assert_array_equal(setting.evidence.gaussians.means, load_ply(file).means)
     prepare(dataclasses.replace(data, seeds=(1,)), "figurines", 1, "medium", fit_steps=20)
     assert len(list((folder / "fits" / "fitted").iterdir())) == 2  # another room
-
-
-@pytest.mark.long
-def test_ablations(folder):
-    few = ("masklets, anchored by code", "each frame's own masks, anchored by code", TRACKED)
-    plan = small(ablation_components.QUICK, folder, "components", methods=few)
-    ablation_components.main(plan)
-    assert [c["method"] for c in read(folder, "components")[0]["cells"]] == list(few)
-    both = dataclasses.replace(
-        small(ablation_query.QUICK, folder, "query", methods=("one-step", TRACKED)),
-        cells=str(folder / "components" / "cells.jsonl"),
-    )
-    ablation_query.main(both)
-    assert "| one-step |" in read(folder, "query")[1]
-    measured = [cell["method"] for cell in read_cells(Path(both.cells)).values()]
-    assert measured == [*few, "one-step"]  # the row that both have is taken
-    assert len(Path(both.cells).read_text().splitlines()) == 4  # and not measured again
-    assert not (folder / "query" / "cells.jsonl").exists()
-
-
-@pytest.mark.long
-def test_threshold_sweep(folder):
-    threshold_sweep.main(small(threshold_sweep.QUICK, folder, "sweep", thresholds=(0.5, 0.9)))
-    metrics, _ = read(folder, "sweep")
-    assert set(metrics["curves"]) == set(threshold_sweep.WAYS)
-    assert all(len(curve) == 2 and np.isfinite(curve).all() for curve in metrics["curves"].values())
-    cells = read_cells(folder / "sweep" / "cells.jsonl").values()
-    texts = {text for cell in cells for text in cell["texts"]}
-    assert all(told[0] == len(texts) for told in metrics["best thresholds"].values())
 
 
 def test_best_thresholds_are_those_of_single_queries():
@@ -185,16 +135,6 @@ def test_levels_that_are_alike_are_learnt_once(folder, tmp_path):
     large, smaller = levels_of(setting.evidence, tmp_path, setting.names)
     np.testing.assert_array_equal(large.masks, setting.evidence.masks)
     assert len(smaller.embeddings) == len(large.embeddings) - len(setting.names)  # the first mask of each frame
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("table", ["lerf", "replica"])
-def test_qualitative(folder, table):
-    qualitative.main(small(qualitative.plans(table)[1], folder, "qualitative", methods=CHEAP))
-    metrics, text = read(folder, "qualitative")
-    assert 1 <= len(metrics["iou"]) <= qualitative.TEXTS
-    assert f"a twin in the layout of {table}" in text
-    assert set(qualitative.QUICK_METHODS) <= set(METHODS)
 
 
 def test_vision_on_disk_is_what_was_simulated(folder):
