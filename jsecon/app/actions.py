@@ -7,10 +7,12 @@ that is printed.
 import dataclasses
 import re
 import sys
+from pathlib import Path
 from typing import Any
 
 from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, VerbResult, View
 from jsecon.errors import InputError
+from jsecon.pipeline.bare_stages import is_bare_scene
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import worker_info
@@ -84,6 +86,9 @@ def _query(verb: Query, console: Console) -> VerbResult:
         from jsecon.language.field import check_field, load_field
 
         require_writable_format(verb.out / f"answer.{verb.format}")
+    if is_bare_scene(verb.field):
+        verb = dataclasses.replace(verb, field=_field_of_scene(verb, console))
+    with console.progress("field"):
         if large := ask.larger_than_memory(verb.field):
             outlined = bool(verb.mask or boxes or verb.phrases)
             ask.require_blocks(verb.field, by=verb.by, even=verb.even, outlined=outlined)
@@ -104,6 +109,21 @@ def _query(verb: Query, console: Console) -> VerbResult:
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
     return result | {"refused": refused}
+
+
+def _field_of_scene(verb: Query, console: Console) -> Path:
+    """Returns the field of a scene without photographs, made in OUT/field if it is not there yet."""
+    from jsecon.pipeline import pipeline
+    from jsecon.pipeline.options import Options
+
+    options, folder = Options(verb.field, embedder=verb.embedder), verb.out / "field"
+    with console.progress("plan"):
+        path = pipeline.current_field(options, folder)
+    if path is None:
+        pipeline.run(options, folder, listener=console)
+        path = folder / pipeline.FIELD_FILE
+        console.say(f"field   {path}")
+    return path
 
 
 def _check_phrases(verb: Query) -> None:

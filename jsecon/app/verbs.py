@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 from tyro.conf import Positional, UseAppendAction, arg
 
 from jsecon.pipeline.options import (
+    BareOptions,
     FieldOptions,
     InputOptions,
     MaskOptions,
@@ -97,6 +98,7 @@ class Run(Verb, InputOptions):
     coordinator: Option[str | None] = None
     process: Option[int | None] = None
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
+    bare: BareOptions = dataclasses.field(default_factory=BareOptions)
     masks: MaskOptions = dataclasses.field(default_factory=MaskOptions)
     models: ModelOptions = dataclasses.field(default_factory=ModelOptions)
     field: FieldOptions = dataclasses.field(default_factory=FieldOptions)
@@ -104,7 +106,7 @@ class Run(Verb, InputOptions):
     @property
     def options(self) -> Options:
         """Options of the run without the groups."""
-        groups = self.scene, self.masks, self.models, self.field
+        groups = self.scene, self.bare, self.masks, self.models, self.field
         return Options(self.capture, self.gaussians, **{name: x for group in groups for name, x in vars(group).items()})
 
 

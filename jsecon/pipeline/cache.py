@@ -36,7 +36,7 @@ from jsecon.files import (
 )
 
 PACKAGE = Path(jsecon.__file__).parent
-ROOMS = ("splat", "vision", "data", "fit", "networks", "language", "association")
+ROOMS = ("splat", "vision", "data", "fit", "networks", "language", "views", "association")
 """subpackages that stages compute with, in import order: each imports only those before it"""
 MAPPED = 1 << 30
 """bytes; larger arrays are memory-mapped"""

@@ -32,7 +32,8 @@ class InputOptions:
     Attributes:
       capture: Folder with images/ and sparse/0 (COLMAP), or with transforms.json (nerfstudio, instant-ngp); a folder of
         ScanNet, TUM, ARKitScenes, Polycam or Record3D; or a folder of photographs, or a video, without poses (extra
-        sfm).
+        sfm). Or a file of Gaussians (.ply, .spz, .sog, .splat, .glb) without photographs: jsecon plans virtual views
+        of the scene and renders them.
       gaussians: File with the 3D Gaussians of the scene: .ply (INRIA's layout, also of 2D Gaussians, or SuperSplat's
         compressed one), .glb, .spz, .splat, with the extra formats also .sog. Its world may be that of the capture's
         files, of its poses, of a dataparser_transforms.json beside it, or the one that gsplat or nerfstudio normalise
@@ -87,6 +88,19 @@ class SceneOptions:
     sh_degree: Option[Literal[0, 1, 2, 3]] = 2
     start: Option[Literal["auto", "sparse", "dense", "random"]] = "auto"
     seed: Option[int] = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class BareOptions:
+    """Options of a scene of Gaussians that comes without photographs.
+
+    Attributes:
+      views: Number of virtual views that are planned and rendered, at least 2.
+      up: Up axis of the scene, three numbers. By default it is the normal of the largest plane, the ground.
+    """
+
+    views: Option[int] = 24
+    up: Option[tuple[float, float, float] | None] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +179,7 @@ class FieldOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(FieldOptions, ModelOptions, MaskOptions, SceneOptions, InputOptions):
+class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions, InputOptions):
     """All that the result of a run depends on, except for the content of its files."""
 
     @property
@@ -178,6 +192,7 @@ LEAST: dict[str, float] = {
     "downscale": 1,
     "long_side": 16,
     "frames": 2,
+    "views": 2,
     "holdout": 0,
     "steps": 1,
     "minutes": 0.05,

@@ -217,6 +217,33 @@ def run(
     return Run(field, capture, labels, quality, done.seconds, steps, notes, options, _since(before), done.built)
 
 
+def current_field(options: Options, out: Path) -> Path | None:
+    """Looks for the field that a run would write, without running.
+
+    Args:
+      options: Options of the run.
+      out: Its output folder.
+
+    Returns:
+      The field's file, or None if it is missing, or other options, inputs or sources made it.
+
+    Raises:
+      InputError: The run would refuse its options or inputs.
+    """
+    from jsecon.language.field import load_field
+
+    path = out / FIELD_FILE
+    if not path.is_file():
+        return None
+    work = RunContext(options, networks.open_networks(options, out / "cache"), out)
+    keys = _planned(work, stages_of(work), out / "cache").keys
+    try:
+        made_by = json.loads(load_field(path, mapped=True).provenance)
+    except (InputError, ValueError):  # damaged: the run writes it anew
+        return None
+    return path if made_by.get("keys") == keys else None
+
+
 def run_worker(options: Options, out: Path) -> None:
     """What every process of a run but the first does, see `processes`."""
     processes.run_worker(stages_of(RunContext(options, networks.open_networks(options, out / "cache"), out)), out)

@@ -13,6 +13,7 @@ import numpy as np
 from jsecon.data.coordinates import transform_poses
 from jsecon.errors import InputError
 from jsecon.files import write_text
+from jsecon.pipeline.bare_stages import is_bare_scene, planned_views, scene_itself
 from jsecon.pipeline.options import SceneOptions
 from jsecon.pipeline.progress import Progress
 from jsecon.pipeline.stages import (
@@ -30,6 +31,8 @@ from jsecon.types import Camera, Capture, Gaussians
 
 def capture_stages(work: RunContext) -> list[Stage]:
     """The capture; before it, where there are photographs or a video without poses, the poses."""
+    if work.load is None and is_bare_scene(work.options.capture):
+        return [planned_views(work)]
     if work.load is not None or not _bare(work.options.capture):
         return [load(work)]
     found = poses(work)
@@ -189,6 +192,8 @@ def _checked(capture: Capture, size: str) -> StageResult:
 
 def gaussians(work: RunContext) -> Stage:
     """The scene's Gaussians: of a file in the capture's world, or fitted to the training frames."""
+    if work.load is None and is_bare_scene(work.options.capture):
+        return scene_itself(work)
     return _fitted(work) if work.options.gaussians is None else _read(work)
 
 

@@ -1,0 +1,1 @@
+"""Virtual views of a scene of Gaussians that comes without photographs."""

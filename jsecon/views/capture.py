@@ -1,0 +1,118 @@
+"""A capture of renders: the frames of a bare scene, seen from planned views."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.splat.render import render_rgb
+from jsecon.splat.sh import colours_from_sh
+from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.types import Capture, Gaussians
+from jsecon.views.frame import scene_frame, surface_points
+from jsecon.views.plan import PlannedViews, plan_views
+
+ORDINARY = (3.0, 30.0)
+"""diagonal of a scene that keeps its units: a table to a flat, in metres"""
+DIAGONAL = 6.0
+"""diagonal that any other scene is brought to"""
+FAR = 100.0
+"""diagonals from the origin beyond which a scene is moved to it: float32 has few digits out there"""
+BACKGROUNDS = (0.0, 1.0, 0.5)
+"""grey values that may lie behind a scene, the usual one first"""
+
+
+def world_of_scene(gaussians: Gaussians) -> np.ndarray:
+    """Finds the world in which a bare scene has ordinary numbers.
+
+    Args:
+      gaussians: Scene of N Gaussians, in the world of its file.
+
+    Returns:
+      (4, 4) float64 similarity (a shift and a scale) from that world to the file's; the identity for ordinary scenes.
+
+    Raises:
+      InputError: The scene has no visible surface.
+    """
+    frame = scene_frame(surface_points(gaussians))
+    to_source = np.eye(4)
+    if not ORDINARY[0] <= frame.diagonal <= ORDINARY[1]:
+        to_source[:3, :3] *= frame.diagonal / DIAGONAL
+    if np.linalg.norm(frame.centre) > FAR * frame.diagonal:
+        to_source[:3, 3] = frame.centre
+    return to_source
+
+
+def render_capture(
+    gaussians: Gaussians,
+    to_source: np.ndarray,
+    *,
+    views: int = 24,
+    width: int = 400,
+    height: int = 300,
+    up: np.ndarray | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Capture, PlannedViews]:
+    """Plans views of a bare scene and renders them as the frames of a capture.
+
+    Args:
+      gaussians: Scene of N Gaussians, in the capture's world.
+      to_source: (4, 4) similarity from that world to the file's.
+      views: T, number of views.
+      width: Width of the frames, px.
+      height: Height of the frames, px.
+      up: (3,) up axis; None takes it from the scene.
+      progress: Called as progress(done, total).
+
+    Returns:
+      The capture, no frame of it held out, and the planned views.
+
+    Raises:
+      InputError: The scene cannot be judged.
+    """
+    planned = plan_views(gaussians, views=views, width=width, height=height, up=up, progress=progress)
+    scene = jax.tree.map(jnp.asarray, gaussians)
+    background = _background(scene, planned)
+    frames = np.empty((len(planned.cameras), height, width, 3), np.uint8)
+    for frame, camera in zip(frames, planned.cameras):
+        image = np.asarray(render_rgb(scene, camera, background=background).features)
+        frame[:] = np.round(255 * np.clip(image, 0, 1))
+    count = len(frames)
+    capture = Capture(
+        frames=frames,
+        cameras=planned.cameras,
+        points=np.zeros((0, 3), np.float32),
+        point_colors=np.zeros((0, 3), np.uint8),
+        held_out=np.zeros(count, bool),
+        depths=None,
+        to_source=to_source,
+        names=tuple(f"view_{index:03d}" for index in range(count)),
+        notes=(f"{planned.describe()}.",),
+    )
+    return capture, planned
+
+
+def into_world(gaussians: Gaussians, to_source: np.ndarray) -> Gaussians:
+    """Moves Gaussians from the world of their file into that of the capture.
+
+    Args:
+      gaussians: Scene of N Gaussians, means float32 or float64.
+      to_source: (4, 4) similarity from the capture's world to the file's.
+
+    Returns:
+      The scene in float32.
+    """
+    moved = transform_gaussians_float64(gaussians, np.linalg.inv(to_source))
+    return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
+
+
+def _background(gaussians: Gaussians, planned: PlannedViews) -> np.ndarray:
+    """(3,) the grey that is farthest from the scene's colours: a black object would vanish before black."""
+    colours = np.clip(np.asarray(colours_from_sh(gaussians, planned.cameras[0])), 0, 1)
+    opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)))
+    colours = colours[opacity >= 0.5] if (opacity >= 0.5).any() else colours
+    distances = [float(np.quantile(np.abs(colours - grey).max(1), 0.05)) for grey in BACKGROUNDS]
+    best = BACKGROUNDS[int(np.argmax(distances))] if distances[0] < 0.1 else BACKGROUNDS[0]
+    return np.full(3, best, np.float32)

@@ -1,0 +1,191 @@
+"""The frame of a bare scene: its centre, its size, and which way is up, from the Gaussians alone.
+
+Host functions on NumPy arrays. All choices are relative to the scene's own size and to the order of its Gaussians, so
+that a scene that is turned, scaled or shifted gets the same frame, turned, scaled and shifted with it.
+"""
+
+import dataclasses
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from jsecon.errors import InputError
+from jsecon.types import Gaussians
+
+SAMPLES = 6000
+"""points that stand for the scene's surface, drawn by opacity times area"""
+VISIBLE_OPACITY = 0.1
+"""opacity from which a Gaussian counts as surface"""
+TRIM = 0.02
+"""share of the surface that lies outside the robust bounds on each side of an axis: floaters and far background"""
+WIDEST = 0.1
+"""largest standard deviation of a surface Gaussian, in units of the scene's diagonal: wider ones are sky or fog"""
+TRIPLES = 2000
+"""planes that are tried, each through three points"""
+PLANE_TOLERANCE = 0.01
+"""distance of a plane's points from it, in units of the scene's diagonal"""
+RIVAL = 0.5
+"""share of the largest plane's surface from which another plane may be the ground"""
+SURE_SHARE = 0.1
+"""share of the surface in the ground plane from which its direction is trusted"""
+SURE_SIDE = 0.85
+"""share of the remaining surface on one side of the ground plane from which its sign is trusted"""
+DISTINCT = np.cos(np.radians(20))
+"""cosine below which two planes have different normals"""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFrame:
+    """The robust box of a scene, one axis of which is up.
+
+    Attributes:
+      axes: (3, 3) orthonormal rows: two horizontal axes along the box's sides, then up; world.
+      centre: (3,) centre of the box, world.
+      half: (3,) half extents along the axes, world units.
+      sure: Whether the up axis is trusted.
+      evidence: What the up axis was taken from, in words.
+    """
+
+    axes: np.ndarray
+    centre: np.ndarray
+    half: np.ndarray
+    sure: bool
+    evidence: str
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the box's diagonal, world units."""
+        return 2 * float(np.linalg.norm(self.half))
+
+    def to_world(self, local: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        """Maps points in the box, -1 to 1 along each axis, into the world."""
+        return (np.asarray(local) * self.half) @ self.axes + self.centre
+
+
+def surface_points(gaussians: Gaussians) -> Float[np.ndarray, "p 3"]:
+    """Draws points of the scene's surface: centres of Gaussians, by opacity times area.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+
+    Returns:
+      (P, 3) float64 points, at most `SAMPLES`, the same ones however the scene is turned.
+
+    Raises:
+      InputError: The scene has no visible surface.
+    """
+    means = np.asarray(gaussians.means, np.float64)
+    scales = np.sort(np.exp(np.asarray(gaussians.log_scales, np.float64)), axis=1)
+    opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)))
+    finite = np.isfinite(means).all(1) & np.isfinite(scales).all(1) & np.isfinite(opacity)
+    visible = finite & (opacity >= VISIBLE_OPACITY)
+    if visible.sum() < 4:
+        remedy = "Open it in a viewer to check it. A scene needs visible Gaussians, and more than a few."
+        raise InputError("scene", f"{int(visible.sum())} of its {len(means)} Gaussians are visible", "", remedy)
+    low, high = np.quantile(means[visible], [TRIM, 1 - TRIM], axis=0)
+    size = float(np.linalg.norm(high - low))
+    if not size > 0:
+        raise InputError("scene", "all of its Gaussians lie in one place", "", "Check how it was exported.")
+    visible &= scales[:, 2] <= WIDEST * size
+    chosen = np.flatnonzero(visible)
+    if len(chosen) < 4:
+        raise InputError("scene", "its Gaussians are as wide as itself", "", "Check the scales of the file.")
+    weights = opacity[chosen] * scales[chosen, 1] * scales[chosen, 2]
+    weights = np.minimum(weights, np.quantile(weights, 0.99))
+    rng = np.random.default_rng(0)
+    drawn = rng.choice(chosen, min(SAMPLES, 4 * len(chosen)), p=weights / weights.sum())
+    return means[drawn]
+
+
+def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) -> SceneFrame:
+    """Finds the robust box of a scene and its up axis.
+
+    The ground is the largest plane, or one of those nearly as large along whose normal the scene is flattest. It is
+    turned so that the scene lies above it.
+
+    Args:
+      points: (P, 3) points of the surface (`surface_points`).
+      up: (3,) the up axis where it is known.
+
+    Returns:
+      The frame.
+
+    Raises:
+      InputError: `up` has no direction.
+    """
+    if up is None:
+        up, sure, evidence = _ground_normal(points)
+    else:
+        up = np.asarray(up, np.float64)
+        if not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
+            raise InputError("--up", f"{up.tolist()} is no direction", "", "Give three numbers, for example 0 0 1.")
+        sure, evidence = True, "given"
+    up = up / np.linalg.norm(up)
+    side = np.eye(3)[np.argmin(np.abs(up))]
+    first = np.cross(up, side)
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    flat = np.stack([points @ first, points @ second], axis=1)
+    middle = np.median(flat, axis=0)
+    size = np.abs(flat - middle).max()
+    inner = np.all(np.abs(flat - middle) <= np.quantile(np.abs(flat - middle), 1 - TRIM, axis=0), axis=1)
+    (_, _, degrees) = cv2.minAreaRect(((flat[inner] - middle) / size).astype(np.float32))
+    turn = np.radians(degrees)
+    axes = np.stack([np.cos(turn) * first + np.sin(turn) * second, np.cos(turn) * second - np.sin(turn) * first, up])
+    local = points @ axes.T
+    low, high = np.quantile(local, [TRIM, 1 - TRIM], axis=0)
+    half = np.maximum((high - low) / 2, 1e-3 * np.linalg.norm(high - low))
+    return SceneFrame(axes, ((low + high) / 2) @ axes, half, sure, evidence)
+
+
+def _ground_normal(points: np.ndarray) -> tuple[np.ndarray, bool, str]:
+    """Returns the normal of the ground, whether it is trusted, and on what evidence."""
+    low, high = np.quantile(points, [TRIM, 1 - TRIM], axis=0)
+    tolerance = PLANE_TOLERANCE * np.linalg.norm(high - low)
+    normals, offsets, shares = _planes(points, tolerance)
+    order = np.argsort(-shares)
+    distinct: list[int] = []
+    for index in order:
+        if shares[index] < RIVAL * shares[order[0]]:
+            break
+        if all(abs(normals[index] @ normals[other]) < DISTINCT for other in distinct):
+            distinct.append(index)
+    spans = []
+    for index in distinct:
+        heights = points @ normals[index]
+        spans.append(np.subtract(*np.quantile(heights, [1 - TRIM, TRIM])))
+    best = distinct[int(np.argmin(spans))]
+    normal, offset = _refined(points, normals[best], offsets[best], tolerance)
+    heights = points @ normal - offset
+    rest = np.abs(heights) > tolerance
+    above = float((heights[rest] > 0).mean()) if rest.any() else 0.5
+    if above < 0.5:
+        normal, above = -normal, 1 - above
+    share = float(1 - rest.mean())
+    sure = share >= SURE_SHARE and above >= SURE_SIDE
+    evidence = f"a plane with {share:.0%} of the surface, and {above:.0%} of the rest above it"
+    return normal, sure, evidence
+
+
+def _planes(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns planes through random triples of points: normals, offsets, and the share of points near each."""
+    rng = np.random.default_rng(1)
+    triples = points[rng.integers(len(points), size=(TRIPLES, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    proper = lengths > 0
+    normals = normals[proper] / lengths[proper, None]
+    offsets = (triples[proper, 0] * normals).sum(1)
+    sample = points[:: max(len(points) // 2000, 1)]
+    near = np.abs(sample @ normals.T - offsets) <= tolerance
+    return normals, offsets, near.mean(0)
+
+
+def _refined(points: np.ndarray, normal: np.ndarray, offset: float, tolerance: float) -> tuple[np.ndarray, float]:
+    """Fits a plane to the points near it, by principal components."""
+    near = points[np.abs(points @ normal - offset) <= tolerance]
+    middle = near.mean(0)
+    fitted = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+    fitted *= np.sign(fitted @ normal) or 1.0
+    return fitted, float(middle @ fitted)

@@ -1,0 +1,281 @@
+"""Which virtual views show a bare scene best: candidates, small renders of them, and a greedy cover.
+
+A scene is a room or an object. In a room, candidates stand in free places inside and look around; around an object
+they stand on orbits. The two kinds are never mixed: from outside a room, the things in it are a few pixels.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from jsecon.errors import InputError, require
+from jsecon.language.votes import region_votes
+from jsecon.types import Camera, Gaussians
+from jsecon.views.frame import SceneFrame, scene_frame, surface_points
+
+FIELD_OF_VIEW = 60.0
+"""degrees, horizontal"""
+CANDIDATE_WIDTH, CANDIDATE_HEIGHT = 80, 60
+"""px of the small renders"""
+PLACES = 24
+"""free places in a room"""
+YAWS, PITCHES = 8, (-45.0, -20.0, 5.0)
+"""directions that are looked at from each place: how many around, and degrees above the horizon"""
+GRID = 12
+"""places that are tried along each side of a room"""
+FREE_DISTANCE = 0.06
+"""distance of a free place from any surface, in units of the box's diagonal"""
+HEIGHTS = (-0.2, 0.9)
+"""range of the free places between the middle of a room (0) and its upper end (1)"""
+ENCLOSED_ALPHA, ENCLOSED_YAWS, ROOM_SHARE = 0.8, 0.75, 0.5
+"""a view is closed from this mean alpha on; a place is enclosed if this share of its downward views is closed; a scene
+is a room if this share of its places is enclosed"""
+FILL = 0.92
+"""share of the frame that the box fills from an orbit"""
+ORBIT_YAWS, ORBIT_PITCHES, ORBIT_DISTANCES = 16, (5.0, 25.0, 50.0), (1.0, 0.5)
+"""orbits around an object: views around, degrees above the horizon, distances in units of the fitting one"""
+BELOW = (-25.0, -50.0)
+"""degrees of further orbits where the up axis is not sure"""
+BLANK_ALPHA = 0.03
+"""mean alpha below which a view shows no scene"""
+FULL_WEIGHT = 0.3
+"""px of rendering weight, in a candidate, with which a Gaussian counts as seen"""
+SEEN_SHARE = 4
+"""each Gaussian shall be seen in one of this many views"""
+COVERED_GAUSSIANS = 100_000
+"""Gaussians that the cover looks at, evenly spaced"""
+VIEWS_AT_ONCE = 64
+"""candidates that are rendered between two reports"""
+NEAR = 0.01
+"""near plane of the candidates, in units of the box's diagonal"""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedViews:
+    """Virtual views of a bare scene.
+
+    Attributes:
+      cameras: Batch of T cameras, in the scene's world.
+      frame: The scene's box and up axis.
+      kind: "room" or "object".
+      coverage: Share of the scene, by opacity, that the views show.
+      candidates: Number of views that were looked at.
+    """
+
+    cameras: Camera
+    frame: SceneFrame
+    kind: str
+    coverage: float
+    candidates: int
+
+    def describe(self) -> str:
+        """Says what was planned, in one line."""
+        up = ", ".join(f"{number:.2f}" for number in self.frame.axes[2])
+        trust = "" if self.frame.sure else "; not sure, --up X Y Z sets it"
+        return (
+            f"{len(self.cameras)} virtual views of {'a room' if self.kind == 'room' else 'an object'}, "
+            f"{self.coverage:.0%} of it seen; up is ({up}), from {self.frame.evidence}{trust}"
+        )
+
+
+def plan_views(
+    gaussians: Gaussians,
+    *,
+    views: int = 24,
+    width: int = 400,
+    height: int = 300,
+    up: np.ndarray | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> PlannedViews:
+    """Plans virtual views of a scene from its Gaussians alone.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      views: T, number of views.
+      width: Width of the views, px.
+      height: Height of the views, px.
+      up: (3,) up axis of the world; None takes it from the largest plane.
+      progress: Called as progress(done, total) while candidates are rendered.
+
+    Returns:
+      The views.
+
+    Raises:
+      InputError: The scene cannot be judged: it has no visible surface, or no view shows it.
+      ValueError: `views` is not positive.
+    """
+    require(views >= 1, "views", views, ">= 1", "Ask for at least one view.")
+    points = surface_points(gaussians)
+    frame = scene_frame(points, up)
+    places = free_places(points, frame)
+    inside = _interior_cameras(frame, places)
+    orbits = _orbit_cameras(frame)
+    counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, COVERED_GAUSSIANS)).astype(int))
+    total = len(inside) + len(orbits)
+
+    def report(start: int) -> Callable[[int], None]:
+        return lambda done: None if progress is None else progress(start + done, total)
+
+    seen, alpha = _weights_by_view(gaussians, inside, counted, frame.diagonal, report(0))
+    kind = "room" if _is_room(alpha, len(places)) else "object"
+    candidates = inside
+    if kind == "object":
+        candidates = orbits
+        seen, alpha = _weights_by_view(gaussians, orbits, counted, frame.diagonal, report(len(inside)))
+    usable = np.flatnonzero(alpha >= BLANK_ALPHA)
+    if not len(usable):
+        remedy = "Open it in a viewer to check it, or give cameras of your own with --cameras FILE."
+        raise InputError("scene", "no virtual view shows it", "", remedy)
+    opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)[counted]))
+    chosen, coverage = greedy_cover(seen[usable], opacity, views)
+    chosen = usable[chosen]
+    cameras = _cameras(candidates[chosen], width, height)
+    return PlannedViews(cameras, frame, kind, coverage, total)
+
+
+def free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np.ndarray, "k 3"]:
+    """Finds places inside the box of a scene that are away from every surface, far from each other.
+
+    Args:
+      points: (P, 3) points of the surface.
+      frame: The scene's frame.
+
+    Returns:
+      (K, 3) places, K <= `PLACES`; none where the box has no free place.
+    """
+    ticks = np.linspace(-0.9, 0.9, GRID)
+    grid = np.stack(np.meshgrid(ticks, ticks, np.linspace(*HEIGHTS, 5), indexing="ij"), axis=-1).reshape(-1, 3)
+    world = frame.to_world(grid)
+    distance = cKDTree(points).query(world)[0]
+    free = np.flatnonzero(distance >= FREE_DISTANCE * frame.diagonal)
+    if not len(free):
+        return np.zeros((0, 3))
+    chosen = [free[np.argmin(np.abs(grid[free]).sum(1))]]
+    nearest = np.full(len(free), np.inf)
+    while len(chosen) < min(PLACES, len(free)):
+        nearest = np.minimum(nearest, np.linalg.norm(world[free] - world[chosen[-1]], axis=1))
+        chosen.append(free[np.argmax(nearest)])
+    return world[chosen]
+
+
+def greedy_cover(
+    weights: Float[np.ndarray, "v n"], importance: Float[np.ndarray, " n"], views: int
+) -> tuple[np.ndarray, float]:
+    """Chooses views that show the scene, one after the other, each time the one that adds most.
+
+    A view shows a Gaussian fully from `FULL_WEIGHT` on, and each Gaussian is wanted in one of `SEEN_SHARE` views. The
+    gain is submodular, so the choice is within 1 - 1/e of the best one.
+
+    Args:
+      weights: (V, N) rendering weight of each Gaussian in each candidate, px.
+      importance: (N,) weight of each Gaussian in the gain.
+      views: Number of views to choose.
+
+    Returns:
+      Indices of the chosen candidates, at most `views`; and the share of the importance that they show at least once.
+    """
+    shown = np.minimum(weights / FULL_WEIGHT, 1).astype(np.float32)
+    importance = importance.astype(np.float32)
+    target = max(views / SEEN_SHARE, 1.0)
+    covered = np.zeros(weights.shape[1], np.float32)
+    chosen: list[int] = []
+    bound = np.full(len(shown), np.inf)
+    for _ in range(min(views, len(shown))):
+        bound[chosen] = -np.inf
+        best, gain = -1, -np.inf
+        for index in np.argsort(-bound, kind="stable"):  # lazy: a gain never grows
+            if bound[index] <= gain:
+                break
+            bound[index] = float(importance @ (np.minimum(covered + shown[index], target) - covered))
+            if bound[index] > gain:
+                best, gain = int(index), bound[index]
+        chosen.append(best)
+        covered = np.minimum(covered + shown[best], target)
+    once = np.minimum(shown[chosen].sum(0), 1)
+    return np.array(chosen), float(importance @ once / max(importance.sum(), 1e-30))
+
+
+def _is_room(alpha: np.ndarray, places: int) -> bool:
+    """Whether at least half of the places are enclosed, by the mean alpha of their views."""
+    if not places:
+        return False
+    down = [index for index, pitch in enumerate(PITCHES) if pitch < 0]
+    closed = alpha.reshape(places, YAWS, len(PITCHES))[:, :, down].min(2) >= ENCLOSED_ALPHA
+    return bool((closed.mean(1) >= ENCLOSED_YAWS).mean() >= ROOM_SHARE)
+
+
+def _interior_cameras(frame: SceneFrame, places: np.ndarray) -> np.ndarray:
+    """(K, 4, 4) poses that look around from each place: places, then yaws, then pitches."""
+    poses = []
+    for place in places:
+        for yaw in np.arange(YAWS) * 2 * np.pi / YAWS:
+            poses += [_look(place, _direction(frame, yaw, pitch), frame.axes[2]) for pitch in PITCHES]
+    return np.array(poses).reshape(-1, 4, 4)
+
+
+def _orbit_cameras(frame: SceneFrame) -> np.ndarray:
+    """(K, 4, 4) poses on orbits from where the scene's box fills the frame, and from half as far."""
+    poses = []
+    corners = frame.to_world(np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3))
+    for pitch in ORBIT_PITCHES if frame.sure else (*ORBIT_PITCHES, *BELOW):
+        for yaw in np.arange(ORBIT_YAWS) * 2 * np.pi / ORBIT_YAWS:
+            forward = -_direction(frame, yaw, pitch)
+            distance = _fitting_distance(frame, corners, forward)
+            poses += [_look(frame.centre - d * distance * forward, forward, frame.axes[2]) for d in ORBIT_DISTANCES]
+    return np.array(poses)
+
+
+def _fitting_distance(frame: SceneFrame, corners: np.ndarray, forward: np.ndarray) -> float:
+    """Distance from the centre at which all corners of the box lie within `FILL` of the frame."""
+    pose = _look(frame.centre, forward, frame.axes[2])
+    x, y, z = pose[:3, :3] @ (corners - frame.centre).T
+    tangent = FILL * np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    ratio = CANDIDATE_HEIGHT / CANDIDATE_WIDTH
+    return float(np.max(np.maximum(np.abs(x), np.abs(y) / ratio) / tangent - z))
+
+
+def _direction(frame: SceneFrame, yaw: float, pitch: float) -> np.ndarray:
+    """Unit vector at an angle around the up axis (radians) and above the horizon (degrees)."""
+    first, second, up = frame.axes
+    level = np.cos(yaw) * first + np.sin(yaw) * second
+    return np.cos(np.radians(pitch)) * level + np.sin(np.radians(pitch)) * up
+
+
+def _look(eye: np.ndarray, forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(4, 4) world-to-camera pose of a camera at `eye` that looks along `forward`."""
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ eye
+    return pose
+
+
+def _cameras(poses: np.ndarray, width: int, height: int) -> Camera:
+    """Makes the cameras of poses, with the planned field of view."""
+    count = len(poses)
+    focal = np.full(count, max(width, height) / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2), np.float32)
+    middle = np.full(count, width / 2, np.float32), np.full(count, height / 2, np.float32)
+    return Camera(poses.astype(np.float32), focal, focal, *middle, width, height)
+
+
+def _weights_by_view(
+    gaussians: Gaussians, poses: np.ndarray, counted: np.ndarray, diagonal: float, report: Callable[[int], None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the weight of some Gaussians in each small view (V, M), and the mean alpha of each view (V,)."""
+    seen = np.zeros((len(poses), len(counted)), np.float32)
+    alpha = np.zeros(len(poses))
+    cameras = _cameras(poses, CANDIDATE_WIDTH, CANDIDATE_HEIGHT)
+    labels = np.full((VIEWS_AT_ONCE, CANDIDATE_HEIGHT, CANDIDATE_WIDTH), -1, np.int32)
+    for start in range(0, len(poses), VIEWS_AT_ONCE):
+        rows = np.minimum(np.arange(start, start + VIEWS_AT_ONCE), len(poses) - 1)  # one program for all chunks
+        votes = region_votes(gaussians, cameras[rows], labels, 1, top=1, by_view=True, near=NEAR * diagonal)
+        by_view = np.asarray(votes.by_view)[: len(poses) - start]
+        seen[start : start + len(by_view)] = by_view[:, counted]
+        alpha[start : start + len(by_view)] = by_view.sum(1) / (CANDIDATE_WIDTH * CANDIDATE_HEIGHT)
+        report(min(start + VIEWS_AT_ONCE, len(poses)))
+    return seen, alpha

@@ -1,0 +1,178 @@
+"""Scenes without photographs: their up axis, their planned views, and a run and a question on one."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jsecon
+from jsecon.app.cli import main
+from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.types import Gaussians
+from jsecon.views.frame import scene_frame, surface_points
+from jsecon.views.plan import free_places, greedy_cover, plan_views
+
+BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
+CENTRES = np.array([(-1.2, -0.8, 0.4), (1.0, 0.2, 0.4), (-0.2, 1.1, 0.4)])
+SPACING = 0.16
+
+
+def sheet(corner, first, second):
+    """Points of a rectangle, `SPACING` apart."""
+    counts = [round(np.linalg.norm(side) / SPACING) + 1 for side in (first, second)]
+    a, b = np.meshgrid(*(np.linspace(0, 1, count) for count in counts), indexing="ij")
+    return np.asarray(corner) + a.reshape(-1, 1) * np.asarray(first) + b.reshape(-1, 1) * np.asarray(second)
+
+
+def scene_of(parts):
+    """Gaussians of parts (points, colour, size); z is up."""
+    count = [len(points) for points, _, _ in parts]
+    colours = np.concatenate([np.tile(colour, (n, 1)) for n, (_, colour, _) in zip(count, parts)])
+    sizes = np.concatenate([np.full(n, size) for n, (_, _, size) in zip(count, parts)])
+    total = sum(count)
+    return Gaussians(
+        means=np.concatenate([points for points, _, _ in parts]).astype(np.float32),
+        log_scales=np.log(np.repeat(sizes[:, None], 3, 1)).astype(np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (total, 1)),
+        opacity_logits=np.full(total, 4.0, np.float32),
+        sh=((colours - 0.5) / 0.28209479).astype(np.float32)[:, None],
+    )
+
+
+def ball_points(centre):
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(400, 3))
+    return centre + 0.32 * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def balls():
+    return [(ball_points(centre), colour, 0.04) for centre, colour in zip(CENTRES, BALLS.values())]
+
+
+@pytest.fixture(scope="module")
+def room():
+    """A floor of 6 x 5, walls of 2.4, and three balls on the floor."""
+    grey = (0.55, 0.55, 0.5)
+    x, y, z = np.diag([6.0, 5.0, 2.4])
+    corner = np.array([-3.0, -2.5, 0.0])
+    walls = [sheet(corner, x, z), sheet(corner, y, z), sheet(corner + y, x, z), sheet(corner + x, y, z)]
+    parts = [(sheet(corner, x, y), (0.4, 0.35, 0.3), 0.1), *((wall, grey, 0.1) for wall in walls)]
+    return scene_of([*parts, *balls()])
+
+
+@pytest.fixture(scope="module")
+def object_alone():
+    return scene_of(balls())
+
+
+def moved(gaussians, seed):
+    """The scene turned, scaled and shifted at random; and the similarity."""
+    rng = np.random.default_rng(seed)
+    similarity = np.eye(4)
+    similarity[:3, :3] = Rotation.random(random_state=seed).as_matrix() * np.exp(rng.uniform(-2, 2))
+    similarity[:3, 3] = rng.normal(size=3) * 20
+    return transform_gaussians_float64(gaussians, similarity), similarity
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_frame_turns_scales_and_moves_with_the_scene(room, seed):
+    there, similarity = moved(room, seed)
+    size = np.cbrt(np.linalg.det(similarity[:3, :3]))
+    first, second = (scene_frame(surface_points(scene)) for scene in (room, there))
+    np.testing.assert_allclose(first.axes[2], [0, 0, 1], atol=0.01)
+    np.testing.assert_allclose(second.axes[2], similarity[:3, :3] @ first.axes[2] / size, atol=0.01)
+    np.testing.assert_allclose(second.centre, similarity[:3, :3] @ first.centre + similarity[:3, 3], atol=0.02 * size)
+    np.testing.assert_allclose(np.sort(second.half), np.sort(first.half) * size, rtol=0.03)
+    assert first.sure
+    assert second.sure
+
+
+def test_the_up_axis_can_be_given(room):
+    frame = scene_frame(surface_points(room), np.array([0.0, 2.0, 0.0]))
+    np.testing.assert_allclose(frame.axes[2], [0, 1, 0])
+    with pytest.raises(jsecon.InputError, match="direction"):
+        scene_frame(surface_points(room), np.zeros(3))
+
+
+def test_free_places_lie_in_the_room_away_from_its_things(room):
+    points = surface_points(room)
+    frame = scene_frame(points)
+    places = free_places(points, frame)
+    assert len(places) == 24
+    assert (np.abs(places[:, 0]) < 3).all()
+    assert (np.abs(places[:, 1]) < 2.5).all()
+    distance = np.linalg.norm(places[:, None] - np.asarray(room.means), axis=2).min(1)
+    assert (distance > 0.05 * frame.diagonal).all()
+
+
+def test_greedy_cover_gains_at_each_step_the_most_that_any_view_would():
+    rng = np.random.default_rng(0)
+    weights = rng.exponential(0.2, (12, 40)) * (rng.random((12, 40)) < 0.3)
+    importance = rng.random(40)
+    chosen, share = greedy_cover(weights, importance, 5)
+    shown = np.minimum(weights / 0.3, 1)
+
+    def value(rows):
+        return importance @ np.minimum(shown[rows].sum(0), 5 / 4)
+
+    picked = []
+    for view in chosen:
+        assert value([*picked, view]) == pytest.approx(max(value([*picked, other]) for other in range(12)), rel=1e-5)
+        picked.append(int(view))
+    assert share == pytest.approx(importance @ np.minimum(shown[picked].sum(0), 1) / importance.sum(), rel=1e-5)
+    assert len(set(picked)) == 5
+
+
+def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone):
+    inside = plan_views(room, views=6)
+    assert inside.kind == "room"
+    centres = np.asarray(inside.cameras.centres)
+    assert (np.abs(centres[:, 0]) < 3).all()
+    assert (np.abs(centres[:, 1]) < 2.5).all()
+    around = plan_views(object_alone, views=6)
+    assert around.kind == "object"
+    assert (np.linalg.norm(np.asarray(around.cameras.centres) - around.frame.centre, axis=1) > 1).all()
+    for scene, planned in ((room, inside), (object_alone, around)):
+        alphas = [np.asarray(jsecon.render_rgb(scene, camera).alpha).mean() for camera in planned.cameras]
+        assert min(alphas) > 0.03
+        assert planned.coverage > 0.7
+
+
+@pytest.mark.parametrize(
+    ("change", "clause"),
+    [
+        (lambda g: {"opacity_logits": np.full(g.count, -9.0, np.float32)}, "visible"),
+        (lambda g: {"means": np.zeros_like(g.means)}, "one place"),
+        (lambda g: {"log_scales": np.full_like(g.log_scales, 5.0)}, "wide"),
+    ],
+    ids=["transparent", "one place", "fog"],
+)
+def test_a_scene_that_cannot_be_judged_is_refused(object_alone, change, clause):
+    import dataclasses
+
+    with pytest.raises(jsecon.InputError, match=clause):
+        plan_views(dataclasses.replace(object_alone, **change(object_alone)))
+
+
+def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):
+    scene = tmp_path / "scene.ply"
+    there, _ = moved(room, 5)
+    jsecon.save_ply(scene, there)
+    field = tmp_path / "field"
+    assert main(["run", str(scene), "--out", str(field), "--views", "8", "--long-side", "160"]) == 0
+    assert "of a room" in capsys.readouterr().out
+    out = tmp_path / "answers"
+    assert main(["query", str(field / "field.safetensors"), "red ball", "--out", str(out)]) == 0
+    (answer,) = out.glob("*.ply")
+    selected = {tuple(mean) for mean in np.round(np.asarray(jsecon.load_ply(answer).means), 3)}
+    truth = {tuple(mean) for mean in np.round(np.asarray(there.means, np.float32)[-1200:-800], 3)}
+    assert len(selected & truth) / len(selected | truth) > 0.8
+    assert json.loads(next(out.glob("*.json")).read_text())["count"] == len(selected)
+
+
+def test_a_scene_of_gaussians_takes_no_other_gaussians(room, tmp_path, capsys):
+    scene = tmp_path / "scene.ply"
+    jsecon.save_ply(scene, room)
+    assert main(["run", str(scene), "--gaussians", str(scene), "--out", str(tmp_path / "field")]) == 2
+    assert "--gaussians" in capsys.readouterr().err
