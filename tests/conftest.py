@@ -62,29 +62,14 @@ from jsecon.types import Camera, Gaussians  # noqa: E402
 gc.freeze()
 gc.set_threshold(20_000, 20, 20)
 
-LONGEST = (
-    "test_pipeline",
-    "test_rivals",
-    "test_fit",
-    "test_corrections",
-    "test_demo",
-    "test_cli",
-    "test_processes",
-    "test_cores",
-    "test_stability",
-    "test_capacity",
-    "test_silhouette",
-    "test_synthetic",
-    "test_render",
-    "test_process",
-    "test_blocks",
-    "test_codes",
-    "test_distill",
-    "test_plan",
-    "test_autoencoder",
-    "test_tables",
-    "test_networks",
-)
+LONGEST = [
+    f"test_{name}"
+    for name in (
+        "pipeline fit corrections rivals cores cli readme networks plan classes render motion silhouette refinement "
+        "synthetic tables codes autoencoder consensus scene_stages processes capacity distill"
+    ).split()
+]
+"""files that start first; those that wait for the shared run come after its own"""
 
 
 def pytest_collection_modifyitems(items):

@@ -130,6 +130,7 @@ def test_points_on_top_of_each_other():
     assert remove_outliers(mostly, np.ones(70, bool))[:50].all()
 
 
+@pytest.mark.long
 def test_half_a_million_points_in_seconds():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500_000, 3))
