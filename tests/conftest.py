@@ -62,14 +62,14 @@ from jsecon.types import Camera, Gaussians  # noqa: E402
 gc.freeze()
 gc.set_threshold(20_000, 20, 20)
 
-LONGEST = [
-    f"test_{name}"
-    for name in (
-        "pipeline fit corrections rivals cores cli readme networks plan classes render motion silhouette refinement "
-        "synthetic tables codes autoencoder consensus scene_stages processes capacity distill"
-    ).split()
-]
-"""files that start first; those that wait for the shared run come after its own"""
+# fmt: off
+LONGEST = (
+    "pipeline", "fit", "corrections", "rivals", "cores", "cli", "readme", "networks", "plan", "classes", "render",
+    "motion", "silhouette", "refinement", "synthetic", "tables", "codes", "autoencoder", "consensus",
+    "scene_stages", "processes", "capacity", "distill",
+)
+# fmt: on
+"""files, without test_, that start first; those that wait for the shared run come after its own file"""
 
 
 def pytest_collection_modifyitems(items):
@@ -79,7 +79,7 @@ def pytest_collection_modifyitems(items):
     items.sort(
         key=lambda item: (
             item.get_closest_marker("as_shipped") is None,
-            place.get(item.path.stem, len(place)),
+            place.get(item.path.stem.removeprefix("test_"), len(place)),
         )
     )
 
