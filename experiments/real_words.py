@@ -54,6 +54,7 @@ from jsecon.query.match import CONTRAST_THRESHOLD, KIND_THRESHOLD, RETRIEVAL_THR
 from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField, Regions, Votes
+from jsecon.vision.reference_words import reference_of
 
 CROPS = tuple(
     Crop(margin, shape, surroundings)
@@ -159,6 +160,7 @@ def case_of(options: Options, scene: WordScene, embedder: Conse) -> Case:
         to_source=np.eye(4),
         names=tuple(map(str, range(len(scene.pixels[0])))),
         embedder=embedder.name,
+        reference=reference_of(embedder),
     )
     return Case(scene, crops, regions, embedder.embed_text(list(scene.texts)), embedder.canonical, field)
 

@@ -87,7 +87,7 @@ def on_points(data: twins.Data, scene: str, seed: int, level: str) -> tuple[Sett
     evidence = Evidence(gaussians, cameras, masks, np.concatenate(rows), np.array(owners), tracks)
     texts, levels = embedder.embed_text(list(bench.queries)), (evidence,)
     known = (bench, evidence, frames, levels, associated(levels, tracks), texts, embedder.canonical)
-    setting = Setting(*known, {}, tuple(names), seed, root / scene, level)
+    setting = Setting(*known, {}, tuple(names), seed, root / scene, level, embedder.reference)
     votes = region_votes(gaussians, cameras, jnp.asarray(truth, jnp.int32), int(truth.max()) + 1)
     inside, outside = np.asarray(votes.weights[:, 0]), np.asarray(votes.total - votes.labelled)
     return setting, np.where(inside > outside, np.asarray(votes.regions[:, 0]), -1)
@@ -175,7 +175,7 @@ def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.n
 def refusal(setting: Setting, field: LanguageField) -> dict[str, float]:
     """Shares of the texts of what is there that are kept, and of what is not that are refused, by each threshold; and
     how often a text of the first kind is more similar to its best region than one of the second."""
-    absent = twins.absent_texts(setting.bench, setting.folder.parent, setting.level, setting.seed)
+    absent = twins.words_of(setting.bench, setting.folder.parent, setting.level, setting.seed).absent
     told = {}
     for retrieval, constant in CONSTANTS.items():
         present, beside = (best_scores(field, texts, retrieval) for texts in (setting.texts, absent))

@@ -109,7 +109,7 @@ def pooled(bench: Benchmark, root: Path, level: str, seed: int) -> Pooled:
         masks[t, here] = embedder.embed_regions(frames[t], image[None] == here[:, None, None])
     embeddings = unit(np.einsum("tre,rt->re", masks, pixels)).astype(np.float32)
     asked = np.array([names.index(query) for query in bench.queries])
-    absent = twins.absent_texts(bench, root, level, seed)
+    absent = twins.words_of(bench, root, level, seed).absent
     texts = embedder.embed_text(names)
     return Pooled(embeddings, pixels, labels.origin, masks, texts, asked, absent, embedder.canonical)
 

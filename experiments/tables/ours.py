@@ -113,6 +113,7 @@ def field_of(
         setting.canonical,
         np.eye(4),
         setting.names,
+        reference=setting.reference,
     )
 
 

@@ -1,8 +1,8 @@
 """Every way to read every method: text rules and ways of choosing Gaussians that are no method's own idea.
 
-A feature of each Gaussian can be held against a text by the cosine, by LERF's relevancy, or by jsecon's contrast; the
-similarity that follows can be cut at VALA's threshold, or be handed to the ascent of the expected IoU. No row may
-answer "nothing": the protocols have no such answer.
+A feature of each Gaussian is compared with a text by the cosine, by LERF's relevancy, or by one of jsecon's rules, the
+contrast and "apart". The similarity is cut at VALA's threshold, or handed to the ascent of the expected IoU. Every row
+answers every text, as the protocols ask.
 """
 
 import dataclasses
@@ -16,12 +16,14 @@ from experiments.rivals import lifting
 from experiments.rivals.evidence import Evidence
 from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
+from jsecon.errors import require
 from jsecon.numerics import cosine_matrix, normalize
 from jsecon.query.baselines import relevancies
 from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.types import Selection
 
-RULES = ("cosine", "relevancy", "contrast")
+RULES = ("cosine", "relevancy", "contrast", "apart")
+"""of comparing a feature with a text"""
 CHOOSERS = {"threshold": None} | {name.replace("_", " "): weights for name, weights in SILHOUETTE_WEIGHTS.items()}
 """a threshold, or the ascent of the expected IoU with these weights of its two levels of alpha"""
 SHARP = ", sharp"
@@ -33,15 +35,19 @@ SHARPENED = tuple((rule, f"{name} silhouette{SHARP}") for rule in RULES[1:] for 
 def scores(
     setting: Setting, features: Float[np.ndarray, "n e"], rule: str, evidence: Evidence | None = None
 ) -> Float[np.ndarray, "q n"]:
-    """How far each Gaussian answers each text by a rule; NaN where its feature is unknown.
+    """Similarity of each Gaussian with each text by a rule; NaN where its feature is unknown.
 
-    The contrast is jsecon's of regions, asked of Gaussians: the mean that is taken out of them is that of the masks of
-    the `evidence` (default: the setting's), weighted by their pixels.
+    The last two rules are jsecon's for regions. The contrast subtracts the mean of the masks of the `evidence`
+    (default: the setting's), weighted by their pixels. "apart" subtracts the mean of the unrelated words from the text.
     """
     features, texts = jnp.asarray(features), jnp.asarray(setting.texts)
     known = np.asarray(jnp.any(features != 0, axis=1))
     if rule == "cosine":
         found = np.asarray(cosine_matrix(texts, features))
+    elif rule == "apart":
+        require(setting.reference is not None, "apart", "a setting without unrelated words", "a twin", "Use contrast.")
+        words = normalize(jnp.asarray(setting.reference))
+        found = np.asarray(cosine_matrix(normalize(texts) - words.mean(0), features))
     elif rule == "relevancy":
         found = np.stack([np.asarray(relevancies(features, t, jnp.asarray(setting.canonical))[0]) for t in texts])
     else:

@@ -213,12 +213,12 @@ def rows_of(points: bool) -> dict[str, Method]:
             for rule, chooser in every + (() if points else SHARPENED):
                 found[f"{name}: {way}{rule}, {chooser}"] = reading((name, way), features, rule, chooser)
     for name, association in OURS.items():
-        for rule in ("cosine", "contrast"):
+        for rule in ("cosine", "contrast", "apart"):
             for chooser in choosers:
-                for told, options in CENTRES.items() if points and rule == "contrast" else (("", {}),):
+                for told, options in CENTRES.items() if points and rule != "cosine" else (("", {}),):
                     if association == "consensus" or "agreement" not in options:
                         found[f"{name}: {rule}, {chooser}{told}"] = own(association, rule, chooser, **options)
-                if association == "consensus" and rule == "contrast" and not points:
+                if association == "consensus" and rule != "cosine" and not points:
                     for way in ("all", "parts"):
                         found[f"{name}: {rule}, {chooser}{WAYS[way]}"] = own(association, rule, chooser, way=way)
                     for told, options in EVENED.items():

@@ -48,6 +48,8 @@ class Setting:
     """of the scene's files: masks, language_features, text_features.json."""
     level: str = ""
     """of a twin's simulated vision."""
+    reference: np.ndarray | None = None
+    """(W, E) of the unrelated words; None of a real dataset, whose files have none."""
     shared: Shared = dataclasses.field(default_factory=Shared, compare=False)
     """what methods have in common."""
 
@@ -87,6 +89,7 @@ def prepare(data: twins.Data, scene: str, seed: int, level: str, *, fit_steps: i
         seed,
         folder,
         level,
+        None if data.root else twins.words_of(bench, root, level, seed).reference,
     )
 
 

@@ -38,6 +38,7 @@ from jsecon.demo.raycast import trace_rays
 from jsecon.demo.room import make_room
 from jsecon.files import write_text
 from jsecon.vision.protocols import CANONICAL
+from jsecon.vision.reference_words import REFERENCE_WORDS
 
 PERFECT = Faults(0, 2, 0, 0, 0, 0, 0, 0, object_noise=1.0, view_noise=0)
 """true masks that agree in all views, each object embedded alike in all; texts and images lie apart, as in CLIP"""
@@ -121,15 +122,17 @@ def sight(bench: Benchmark, root: Path, level: str, seed: int) -> Sight:
         points, _ = surfaces_of(room, dataclasses.replace(bench.capture, cameras=cameras, depths=depths), truth)
         table = len(room.objects) + SURROUNDINGS.index("table")
         seen = seen_in(world, truth, points, room, table, seed=seed)
-    space, others = space_of(words, world, seed)
+    texts = space_of(words, world, seed)
     masks = simulated_masks(seen.masks, faults, seed=seed)
     levels = [masks] * len(LEVELS)
     if seen.small is not None and seen.large is not None:
         small, large = (simulated_masks(m, faults, seed=seed + 1000 * k) for k, m in ((1, seen.small), (2, seen.large)))
         levels = [masks, small, masks, large]
     azimuths = np.arctan2(cameras.centres[:, 1], cameras.centres[:, 0])
-    hard = {"world": world, "objects": seen.objects, "azimuths": azimuths, "others": others}
-    embedder = SimulatedEmbedder(frames, seen.content, told["objects"], space, faults, seed=seed, **hard)
+    hard = {"world": world, "objects": seen.objects, "azimuths": azimuths, "others": texts.absent}
+    embedder = SimulatedEmbedder(
+        frames, seen.content, told["objects"], texts.space, faults, seed=seed, reference=texts.reference, **hard
+    )
     return Sight(names, frames, truth, levels, embedder)
 
 
@@ -152,21 +155,36 @@ def look(bench: Benchmark, root: Path, level: str, seed: int) -> None:
     write_text_features(folder / "text_features.json", [*bench.queries, *CANONICAL], vectors)
 
 
-def space_of(words: list[str], world: World, seed: int) -> tuple[TextSpace, np.ndarray]:
-    """The texts of a twin's words, and the vectors (ABSENT, E) of names that nothing in it has."""
+class Words(NamedTuple):
+    """The texts of a twin's space."""
+
+    space: TextSpace
+    """its own names and the benchmark's queries."""
+    absent: np.ndarray
+    """(ABSENT, E) vectors of names that nothing in the twin has."""
+    reference: np.ndarray
+    """(W, E) vectors of the unrelated words, one for each of `REFERENCE_WORDS`."""
+
+
+def space_of(words: list[str], world: World, seed: int) -> Words:
+    """The texts of a twin with these words."""
     absent = [f"absent{n}" for n in range(ABSENT)]
-    if not world.lvis:
-        # Made twice: a product of more rows need not give the words the same bits.
-        every = made_text_space([*words, *absent], seed=seed, common=world.names)
-        return made_text_space(words, seed=seed, common=world.names), every.vectors[len(words) :]
-    real = load_text_space(*(results.CAPTURES.parent / "text" / name for name in LVIS))
-    every = named_after(real, words, near=world.lvis == 1, seed=seed, others=absent)
-    return TextSpace(every.names[: len(words)], every.vectors[: len(words)]), every.vectors[len(words) :]
+    reference = [f"reference{n}" for n in range(len(REFERENCE_WORDS))]
+    ends = np.cumsum([len(words), len(absent), len(reference)])
+    if world.lvis:
+        real = load_text_space(*(results.CAPTURES.parent / "text" / name for name in LVIS))
+        own = named_after(real, words, near=world.lvis == 1, seed=seed, others=[*absent, *reference])
+        spaces = [TextSpace(own.names[:end], own.vectors[:end]) for end in ends]
+    else:
+        # A space for each: a product of more rows need not give the first ones the same bits.
+        names = [*words, *absent, *reference]
+        spaces = [made_text_space(names[:end], seed=seed, common=world.names) for end in ends]
+    return Words(spaces[0], spaces[1].vectors[ends[0] :], spaces[2].vectors[ends[1] :])
 
 
-def absent_texts(bench: Benchmark, root: Path, level: str, seed: int) -> np.ndarray:
-    """(ABSENT, E) vectors of names that nothing in a twin has, in the space of its own texts."""
-    return space_of(sorted({*objects_of(bench, root), *bench.queries}), world_of(level)[1], seed)[1]
+def words_of(bench: Benchmark, root: Path, level: str, seed: int) -> Words:
+    """The texts of a twin under simulated vision of a level."""
+    return space_of(sorted({*objects_of(bench, root), *bench.queries}), world_of(level)[1], seed)
 
 
 def objects_of(bench: Benchmark, root: Path) -> list[str]:

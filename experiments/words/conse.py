@@ -21,6 +21,7 @@ from experiments import results
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError, describe_error, require_one_of, require_shape
 from jsecon.vision.protocols import CANONICAL
+from jsecon.vision.reference_words import REFERENCE_WORDS
 
 WORDS = results.CAPTURES.parent / "words"
 """the labeller and the vectors beside the checkout"""
@@ -266,6 +267,8 @@ class Conse:
         self.kernel = kernel
         self.class_vectors = np.eye(len(self._names), dtype=np.float32) if kernel else self._names
         self.canonical = self.embed_text(list(CANONICAL))
+        # Without a model for the vectors the table lacks some of the words: those that it has are enough.
+        self.reference = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
         self.dim = self.class_vectors.shape[1]
         digest = hashlib.sha256(self._names.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
         told = f"{crop.margin:g}-{crop.shape}-{crop.surroundings}-{weights}-{top or 'all'}-{kernel:g}"

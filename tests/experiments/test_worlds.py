@@ -198,7 +198,7 @@ def test_without_strength_the_simulation_is_as_it_was_to_the_bit(space):  # noqa
     off, _ = shared_rows(space, 0.0, seed=4, faults=faults, others=space.vectors[100:])
     np.testing.assert_array_equal(off[0], plain.embed_regions(pictures[0], masks))
     words = ["dog", "cup", "red mug"]
-    found, others = twins.space_of(words, World(), 3)
+    found, others, _ = twins.space_of(words, World(), 3)
     np.testing.assert_array_equal(found.vectors, made_text_space(words, seed=3).vectors)
     assert others.shape == (twins.ABSENT, found.vectors.shape[1])
 
