@@ -236,7 +236,7 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
     if "avx512f" in cpu_features and "--xla_cpu_prefer_vector_width" not in given:
         flags.append("--xla_cpu_prefer_vector_width=512")
     chosen = {"XLA_FLAGS": " ".join(flags)}
-    if "JAX_COMPILATION_CACHE_DIR" not in environ and (home := _cache_home(environ)) is not None:
+    if "JAX_COMPILATION_CACHE_DIR" not in environ and (home := cache_home(environ)) is not None:
         features = hashlib.blake2b(" ".join(sorted(cpu_features)).encode(), digest_size=6).hexdigest()
         chosen["JAX_COMPILATION_CACHE_DIR"] = str(home / "jsecon" / f"xla-{features}")
         # Programs of less than a second too: a query has half a dozen of them.
@@ -244,8 +244,8 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
     return chosen
 
 
-def _cache_home(environ: Mapping[str, str]) -> Path | None:
-    """The user's cache folder where it can be written, else None: a program must run without one."""
+def cache_home(environ: Mapping[str, str]) -> Path | None:
+    """Returns the user's cache folder, or None where it cannot be written: a program must run without one."""
     home = Path(environ["HOME"]) / ".cache" if "HOME" in environ else None
     base = environ.get("XDG_CACHE_HOME") or home or environ.get("LOCALAPPDATA")  # the last on Windows
     if base is None:

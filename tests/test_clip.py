@@ -12,6 +12,7 @@ from jsecon.errors import InputError
 from jsecon.networks.clip import ClipEmbedder, masked_crop
 from jsecon.networks.clip_folder import ClipFiles, find_clip, read_preprocessing
 from jsecon.vision.protocols import CANONICAL, Embedder
+from jsecon.vision.reference_words import REFERENCE_WORDS, cached_reference
 
 LAYOUTS = ("immich", "transformers.js", "flat")
 
@@ -232,3 +233,21 @@ def test_preprocessing_in_all_its_spellings(tmp_path, content, expected):
         mean, std, size = read_preprocessing(path)
         assert size == expected
         assert len(mean) == len(std) == 3
+
+
+def test_unrelated_words_are_embedded_once_for_a_model_and_its_templates(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    asked = []
+
+    def embed_text(texts):
+        asked.append(len(texts))
+        return np.random.default_rng(0).standard_normal((len(texts), 5)).astype(np.float32)
+
+    first = cached_reference("model a", embed_text)
+    np.testing.assert_array_equal(cached_reference("model a", embed_text), first)
+    assert asked == [len(REFERENCE_WORDS)]
+    (kept,) = tmp_path.rglob("*.safetensors")
+    kept.write_bytes(kept.read_bytes()[:-7])  # damaged: embedded anew
+    np.testing.assert_array_equal(cached_reference("model a", embed_text), first)
+    cached_reference("model b", embed_text)
+    assert len(asked) == 3

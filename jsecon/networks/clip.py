@@ -20,7 +20,7 @@ from jsecon.networks.onnx_graph import Graph, Tensor, batches, describe
 from jsecon.networks.sigmoid import fitted_logits, read_logits
 from jsecon.networks.tokenizer import CONTEXT_LENGTH, ClipTokenizer, load_tokenizer
 from jsecon.vision.protocols import CANONICAL, Logits
-from jsecon.vision.reference_words import REFERENCE_WORDS
+from jsecon.vision.reference_words import cached_reference
 from jsecon.vision.stores import EmbeddingStore, lookup_vectors, mask_key
 
 
@@ -100,8 +100,9 @@ class ClipEmbedder:
 
     @functools.cached_property
     def reference(self) -> Float32[np.ndarray, "w e"]:
-        """(W, E) float32 unit: REFERENCE_WORDS, in the templates, as texts are."""
-        return self.embed_text(list(REFERENCE_WORDS))
+        """(W, E) float32 unit: REFERENCE_WORDS, in the templates, as texts are. They are embedded once for each model
+        and its templates, and kept in the user's cache folder."""
+        return cached_reference(f"{self.name} {self.templates}", self.embed_text)
 
     @functools.cached_property
     def logits(self) -> Logits | None:

@@ -4,10 +4,17 @@ Few of them are in any one scene. So their best regions say how similar a text i
 it names (jsecon.query.match). The list was written before anything was measured with it.
 """
 
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float32
 
 from jsecon.errors import InputError
+from jsecon.files import READ_ERRORS, atomic_write, read_arrays, write_arrays
+from jsecon.process import cache_home
 from jsecon.vision.protocols import Embedder
 
 _WORDS = """
@@ -61,3 +68,29 @@ def reference_of(embedder: Embedder) -> Float32[np.ndarray, "w e"]:
         except InputError:
             rows = np.zeros((0, embedder.dim))
     return np.asarray(rows, np.float32)
+
+
+def cached_reference(
+    space: str, embed_text: Callable[[list[str]], Float32[np.ndarray, "w e"]]
+) -> Float32[np.ndarray, "w e"]:
+    """Embeds REFERENCE_WORDS, or reads them from the user's cache folder, where they are kept for each space.
+
+    Args:
+      space: Names the space by its content: the model's digest and all else that changes its texts.
+      embed_text: W texts -> (W, E) unit rows.
+
+    Returns:
+      (W, E) unit rows.
+    """
+    home = cache_home(os.environ)
+    if home is None:
+        return embed_text(list(REFERENCE_WORDS))
+    digest = hashlib.blake2b(repr((space, REFERENCE_WORDS)).encode(), digest_size=12).hexdigest()
+    path = home / "jsecon" / f"words-{digest}.safetensors"
+    with contextlib.suppress(*READ_ERRORS):
+        return read_arrays(path)[1]["rows"]
+    rows = embed_text(list(REFERENCE_WORDS))
+    # A full disk costs the next run a minute, and is no reason to end this one.
+    with contextlib.suppress(InputError), atomic_write(path) as temporary:
+        write_arrays(temporary, {"rows": rows})
+    return rows
