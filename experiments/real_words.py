@@ -29,6 +29,7 @@ import numpy as np
 from scipy import sparse
 
 from experiments import results
+from experiments.calibration import Bin, calibration_error
 from experiments.cells import append_cell, read_cells
 from experiments.rivals.lifting import READOUT
 from experiments.words import rules
@@ -50,7 +51,7 @@ from jsecon.evaluate.metrics import iou
 from jsecon.language.membership import finish_votes
 from jsecon.query.anchored import query_anchored
 from jsecon.query.classes import query_classes
-from jsecon.query.match import CONTRAST_THRESHOLD, KIND_THRESHOLD, RETRIEVAL_THRESHOLD
+from jsecon.query.match import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD, evidence
 from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.query.several import query_several
 from jsecon.types import LanguageField, Regions, Votes
@@ -132,8 +133,13 @@ class Case:
     regions: Regions
     texts: np.ndarray
     """(Q, E)"""
-    canonical: np.ndarray
     field: LanguageField
+
+    def scores(self, kind: str) -> np.ndarray:
+        """(Q, R) of all texts with all regions, by one of `rules.SCORES`."""
+        embeddings, pixels = self.regions.embeddings, self.regions.pixels
+        canonical, words = np.asarray(self.field.canonical), np.asarray(self.field.reference)
+        return rules.scores(embeddings, self.texts, canonical, words, pixels, kind)
 
 
 def embedder_of(options: Options, crop: Crop | None = None, weights: str = "probability") -> Conse:
@@ -162,7 +168,7 @@ def case_of(options: Options, scene: WordScene, embedder: Conse) -> Case:
         embedder=embedder.name,
         reference=reference_of(embedder),
     )
-    return Case(scene, crops, regions, embedder.embed_text(list(scene.texts)), embedder.canonical, field)
+    return Case(scene, crops, regions, embedder.embed_text(list(scene.texts)), field)
 
 
 Chooser = Callable[[Case], np.ndarray]
@@ -173,14 +179,14 @@ def _by_regions(kind: str, way: str) -> Chooser:
     """A rule of `experiments.words.rules`: scores of regions, and which of them a text takes. It refuses nothing."""
 
     def choose(case: Case) -> np.ndarray:
-        table = rules.scores(case.regions.embeddings, case.texts, case.canonical, case.regions.pixels, kind)
-        area = case.regions.pixels.sum(axis=1).astype(float)
+        table, weight = case.scores(kind), np.asarray(evidence(jnp.asarray(case.regions.pixels)))
         chosen = {
             "best region": lambda: rules.best_of(table),
+            "best region by evidence": lambda: rules.best_of(np.where(table > 0, table * weight, table)),
             "all near": lambda: rules.near_best(table, KIND_THRESHOLD),
             CLASS_LIST: lambda: rules.best_text(table),
             f"{CLASS_LIST}, standardised": lambda: rules.best_text(rules.standardised(table)),
-            f"{CLASS_LIST}, standardised by pixels": lambda: rules.best_text(rules.standardised(table, area)),
+            f"{CLASS_LIST}, standardised by evidence": lambda: rules.best_text(rules.standardised(table, weight)),
         }[way]()
         return rules.selected(case.field.votes, chosen)
 
@@ -206,8 +212,8 @@ PRODUCT: dict[str, Chooser] = {
     "jsecon: query_classes": _classes,
 }
 """as the library has them, with its thresholds"""
-STANDARDISED = (f"{CLASS_LIST}, standardised", f"{CLASS_LIST}, standardised by pixels")
-WAYS = ("best region", "all near", CLASS_LIST, *STANDARDISED)
+STANDARDISED = (f"{CLASS_LIST}, standardised", f"{CLASS_LIST}, standardised by evidence")
+WAYS = ("best region", "best region by evidence", "all near", CLASS_LIST, *STANDARDISED)
 RULES: dict[str, Chooser] = {f"{kind}, {way}": _by_regions(kind, way) for kind in rules.SCORES for way in WAYS}
 ROWS = PRODUCT | RULES
 
@@ -223,8 +229,8 @@ def alone(case: Case, weights: sparse.csr_matrix) -> dict[str, np.ndarray]:
     """reading -> (Q,) IoUs by T2 of each Gaussian compared with the texts alone: at thresholds that are fixed, and at
     those that are best on this very scene."""
     features, truth, asked = features_of(case, weights), case.scene.truth["T2"], case.scene.asked
-    cosine = rules.point_scores(features, case.texts, case.canonical, "cosine")
-    relevancy = rules.point_scores(features, case.texts, case.canonical, "relevancy")
+    cosine = rules.point_scores(features, case.texts, case.field.canonical, "cosine")
+    relevancy = rules.point_scores(features, case.texts, case.field.canonical, "relevancy")
     smooth = rules.smoothed(case.scene.gaussians.means, relevancy)
     return {
         f"relevancy, smoothed, {READOUT}": rules.ious(smooth > READOUT, truth, asked),
@@ -355,21 +361,28 @@ def _votes_without_embeddings(scene: WordScene) -> Votes:
 
 
 def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
-    """How the best region's score tells present names from absent ones: the area under the curve, and what the
-    library's thresholds refuse and keep."""
+    """Which names `query_anchored` answers: of the scene's the share that is kept, of absent ones the share that is
+    refused. Beside them the quantiles of both, how often those of the scene have the larger one, and the confidence of
+    each answer with whether its region has the name."""
     scene = case.scene
     absent = absent_names(embedder.texts, scene.name, scene.names)
-    vectors = embedder.embed_text(list(absent))
-    found: dict[str, Any] = {"absent": len(absent)}
-    for kind, least in (("cosine", RETRIEVAL_THRESHOLD), ("contrast", CONTRAST_THRESHOLD)):
-        how = case.canonical, case.regions.pixels, kind
-        there = rules.scores(case.regions.embeddings, case.texts, *how).max(axis=1)
-        not_there = rules.scores(case.regions.embeddings, vectors, *how).max(axis=1)
-        found[kind] = {
-            "auc": rules.auc(there, not_there),
-            "kept": float((there >= least).mean()),
-            "refused": float((not_there < least).mean()),
-        }
+    ask = jax.jit(lambda text: query_anchored(case.field, text))
+    found: dict[str, Any] = {"asked": [len(scene.texts), len(absent)]}
+    quantiles, answers = [], []
+    for names, wanted in ((scene.texts, scene.asked), (absent, np.full(len(absent), -1))):
+        told = [ask(jnp.asarray(text)) for text in embedder.embed_text(list(names))]
+        quantiles.append(np.array([float(answer.quantile) for answer in told]))
+        answers.append([int(answer.region) for answer in told])
+        found.setdefault("confidence", []).append(
+            [
+                (round(float(answer.confidence), 4), bool(scene.region_names[int(answer.region)] == name))
+                for answer, name in zip(told, wanted, strict=True)
+                if int(answer.region) >= 0
+            ]
+        )
+    found["auc"] = rules.auc(*quantiles)
+    found["kept"] = float(np.mean(np.array(answers[0]) >= 0))
+    found["refused"] = float(np.mean(np.array(answers[1]) < 0))
     return found
 
 
@@ -448,7 +461,7 @@ def main(options: Options = Options(), tell: Callable[[str], None] = print) -> d
         for variant in VARIANTS
         for row in ROWS
     }
-    rule, variant = max((key for key in score if key[0] in RULES), key=lambda key: score[key])
+    rule, variant = max(score, key=lambda key: score[key])
     metrics["best_rule"] = [rule, variant]
     for k, (name, masks) in told.items():
 
@@ -508,13 +521,23 @@ def tables(metrics: dict, told: list[str], score: dict) -> list[str]:
     rows = []
     for k, figures in cases.items():
         own = figures["refusal"]
-        for kind in ("cosine", "contrast"):
-            rows.append((k, kind, own["absent"], *(own[kind][key] for key in ("auc", "kept", "refused"))))
+        rows.append((k, own["asked"][1], *(own[key] for key in ("auc", "kept", "refused")), calibration(own)[0]))
     text.append(
-        "Present against absent names by the best region's score; kept and refused by the library's thresholds."
+        f"Present and absent names by `query_anchored`, which answers above the quantile {QUANTILE}; the calibration "
+        "error of its confidence, both kinds weighing the same in all."
     )
-    text.append(results.table(("scene, masks, embedder", "score", "absent", "AUC", "kept", "refused"), rows))
+    text.append(
+        results.table(("scene, masks, embedder", "absent", "AUC", "kept", "refused", "calibration error"), rows)
+    )
     return [*text, "  \n".join(acceptance(metrics))]
+
+
+def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
+    """Expected calibration error and reliability curve of `refusal`, names of the scene and absent ones weighing the
+    same in all."""
+    rows = [(*own, 1 / count) for kind, count in zip(refused["confidence"], refused["asked"]) for own in kind]
+    said, right, weight = np.array(rows, float).reshape(-1, 3).T
+    return calibration_error(said, right, weight)
 
 
 def acceptance(metrics: dict) -> list[str]:

@@ -293,3 +293,6 @@ class Selection(_Shown):
     quantile: Array | None = None
     """() float: share of unrelated words that are less similar to the scene than the text is; NaN or None where that is
     not known."""
+    confidence: Array | None = None
+    """() float: probability that the region shows what the text names (jsecon.query.confidence); NaN or None where that
+    is not known."""

@@ -13,10 +13,9 @@ from scipy.spatial import KDTree
 from experiments.rivals.lifting import NEIGHBOURS
 from jsecon.language.membership import SHARE_THRESHOLD, share_of
 from jsecon.query.baselines import TEMPERATURE
-from jsecon.query.match import scene_residuals
 from jsecon.types import Votes
 
-SCORES = ("cosine", "relevancy", "contrast")
+SCORES = ("cosine", "relevancy", "contrast", "apart")
 """of a text and a region"""
 
 
@@ -24,18 +23,25 @@ def scores(
     embeddings: Float[np.ndarray, "r e"],
     texts: Float[np.ndarray, "q e"],
     canonical: Float[np.ndarray, "c e"],
+    words: Float[np.ndarray, "w e"],
     pixels: Int[np.ndarray, "r t"],
     kind: str,
 ) -> Float[np.ndarray, "q r"]:
     """Scores of all texts with all regions, by one of SCORES; -inf for a region without an embedding.
 
-    "relevancy" is LERF's; "contrast" is `jsecon.query.match.contrasts` for all texts at once.
+    "relevancy" is LERF's. "apart" is jsecon's: it subtracts the mean of the unrelated words (W, E) from the text.
+    "contrast" compares what is left of a text across the canonical phrases (C, E) with what is left of a region without
+    the mean of the R regions, weighted by their pixels in T views.
     """
     known = np.asarray(embeddings).any(axis=1)
     if kind == "contrast":
-        apart = np.asarray(scene_residuals(jnp.asarray(embeddings), jnp.asarray(pixels))[0])
+        weight = pixels.sum(axis=1) * known
+        mean = weight @ embeddings / max(weight.sum(), 1)
+        residual = embeddings - known.sum() / (known.sum() + 1) * mean
         cone = _units(_units(canonical).sum(axis=0)[None])
-        table = _units(texts - texts @ cone.T * cone) @ _units(apart).T
+        table = _units(texts - texts @ cone.T * cone) @ _units(residual).T
+    elif kind == "apart":
+        table = _units(_units(texts) - _units(words).mean(axis=0)) @ embeddings.T
     else:
         table = texts @ embeddings.T
         if kind == "relevancy":

@@ -47,6 +47,8 @@ class RegionMatch(NamedTuple):
     """similarity of the best region, chosen or not; 0 where nothing is known."""
     quantile: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
     """share of unrelated words that are less similar to their best region; NaN where there are no such words."""
+    confidence: Float[Array, ""] | np.ndarray = np.asarray(np.nan, np.float32)
+    """probability that the best region shows what the text names (`answer_confidence`); NaN without such words."""
 
 
 NOTHING = RegionMatch(np.zeros(0, bool), np.asarray(-1, np.int32), np.asarray(0.0, np.float32))
@@ -173,7 +175,14 @@ def select_gaussians(
     if isinstance(field.votes.regions, np.memmap) and codes is None:
         parts = [jax.tree.map(np.asarray, part) for part in select_by_block(field, [found], threshold, by=by)]
         mask, similarity = (np.concatenate([getattr(p[0], name) for p in parts]) for name in ("mask", "similarity"))
-        return Selection(mask, similarity, found.region.astype(jnp.int32), found.score, jnp.asarray(found.quantile))
+        return Selection(
+            mask,
+            similarity,
+            found.region.astype(jnp.int32),
+            found.score,
+            jnp.asarray(found.quantile),
+            jnp.asarray(found.confidence),
+        )
     if by == "votes":
         return _by_share(jax.tree.map(jnp.asarray, field.votes), found, threshold)
     seen, table = jnp.asarray(field.votes.views) > 0, jnp.asarray(field.region_codes)
@@ -213,7 +222,7 @@ def _retrieve_body(
     chosen = regions_of_text(embeddings, found.similarity, found.known, overlap, several=False, **rule)
     best, known = found.anchor, found.known[found.anchor]
     score, quantile = jnp.where(known, found.similarity[best], 0.0), jnp.where(known, found.quantile, jnp.nan)
-    return RegionMatch(chosen, jnp.where(chosen[best], best, -1), score, quantile)
+    return RegionMatch(chosen, jnp.where(chosen[best], best, -1), score, quantile, found.confidence)
 
 
 _retrieve = jax.jit(_retrieve_body, static_argnames="retrieval")
@@ -237,7 +246,7 @@ def _found_region(
 def _by_share(votes, found: RegionMatch, threshold: Number) -> Selection:
     share, known = share_of(votes, found.chosen)
     mask = known & (share >= threshold) & (found.region >= 0)
-    return Selection(mask, share, found.region.astype(jnp.int32), found.score, found.quantile)
+    return Selection(mask, share, found.region.astype(jnp.int32), found.score, found.quantile, found.confidence)
 
 
 @jax.jit
@@ -246,4 +255,4 @@ def _by_code(codes, region_codes, seen, found: RegionMatch, threshold: Number) -
     known &= seen & (found.region >= 0)
     mask = known & (similarity >= threshold)
     similarity = jnp.where(known, similarity, 0.0)
-    return Selection(mask, similarity, found.region.astype(jnp.int32), found.score, found.quantile)
+    return Selection(mask, similarity, found.region.astype(jnp.int32), found.score, found.quantile, found.confidence)

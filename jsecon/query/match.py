@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from jsecon.errors import require_one_of
 from jsecon.language.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import cosine_matrix, normalize
+from jsecon.query.confidence import answer_confidence
 from jsecon.query.similarity import Number, similarities
 from jsecon.types import Array, LanguageField, Regions
 from jsecon.vision.protocols import Logits
@@ -222,6 +223,8 @@ class Measured(NamedTuple):
     """whether the scene answers the text."""
     quantile: Float[Array, ""]
     """`quantile_among` of the largest similarity; NaN without unrelated words."""
+    confidence: Float[Array, ""]
+    """`answer_confidence`; NaN without unrelated words."""
 
 
 class Refusal(NamedTuple):
@@ -250,16 +253,17 @@ def measured(
     similarity, known = answers(embeddings, text, canonical, words, pixels, retrieval)
     standing = None if retrieval == "cosine" else evidence(pixels).astype(similarity.dtype)
     anchor = anchor_of(similarity, known, standing)
-    quantile = jnp.asarray(jnp.nan, similarity.dtype)
+    quantile = confidence = jnp.asarray(jnp.nan, similarity.dtype)
     if words is not None and similar is not None:
         best = jnp.max(jnp.where(known, similarity, -jnp.inf))
         quantile = quantile_among(best, text, words, similar)
+        confidence = answer_confidence(similarity, known, evidence(pixels).astype(similarity.dtype), similar)
     if refusal.threshold is None and words is not None:
         accepted = quantile >= refusal.quantile
     else:
         on = similarity if refusal.logits is None else presence(embeddings, text, refusal.logits)
         accepted = on[anchor] >= fixed_threshold(refusal, retrieval)
-    return Measured(similarity, known, standing, anchor, accepted, quantile)
+    return Measured(similarity, known, standing, anchor, accepted, quantile, confidence)
 
 
 def fixed_threshold(refusal: Refusal, retrieval: str) -> Number:

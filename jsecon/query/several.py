@@ -104,7 +104,8 @@ def _retrieve_body(
     similar = None if words is None else unrelated_similarities(embeddings, words, canonical, pixels, retrieval)
 
     def answering(texts):
-        chosen, closeness, quantile = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, dtype), jnp.asarray(jnp.nan)
+        chosen, closeness = jnp.zeros(count, bool), jnp.full(count, -jnp.inf, dtype)
+        quantile = confidence = jnp.asarray(jnp.nan)
         for text in texts:
             found = measured(embeddings, text, canonical, pixels, words, similar, refusal, retrieval)
             rule = {"several": several, "kind_threshold": kind_threshold, "piece_threshold": pieces}
@@ -112,13 +113,15 @@ def _retrieve_body(
             own = regions_of_text(embeddings, found.similarity, found.known, overlap, **rule)
             chosen, closeness = chosen | own, jnp.maximum(closeness, jnp.where(own, found.similarity, -jnp.inf))
             quantile = jnp.fmax(quantile, found.quantile)
-        return chosen, closeness, quantile
+            confidence = jnp.fmax(confidence, found.confidence)
+        return chosen, closeness, quantile, confidence
 
-    chosen, closeness, quantile = answering(wanted)
-    refused, against, _ = answering(unwanted)
+    chosen, closeness, quantile, confidence = answering(wanted)
+    refused, against, *_ = answering(unwanted)
     chosen &= ~(refused & (against >= closeness - ROUNDING))
     best, found = jnp.argmax(jnp.where(chosen, closeness, -jnp.inf)), jnp.any(chosen)
-    return RegionMatch(chosen, jnp.where(found, best, -1), jnp.where(found, closeness[best], 0.0), quantile)
+    score = jnp.where(found, closeness[best], 0.0)
+    return RegionMatch(chosen, jnp.where(found, best, -1), score, quantile, confidence)
 
 
 _retrieve = jax.jit(_retrieve_body, static_argnames=("several", "retrieval"))

@@ -1,0 +1,162 @@
+"""The confidence of an answer against how often it is right: fitted on some simulated rooms, measured on others.
+
+    python -m experiments.calibration [--scenes NAME ...] [--fitted 0 1 2] [--seeds 10 11 ...]
+                                      [--levels medium high shared ...] [--quick] [--out FOLDER]
+
+Twins of LERF, regions of the simulated tracker. Every name of a thing in the room is asked, and 200 names that nothing
+in it has; the first weigh as much as the second in all. An answer is right if its region shows the thing. Answers that
+the default quantile refuses do not count. `OFFSET` and `SLOPE` of jsecon.query.confidence are fitted on the seeds
+`--fitted` by the likelihood. The expected calibration error has ten bins of equal width.
+"""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+from experiments import lerf, results
+from experiments.shared_errors import pooled
+from experiments.tables import twins
+from jsecon.query.confidence import OFFSET, SLOPE, answer_confidence
+from jsecon.query.match import QUANTILE, anchor_of, answers, evidence, quantile_among, unrelated_similarities
+
+BINS = 10
+
+
+class Bin(NamedTuple):
+    """Answers whose confidence is in one tenth of 0 to 1."""
+
+    confidence: float
+    """mean."""
+    right: float
+    """share."""
+    weight: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the experiment can vary."""
+
+    data: twins.Data = lerf.PLAN.data
+    scenes: tuple[str, ...] = lerf.PLAN.data.scenes
+    fitted: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (10, 11, 12, 13, 14)
+    levels: tuple[str, ...] = ("medium", "high", "medium+shared=0.5", "shared")
+    out: str = str(results.HOME / "results" / "calibration")
+
+
+QUICK = Options(
+    lerf.QUICK.data,
+    lerf.QUICK.data.scenes,
+    (0,),
+    (1,),
+    ("shared",),
+    str(results.HOME / "results" / "quick" / "calibration"),
+)
+
+
+class Answered(NamedTuple):
+    """Texts that a scene answers."""
+
+    confidence: np.ndarray
+    right: np.ndarray
+    weight: np.ndarray
+
+
+def calibration_error(
+    confidence: Float[np.ndarray, " a"], right: Float[np.ndarray, " a"], weight: Float[np.ndarray, " a"]
+) -> tuple[float, list[Bin]]:
+    """The expected calibration error of weighted answers, and the reliability curve: its bins that hold any."""
+    place = np.clip((confidence * BINS).astype(int), 0, BINS - 1)
+    curve = []
+    for own in (place == k for k in range(BINS) if (place == k).any()):
+        mean = lambda values, own=own: float(np.average(values[own], weights=weight[own]))
+        curve.append(Bin(mean(confidence), mean(right), float(weight[own].sum())))
+    error = sum(bin.weight * abs(bin.confidence - bin.right) for bin in curve) / max(weight.sum(), 1e-12)
+    return float(error), curve
+
+
+@jax.jit
+def _ask(embeddings, text, canonical, pixels, words, similar):
+    similarity, known = answers(embeddings, text, canonical, words, pixels, "apart")
+    standing = evidence(pixels).astype(similarity.dtype)
+    quantile = quantile_among(jnp.max(jnp.where(known, similarity, -jnp.inf)), text, words, similar)
+    return anchor_of(similarity, known, standing), quantile, answer_confidence(similarity, known, standing, similar)
+
+
+def answered(options: Options, scene: str, seed: int, level: str) -> Answered:
+    """The answers of one room under simulated vision of a level."""
+    root = options.data.place(scene, seed, "medium")
+    bench = options.data.load(root, scene)
+    found = pooled(bench, root, level, seed)
+    words = jnp.asarray(twins.words_of(bench, root, level, seed).reference)
+    scene_of = [jnp.asarray(own, jnp.float32) for own in (found.embeddings, found.canonical, found.pixels)]
+    embeddings, canonical, pixels = scene_of
+    similar = unrelated_similarities(embeddings, words, canonical, pixels, "apart")
+    rows = []
+    for texts, objects in ((found.texts, np.arange(len(found.texts))), (found.absent, np.full(len(found.absent), -1))):
+        for text, thing in zip(texts, objects):
+            region, quantile, confidence = _ask(embeddings, jnp.asarray(text), canonical, pixels, words, similar)
+            if quantile >= QUANTILE:
+                right = thing >= 0 and found.objects[int(region)] == thing
+                rows.append((float(confidence), float(right), 1 / len(texts)))
+    return Answered(*np.array(rows).reshape(-1, 3).T)
+
+
+def joined(parts: list[Answered]) -> Answered:
+    """The answers of several rooms."""
+    return Answered(*(np.concatenate(own) for own in zip(*parts)))
+
+
+def fit(told: Answered) -> tuple[float, float]:
+    """OFFSET and SLOPE of the largest likelihood, from confidences that the present ones gave."""
+    ratio = (np.log(told.confidence) - np.log1p(-told.confidence) - OFFSET) / SLOPE
+
+    def loss(line: np.ndarray) -> float:
+        logit = line[0] + line[1] * ratio
+        return float(np.average(np.logaddexp(0, logit) - told.right * logit, weights=told.weight))
+
+    offset, slope = minimize(loss, np.array([OFFSET, SLOPE])).x
+    return float(offset), float(slope)
+
+
+def main(options: Options = Options()) -> dict:
+    """Runs the experiment, writes its results and returns the figures."""
+    both = {}
+    for seeds in (options.fitted, options.seeds):
+        for level in options.levels:
+            both[seeds, level] = joined([answered(options, s, seed, level) for s in options.scenes for seed in seeds])
+    offset, slope = fit(joined([both[options.fitted, level] for level in options.levels]))
+    kept, rows = {"fit": [offset, slope], "in jsecon": [OFFSET, SLOPE], "levels": {}}, []
+    own = {level: both[options.seeds, level] for level in options.levels}
+    for level, told in {**own, "all": joined(list(own.values()))}.items():
+        error, curve = calibration_error(*told)
+        kept["levels"][level] = {"error": error, "curve": curve, "answers": len(told.right)}
+        said, right = (float(np.average(part, weights=told.weight)) for part in (told.confidence, told.right))
+        rows.append((level, len(told.right), f"{error:.3f}", f"{said:.3f}", f"{right:.3f}"))
+    table = results.table(("level", "answers", "calibration error", "mean confidence", "right"), rows)
+    curve = results.table(("confidence", "right", "weight"), kept["levels"]["all"]["curve"])
+    text = f"{table}\n\nReliability, all levels:\n\n{curve}\n\nFitted: offset {offset:.2f}, slope {slope:.2f}."
+    results.save(Path(options.out), options, kept, text)
+    print(text)
+    return kept
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", nargs="+", default=list(Options.scenes), help="twins of LERF")
+    parser.add_argument("--fitted", nargs="+", type=int, default=list(Options.fitted), help="seeds to fit on")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds), help="seeds to report")
+    parser.add_argument("--levels", nargs="+", default=list(Options.levels))
+    parser.add_argument("--quick", action="store_true", help="one tiny scene, one level")
+    parser.add_argument("--out", default="", help="where the results go")
+    given = parser.parse_args()
+    values = {name: tuple(getattr(given, name)) for name in ("scenes", "fitted", "seeds", "levels")}
+    chosen = QUICK if given.quick else dataclasses.replace(Options(), **values)
+    main(dataclasses.replace(chosen, out=given.out) if given.out else chosen)
