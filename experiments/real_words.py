@@ -366,11 +366,11 @@ def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
     each answer with whether its region has the name."""
     scene = case.scene
     absent = absent_names(embedder.texts, scene.name, scene.names)
-    ask = jax.jit(lambda text: query_anchored(case.field, text))
+    field = jax.tree.map(jnp.asarray, case.field)
     found: dict[str, Any] = {"asked": [len(scene.texts), len(absent)]}
     quantiles, answers = [], []
     for names, wanted in ((scene.texts, scene.asked), (absent, np.full(len(absent), -1))):
-        told = [ask(jnp.asarray(text)) for text in embedder.embed_text(list(names))]
+        told = [query_anchored(field, jnp.asarray(text)) for text in embedder.embed_text(list(names))]
         quantiles.append(np.array([float(answer.quantile) for answer in told]))
         answers.append([int(answer.region) for answer in told])
         found.setdefault("confidence", []).append(
