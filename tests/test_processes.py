@@ -40,6 +40,7 @@ def small_run(room, room_run, tmp_path_factory) -> list[str]:
     return ["run", str(room), "--gaussians", str(scene), "--masks", str(room / "masks"), "--long-side", "96"]
 
 
+@pytest.mark.long
 def test_two_processes_end_in_the_field_of_one(small_run, tmp_path):
     alone, both = tmp_path / "alone", tmp_path / "both"
     one = subprocess.Popen([*COMMAND, *small_run, "--out", str(alone)], stdout=-1, stderr=-1)
