@@ -1,18 +1,19 @@
-"""A table's cells in one file, and the processes that fill it side by side.
+"""The cells of a table in one file, and the processes that fill it side by side.
 
-A file of cells (cells.jsonl) holds a line per cell, {"key": ..., "value": ...}. A finished cell is appended and no line
-is ever changed; where a key stands twice, the later line counts.
+A file of cells (cells.jsonl) holds one line per cell, {"key": ..., "value": ...}. Finished cells are appended and lines
+are never changed. If a key occurs twice, the later line counts. Cells of finished tables can be kept compressed beside
+it (cells.jsonl.xz); they are read first and never written to.
 
-Who reads or appends holds the kernel's lock on the file (flock; shared among readers). O_APPEND alone would keep the
-lines of two writers apart, but a process killed within its write leaves a part of a line, and nobody could tell that
-from a line that is being written. Under the lock a last line without its end can only be such a part: readers leave it
-out, the next writer cuts it off, and both say so. Which process computes which setting is settled by locks on files of
-their own (`alone`). The kernel frees both kinds with their holder: a stopped process leaves nothing that is stale.
+Readers and writers hold a kernel lock on the file (flock, shared among readers). A process that is killed while it
+writes leaves part of a line. Under the lock an incomplete last line can only be such a rest: readers skip it, the next
+writer removes it, and both warn. Further lock files decide which process computes which setting (`exclusive_lock`).
+The kernel releases all locks when a process ends, so that a killed process leaves no stale lock.
 """
 
 import contextlib
 import fcntl
 import json
+import lzma
 import os
 import subprocess
 import sys
@@ -26,24 +27,31 @@ from jsecon.errors import InputError
 
 
 def read_cells(file: Path) -> dict[str, Any]:
-    """The values of the cells that `file` holds (none where there is no file yet), by key.
+    """Reads the values of all cells.
 
-    Raises InputError where a whole line is no cell, as after a merge with conflicts. Warns of a cut last line.
+    Args:
+      file: The file of cells. It may not exist yet.
+
+    Returns:
+      Values by key, of `file` and of the compressed file beside it.
+
+    Raises:
+      InputError: A complete line is not a cell, as after a merge with conflicts.
     """
-    try:
-        stream = file.open("rb")
-    except FileNotFoundError:
-        return {}
-    with stream:
-        fcntl.flock(stream, fcntl.LOCK_SH)
-        *lines, rest = stream.read().split(b"\n")
-    if rest:
-        warnings.warn(f"{file}: the last line is cut and left out: its cell will be computed again.", stacklevel=2)
-    found = {}
+    packed = file.with_name(f"{file.name}.xz")
+    lines = lzma.decompress(packed.read_bytes()).split(b"\n")[:-1] if packed.exists() else []
+    if file.exists():
+        with file.open("rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH)
+            *own, rest = stream.read().split(b"\n")
+        lines += own
+        if rest:
+            warnings.warn(f"{file}: skipped an incomplete last line. Its cell is computed again.", stacklevel=2)
+    cells = {}
     for number, line in enumerate(lines, 1):
         try:
             cell = json.loads(line)
-            found[cell["key"]] = cell["value"]
+            cells[cell["key"]] = cell["value"]
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(
                 file,
@@ -51,27 +59,27 @@ def read_cells(file: Path) -> dict[str, Any]:
                 '{"key": ..., "value": ...} in every line',
                 "Remove the line: if it was a cell, it will be computed again.",
             ) from error
-    return found
+    return cells
 
 
 def append_cell(file: Path, key: str, value: Any) -> None:
-    """Adds a cell to `file`, after removing a last line that a killed process left cut (a warning says so)."""
+    """Appends a cell to `file`. Removes an incomplete last line of a killed process first, with a warning."""
     line = json.dumps({"key": key, "value": value}).encode() + b"\n"
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a+b") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
         stream.seek(0)
-        held = stream.read()
-        whole = held.rfind(b"\n") + 1
-        if whole < len(held):
-            warnings.warn(f"{file}: a cut last line was removed: {held[whole:][:60]!r}", stacklevel=2)
-            stream.truncate(whole)
+        content = stream.read()
+        end = content.rfind(b"\n") + 1
+        if end < len(content):
+            warnings.warn(f"{file}: removed an incomplete last line: {content[end:][:60]!r}", stacklevel=2)
+            stream.truncate(end)
         stream.write(line)
 
 
 @contextlib.contextmanager
-def alone(file: Path, *, wait: bool) -> Iterator[bool]:
-    """Holds the lock `file`; yields whether it does: without `wait`, False where another process holds it."""
+def exclusive_lock(file: Path, *, wait: bool) -> Iterator[bool]:
+    """Holds the lock `file` and yields True; without `wait`, yields False if another process holds it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a") as lock:
         try:
@@ -82,25 +90,28 @@ def alone(file: Path, *, wait: bool) -> Iterator[bool]:
         try:
             yield True
         finally:
-            # Who waits on the file unlinked here gets it next and finds the work done; who comes later makes a new one.
+            # A process that waits for the unlinked file gets it next and sees the finished work.
             file.unlink(missing_ok=True)
 
 
-def helped(count: int) -> None:
-    """`count` processes of this command with `--processes 0`, each with cores of its own, waited for; they are stopped
-    where this one is interrupted. What one that failed has left undone is left to the caller.
+def run_helpers(count: int) -> None:
+    """Runs this command `count` times with `--processes 0`, each process on its share of the cores, and waits.
 
-    XLA has a thread for each core that it sees: two processes with all cores for each take 1.4 times as long. What one
-    of them compiles the others read from disk.
+    XLA starts a thread for each core that it sees: two processes that see all cores take 1.4 times as long. The
+    processes share compiled programs on disk. They stop if this process is interrupted; the caller computes what a
+    failed one leaves undone.
+
+    Args:
+      count: Number of processes.
     """
     command = [sys.executable, *sys.orig_argv[1:], "--processes", "0"]
     started = []
     with tempfile.TemporaryDirectory(prefix="jsecon-programs-", ignore_cleanup_errors=True) as programs:
-        kept = {"JAX_COMPILATION_CACHE_DIR": programs, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        programs_cache = {"JAX_COMPILATION_CACHE_DIR": programs, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         try:
-            for cores in shares(available(), count):
-                with _on(cores):
-                    started.append(subprocess.Popen(command, env=kept | os.environ))
+            for cores in split_cores(available_cores(), count):
+                with _pinned(cores):
+                    started.append(subprocess.Popen(command, env=programs_cache | os.environ))
             for process in started:
                 process.wait()
         finally:
@@ -110,24 +121,24 @@ def helped(count: int) -> None:
                 process.wait()
 
 
-def available() -> list[int]:
-    """The cores that this process may run on, where the system tells (Linux), else none."""
+def available_cores() -> list[int]:
+    """Cores that this process may run on; empty if the system cannot tell (other than Linux)."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
-def shares(cores: list[int], count: int) -> list[list[int]]:
-    """The cores of each of `count` processes, as even as can be; one each in turn where they are fewer."""
+def split_cores(cores: list[int], count: int) -> list[list[int]]:
+    """Divides cores evenly among `count` processes; several processes share a core if there are fewer cores."""
     return [cores[k::count] or cores[k % len(cores) :][:1] if cores else [] for k in range(count)]
 
 
 @contextlib.contextmanager
-def _on(cores: list[int]) -> Iterator[None]:
-    """Processes started inside inherit these cores; none: all."""
-    own = available()
+def _pinned(cores: list[int]) -> Iterator[None]:
+    """Processes that start inside inherit these cores, or all if the list is empty."""
+    before = available_cores()
     if cores:
         os.sched_setaffinity(0, cores)
     try:
         yield
     finally:
         if cores:
-            os.sched_setaffinity(0, own)
+            os.sched_setaffinity(0, before)

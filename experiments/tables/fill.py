@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import results
-from experiments.cells import alone, append_cell, helped, read_cells
+from experiments.cells import append_cell, exclusive_lock, read_cells, run_helpers
 from experiments.datasets.benchmark import Benchmark
 from experiments.protocols.points import evaluate_points
 from experiments.tables import twins
@@ -100,7 +100,7 @@ def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], Non
             _complete(plan, methods, where, keys[where], tell, wait=False)
         raise SystemExit(0)
     if min(plan.processes, len(todo)) > 1:
-        helped(min(plan.processes, len(todo)))
+        run_helpers(min(plan.processes, len(todo)))
     for where in todo:  # of one process all; of several what another command took, or a helper left undone
         _complete(plan, methods, where, keys[where], tell, wait=True)
     known = read_cells(_file(plan))
@@ -111,7 +111,7 @@ def _complete(plan: Plan, methods: Mapping[str, Method], where: tuple, keys: dic
     """Computes the missing cells of a setting; none where another process is at it, unless that one is waited for."""
     scene, seed, level = where
     file = _file(plan)
-    with alone(file.with_name(f"{scene}-{seed}-{level}.lock"), wait=wait) as free:
+    with exclusive_lock(file.with_name(f"{scene}-{seed}-{level}.lock"), wait=wait) as free:
         known = read_cells(file) if free else keys.values()
         missing = [name for name, key in keys.items() if key not in known]
         if not missing:

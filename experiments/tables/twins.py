@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from experiments import results
-from experiments.cells import alone
+from experiments.cells import exclusive_lock
 from experiments.datasets import twins
 from experiments.datasets.benchmark import Benchmark
 from experiments.datasets.feature_files import write_features, write_text_features
@@ -83,7 +83,7 @@ def make(dataset: str, root: Path, scene: str, seed: int, level: str, size: dict
     marker = place / scene / "made.json"
     if marker.exists():
         return place
-    with alone(place / "twin.lock", wait=True):
+    with exclusive_lock(place / "twin.lock", wait=True):
         if not marker.exists():
             number = sum(map(ord, scene))  # the scenes of a dataset are rooms of their own
             WRITERS[dataset](place, scene, 1000 * seed + number, **size)

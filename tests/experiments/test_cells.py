@@ -1,5 +1,6 @@
 """Cells of tables: kept in one file, also where writers are killed, and shared out among processes."""
 
+import lzma
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.cells import alone, append_cell, available, read_cells, shares
+from experiments.cells import append_cell, available_cores, exclusive_lock, read_cells, split_cores
 from jsecon.errors import InputError
 
 ROOT = Path(__file__).parent.parent.parent
@@ -16,8 +17,8 @@ ROOT = Path(__file__).parent.parent.parent
 HOLDER = """
 import sys, time
 from pathlib import Path
-from experiments.cells import alone
-with alone(Path(sys.argv[1]), wait=False) as free:
+from experiments.cells import exclusive_lock
+with exclusive_lock(Path(sys.argv[1]), wait=False) as free:
     print(free, flush=True)
     time.sleep(600)
 """
@@ -98,7 +99,7 @@ def test_a_writer_killed_within_a_line_costs_that_cell_alone(tmp_path):
     with subprocess.Popen([sys.executable, "-c", HALF, str(file)], stdout=subprocess.PIPE, text=True) as writer:
         assert writer.stdout.readline() == "half\n"
         writer.kill()
-    with pytest.warns(UserWarning, match="last line is cut"):
+    with pytest.warns(UserWarning, match="incomplete last line"):
         assert read_cells(file) == {"a": 1}
     with pytest.warns(UserWarning, match='removed.*"key": "b"'):
         append_cell(file, "c", 3)
@@ -119,21 +120,21 @@ def test_a_whole_line_that_is_no_cell_is_refused(tmp_path, line):
 
 def test_a_lock_is_held_by_one_and_freed_with_its_holder(tmp_path):
     file = tmp_path / "cells" / "a.lock"
-    with alone(file, wait=False) as first:
+    with exclusive_lock(file, wait=False) as first:
         assert first
-        with alone(file, wait=False) as second:
+        with exclusive_lock(file, wait=False) as second:
             assert not second
     assert not file.exists()
     holder = subprocess.Popen([sys.executable, "-c", HOLDER, str(file)], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         assert holder.stdout.readline() == "True\n"
-        with alone(file, wait=False) as free:
+        with exclusive_lock(file, wait=False) as free:
             assert not free
     finally:
         holder.kill()
         holder.wait()
     assert file.exists()  # stopped without a word
-    with alone(file, wait=True) as free:
+    with exclusive_lock(file, wait=True) as free:
         assert free
 
 
@@ -155,7 +156,9 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
     assert len(file.read_text().splitlines()) == len(found) == len(lines) - 1 == 4, lines
     assert not list(tmp_path.glob("*.lock"))
     assert len({cell["process"] for cell in found.values()}) == 2
-    assert {tuple(cell["cores"]) for cell in found.values()} == {tuple(share) for share in shares(available(), 2)}
+    assert {tuple(cell["cores"]) for cell in found.values()} == {
+        tuple(share) for share in split_cores(available_cores(), 2)
+    }
     (programs,) = {cell["programs"] for cell in found.values()}  # one folder for both, while they run
     assert all(cell["kept"] for cell in found.values())
     assert programs
@@ -171,7 +174,7 @@ def test_two_processes_share_a_table_and_each_cell_is_computed_once(tmp_path):
 @pytest.mark.long
 def test_a_helper_goes_on_where_another_process_is_at_a_setting(tmp_path):
     (tmp_path / "other.here").touch()
-    with alone(tmp_path / "a-1-medium.lock", wait=False) as free:  # longer than the helper lives
+    with exclusive_lock(tmp_path / "a-1-medium.lock", wait=False) as free:  # longer than the helper lives
         assert free
         lines = table(tmp_path, 0)
     assert len(lines) == 3, lines
@@ -183,8 +186,22 @@ def test_a_helper_goes_on_where_another_process_is_at_a_setting(tmp_path):
 
 
 def test_cores_are_shared_out():
-    assert shares([0, 1], 2) == [[0], [1]]
-    assert shares([3, 5, 8, 9, 11], 2) == [[3, 8, 11], [5, 9]]
-    assert shares([4, 7], 5) == [[4], [7], [4], [7], [4]]
-    assert shares([], 2) == [[], []]  # unknown: the processes are left where they are
-    assert available() == sorted(os.sched_getaffinity(0))
+    assert split_cores([0, 1], 2) == [[0], [1]]
+    assert split_cores([3, 5, 8, 9, 11], 2) == [[3, 8, 11], [5, 9]]
+    assert split_cores([4, 7], 5) == [[4], [7], [4], [7], [4]]
+    assert split_cores([], 2) == [[], []]  # unknown: the processes are left where they are
+    assert available_cores() == sorted(os.sched_getaffinity(0))
+
+
+def test_compressed_cells_are_read_and_later_ones_replace_them(tmp_path):
+    file = tmp_path / "cells.jsonl"
+    append_cell(file, "a", 1)
+    append_cell(file, "b", 2)
+    packed = tmp_path / "cells.jsonl.xz"
+    packed.write_bytes(lzma.compress(file.read_bytes()))
+    file.unlink()
+    assert read_cells(file) == {"a": 1, "b": 2}
+    before = packed.read_bytes()
+    append_cell(file, "b", 3)
+    assert read_cells(file) == {"a": 1, "b": 3}
+    assert packed.read_bytes() == before
