@@ -13,7 +13,6 @@ middle.
 import argparse
 import dataclasses
 import json
-import resource
 import shutil
 import subprocess
 import sys
@@ -21,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from jsecon.process import prepare_process
+from jsecon.process import peak_memory_mib, prepare_process
 
 prepare_process()
 
@@ -325,7 +324,7 @@ def main() -> None:
     if given.one:
         step, folder, *sizes = given.one
         told = STEPS[step](Path(folder), *map(int, sizes))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        peak = peak_memory_mib() / 1024
         return print(json.dumps(told | {"peak GiB": peak}))
     with tempfile.TemporaryDirectory(dir=given.folder) as base:
         if given.growth:

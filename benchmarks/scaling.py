@@ -9,7 +9,6 @@ Times are medians, in ms; ns a pair = time over (tile, Gaussian) pairs, 8x8 px a
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -24,7 +23,7 @@ SIZES = {
 
 def one(count: int, width: int, height: int, channels: int, repeats: int) -> dict:
     """Renders one size in this process, prepared as the command line prepares it, over all its devices."""
-    from jsecon.process import prepare_process
+    from jsecon.process import peak_memory_mib, prepare_process
 
     prepare_process(keep_programs=False)
     import jax
@@ -51,7 +50,7 @@ def one(count: int, width: int, height: int, channels: int, repeats: int) -> dic
         start = time.perf_counter()
         rendering = jax.block_until_ready(render(gaussians, features))
         taken.append(1e3 * (time.perf_counter() - start))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+    peak = peak_memory_mib()
     assert int(rendering.overflow) == 0
     pairs = int(plan_view(gaussians, camera, capacity=capacity).lists.lengths.sum())
     return {"ms": statistics.median(taken[1:]), "pairs": pairs, "compile_s": compile_s, "peak_mib": peak}

@@ -10,10 +10,11 @@ of the views' votes and of the rest, and of OpenCV's segmentation of such a fram
 """
 
 import argparse
-import resource
 import time
 
 import numpy as np
+
+from jsecon.process import peak_memory_mib
 
 RADIUS = 0.45
 """of a ball, in units of the distance between two"""
@@ -118,7 +119,7 @@ def main() -> None:
     else:
         labels = consensus_masklets(frames, tracker.views)
     rest = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    peak = peak_memory_mib() / 1024
     shared = np.zeros((count + 1, int(labels.max()) + 2), np.int64)
     for pose, image in zip(poses, labels):
         pairs = np.ravel_multi_index((draw(pose, focal, size, centres)[0], image + 1), shared.shape)
