@@ -1,12 +1,10 @@
-"""Four objects in a shelf bin, RGB-D: masks of some views -> votes -> each object's Gaussians -> IoU in the other
-views.
+"""Selections of four objects in a shelf bin against their masks in held-out views; real RGB-D frames.
 
     python -m experiments.apc_bin [FOLDER]
 
 The capture is a scene of the MIT-Princeton APC 2016 data (15 views, 640x480). The Gaussians are the back-projected
-depths of the views that are not held out; their masks vote; a selection is rendered alone in the held-out views (alpha
-> 0.7) and compared with their masks there. The masks are the objects' models projected, so they also cover what the
-gripper hides.
+depths of the training views, whose masks vote. A selection is rendered alone in the held-out views (alpha > 0.7) and
+compared with the masks there. The masks are projections of object models, so that they include what the gripper hides.
 """
 
 import dataclasses
@@ -24,9 +22,7 @@ from experiments.datasets.depth_points import confirmed_depths
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, mean_iou
 from jsecon.fit.depth import points_from_depth
-from jsecon.fit.optimise import fit_gaussians
 from jsecon.fit.quality import evaluate_psnr
-from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.distill import distill_votes
 from jsecon.language.membership import with_shown
@@ -37,7 +33,7 @@ from jsecon.query.render import selection_mask
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}
-"""the numbers that segm/ uses, 0 being none of them"""
+"""Objects by their numbers in segm/; 0 is background."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,27 +42,22 @@ class Options:
 
     capture: str = str(results.CAPTURES / "apc_bin" / "scene-0000")
     held_out_every: int = 3
-    """every so many-th frame is held out, starting with the second"""
+    """Every `held_out_every`-th frame is held out, starting with the second."""
     nearest_m: float = 0.2
-    """depths below are the gripper in front of the camera: the sensor's range begins here"""
+    """Smaller depths show the gripper; the range of the sensor begins here."""
     depth_tolerance: float = 0.015
-    """relative difference up to which two views' depths confirm each other; 0 takes every depth"""
-    confirming_views: int = 1
-    """other views that have to confirm a depth"""
+    """Relative difference up to which the depth of another view confirms a depth."""
     voxel_m: float = 0.003
     scale: float = 0.6
-    """standard deviation of a Gaussian in units of its distance to its neighbours"""
+    """Standard deviation of a Gaussian in units of the distance to its neighbours."""
     opacity: float = 0.9
-    fit_steps: int = 0
-    """steps of a photometric fit of colours, opacities and scales; 0 leaves the points as they are"""
     threshold: float = 0.5
-    """share of votes from which a Gaussian belongs to an object"""
-    seed: int = 0
+    """Share of the votes from which a Gaussian belongs to an object."""
     out: str = str(results.HOME / "results" / "apc_bin")
 
 
 def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
-    """(3, 3) colour intrinsics and (T, 4, 4) camera-to-world poses (OpenCV axes) of a cam.info.txt."""
+    """Reads (3, 3) colour intrinsics and (T, 4, 4) camera-to-world poses (OpenCV axes) from a cam.info.txt."""
     blocks: dict[str, list[list[float]]] = {}
     title = ""
     for line in text.splitlines():
@@ -76,12 +67,8 @@ def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
             blocks.setdefault(title, []).append([float(v) for v in line.split()])
     intrinsics = next((m for t, m in blocks.items() if t.startswith("Color camera intrinsic")), None)
     poses = {t.rsplit("-", 1)[1]: m for t, m in blocks.items() if t.startswith("Camera-to-world")}
-    if (
-        intrinsics is None
-        or np.shape(intrinsics) != (3, 3)
-        or not poses
-        or any(np.shape(m) != (4, 4) for m in poses.values())
-    ):
+    shapes = {np.shape(m) for m in poses.values()}
+    if np.shape(intrinsics) != (3, 3) or shapes != {(4, 4)}:
         raise InputError(
             "cam.info.txt",
             f"the matrices {sorted(blocks)}",
@@ -92,7 +79,7 @@ def parse_cameras(text: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def decode_depth(raw: np.ndarray) -> np.ndarray:
-    """Metres of a depth PNG (uint16): the bits are rotated by three, the unit is 0.1 mm."""
+    """Depth in metres of a uint16 PNG, whose bits are rotated by three and whose unit is 0.1 mm."""
     return (((raw >> 3) | (raw << 13)) & 0xFFFF).astype(np.float32) / 10_000
 
 
@@ -104,7 +91,7 @@ def _image(path: Path, flags: int) -> np.ndarray:
 
 
 def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tuple[Capture, np.ndarray]:
-    """The capture, and labels (T, H, W) int16: 0..3 the objects in the order of OBJECTS, 4 the rest."""
+    """Loads the capture and labels (T, H, W) int16: 0 to 3 are the OBJECTS in order, 4 is background."""
     folder = Path(folder)
     try:
         intrinsics, poses = parse_cameras((folder / "cam.info.txt").read_text())
@@ -120,7 +107,7 @@ def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tu
     labels = np.full(segments.shape, len(OBJECTS), np.int16)
     for index, number in enumerate(OBJECTS):
         labels[segments == number] = index
-    # The matrix counts pixel centres as integers (OpenCV), jsecon from the upper left corner: half a pixel more.
+    # The matrix puts pixel centres at integers (OpenCV), jsecon half a pixel farther from the upper left corner.
     count = len(names)
     fx, fy, cx, cy = (
         np.full(count, v, np.float32)
@@ -130,34 +117,22 @@ def load_apc(folder: str | Path, *, held_out_every: int, nearest_m: float) -> tu
         np.linalg.inv(poses).astype(np.float32), fx, fy, cx, cy, width=frames.shape[2], height=frames.shape[1]
     )
     held_out = np.arange(count) % held_out_every == 1
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    return Capture(frames, cameras, *nothing, held_out, depths, np.eye(4), names), labels
+    no_points = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return Capture(frames, cameras, *no_points, held_out, depths, np.eye(4), names), labels
 
 
 def build_gaussians(capture: Capture, options: Options) -> Gaussians:
-    """The back-projected depths of the views that are not held out, fitted where the options ask for it."""
-    if options.depth_tolerance:
-        depths = confirmed_depths(capture, tolerance=options.depth_tolerance, min_views=options.confirming_views)
-        capture = dataclasses.replace(capture, depths=depths)
-    points = points_from_depth(capture, voxel=options.voxel_m)
+    """One Gaussian per voxel of the back-projected depths of the training views."""
+    depths = confirmed_depths(capture, tolerance=options.depth_tolerance, min_views=1)
+    points = points_from_depth(dataclasses.replace(capture, depths=depths), voxel=options.voxel_m)
     gaussians = gaussians_from_points(
         points.points, points.colors, opacity=options.opacity, scale=options.scale, max_scale=3 * options.voxel_m
     )
-    if options.fit_steps:
-        rates = LearningRates(means=0.0, quaternions=0.0)
-        gaussians, _ = fit_gaussians(
-            capture,
-            steps=options.fit_steps,
-            key=jax.random.key(options.seed),
-            start=gaussians,
-            schedule=Schedule(growth="none"),
-            rates=rates,
-        )
     return jax.tree.map(jnp.asarray, gaussians)
 
 
 def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> LanguageField:
-    """Votes of the masks that are not held out. The regions are told apart by unit codes of their own: one-hot."""
+    """Field of the votes of the training masks. The regions have one-hot codes."""
     used = np.flatnonzero(~capture.held_out)
     cameras = jax.tree.map(jnp.asarray, capture.cameras[used])
     count = len(OBJECTS) + 1
@@ -181,13 +156,14 @@ def build_field(gaussians: Gaussians, capture: Capture, labels: np.ndarray) -> L
 
 
 WAYS = ("votes", "code", "votes + DBSCAN")
+"""Ways to select the Gaussians of a region."""
 
 
 def evaluate(
     field: LanguageField, capture: Capture, labels: np.ndarray, options: Options, ways: tuple[str, ...] = WAYS
-) -> tuple[list[dict], dict]:
-    """A row for each way to select, object and held-out view; and the predicted masks by (way, object, frame)."""
-    rows, masks = [], {}
+) -> list[dict]:
+    """Rows of each way to select, object and held-out view."""
+    rows = []
     for way in ways:
         by = way.split()[0]
         for index, name in enumerate(OBJECTS.values()):
@@ -198,7 +174,7 @@ def evaluate(
                 chosen = jnp.asarray(remove_outliers(np.asarray(field.gaussians.means), np.asarray(chosen), keep="all"))
             for t in np.flatnonzero(capture.held_out):
                 camera = jax.tree.map(jnp.asarray, capture.cameras[int(t)])
-                masks[way, index, int(t)] = np.asarray(selection_mask(field.gaussians, camera, chosen))
+                mask = np.asarray(selection_mask(field.gaussians, camera, chosen))
                 true = labels[t] == index
                 rows.append(
                     {
@@ -206,35 +182,10 @@ def evaluate(
                         "object": name,
                         "frame": capture.names[t],
                         "selected": int(chosen.sum()),
-                        "iou": float(iou(masks[way, index, int(t)], true)),
+                        "iou": float(iou(mask, true)),
                     }
                 )
-    return rows, masks
-
-
-def draw(capture: Capture, labels: np.ndarray, masks: dict, way: str):
-    """Held-out views: true outlines in white, selected pixels in the object's colour."""
-    from matplotlib.figure import Figure
-
-    held = np.flatnonzero(capture.held_out)
-    colors = np.array([[230, 80, 230], [60, 200, 60], [60, 120, 240], [240, 200, 40]])
-    figure = Figure(figsize=(6 * len(held), 4.6))
-    for column, t in enumerate(held):
-        picture = capture.frames[t].astype(np.float32)
-        for index in range(len(OBJECTS)):
-            mask = masks[way, index, int(t)]
-            picture[mask] = 0.4 * picture[mask] + 0.6 * colors[index]
-        picture = np.ascontiguousarray(picture.astype(np.uint8))
-        for index in range(len(OBJECTS)):
-            outline, _ = cv2.findContours(
-                (labels[t] == index).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-            )
-            cv2.drawContours(picture, outline, -1, (255, 255, 255), 2)
-        axes = figure.add_subplot(1, len(held), column + 1)
-        axes.imshow(picture)
-        axes.set_title(capture.names[t], fontsize=8)
-        axes.axis("off")
-    return figure
+    return rows
 
 
 def main(options: Options = Options()) -> dict:
@@ -251,7 +202,7 @@ def main(options: Options = Options()) -> dict:
     lap("gaussians")
     field = jax.block_until_ready(build_field(gaussians, capture, labels))
     lap("votes")
-    rows, masks = evaluate(field, capture, labels, options)
+    rows = evaluate(field, capture, labels, options)
     lap("select and render")
     metrics = {
         "gaussians": gaussians.count,
@@ -274,7 +225,6 @@ def main(options: Options = Options()) -> dict:
     out = Path(options.out)
     series = {way: [metrics["objects"][way][name] for name in OBJECTS.values()] for way in WAYS}
     results.save(out, options, metrics, table, results.bars(list(OBJECTS.values()), series, "IoU, held-out views"))
-    results.save_picture(out, "held_out.png", draw(capture, labels, masks, "votes"))
     print(table)
     return metrics
 

@@ -1,12 +1,12 @@
-"""A Replica scan, RGB-D with instance masks: how many depth points end up with the code of the right region?
+"""Share of the points of a real RGB-D scan whose code is nearest to that of the right region; masks given.
 
     python -m experiments.replica_apartment_0 [FOLDER]
 
-The Gaussians are the back-projected depths of all 163 views, one per voxel; nothing is fitted. The masks of every
-second view vote. Each Gaussian's code is compared with the regions' codes, and the nearest region with the label that
-most of the Gaussian's depth pixels carry: over all views, and over only those views whose masks did not vote. The ids
-have no names, so each gets the CLIP text vector of an LVIS class, drawn by the seed: a code has to keep apart what a
-real embedding space keeps apart (mean pairwise cosine 0.74).
+The Gaussians are the back-projected depths of all 163 views, one per voxel, without a fit. The masks of every second
+view vote. The region whose code is nearest to the Gaussian's code is compared with the label that most of its depth
+pixels carry, over all views and over the views whose masks do not vote. The ids have no names. Each gets the CLIP text
+vector of an LVIS class, drawn by the seed, so that codes must keep apart what a real embedding space keeps apart (mean
+pairwise cosine 0.74).
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ _HEX = """
 e7ba52 e7cb94 843c39 ad494a d6616b e7969c 7b4173 a55194 ce6dbd de9ed6
 """
 PALETTE = np.array([int(h, 16) for h in _HEX.split()])
-"""the 40 colours of d3's category20 and category20b, in which semantic/ draws an instance's id modulo 40"""
+"""The 40 colours of d3's category20 and category20b, in which semantic/ draws the id of an instance modulo 40."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,16 +49,16 @@ class Options:
     capture: str = str(results.CAPTURES / "replica_apartment_0")
     text_vectors: str = str(results.CAPTURES.parent / "text" / "clip_vitb32_lvis.npy")
     voting_every: int = 2
-    """the masks of every so many-th view vote"""
+    """The masks of every `voting_every`-th view vote."""
     voxel_m: float = 0.06
     stride: int = 2
-    """every so many-th pixel, in each direction, is back-projected"""
+    """Every `stride`-th pixel of rows and columns is back-projected."""
     scale: float = 0.5
-    """standard deviation of a Gaussian in units of its distance to its neighbours: half is the least that leaves
-    surfaces closed"""
+    """Standard deviation of a Gaussian in units of the distance to its neighbours. Half is the least that leaves
+    surfaces closed."""
     opacity: float = 0.9
     latents: tuple[int, ...] = (16, 3)
-    """sizes of the code"""
+    """Sizes of the code."""
     seed: int = 0
     out: str = str(results.HOME / "results" / "replica_apartment_0")
 
@@ -204,54 +204,22 @@ def main(options: Options = Options()) -> dict:
         "seconds": seconds,
         "rows": rows,
     }
-    header = (
-        "d",
-        "votes reduced by",
-        "point accuracy",
-        "against silent views",
-        "point mIoU",
-        "point mAcc",
-        "largest cosine between codes",
-    )
-    table = results.table(
-        header,
-        [
-            (
-                r["latent"],
-                r["reduce"],
-                r["accuracy"],
-                r["accuracy_silent_views"],
-                r["point_miou"],
-                r["point_macc"],
-                r["largest_cosine_between_codes"],
-            )
-            for r in rows
-        ],
-    )
+    columns = {
+        "latent": "d",
+        "reduce": "votes reduced by",
+        "accuracy": "point accuracy",
+        "accuracy_silent_views": "against silent views",
+        "point_miou": "point mIoU",
+        "point_macc": "point mAcc",
+        "largest_cosine_between_codes": "largest cosine between codes",
+    }
+    table = results.table(tuple(columns.values()), [tuple(row[key] for key in columns) for row in rows])
     reductions = ("mode", "median", "mean")
     series = {f"d = {d}": [r["accuracy"] for r in rows if r["latent"] == d] for d in options.latents}
     out = Path(options.out)
     results.save(out, options, metrics, table, results.bars(list(reductions), series, "point accuracy"))
-    results.save_picture(out, "from_above.png", draw(np.asarray(points.points), truth, nearest))
     print(table)
     return metrics
-
-
-def draw(points: np.ndarray, truth: np.ndarray, found: np.ndarray):
-    """The points from above, by true and by found region, in the palette's colours."""
-    from matplotlib.figure import Figure
-
-    colors = np.stack([PALETTE >> 16, PALETTE >> 8 & 255, PALETTE & 255], axis=1) / 255
-    figure = Figure(figsize=(11, 5.5))
-    order = np.argsort(points[:, 2], kind="stable")
-    order = order[points[order, 2] < np.quantile(points[:, 2], 0.9)]  # without the ceiling
-    for column, (title, ids) in enumerate((("true", truth), ("nearest region of the code", found))):
-        axes = figure.add_subplot(1, 2, column + 1)
-        axes.scatter(*points[order, :2].T, s=0.1, c=np.where(ids[order, None] >= 0, colors[ids[order]], 0.9))
-        axes.set_title(title)
-        axes.set_aspect("equal")
-        axes.axis("off")
-    return figure
 
 
 if __name__ == "__main__":

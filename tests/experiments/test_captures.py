@@ -147,7 +147,7 @@ def test_apc_small_voxels_select_an_object(shared):
     )
     gaussians = apc_bin.build_gaussians(capture, options)
     field = apc_bin.build_field(gaussians, capture, labels[few])
-    rows, _ = apc_bin.evaluate(field, capture, labels[few], options, ways=("votes",))
+    rows = apc_bin.evaluate(field, capture, labels[few], options, ways=("votes",))
     assert [r["object"] for r in rows] == list(apc_bin.OBJECTS.values())
     assert np.mean([r["iou"] for r in rows]) > 0.5
     assert all(bool(np.isfinite(leaf).all()) for leaf in jax.tree.leaves(gaussians))
