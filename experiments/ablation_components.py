@@ -28,7 +28,6 @@ COMPONENTS: dict[str, Method] = {
     "ours, consensus, the region by cosine": asked("votes", by="consensus", **BY_COSINE),
     "ours, consensus, without pieces": asked("votes", by="consensus"),
     "ours, consensus": METHODS["ours, consensus"],
-    "ours, consensus, by lead": asked("lead", by="consensus"),
 }
 """the rows of Table 4: per-frame masks asked in one step (LangSplat-m) and anchored, then the paper's parts distilled
 by votes, the whole of the paper's path, and ours: the region of the largest contrast and its pieces, by the tracks or

@@ -18,7 +18,6 @@ QUERIES: dict[str, Method] = {
     "anchored by code": asked("code", **BY_COSINE),
     "anchored by code, the region by contrast": asked("code"),
     "anchored by votes of all views": asked("all_views", **BY_COSINE),
-    "anchored by lead": asked("lead", **BY_COSINE),
     "anchored by votes": asked("votes", **BY_COSINE),
     "the region by contrast": asked("votes"),
     "ours, tracks": METHODS["ours, tracks"],

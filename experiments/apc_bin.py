@@ -190,20 +190,11 @@ def evaluate(
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    seconds, began = {}, time.perf_counter()
-
-    def lap(stage: str) -> None:
-        nonlocal began
-        seconds[stage], began = round(time.perf_counter() - began, 2), time.perf_counter()
-
+    began = time.perf_counter()
     capture, labels = load_apc(options.capture, held_out_every=options.held_out_every, nearest_m=options.nearest_m)
-    lap("load")
     gaussians = build_gaussians(capture, options)
-    lap("gaussians")
     field = jax.block_until_ready(build_field(gaussians, capture, labels))
-    lap("votes")
     rows = evaluate(field, capture, labels, options)
-    lap("select and render")
     metrics = {
         "gaussians": gaussians.count,
         "held_out": [capture.names[t] for t in np.flatnonzero(capture.held_out)],
@@ -217,7 +208,7 @@ def main(options: Options = Options()) -> dict:
             }
             for way in WAYS
         },
-        "seconds": seconds,
+        "seconds": round(time.perf_counter() - began, 2),
         "rows": rows,
     }
     lines = [(way, *(metrics["objects"][way][n] for n in OBJECTS.values()), metrics["miou"][way]) for way in WAYS]

@@ -147,24 +147,16 @@ def points_as_gaussians(capture: Capture, options: Options) -> tuple[DepthPoints
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the metrics."""
-    seconds, began = {}, time.perf_counter()
-
-    def lap(stage: str) -> None:
-        nonlocal began
-        seconds[stage], began = round(time.perf_counter() - began, 2), time.perf_counter()
-
+    began = time.perf_counter()
     capture, labels = load_replica(options.capture, voting_every=options.voting_every)
-    lap("load")
     points, gaussians = points_as_gaussians(capture, options)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     truth = labels_of_points(points, labels, len(PALETTE))
     silent = np.where(capture.held_out[:, None, None], labels, np.int16(-1))
     truth_silent = labels_of_points(points, silent, len(PALETTE))
-    lap("points")
     voting = np.flatnonzero(~capture.held_out)
     cameras = jax.tree.map(jnp.asarray, capture.cameras[voting])
     votes = jax.block_until_ready(region_votes(gaussians, cameras, jnp.asarray(labels[voting]), len(PALETTE)))
-    lap("votes")
 
     vectors = np.load(options.text_vectors)
     rng = np.random.default_rng(options.seed)
@@ -173,7 +165,6 @@ def main(options: Options = Options()) -> dict:
     for latent in options.latents:
         codes, _, how = region_codes(jnp.asarray(embeddings), latent=latent, key=jax.random.key(options.seed))
         gram = np.asarray(cosine_matrix(codes, codes)) - 2 * np.eye(len(PALETTE))
-        lap(f"codes, d = {latent}")
         for reduce in ("mode", "median", "mean"):
             point_codes = jax.block_until_ready(distill_votes(votes, codes, reduce))
             nearest = np.where(
@@ -192,7 +183,6 @@ def main(options: Options = Options()) -> dict:
                     "coder": how,
                 }
             )
-        lap(f"distil and compare, d = {latent}")
     metrics = {
         "gaussians": gaussians.count,
         "voting_views": len(voting),
@@ -201,7 +191,7 @@ def main(options: Options = Options()) -> dict:
         "overflow": int(votes.overflow),
         "points_with_label": int((truth >= 0).sum()),
         "points_in_silent_views": int((truth_silent >= 0).sum()),
-        "seconds": seconds,
+        "seconds": round(time.perf_counter() - began, 2),
         "rows": rows,
     }
     columns = {

@@ -17,7 +17,7 @@ from experiments.tables import layout
 from experiments.tables.fill import Plan, fill, options_of, totals
 from experiments.tables.ours import ask_field, field_of
 
-WAYS = ("one_step", "canonical", "code", "votes", "probability", "lead")
+WAYS = ("one_step", "canonical", "code", "votes", "probability")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,10 +1,8 @@
 """Replica as NICE-SLAM rendered it, with the semantics of the original release; truth is at the vertices.
 
 ROOT/cam_params.json, ROOT/<room0>/{traj.txt, results/frame000000.jpg, results/depth000000.png}, ROOT/<room0>_mesh.ply;
-semantics as ROOT/<room_0>/habitat/{mesh_semantic.ply, info_semantic.json} or, ready for each vertex of the mesh,
-ROOT/semantic_labels_<room0>.txt beside ROOT/replica_class_id_to_names.txt. Frames as cvg/nice-slam reads them
-(src/utils/datasets.py), semantics as facebookresearch/Replica-Dataset's README describes them, labels for each vertex
-as opennerf ships them.
+semantics as ROOT/<room_0>/habitat/{mesh_semantic.ply, info_semantic.json}. Frames as cvg/nice-slam reads them
+(src/utils/datasets.py), semantics as facebookresearch/Replica-Dataset's README describes them.
 """
 
 from __future__ import annotations
@@ -118,15 +116,6 @@ def load_semantics(
     root: Path, scene: str
 ) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"], Int[np.ndarray, " p"], dict[int, str]]:
     """Vertices in order, their colours, class ids (-1 = undefined), and the names of the classes."""
-    ready = root / f"semantic_labels_{scene}.txt"
-    if ready.is_file():
-        points, colors = load_point_cloud(root / f"{scene}_mesh.ply")
-        try:
-            ids = np.loadtxt(ready, dtype=np.int64, ndmin=1)
-        except ValueError as error:
-            raise InputError(ready, str(error), "a class id per line", "Copy it again.") from error
-        require_count(ready, len(ids), len(points), "labels for the vertices of the mesh")
-        return points, colors, ids, _names(root / "replica_class_id_to_names.txt")
     habitat = root / re.sub(r"(\D)(\d+)$", r"\1_\2", scene) / "habitat"
     mesh = habitat / "mesh_semantic.ply"
     points, colors = load_point_cloud(mesh)
@@ -158,14 +147,6 @@ def vertex_classes(
     # Written last to first: where several faces share a vertex the first one's class stays.
     result[faces[::-1].reshape(-1)] = np.repeat(of_face[::-1], faces.shape[1])
     return result
-
-
-def _names(file: Path) -> dict[int, str]:
-    try:
-        lines = file.read_text(encoding="utf-8").split("\n")
-        return {int(number): name for number, name in (line.split(maxsplit=1) for line in lines if line.strip())}
-    except (OSError, ValueError) as error:
-        raise InputError(file, str(error), "a class id and its name per line", "Copy it again.") from error
 
 
 def _json(file: Path) -> dict[str, Any]:

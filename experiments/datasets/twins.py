@@ -125,15 +125,13 @@ def write_replica_twin(
     num_objects: int = 12,
     fine_m: float = 0.012,
     coarse_m: float = 0.05,
-    ready_labels: bool = False,
 ) -> Path:
     """A room as a scene of Replica in NICE-SLAM's rendering. Classes are the objects' shapes, wall, floor, ceiling and
-    table; `ready_labels` writes them a line per vertex instead of as habitat's semantic mesh."""
+    table, in habitat's semantic mesh."""
     names = tuple(f"frame{view:06d}" for view in range(views))
     room, capture, owners, mesh = _scanned(seed, names, width, height, num_objects, fine_m, coarse_m)
     classes = [item.shape for item in room.objects] + list(SURROUNDINGS)
     table = {name: n for n, name in enumerate(sorted(set(classes)), start=1)}
-    ids = np.array([table[name] for name in classes])
     scale, fx = 6553.5, float(capture.cameras.fx[0])
     camera = {"w": width, "h": height, "fx": fx, "fy": fx, "scale": scale}
     camera |= {"cx": width / 2 - 0.5, "cy": height / 2 - 0.5}
@@ -145,21 +143,16 @@ def write_replica_twin(
         write_image(root / scene / "results" / f"frame{t:06d}.jpg", capture.frames[t])
         _write_png16(root / scene / "results" / f"depth{t:06d}.png", np.rint(capture.depths[t] * scale))
     write_mesh(root / f"{scene}_mesh.ply", mesh.vertices, mesh.faces)
-    if ready_labels:
-        write_text(root / f"semantic_labels_{scene}.txt", "".join(f"{n}\n" for n in ids[mesh.vertex_owners]))
-        lines = ["-1 undefined", *(f"{n} {name}" for name, n in table.items())]
-        write_text(root / "replica_class_id_to_names.txt", "\n".join(lines) + "\n")
-    else:
-        habitat = root / f"{scene[:-1]}_{scene[-1]}" / "habitat"
-        numbers = mesh.face_owners.astype(np.int32) + 1
-        write_mesh(habitat / "mesh_semantic.ply", mesh.vertices, mesh.faces, {"object_id": numbers})
-        info = {
-            "classes": [{"id": n, "name": name, "children": [], "parents": []} for name, n in table.items()],
-            "objects": [{"id": k + 1, "class_id": table[c], "class_name": c} for k, c in enumerate(classes)],
-            "id_to_label": [-1, *(table[c] for c in classes)],
-            "gravity_dir": [0.0, 0.0, -1.0],
-        }
-        write_text(habitat / "info_semantic.json", json.dumps(info))
+    habitat = root / f"{scene[:-1]}_{scene[-1]}" / "habitat"
+    numbers = mesh.face_owners.astype(np.int32) + 1
+    write_mesh(habitat / "mesh_semantic.ply", mesh.vertices, mesh.faces, {"object_id": numbers})
+    info = {
+        "classes": [{"id": n, "name": name, "children": [], "parents": []} for name, n in table.items()],
+        "objects": [{"id": k + 1, "class_id": table[c], "class_name": c} for k, c in enumerate(classes)],
+        "id_to_label": [-1, *(table[c] for c in classes)],
+        "gravity_dir": [0.0, 0.0, -1.0],
+    }
+    write_text(habitat / "info_semantic.json", json.dumps(info))
     queries = sorted({item.shape for item in room.objects} | {"table"})
     occurring = {classes[k] for k in np.unique(mesh.vertex_owners)} & set(queries)
     pairs = len(occurring)

@@ -1,7 +1,6 @@
 """A clip tracked by the official SAM 2 video predictor and by jsecon over exported graphs, compared frame by frame."""
 
 import dataclasses
-import hashlib
 import tempfile
 import time
 from collections.abc import Sequence
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 import torch
 
-from jsecon.files import atomic_write
 from jsecon.networks.sam2.graphs import open_sam2
 from jsecon.networks.sam2.heads import Prompt
 from jsecon.networks.sam2.tracker import at_size, follow
@@ -82,24 +80,6 @@ def officially(model: torch.nn.Module, clip: Clip) -> tuple[np.ndarray, np.ndarr
     return logits, scores
 
 
-def officially_once(model: torch.nn.Module, clip: Clip, path: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """`officially` and its CPU seconds, kept in `path` (.npz): it takes minutes, and a stopped comparison goes on."""
-    digest = hashlib.blake2b(digest_size=16)
-    for array in (clip.frames, *model.state_dict().values()):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(repr([[(p.frame, p.points, p.labels, p.mask is None) for p in own] for own in clip.prompts]).encode())
-    if path.exists():
-        with np.load(path, allow_pickle=False) as kept:
-            if str(kept["key"]) == digest.hexdigest():
-                return kept["logits"], kept["scores"], float(kept["seconds"])
-    started = time.process_time()
-    logits, scores = officially(model, clip)
-    seconds = time.process_time() - started
-    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
-        np.savez_compressed(stream, key=digest.hexdigest(), logits=logits, scores=scores, seconds=seconds)
-    return logits, scores, seconds
-
-
 def ours(folder: Path, clip: Clip, *, threads: int) -> np.ndarray:
     """Logits (T, B, H, W) by jsecon over the graphs in `folder`."""
     sam2 = open_sam2(folder, threads=threads)
@@ -111,7 +91,9 @@ def ours(folder: Path, clip: Clip, *, threads: int) -> np.ndarray:
 
 def compare(model: torch.nn.Module, folder: Path, clip: Clip, *, threads: int) -> dict:
     """Frame by frame: the largest difference of logits and the share of pixels with the same mask."""
-    wanted, scores, official_seconds = officially_once(model, clip, folder / f"official_{len(clip.frames)}_frames.npz")
+    started = time.process_time()
+    wanted, scores = officially(model, clip)
+    official_seconds = time.process_time() - started
     started = time.process_time()
     found = ours(folder, clip, threads=threads)
     our_seconds = time.process_time() - started

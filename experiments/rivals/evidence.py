@@ -8,9 +8,8 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from jsecon.errors import require
 from jsecon.splat.plan import ViewPlan, plan_views
 from jsecon.types import Array, Camera, Gaussians
 
@@ -36,34 +35,6 @@ class Evidence:
     """(M,) int32 the frame of each mask."""
     tracks: Array
     """(T, H, W) int32 the same regions under a tracker's ids, alike in all frames; -1 = none."""
-
-
-def evidence_of_tracks(
-    gaussians: Gaussians,
-    cameras: Camera,
-    tracks: Int[Array, "t h w"],
-    embeddings: Float[Array, "t r e"],
-) -> Evidence:
-    """Evidence whose masks are those of the tracks, taken apart by frame: embeddings (T, R, E) of region r in frame t.
-
-    Raises ValueError where a track has no embedding row.
-    """
-    tracks, embeddings = np.asarray(tracks), np.asarray(embeddings, np.float32)
-    require(
-        len(tracks) == len(embeddings) and int(tracks.max(initial=-1)) < embeddings.shape[1],
-        "evidence_of_tracks",
-        f"tracks {tracks.shape} up to {int(tracks.max(initial=-1))}, embeddings {embeddings.shape}",
-        "an embedding for each region and frame",
-        "Embed each region in each frame that shows it.",
-    )
-    masks, rows, frame = np.full(tracks.shape, -1, np.int32), [], []
-    for t, image in enumerate(tracks):
-        for region in np.unique(image[image >= 0]):
-            masks[t][image == region] = len(rows)
-            rows.append(embeddings[t, region])
-            frame.append(t)
-    table = np.stack(rows) if rows else np.zeros((0, embeddings.shape[2]), np.float32)
-    return Evidence(gaussians, cameras, masks, table, np.array(frame, np.int32), tracks.astype(np.int32))
 
 
 def local_masks(evidence: Evidence) -> tuple[Int[np.ndarray, "t h w"], Int[np.ndarray, "t k"]]:

@@ -9,7 +9,6 @@ import numpy as np
 from experiments.rivals.evidence import with_room
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.association import Association, associated, by_consensus, proposals
-from experiments.tables.memberships import by_lead, of_all_views
 from experiments.tables.setting import Setting
 from jsecon.association.consensus import pieces_on_masks
 from jsecon.association.views import SceneViews
@@ -130,6 +129,11 @@ def parts_of(setting: Setting) -> Parts:
     return setting.shared.get("parts", make)
 
 
+def of_all_views(field: LanguageField) -> LanguageField:
+    """A field whose votes count every view that sees a Gaussian, not only those that show the region."""
+    return dataclasses.replace(field, votes=dataclasses.replace(field.votes, shown=None))
+
+
 def ask_field(
     setting: Setting,
     field: LanguageField,
@@ -142,10 +146,10 @@ def ask_field(
     instead: bool = False,
     retrieval_threshold: float | None = None,
 ) -> Answers:
-    """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), lead, code,
+    """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), code,
     probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that answer)
     and parts (of them the parts that do). `clean` drops outliers, `pieces` joins the regions that are pieces of what
-    the text found (not by lead); `instead`: by votes, parts answer where no region does (`parts_instead`)."""
+    the text found; `instead`: by votes, parts answer where no region does (`parts_instead`)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases = jnp.asarray(field.canonical)
@@ -170,8 +174,6 @@ def ask_field(
             probability = membership_probability(found.similarity, field.votes)
             inside = (found.region >= 0) & (probability >= (0.5 if threshold is None else threshold))
             found = dataclasses.replace(found, mask=inside)
-        elif way == "lead":
-            found = by_lead(field, query_anchored(field, text, retrieval=retrieval), threshold=threshold)
         else:
             by = "votes" if way == "all_views" else way
             options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_threshold": nearness}

@@ -6,8 +6,9 @@ import time
 import numpy as np
 import pytest
 from balls import ring_of_balls
+from twin_files import evidence_of_tracks
 
-from experiments.rivals.evidence import Evidence, evidence_of_tracks
+from experiments.rivals.evidence import Evidence
 from experiments.tables.association import ROWS, Shared, associated, by_consensus, overlaps, unit
 from jsecon.types import Camera
 

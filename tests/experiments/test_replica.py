@@ -61,17 +61,6 @@ def test_every_nth_frame(twin):
     assert not scene.capture.held_out.any()
 
 
-def test_both_forms_of_semantics_say_the_same(twin, tmp_path):
-    ready = replica_twin(tmp_path / "ready", ready_labels=True)
-    one, other = (load_replica(root, "room0", every=3) for root in (twin, ready))
-    np.testing.assert_array_equal(one.points, other.points)
-    np.testing.assert_array_equal(one.point_classes, other.point_classes)
-    lines = (ready / "semantic_labels_room0.txt").read_text().splitlines()
-    (ready / "semantic_labels_room0.txt").write_text("\n".join(lines[:-1]) + "\n")
-    with refused("semantic_labels_room0.txt", f"{len(lines) - 1} labels", len(lines)):
-        load_replica(ready, "room0")
-
-
 def test_what_is_missing_or_unknown_is_told(copy):
     with refused("classes no such class", "own table, such as"):
         load_replica(copy, "room0", classes=("table", "no such class"))

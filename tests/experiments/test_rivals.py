@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from balls import HEIGHT, WIDTH, ring_of_balls
+from twin_files import evidence_of_tracks
 
 from experiments.datasets.ovs3d import box_of
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text
 from experiments.rivals import evidence as evidence_module, lifting
-from experiments.rivals.evidence import evidence_of_tracks, local_masks, with_room
+from experiments.rivals.evidence import local_masks, with_room
 from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
 from experiments.rivals.langsplat import train_langsplat
 from experiments.rivals.opengaussian import Schedule, train_instances, train_opengaussian

@@ -1,6 +1,9 @@
 """Twins as small as they can be and still hold objects to find, one a dataset; a test changes a copy."""
 
+import numpy as np
+
 from experiments.datasets import twins
+from experiments.rivals.evidence import Evidence
 
 SMALL = {"views": 6, "width": 64, "height": 48, "num_objects": 6}
 
@@ -13,13 +16,9 @@ def ovs3d_twin(root):
     return twins.write_ovs3d_twin(root, "bed", 1, labelled_frames=3, **SMALL)
 
 
-def replica_twin(root, scene="room0", **more):
+def replica_twin(root, scene="room0"):
     size = {"views": 6, "width": 75, "height": 43, "num_objects": 6, "fine_m": 0.02, "coarse_m": 0.15}
-    return twins.write_replica_twin(root, scene, 2, **size, **more)
-
-
-def scannet_twin(root):
-    return twins.write_scannet_twin(root, "scene0000_00", 3, fine_m=0.02, coarse_m=0.15, lost=(4,), **SMALL)
+    return twins.write_replica_twin(root, scene, 2, **size)
 
 
 def rooms_instances(seed, cameras):
@@ -27,3 +26,14 @@ def rooms_instances(seed, cameras):
     from jsecon.demo import make_room, render_views
 
     return render_views(make_room(seed, num_objects=SMALL["num_objects"]), cameras)
+
+
+def evidence_of_tracks(gaussians, cameras, tracks, embeddings):
+    """Evidence whose masks are the tracks (T, H, W) of each frame; embeddings (T, R, E) of region r in frame t."""
+    masks, rows, frame = np.full(tracks.shape, -1, np.int32), [], []
+    for t, image in enumerate(tracks):
+        for region in np.unique(image[image >= 0]):
+            masks[t][image == region] = len(rows)
+            rows.append(embeddings[t, region])
+            frame.append(t)
+    return Evidence(gaussians, cameras, masks, np.stack(rows), np.array(frame, np.int32), tracks.astype(np.int32))
