@@ -43,10 +43,10 @@ NOTES = (
     "of similarity, loc_mask by the mask. Labelled frames are held out. Mean over seeds ± deviation."
 )
 WHY = {
-    "miou": "Where a text found its region, what is missing is missing in the masks (`experiments.causes`): a method "
+    "miou": "Where a text found its region, what is missing is missing in the masks (retired.md): a method "
     "that compares each Gaussian with the text averages over all masks and needs no region to be whole.",
     "miou_vala": "alpha > 10/255 counts the faint rim of the selected Gaussians too, so that it rewards a selection "
-    "that leaves the object's own rim out. On figurines, seed 1 (`experiments.causes`), true masks end at 0.680 there "
+    "that leaves the object's own rim out. On figurines, seed 1, true masks end at 0.680 there "
     "and VALA at 0.692; ours, asked for a share of the votes of 0.9 in place of 0.5, at 0.742, and then at 0.514 at "
     "alpha > 0.7.",
 }

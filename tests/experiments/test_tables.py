@@ -16,7 +16,6 @@ from experiments import (
     ovs3d,
     replica,
     threshold_sweep,
-    two_protocols,
 )
 from experiments.datasets.replica import REPLICA_SCENES
 from experiments.tables import fill, layout, published, twins
@@ -110,17 +109,6 @@ def test_best_thresholds_are_those_of_single_queries():
     each = np.array([[0.2, 0.8, 0.3], [0.6, 0.6, 0.1], [0.0, 0.1, 0.9]])
     found = threshold_sweep.best_thresholds(each, (0.2, 0.4, 0.8))
     assert found == pytest.approx((3, 0.4, 0.32, 0.72, (0.8 + 0.6 + 0.9) / 3 - 0.5))
-
-
-@pytest.mark.long
-def test_protocols(folder):
-    plan = with_gaussians(small(two_protocols.QUICK, folder, "protocols", methods=("VALA",), level="perfect"))
-    two_protocols.main(plan)
-    metrics, text = read(folder, "protocols")
-    (cell,) = metrics["cells"]
-    assert cell["pairs"] > 0
-    assert min(cell["miou"], cell["miou_2d"]) > 0.02  # its objects fill 0.012 of an image
-    assert "mean miou_2d" in text
 
 
 def test_levels_that_are_alike_are_learnt_once(folder, tmp_path):
