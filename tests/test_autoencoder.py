@@ -141,6 +141,7 @@ def test_sound_for_few_regions(regions):
     assert float(back.mean()) > 0.99
 
 
+@pytest.mark.long
 def test_sound_for_equal_embeddings_beside_an_unknown_one():
     embeddings = np.repeat(unit_rows(np.random.default_rng(0), 1, 20), 3, axis=0)
     embeddings[1] = 0

@@ -59,7 +59,7 @@ def assert_alike(blocks, memory, *, pixels=0):
     np.testing.assert_allclose(blocks.peak, memory.peak, rtol=2e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("rows", [5, 64, 1 << 18])
+@pytest.mark.parametrize("rows", [5, *(pytest.param(rows, marks=pytest.mark.long) for rows in (64, 1 << 18))])
 def test_equal_to_votes_in_memory_and_to_the_oracle(
     scene,
     cameras,
@@ -97,7 +97,7 @@ def test_few_splats_held_at_once_and_weights_at_the_centre(
     np.testing.assert_array_equal(cast.regions, memory.regions)
 
 
-@pytest.mark.parametrize("opaque", [0.0, 4.0])
+@pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
     """40,000, more than a band holds, all visible; opaque, most lie behind what stopped every pixel."""
     monkeypatch.setattr(bands, "BAND", 4096)

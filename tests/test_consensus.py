@@ -67,6 +67,7 @@ def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
     assert np.nanmean(scores[[2, 9, 16, 20]]) > 0.6  # and there, too, the Gaussians tell the balls apart
 
 
+@pytest.mark.long
 def test_masks_that_lie_over_each_other_have_one_vote(world, scene):
     _, _, frames, _, proposals = world
     twice = [np.concatenate([masks, masks]) for masks in proposals]
@@ -111,6 +112,7 @@ def test_the_weight_on_masks_is_that_of_the_splatting(world, scene):
         start += len(masks)
 
 
+@pytest.mark.long
 def test_nothing_proposed_anywhere_gives_one_thing_or_none(world):
     _, _, frames, _, _ = world
     nothing = [np.zeros((0, HEIGHT, WIDTH), bool)] * VIEWS

@@ -17,11 +17,10 @@ from jsecon.vision.colours import ColourEmbedder
 
 pytestmark = pytest.mark.few_steps
 TESTS = Path(__file__).resolve().parent
-PARTS = {3: ("image", "fit"), 6: ("votes", "query")}
-"""number of devices -> what a process with so many computes"""
+PARTS = "votes", "image", "fit", "query"
 VOTES = "regions", "weights", "labelled", "total", "peak", "views", "by_view"
 VIEWS, HEIGHT, WIDTH = 5, 43, 50
-"""fewer views than 6 devices; rows of pixels that no number of devices divides"""
+"""fewer views than some numbers of devices; rows of pixels that no number of devices divides"""
 
 
 def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
@@ -85,38 +84,36 @@ def asked(scene, cameras, tmp_path_factory) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def on(asked, tmp_path_factory) -> dict[int, Path]:
-    """Number of devices -> the folder of what a process with so many found; this one has two, and computes all."""
-    base, running = tmp_path_factory.mktemp("cores"), []
-    for count, parts in PARTS.items():
-        (base / str(count)).mkdir()
-        environ = os.environ | {
-            "XLA_FLAGS": f"--xla_force_host_platform_device_count={count} {compiling.ENVIRONMENT}",
-            "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
-        }
-        program = f"import jax; from test_cores import work; work{str(base / str(count)), *asked, parts}; "
-        line = [sys.executable, "-c", f"{program}assert jax.local_device_count() == {count}"]
-        running.append(subprocess.Popen(line, env=environ, stdout=-1, stderr=-2, text=True))
-    (base / "2").mkdir()
-    work(str(base / "2"), *asked, ("votes", "image", "fit", "query"))
-    for process in running:
-        said, _ = process.communicate(timeout=300)
-        assert process.returncode == 0, said
-    return {count: base / str(count) for count in (2, *PARTS)}
+def two(asked, tmp_path_factory) -> Path:
+    """The folder of what this process computes on its two devices."""
+    folder = tmp_path_factory.mktemp("two")
+    work(str(folder), *asked, PARTS)
+    return folder
 
 
-@pytest.mark.parametrize("devices", PARTS)
-def test_any_number_of_devices_gives_the_same_answers(on, devices):
-    two, others = (np.load(on[count] / "found.npz") for count in (2, devices))
-    assert two["weights"].max() > 1
-    for name in others.files:
+@pytest.mark.parametrize(
+    ("devices", "parts"),
+    [(3, ("votes", "fit", "query")), *(pytest.param(n, PARTS, marks=pytest.mark.long) for n in (1, 5, 6, 8, 16))],
+)
+def test_any_number_of_devices_gives_the_same_answers(two, asked, tmp_path, devices, parts):
+    environ = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {compiling.ENVIRONMENT}",
+        "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
+    }
+    program = f"import jax; from test_cores import work; work{str(tmp_path), *asked, parts}; "
+    line = [sys.executable, "-c", f"{program}assert jax.local_device_count() == {devices}"]
+    done = subprocess.run(line, env=environ, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    expected, found = (np.load(folder / "found.npz") for folder in (two, tmp_path))
+    assert expected["weights"].max() > 1
+    for name in found.files:
         if name in VOTES:  # added up in one order everywhere
-            np.testing.assert_array_equal(others[name], two[name], err_msg=name)
+            np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
         else:  # the sums of gradients in another
-            np.testing.assert_allclose(others[name], two[name], atol=1e-6 if name == "image" else 2e-3, err_msg=name)
-    if "query" in PARTS[devices]:
-        assert answers(on[2] / "answer")
-        assert answers(on[devices] / "answer") == answers(on[2] / "answer")
+            tolerance = 1e-6 if name == "image" else 2e-3
+            np.testing.assert_allclose(found[name], expected[name], atol=tolerance, err_msg=name)
+    assert answers(two / "answer")
+    assert answers(tmp_path / "answer") == answers(two / "answer")
 
 
 HIDDEN = "fcntl", "resource", "termios", "pwd", "grp"
@@ -151,10 +148,10 @@ sys.exit(code)
 """
 
 
-def test_every_module_is_imported_and_a_query_answered_without_the_modules_of_unix(on, asked, tmp_path):
+def test_every_module_is_imported_and_a_query_answered_without_the_modules_of_unix(two, asked, tmp_path):
     environ = os.environ | {"PYTHONPATH": str(TESTS.parent)}
     line = [sys.executable, "-c", WITHOUT, *asked, str(tmp_path)]
     done = subprocess.run(line, env=environ, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert answers(tmp_path)
-    assert answers(tmp_path) == answers(on[2] / "answer")
+    assert answers(tmp_path) == answers(two / "answer")

@@ -87,7 +87,7 @@ def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_
     ("changes", "rerun"),
     [
         ({"reduce": "mean"}, {"distil"}),
-        ({"latent": 3}, {"codes", "distil"}),
+        pytest.param({"latent": 3}, {"codes", "distil"}, marks=pytest.mark.long),
         ({"top": 4}, {"votes", "distil"}),
     ],
 )

@@ -56,6 +56,7 @@ def test_a_plan_says_what_it_lacks(scene, camera):
     assert int(plan_view(scene, camera, capacity=32).overflow) > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("channels", [3, pytest.param(16, marks=pytest.mark.long)])
 def test_several_devices_give_the_image_and_the_gradients_of_one(scene, camera, channels):
     """To rounding; to the last bit as shipped: tests/test_exact.py."""

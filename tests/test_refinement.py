@@ -61,6 +61,7 @@ def _small(monkeypatch, truth):
     monkeypatch.setattr(refine, "starting_gaussians", lambda capture, **_: (truth, ""))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_small")
 def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, tmp_path):
     told = write(rough(capture, **errors()), tmp_path / "rough")

@@ -47,7 +47,9 @@ def photographed(scene, capture=None):
     return dataclasses.replace(capture, frames=(255 * np.clip(np.stack(frames), 0, 1)).astype(np.uint8))
 
 
-@pytest.mark.parametrize("name", ["scene.ply", "scene.spz", "scene.glb"])
+@pytest.mark.parametrize(
+    "name", ["scene.ply", *(pytest.param(name, marks=pytest.mark.long) for name in ("scene.spz", "scene.glb"))]
+)
 def test_a_scene_that_nerfstudio_trained_is_carried_back(tmp_path, near, name):
     """Into the world of transforms.json, which is not the source's where an applied_transform made it."""
     applied = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
@@ -126,7 +128,9 @@ def test_a_wrong_world_is_told(tmp_path, near):
 
 
 @pytest.mark.parametrize("ending", ["ply", "glb"])
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize(
+    "scale", [1e-3, pytest.param(1.0, marks=pytest.mark.long), pytest.param(1e3, marks=pytest.mark.long)]
+)
 def test_gaussians_are_read_as_they_were_written_in_a_map_projections_world(tmp_path, near, scale, ending):
     """Where float32 would round them to half a unit."""
     to_source = np.diag([scale, scale, scale, 1.0])

@@ -68,6 +68,7 @@ def test_langsplat(world):
     assert by_most_similar_text(world, model.features()) >= 0.6
 
 
+@pytest.mark.long
 def test_gaussian_grouping(world):
     evidence, _, _, texts, canonical = world
     model, history = train_gaussian_grouping(
