@@ -5,7 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from experiments.stability.case import (
+from jsecon.splat.transform import recenter
+from jsecon.types import Camera
+from stability.case import (
     ARGUMENTS,
     STRAIGHT,
     Case,
@@ -17,8 +19,6 @@ from experiments.stability.case import (
     ordinary,
     quaternion_onto,
 )
-from jsecon.splat.transform import recenter
-from jsecon.types import Camera
 
 CANCELS = (
     "the gradient of the camera is a sum over the stack that cancels: each Gaussian's own gradient is within 5e-6, and "

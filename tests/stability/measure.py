@@ -12,11 +12,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.stability.case import ARGUMENTS, VALUE, Case
-from experiments.stability.render import dense, engine
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.reference import project_reference, render_reference
 from jsecon.types import Camera, Gaussians
+from stability.case import ARGUMENTS, VALUE, Case
+from stability.render import dense, engine
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.stability.case import ARGUMENTS, Case
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
 from jsecon.splat.render import render
+from stability.case import ARGUMENTS, Case
 
 TILE_PAIRS_PX = 8
 """capacity: every Gaussian in every tile of this edge; `overflow` is checked"""

@@ -1,4 +1,4 @@
-"""Every row of experiments/stability within its stated bound, no bound wider than float32 needs, and what happens to
+"""Every row of tests/stability within its stated bound, no bound wider than float32 needs, and what happens to
 numbers that are none beyond those rows."""
 
 import dataclasses
@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stability.case import GRADIENT, VALUE, ordinary
+from stability.cases import CANCELS, cases
+from stability.measure import evaluate
+from stability.render import engine
 
-from experiments.stability.case import GRADIENT, VALUE, ordinary
-from experiments.stability.cases import CANCELS, cases
-from experiments.stability.measure import evaluate
-from experiments.stability.render import engine
 from jsecon.splat.project import count_non_finite, is_usable
 from jsecon.splat.reference import weights_reference
 from jsecon.splat.render import render, render_depth, render_rgb
