@@ -31,6 +31,8 @@ TOLD_APART = 4.0
 """standard deviations by which the correlation lies above that with shuffled photographs: 4.2 and 4.9 in those right
 worlds, up to 3.6 in wrong ones (a tenth of the scene's size beside: 4.0)"""
 _SHUFFLES = 500
+_COLMAP_TO_NERFSTUDIO = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""(x, y, z) to (x, z, -y), before all else, where nerfstudio reads a COLMAP model itself"""
 
 
 class PhotoSimilarity(NamedTuple):
@@ -84,3 +86,71 @@ def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:
     centred = image.astype(np.float64) - image.mean((0, 1), dtype=np.float64)
     length = np.linalg.norm(centred)
     return (centred / length if length > 1e-6 else np.zeros_like(centred)).ravel()
+
+
+def training_worlds(
+    cameras_to_world: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"]
+) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
+    """The worlds that programs bring a capture into before they train, as far as its cameras and points tell.
+
+    gsplat (examples/datasets/normalize.py): the cameras' up to -y by the smallest turn, the median of the points of
+    their axes nearest to the origin to the origin, the median camera to distance 1; then the points' principal axes,
+    whose signs are open. nerfstudio (auto_orient_and_center_poses, "up" and "poses"): the cameras' up to z, their mean
+    to the origin, the largest coordinate of one to 1.
+
+    Args:
+      cameras_to_world: All T cameras in the world of their poses, float64, OpenCV axes.
+      points: P sparse points there, float64.
+
+    Returns:
+      The program and the (4, 4) similarity from the world of the poses to the one that it trains in, each.
+    """
+    turns, centres = cameras_to_world[:, :3, :3], cameras_to_world[:, :3, 3]
+    up = -turns[:, :, 1].mean(0)
+    if not np.linalg.norm(up) > 1e-6:
+        return []
+    found = []
+    turn = _least_turn(up, np.array([0.0, -1.0, 0.0]))
+    ahead, places = turns[:, :, 2] @ turn.T, centres @ turn.T
+    middle = np.median(places - (ahead * places).sum(1, keepdims=True) * ahead, axis=0)
+    plain = _scaled(turn, middle, np.median(np.linalg.norm(places - middle, axis=1)))
+    if plain is not None:
+        if len(points) > 3:
+            there = points @ plain[:3, :3].T + plain[:3, 3]
+            centre = np.median(there, axis=0)
+            axes = np.linalg.eigh(np.cov(there - centre, rowvar=False))[1][:, ::-1].T
+            axes[0] *= np.sign(np.linalg.det(axes))
+            for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
+                aligned = np.eye(4)
+                aligned[:3, :3] = np.diag(signs) @ axes
+                aligned[:3, 3] = -aligned[:3, :3] @ centre
+                found.append(("gsplat", aligned @ plain))
+        found.append(("gsplat", plain))
+    for before in (np.eye(4), _COLMAP_TO_NERFSTUDIO):
+        turn = _least_turn(before[:3, :3] @ up, np.array([0.0, 0.0, 1.0]))
+        places = centres @ (turn @ before[:3, :3]).T
+        middle = places.mean(0)
+        trained = _scaled(turn, middle, np.abs(places - middle).max())
+        if trained is not None:
+            found.append(("nerfstudio", trained @ before))
+    return found
+
+
+def _scaled(turn: np.ndarray, middle: np.ndarray, size: float) -> np.ndarray | None:
+    """Turned, `middle` to the origin, `size` to 1; None without a size."""
+    if not (np.isfinite(size) and size > 0):
+        return None
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = turn / size, -middle / size
+    return result
+
+
+def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, 3) the smallest rotation that brings the direction of a to the unit vector b."""
+    a = a / np.linalg.norm(a)
+    x, y, z = np.cross(a, b)
+    cosine = float(a @ b)
+    if cosine < -1 + 1e-8:
+        return np.diag([-1.0, 1.0, -1.0]) if abs(b[1]) < 0.5 else np.diag([-1.0, -1.0, 1.0])
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cosine)

@@ -250,8 +250,7 @@ def _in_the_captures_world(
     The file does not tell its world, so a few frames are rendered in each that it may be: the one that `trained` leads
     back from, the capture files', the poses', those of known trainings. The one that looks like the frames is taken.
     """
-    from jsecon.data.coordinates import training_worlds
-    from jsecon.fit.worlds import photo_similarity
+    from jsecon.fit.worlds import photo_similarity, training_worlds
     from jsecon.splat.transform import transform_gaussians_float64
 
     to_source = np.asarray(capture.to_source, np.float64)
