@@ -63,7 +63,7 @@ def main() -> None:
     current = put_on_devices(TrainState(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
     views = TrainingViews(dataclasses.replace(capture, held_out=np.arange(9) != 4))
     steps = StepRunner(views, mesh)
-    ways = [StepConfig(3, growth, LearningRates(), None, gaussians.count) for growth in ("votes", "none")]
+    ways = [StepConfig(3, count_votes, LearningRates(), None) for count_votes in (True, False)]
     voting, plain_step = (functools.partial(steps.take, current, 0, 0, 0.0, way) for way in ways)
     reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current[0], camera, frame)
     runs = {"l1": reference, "step": plain_step, "step_with_votes": voting}

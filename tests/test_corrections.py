@@ -31,7 +31,7 @@ from jsecon.types import Camera, Capture, Gaussians
 
 KEY, VIEWS = jax.random.key(0), 6
 FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
-WHOLE = Schedule(sizes=((1.0, 1.0),), growth="none")
+WHOLE = Schedule(sizes=((1.0, 1.0),), max_gaussians=0)
 GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
 
 

@@ -1,20 +1,14 @@
 """Growth: halves keep what the whole was, rows stay where they are, and the draw follows the votes."""
 
-import dataclasses
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jsecon.fit.growth import (
     MIN_OPACITY,
-    copies,
     drop_free_rows,
     grow,
     in_use,
-    noise,
-    opacities,
     pad_with_free_rows,
     padded_row_count,
     sample_rows,
@@ -119,30 +113,3 @@ def test_nothing_is_added_where_nothing_is_wrong():
     after, _ = grow(whole, moments, np.zeros(64, np.float32), 60, 60, [0])
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_copies_look_as_the_one_did():
-    """Through its centre two of them let as much light pass, and over all directions together they hide as much."""
-    whole = scene()
-    one, other = copies(whole)
-    assert one is other
-    before, after = opacities(whole), opacities(one)
-    free = (after > 2 * MIN_OPACITY + 1e-9) & (after < 1 - MIN_OPACITY - 1e-9)
-    np.testing.assert_allclose((1 - (1 - after) ** 2)[free], before[free], rtol=1e-4)
-    # The integral of 1 - (1 - o' g)^2 over a line, g = exp(-x^2 / 2 s'^2), against that of o g.
-    x = np.linspace(-40, 40, 20001)[:, None]
-    shrunk = np.exp(one.log_scales[:, 0] - whole.log_scales[:, 0])
-    two = 1 - (1 - after * np.exp(-((x / shrunk) ** 2) / 2)) ** 2
-    integral = lambda y: y.sum(0) * (x[1, 0] - x[0, 0])
-    np.testing.assert_allclose(integral(two)[free], integral(before * np.exp(-(x**2) / 2))[free], rtol=1e-3)
-
-
-def test_noise_has_the_covariance_of_the_gaussian_and_spares_what_shows():
-    many = jax.tree.map(lambda a: np.repeat(a[:1], 20000, axis=0), scene())
-    faint = dataclasses.replace(many, opacity_logits=np.full(20000, -12.0, np.float32))
-    moved = np.asarray(noise(faint, jnp.float32(1e-5), jnp.int32(3)))
-    shape = covariance(jax.tree.map(lambda a: a[:1], many))[0]
-    expected = (shape @ shape) * (1 / (1 + np.exp(-0.5))) ** 2  # the factor of an opacity of 0
-    np.testing.assert_allclose(np.cov(moved.T), expected, rtol=0.1, atol=0.03 * np.abs(expected).max())
-    shown = dataclasses.replace(many, opacity_logits=np.full(20000, 1.0, np.float32))
-    assert np.abs(noise(shown, jnp.float32(1e-5), jnp.int32(3))).max() < 1e-20

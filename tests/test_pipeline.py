@@ -142,10 +142,10 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tm
     run, _ = room_run
     given, listener = on_given_gaussians
     assert {"segmenter", "association"} <= set(run.skipped)
-    flat = dataclasses.replace(run.options, sh_degree=0, growth="none")
+    flat = dataclasses.replace(run.options, sh_degree=0, gaussians_at_most=1)
     work, bare = (RunContext(options, Networks(ColourEmbedder()), tmp_path) for options in (run.options, flat))
     left = set(gaussians(bare).skipped) - set(gaussians(work).skipped)
-    assert left == {"view-dependent colour", "densification"}
+    assert left == {"view-dependent colour"}
     assert "scene.ply" in given.skipped["photometric fit"]
     assert listener.planned["photometric fit"].status == "skipped"
     assert listener.planned["gaussians"].status == "run"

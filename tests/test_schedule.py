@@ -1,7 +1,5 @@
 """What a fit does when."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,13 +17,6 @@ def test_the_number_of_gaussians_rises_evenly_and_stops():
     schedule = Schedule(max_gaussians=300, growth_start=0.1, growth_end=0.6)
     assert [schedule.count(done, 100) for done in (0.05, 0.1, 0.35, 0.6, 0.61)] == [None, 100, 200, 300, None]
     assert schedule.count(0.3, 400) is None
-    assert dataclasses.replace(schedule, growth="none").count(0.3, 100) is None
-
-
-def test_votes_are_counted_as_long_as_they_are_of_use():
-    schedule = Schedule(growth_end=0.5)
-    assert [schedule.growth_at(done) for done in (0.0, 0.5, 0.51)] == ["votes", "votes", "none"]
-    assert dataclasses.replace(schedule, growth="mcmc").growth_at(0.9) == "mcmc"
 
 
 def test_degrees_open_one_after_another():

@@ -2,22 +2,19 @@
 
 Rows whose Gaussian is too faint to be seen are free. Where Gaussians are wanted, they are drawn by their votes of the
 error (the weight alpha T that each casts on a pixel, times how wrong the pixel is; arXiv 2511.04283 counts bad pixels
-so), or by their opacity (MCMC, arXiv 2404.09591), and each becomes two, the second in a free row. Faint Gaussians
+so), and each becomes two, the second in a free row. Faint Gaussians
 thereby go where they are of use, and jax compiles anew only where the arrays become longer. NumPy, on the host: an
 event in fifty steps.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jsecon.numerics import normalize, sigmoid
 from jsecon.splat.capacity import round_capacity
 from jsecon.types import Array, Gaussians
 
@@ -25,8 +22,6 @@ MIN_OPACITY = 0.005
 """opacity below which a Gaussian is pruned (Kerbl et al. 2023)"""
 AT_ONCE = 0.3
 """most that an event adds, as a share of the Gaussians there are"""
-NOISE = 1e5
-"""of MCMC, times the positions' rate"""
 _FREE = {"opacity_logits": -20.0, "log_scales": -5.0, "quaternions": 1.0}
 """of a row without Gaussian: any numbers that are none to be seen"""
 _APART, _NARROWER = 0.6, 0.8
@@ -104,17 +99,6 @@ def opacities(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     return 1 / (1 + np.exp(-np.clip(np.asarray(gaussians.opacity_logits, np.float64), -30, 30)))
 
 
-def copies(gaussians: Gaussians) -> tuple[Gaussians, Gaussians]:
-    """Each Gaussian as two in its place that together look as it did (arXiv 2404.09591, eq. 9, for two)."""
-    opacity = opacities(gaussians)
-    half = np.clip(1 - np.sqrt(1 - opacity), 2 * MIN_OPACITY, 1 - MIN_OPACITY)
-    narrower = np.log(opacity / (2 * half - half**2 / math.sqrt(2)))[:, None]
-    scales, logits = np.asarray(gaussians.log_scales), np.log(half / (1 - half))
-    given = {"log_scales": (scales + narrower).astype(scales.dtype), "opacity_logits": logits.astype(scales.dtype)}
-    one = dataclasses.replace(gaussians, **given)
-    return one, one
-
-
 def grow(
     gaussians: Gaussians,
     moments: tuple[Gaussians, Gaussians],
@@ -122,7 +106,6 @@ def grow(
     target: int,
     most: int,
     seed: list[int],
-    divide: Callable[[Gaussians], tuple[Gaussians, Gaussians]] = split_in_two,
 ) -> tuple[Gaussians, tuple[Gaussians, Gaussians]]:
     """The arrays with up to `target` Gaussians: as many as are wanted, drawn by their votes, are each divided in two.
     The moments of the two begin at zero. Where the rows do not suffice they are doubled, up to those of the `most` that
@@ -138,33 +121,10 @@ def grow(
         seen = in_use(gaussians)
     parents = sample_rows(np.where(seen, votes, 0.0), add, np.random.default_rng(seed))
     places = np.flatnonzero(~seen)[: len(parents)]
-    one, other = divide(jax.tree.map(lambda a: a[parents], gaussians))
+    one, other = split_in_two(jax.tree.map(lambda a: a[parents], gaussians))
     for part, where in ((one, parents), (other, places)):
         for whole, new in zip(jax.tree.leaves(gaussians), jax.tree.leaves(part), strict=True):
             whole[where] = new
         for whole in jax.tree.leaves(moments):
             whole[where] = 0
     return gaussians, moments
-
-
-def pressure(gaussians: Gaussians, rows: Array) -> Array:
-    """What MCMC adds to the loss: 0.01 times the mean opacity and 0.01 times the mean scale, both of `rows` rows."""
-    opacity, scale = sigmoid(gaussians.opacity_logits).sum() / rows, jnp.exp(gaussians.log_scales).sum() / (3 * rows)
-    return 0.01 * opacity + 0.01 * scale
-
-
-def noise(gaussians: Gaussians, rate: Array, step: Array) -> Float[Array, "n 3"]:
-    """What MCMC moves the centres by: normal numbers of the Gaussian's covariance, times the positions' rate, on those
-    that hardly show (arXiv 2404.09591, eq. 8)."""
-    normal = jax.random.normal(jax.random.fold_in(jax.random.key(0), step), gaussians.means.shape)
-    shows = jax.nn.sigmoid(100 * (MIN_OPACITY - sigmoid(gaussians.opacity_logits)))[:, None]
-    w, x, y, z = (normalize(gaussians.quaternions)[:, i] for i in range(4))
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    own = [sum(rotation[i][j] * normal[:, i] for i in range(3)) for j in range(3)]
-    own = [own[j] * jnp.exp(2 * gaussians.log_scales[:, j]) for j in range(3)]
-    world = jnp.stack([sum(rotation[i][j] * own[j] for j in range(3)) for i in range(3)], axis=-1)
-    return NOISE * rate * shows * world

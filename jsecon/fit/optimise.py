@@ -16,15 +16,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionState, RefineOptions, init_corrections
-from jsecon.fit.growth import (
-    copies,
-    drop_free_rows,
-    grow,
-    opacities,
-    pad_with_free_rows,
-    padded_row_count,
-    split_in_two,
-)
+from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows, padded_row_count
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
 from jsecon.fit.view import TrainingViews
@@ -141,11 +133,8 @@ def fit_gaussians(
     taking = StepRunner(views, mesh)
     if start is not None:
         # A doubling is one more program to compile, which takes as long as hundreds of steps over free rows.
-        room = (
-            0
-            if schedule.growth == "none"
-            else schedule.max_gaussians // (1 if schedule.max_gaussians <= AT_ONCE else 2)
-        )
+        divisor = 1 if schedule.max_gaussians <= AT_ONCE else 2
+        room = schedule.max_gaussians // divisor if schedule.grows(start.count) else 0
         state = init_fit_state(start, None if refine is None else len(capture.names), at_least=room)
     assert state is not None
     given, alike = state.refined is not None, (state.refined is None) == (refine is None)
@@ -164,12 +153,13 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         views.at(schedule.size(done))
         order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
-        way = StepConfig(schedule.degree(done), schedule.growth_at(done), rates, refine, state.gaussians.count)
+        count_votes = schedule.grows(int(state.started)) and done <= schedule.growth_end
+        way = StepConfig(schedule.degree(done), count_votes, rates, refine)
         taking.compile(current, int(order[0]), first, done, way)  # which is not the fit's time
         began = time.monotonic()
         current, taken = _chunk(current, taking, order, first, dones, way)
         losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
-        host = to_host(current, way.rows)
+        host = to_host(current, state.gaussians.count)
         # A Gaussian that is not finite is invisible, so the loss alone would not tell.
         moved = jax.tree.leaves((losses[-1], host.gaussians, host.refined))
         if not all(np.isfinite(array).all() for array in moved):
@@ -203,7 +193,6 @@ def fit_gaussians(
 
 def _grown(current: TrainState, schedule: Schedule, target: int, seed: list[int]) -> TrainState:
     """With up to `target` Gaussians, on the host; the votes are counted anew."""
-    by, divide = (opacities(current.gaussians), copies) if schedule.growth == "mcmc" else (current.votes, split_in_two)
     moments = current.first_moment, current.second_moment
-    gaussians, moments = grow(current.gaussians, moments, by, target, schedule.max_gaussians, seed, divide)
+    gaussians, moments = grow(current.gaussians, moments, current.votes, target, schedule.max_gaussians, seed)
     return TrainState(gaussians, *moments, np.zeros_like(current.votes, shape=gaussians.count), current.refined)

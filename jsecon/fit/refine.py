@@ -250,7 +250,7 @@ def _probed(
     if capture.ignored is None:  # one program serves probes and alignments on parts of a frame
         capture = dataclasses.replace(capture, ignored=np.broadcast_to(False, np.shape(capture.frames)[:3]))
     keep = lambda state: last.__setitem__(slice(None), [state])
-    schedule = Schedule(sizes=((size, 1.0),), growth="none")
+    schedule = Schedule(sizes=((size, 1.0),), max_gaussians=0)
     found, _ = fit_gaussians(capture, start=start, refine=refine, schedule=schedule, on_checkpoint=keep, **given)
     refined = last[0].refined
     return found, identity_corrections(len(capture.names)) if refined is None else jax.tree.map(np.asarray, refined.now)

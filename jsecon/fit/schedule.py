@@ -5,7 +5,7 @@ minutes go the same way.
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import jax.numpy as jnp
@@ -52,11 +52,8 @@ class Schedule:
     sizes: tuple[tuple[float, float], ...] = ((0.5, 0.5), (1.0, 1.0))
     """(size of the frames, share of the fit at which it ends): smaller frames cost less and move what is large first
     (arXiv 2503.18402)"""
-    growth: Literal["votes", "mcmc", "none"] = "votes"
-    """Gaussians are added where the picture is wrong, or by their opacity while all are moved by noise (arXiv
-    2404.09591), or keep their number"""
     max_gaussians: int = 100_000
-    """Gaussians; a start with more keeps its number"""
+    """Number of Gaussians after growth. A start with as many or more keeps its number: 0 means no growth."""
     growth_start: float = 0.05
     growth_end: float = 0.5
     """shares of the fit between which the number of Gaussians rises evenly to `max_gaussians`"""
@@ -78,13 +75,13 @@ class Schedule:
         """The highest of the spherical harmonics that learns."""
         return int(done / self.degree_interval) if self.degree_interval > 0 else 3
 
-    def growth_at(self, done: float) -> Literal["votes", "mcmc", "none"]:
-        """What a step does for growth: votes are counted only as long as they are of use."""
-        return "none" if self.growth == "votes" and done > self.growth_end else self.growth
+    def grows(self, start: int) -> bool:
+        """Whether a fit that starts with `start` Gaussians adds any."""
+        return self.max_gaussians > start
 
     def count(self, done: float, start: int) -> int | None:
-        """Gaussians wanted, or None where none are added now."""
-        if self.growth == "none" or not self.growth_start <= done <= self.growth_end or self.max_gaussians <= start:
+        """Number of Gaussians at this share of the fit, or None outside of the growth phase."""
+        if not self.growth_start <= done <= self.growth_end or not self.grows(start):
             return None
         share = (done - self.growth_start) / (self.growth_end - self.growth_start)
         return round(start + share * (self.max_gaussians - start))

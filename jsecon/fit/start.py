@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import KDTree
 
-from jsecon.errors import require, require_one_of
-from jsecon.fit.dense import dense_points, random_points
+from jsecon.errors import require
 from jsecon.fit.depth import points_from_depth
 from jsecon.fit.triangulate import MIN_POINTS, triangulated_points
 from jsecon.splat.sh import sh_from_rgb
@@ -18,51 +17,63 @@ from jsecon.types import Array, Capture, Gaussians
 MIN_SQUARED_DISTANCE = 1e-7
 """floor under a squared neighbour distance, world units^2 (INRIA): duplicate points still get a scale"""
 
-Start = Literal["auto", "sparse", "dense", "random"]
-MAX_DENSE = 100_000
-"""points of a start from depth, from stereo or drawn at random"""
+MAX_DEPTH_POINTS = 100_000
+"""maximum number of points taken from depth frames"""
+
+
+class Start(NamedTuple):
+    """Initial scene of a fit."""
+
+    gaussians: Gaussians
+    origin: str
+    """One clause on where they come from."""
 
 
 def starting_gaussians(
     capture: Capture,
     *,
     sh_degree: int = 0,
-    start: Start = "auto",
-    max_points: int = MAX_DENSE,
+    max_points: int = MAX_DEPTH_POINTS,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Gaussians, str]:
-    """The Gaussians that a fit of `capture` starts from, and one sentence on where they come from.
+) -> Start:
+    """Makes the Gaussians that a fit of `capture` starts from.
 
-    `start` is "auto": from depth where there is depth, else as "sparse"; "sparse": the capture's own points, or points
-    triangulated from the frames that are not held out; "dense": from depth where there is depth, else by stereo between
-    neighbouring views; "random": in the space that the cameras look at. All but sparse points are `max_points` at most.
-    Raises InputError where the views do not give such points, ValueError on another `start`.
+    Points come from depth frames where there are any, else from the capture's sparse points, else by triangulation of
+    the training frames.
 
-    The scale (in units of the distance to the neighbours) is smaller and the opacity larger than INRIA's 1 and 0.1,
-    which are meant for a fit that adds Gaussians. Measured with the same number of steps: on the demo room (seed 0, 400
-    steps) 32.6 dB held out for opacity 0.8 and scale 0.6, 31.0 dB for 0.1 and 1, with half the error of the rendered
-    depth; on fox (216x384, 500 steps) 25.8 and 25.4 dB.
+    The scale (in units of the distance to the neighbours) is smaller and the opacity larger than INRIA's 1 and 0.1.
+    Measured with the same number of steps: the demo room (seed 0, 400 steps) has 32.6 dB held out with opacity 0.8 and
+    scale 0.6, 31.0 dB with 0.1 and 1, and half the error of the rendered depth; fox (216x384, 500 steps) 25.8 and
+    25.4 dB.
+
+    Args:
+      capture: Frames, poses, and depth or sparse points.
+      sh_degree: Degree of the spherical harmonics, 0 to 3.
+      max_points: Maximum number of points from depth frames.
+      progress: Called with the number of frames and pairs triangulated and of all.
+
+    Returns:
+      The Gaussians, and one clause on where they come from.
+
+    Raises:
+      InputError: The frames give too few points.
     """
-    require_one_of("start", start, ("auto", "sparse", "dense", "random"), "auto takes what the capture holds.")
-    count, given = len(capture.points), {"opacity": 0.7, "scale": 0.6}
-    if capture.depths is not None and start in ("auto", "dense"):
-        found = points_from_depth(capture, max_points=max_points, stride=2)
-        points, colors, given = found.points, found.colors, {"opacity": 0.9, "scale": 0.5, "max_scale": 2 * found.voxel}
-        origin = f"{len(points)} points from the depth frames, one a voxel of {found.voxel:.3g} world units"
-    elif start == "dense":
-        points, colors = dense_points(capture, max_points=max_points, progress=progress)
-        origin = f"{len(points)} points by stereo between neighbouring views"
-    elif start == "random":
-        points, colors = random_points(capture, max_points)
-        given = {"opacity": 0.1, "scale": 1.0}
-        origin = f"{len(points)} random points in the space that the cameras look at"
-    elif count >= MIN_POINTS:
-        points, colors, origin = capture.points, capture.point_colors, f"{count} sparse points of the capture"
+    count = len(capture.points)
+    if capture.depths is not None:
+        cloud = points_from_depth(capture, max_points=max_points, stride=2)
+        gaussians = gaussians_from_points(
+            cloud.points, cloud.colors, opacity=0.9, scale=0.5, max_scale=2 * cloud.voxel, sh_degree=sh_degree
+        )
+        origin = f"{len(cloud.points)} points from the depth frames, one per voxel of {cloud.voxel:.3g} world units"
+        return Start(gaussians, origin)
+    if count >= MIN_POINTS:
+        points, colors = capture.points, capture.point_colors
+        origin = f"{count} sparse points of the capture"
     else:
         points, colors = triangulated_points(capture, progress=progress)
         few = f"only {count} points" if count else "no points"
         origin = f"the capture has {few}: {len(points)} points triangulated from feature matches between its views"
-    return gaussians_from_points(points, colors, sh_degree=sh_degree, **given), origin
+    return Start(gaussians_from_points(points, colors, opacity=0.7, scale=0.6, sh_degree=sh_degree), origin)
 
 
 def neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:

@@ -1,7 +1,6 @@
 """One step of a fit: a view's loss, its gradients, and Adam, on all devices of this process."""
 
-import dataclasses
-from typing import Any, Literal, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +9,13 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jsecon.fit.corrections import CorrectionState, RefineOptions, update_corrections
-from jsecon.fit.growth import noise, pad_rows, pad_with_free_rows, pressure
+from jsecon.fit.growth import pad_rows, pad_with_free_rows
 from jsecon.fit.schedule import LearningRates, rates_at
 from jsecon.fit.view import TrainingView, TrainingViews, view_loss
 from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
 from jsecon.types import Array, Gaussians
 
-Growth: TypeAlias = Literal["votes", "mcmc", "none"]
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
@@ -38,31 +36,33 @@ class StepConfig(NamedTuple):
 
     degree: int
     """the highest of the spherical harmonics that learns"""
-    growth: Growth
-    """what it does for growth"""
+    count_votes: bool
+    """Whether the step adds up the votes that growth follows."""
     rates: LearningRates
     refine: RefineOptions | None
-    rows: int
-    """of the scene, before `put_on_devices` filled it up"""
 
 
 def step(
-    current: TrainState, view: TrainingView, numbers: dict[str, Any], capacity: int, mesh: Mesh | None, growth: Growth
+    current: TrainState,
+    view: TrainingView,
+    numbers: dict[str, Any],
+    capacity: int,
+    mesh: Mesh | None,
+    count_votes: bool,
 ) -> tuple[TrainState, Array, Array]:
     """One Adam step on one view. Returns what is current after it, the loss before it, the pairs that overflowed. Over
     a mesh, projection, compositing, loss and update are each shared out among its devices.
 
     `numbers`: the step, the view's frame, how often that was taken before, the share of the fit that is done, the
-    degree, the extent, the rates, those of the corrections, the scene's rows.
+    degree, the extent, the rates, those of the corrections.
     """
     gaussians, first, second, votes, refined = current
-    nothing = jnp.zeros((gaussians.count, 1 if growth == "votes" else 0))
+    nothing = jnp.zeros((gaussians.count, 1 if count_votes else 0))
     own = None if refined is None else jax.tree.map(lambda a: a[numbers["frame"]], refined.now)
     fixed = {"view": view, "extent": numbers["extent"], "capacity": capacity, "mesh": mesh}
 
     def loss(gaussians, nothing, own):
-        total, told = view_loss(gaussians, nothing, own, **fixed)
-        return total + pressure(gaussians, numbers["rows"]) if growth == "mcmc" else total, told
+        return view_loss(gaussians, nothing, own, **fixed)
 
     by = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, nothing, own)
     (_, (value, overflow)), (gradient, by_error, by_own) = by
@@ -76,9 +76,6 @@ def step(
     rate = rates_at(numbers["done"], numbers["rates"], gaussians, numbers["extent"], numbers["degree"])
     rows = gaussians, gradient, first, second
     gaussians, first, second = map_rows(update, rows, (numbers["step"], rate), mesh)
-    if growth == "mcmc":
-        means = gaussians.means + noise(gaussians, rate.means, numbers["step"])
-        gaussians = dataclasses.replace(gaussians, means=means)
     if refined is not None:
         refined = update_corrections(refined, numbers["frame"], by_own, numbers["taken"], numbers["refine_rates"])
     after = TrainState(gaussians, first, second, votes + by_error.sum(1), refined)
@@ -89,7 +86,7 @@ def step(
 
 # of one device, and over a mesh
 step_compiled = [
-    jax.jit(step, static_argnames=("capacity", "mesh", "growth"), compiler_options=options)
+    jax.jit(step, static_argnames=("capacity", "mesh", "count_votes"), compiler_options=options)
     for options in (None, MESH_OPTIONS)
 ]
 
@@ -147,17 +144,16 @@ class StepRunner:
             "degree": np.int32(way.degree),
             "extent": views.extent,
             "rates": way.rates,
-            "rows": np.int32(way.rows),
             "refine_rates": None if way.refine is None else way.refine.rates(done, float(views.extent)),
         }
         place = None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec())
         given = jax.device_put((views[view], numbers), place)
         run = step_compiled[self.mesh is not None]
-        return run(current, *given, capacity=capacity, mesh=self.mesh, growth=way.growth)
+        return run(current, *given, capacity=capacity, mesh=self.mesh, count_votes=way.count_votes)
 
     def compile(self, current: TrainState, view: int, number: int, done: float, way: StepConfig) -> None:
         """Makes the program of such a step, where there is none."""
-        program = *self._shape(current), way.growth
+        program = *self._shape(current), way.count_votes
         if program not in self._compiled:
             jax.block_until_ready(self.take(current, view, number, done, way))
             self._compiled.add(program)

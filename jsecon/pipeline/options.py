@@ -66,12 +66,7 @@ class SceneOptions:
       gaussians_at_most: Maximum number of Gaussians of the fit. A denser initial point cloud is kept as it is. By
         default there is one for every other pixel of a frame, for every pixel in fits of at least 3 minutes or 3000
         steps, and at most 100,000.
-      growth: How the fit adds Gaussians: where the image error is largest (votes), by opacity with noise (mcmc), or not
-        at all (none).
       sh_degree: Degree of the spherical harmonics of the fitted colours.
-      start: Initial points of the fit: the capture's own points or triangulated ones (sparse), stereo between
-        neighbouring views (dense), or random points. With auto they come from depth if the capture has depth, else as
-        with sparse.
       seed: Seed of all random numbers.
     """
 
@@ -84,9 +79,7 @@ class SceneOptions:
     steps: Option[int] = 2000
     minutes: Option[float | None] = None
     gaussians_at_most: Option[int | None] = None
-    growth: Option[Literal["votes", "mcmc", "none"]] = "votes"
     sh_degree: Option[Literal[0, 1, 2, 3]] = 2
-    start: Option[Literal["auto", "sparse", "dense", "random"]] = "auto"
     seed: Option[int] = 0
 
 

@@ -323,8 +323,7 @@ def _fitted(work: RunContext) -> Stage:
         capture, state = results["load"], record.read()
         start, notes = None, ()
         if state is None:
-            given = {"sh_degree": options.sh_degree, "start": options.start, "progress": progress}
-            start, whence = starting_gaussians(capture, **given)
+            start, whence = starting_gaussians(capture, sh_degree=options.sh_degree, progress=progress)
             check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
             notes = (f"start of the fit: {whence}",)
         pixels = capture.cameras.width * capture.cameras.height
@@ -336,22 +335,18 @@ def _fitted(work: RunContext) -> Stage:
             seconds=None if minutes is None else 60 * minutes,
             start=start,
             state=state,
-            schedule=Schedule(growth=options.growth, max_gaussians=most),
+            schedule=Schedule(max_gaussians=most),
             on_checkpoint=lambda current: record.keep(lambda: current),
             progress=progress,
         )
-        if options.growth != "none":
-            notes = (*notes, f"{found.count} Gaussians after {len(losses)} steps")
-        return StageResult(found, notes=notes)
+        return StageResult(found, notes=(*notes, f"{found.count} Gaussians after {len(losses)} steps"))
 
-    left = {} if options.growth != "none" else {"densification": "the fit keeps the points that it starts from"}
-    if options.sh_degree == 0:
-        left["view-dependent colour"] = "SH degree 0"
+    left = {"view-dependent colour": "SH degree 0"} if options.sh_degree == 0 else {}
     length = f"{options.steps} steps" if minutes is None else f"{minutes:g} minutes"
     most = options.gaussians_at_most
-    number = "" if most is None or options.growth == "none" else f", at most {most} Gaussians"
+    number = "" if most is None else f", at most {most} Gaussians"
     how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{number}"
-    given = work.key_options("steps", "minutes", "sh_degree", "growth", "gaussians_at_most", "start", "seed")
+    given = work.key_options("steps", "minutes", "sh_degree", "gaussians_at_most", "seed")
     return Stage("gaussians", how, compute, "fit", after=("load",), key_options=given, skipped=left)
 
 
