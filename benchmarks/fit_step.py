@@ -28,8 +28,7 @@ from jsecon.fit.growth import pad_with_free_rows, padded_row_count
 from jsecon.fit.photometric import l1, photometric_loss
 from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
-from jsecon.fit.view import TrainingViews
+from jsecon.fit.step import StepConfig, StepRunner, TrainingViews, TrainState, put_on_devices
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.render import render, render_rgb

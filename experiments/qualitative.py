@@ -24,8 +24,8 @@ from experiments.tables.fill import Plan, options_of
 from experiments.tables.methods import METHODS
 from experiments.tables.setting import Setting, prepare
 from jsecon.app.pictures import selection_overlay
-from jsecon.evaluate.lerf import resize_camera
 from jsecon.evaluate.metrics import iou
+from jsecon.fit.resize import resize_camera
 from jsecon.query.render import selection_mask
 from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians

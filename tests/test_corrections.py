@@ -25,7 +25,7 @@ from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.refine import refine_capture
 from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.view import TrainingViews, cameras_extent, view_loss
+from jsecon.fit.step import TrainingViews, cameras_extent, view_loss
 from jsecon.splat.render import render
 from jsecon.types import Camera, Capture, Gaussians
 
@@ -38,8 +38,8 @@ GIVEN = {"key": KEY, "schedule": WHOLE, "chunk": 10}
 @pytest.fixture(autouse=True)
 def _one_size(monkeypatch):
     """A program less to compile, and captures of a few frames."""
-    monkeypatch.setattr(refine, "FINE", 1.0)
-    monkeypatch.setattr(refine, "ASIDE", (1, 8))
+    monkeypatch.setattr(refine, "FINE_SIZE", 1.0)
+    monkeypatch.setattr(refine, "MIN_ASIDE", 1)
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +166,7 @@ def test_a_known_twist_and_gain_are_found(capture, truth):
     told, states = rough(capture, twists=twists, gains=gains), []
     given = GIVEN | {"rates": FROZEN, "refine": RefineOptions(pose_rate=2e-3), "on_checkpoint": states.append}
     fit_gaussians(told, start=truth, steps=40 * 5, **given)
-    found, pixels = jax.tree.map(np.asarray, states[-1].refined.now), []
+    found, pixels = jax.tree.map(np.asarray, states[-1].corrections.current), []
     for poses in (capture.cameras.world_to_camera, hat_exp_of(found.twists) @ told.cameras.world_to_camera):
         x, y, z = np.moveaxis(truth.means @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], -1, 0)
         pixels.append(30 * np.stack([x / z, y / z]))
@@ -186,7 +186,7 @@ def test_without_corrections_a_fit_is_what_it_was(capture, truth):
     np.testing.assert_allclose(losses, others, rtol=1e-5)
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(still), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
-    assert init_fit_state(truth).refined is None
+    assert init_fit_state(truth).corrections is None
 
 
 def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, truth):
@@ -194,7 +194,7 @@ def test_a_refining_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, tr
     whole, losses = fit_gaussians(capture, start=truth, on_checkpoint=states.append, **given)
     stopped, ends = jax.tree.map(np.asarray, states[0]), []
     again, others = fit_gaussians(capture, state=stopped, on_checkpoint=ends.append, **given)
-    assert same((again, ends[-1].refined), (whole, states[-1].refined))
+    assert same((again, ends[-1].corrections), (whole, states[-1].corrections))
     np.testing.assert_array_equal(losses, others)
     with pytest.raises(ValueError, match="corrections"):
         fit_gaussians(capture, state=stopped, steps=30, **GIVEN)
@@ -266,7 +266,7 @@ def test_probes_end_when_the_poses_have_settled(capture, truth):
     refine_capture(
         capture, truth, key=KEY, visits=8, probes=9, progress=lambda done, total: steps.append((done, total))
     )
-    total = 8 * 9 * (VIEWS - 1) + refine.ALIGNING_VISITS
+    total = 8 * 9 * (VIEWS - 1) + refine.ALIGN_VISITS
     assert {whole for _, whole in steps} == {total}
     assert sorted(steps) == steps
     assert steps[-1] == (total, total)
@@ -324,8 +324,8 @@ def test_depths_and_masks_are_made_smaller_without_mixing(capture):
     depths = np.tile(slope.astype(np.float32), (VIEWS, 1, 1))
     views = TrainingViews(dataclasses.replace(capture, ignored=ignored, depths=depths))
     np.testing.assert_array_equal(views[0].depth, depths[0])
-    assert np.array_equal(views[0].ignored, ignored[views.used[0]])
-    views.at(0.5)
+    assert np.array_equal(views[0].ignored, ignored[views.frame_indices[0]])
+    views.set_size(0.5)
     depth = views[0].depth
     assert depth.shape == views[0].ignored.shape == views[0].frame.shape[:2] == (12, 16)
     mean = slope.reshape(12, 2, 16, 2).mean(axis=(1, 3))

@@ -14,7 +14,7 @@ from jsecon.fit.growth import in_use
 from jsecon.fit.optimise import fit_gaussians, init_fit_state, view_order
 from jsecon.fit.quality import evaluate_psnr
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.view import cameras_extent
+from jsecon.fit.step import cameras_extent
 from jsecon.parallel import host_mesh
 from jsecon.splat.render import render, render_rgb
 from jsecon.types import Camera, Capture, Gaussians

@@ -14,8 +14,8 @@ from jsecon.evaluate.lerf import (
     VALA_THRESHOLD,
     evaluate_at_thresholds,
     evaluate_point_level_rendered,
-    resize_camera,
 )
+from jsecon.fit.resize import resize_camera
 from jsecon.query.render import selection_mask
 from jsecon.types import Selection
 

@@ -56,8 +56,8 @@ def alike(a, b):
 @pytest.fixture
 def _small(monkeypatch, truth):
     """Frames of one size, and a start of the probes that few views can correct."""
-    monkeypatch.setattr(refine, "FINE", 1.0)
-    monkeypatch.setattr(refine, "ASIDE", (1, 8))
+    monkeypatch.setattr(refine, "FINE_SIZE", 1.0)
+    monkeypatch.setattr(refine, "MIN_ASIDE", 1)
     monkeypatch.setattr(refine, "starting_gaussians", lambda capture, **_: (truth, ""))
 
 

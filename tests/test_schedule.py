@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.fit.schedule import LearningRates, Schedule, rates_at, resize_cameras, resize_frame
+from jsecon.fit.resize import resize_frame, scale_cameras
+from jsecon.fit.schedule import LearningRates, Schedule, rates_at
 from jsecon.types import Camera, Gaussians
 
 
@@ -44,13 +45,13 @@ def test_rates_decay_log_linearly_and_frozen_positions_stay():
 def test_smaller_frames_are_means_seen_by_cameras_as_much_smaller():
     frames = np.random.default_rng(0).integers(0, 256, (2, 24, 32, 3)).astype(np.uint8)
     cameras = Camera(np.tile(np.eye(4), (2, 1, 1)), *(np.full(2, v) for v in (30.0, 31.0, 16.0, 12.0)), 32, 24)
-    half = resize_cameras(cameras, 0.5)
+    half = scale_cameras(cameras, 0.5)
     assert (half.width, half.height) == (16, 12)
     small = resize_frame(frames[1], half)
     np.testing.assert_allclose(small, frames[1].reshape(12, 2, 16, 2, 3).mean(axis=(1, 3)), atol=0.51)
     np.testing.assert_allclose([half.fx[0], half.fy[0], half.cx[0], half.cy[0]], [15, 15.5, 8, 6])
-    odd = resize_cameras(cameras, 0.3)
+    odd = scale_cameras(cameras, 0.3)
     assert (odd.width, odd.height) == (10, 7)
     assert resize_frame(frames[0], odd).shape == (7, 10, 3)
     np.testing.assert_allclose(odd.cx / odd.width, cameras.cx / 32)  # the same part of the image
-    assert np.shares_memory(resize_frame(frames[0], resize_cameras(cameras, 1.0)), frames)
+    assert np.shares_memory(resize_frame(frames[0], scale_cameras(cameras, 1.0)), frames)

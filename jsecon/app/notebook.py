@@ -13,7 +13,7 @@ from jsecon.app import pictures, report
 from jsecon.app.ask import ask_text
 from jsecon.app.outputs import answer_masks
 from jsecon.errors import InputError
-from jsecon.fit.schedule import resize_cameras, resize_frame
+from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.pipeline import networks
 from jsecon.types import Capture, LanguageField, Selection
 
@@ -41,7 +41,7 @@ def _shown(thing: LanguageField | Selection | Capture) -> tuple[UInt8[np.ndarray
 def _of_field(field: LanguageField) -> tuple[np.ndarray, str]:
     """The first view, in the scene's colours and in those of the codes."""
     cameras = jax.tree.map(np.asarray, field.cameras)
-    renderer = pictures.Renderer(field.gaussians, resize_cameras(cameras, _scale(cameras.width, cameras.height)))
+    renderer = pictures.Renderer(field.gaussians, scale_cameras(cameras, _scale(cameras.width, cameras.height)))
     image = np.concatenate([renderer.photo(0), renderer.colours(0, pictures.code_colours(field))], axis=1)
     words = f"LanguageField of {field.gaussians.count:,} Gaussians, {field.regions.count} regions and "
     return image, f"{words}{len(field.names)} frames, texts by {field.embedder or 'no embedder'}"
@@ -50,7 +50,7 @@ def _of_field(field: LanguageField) -> tuple[np.ndarray, str]:
 def _of_capture(capture: Capture) -> tuple[np.ndarray, str]:
     """SHOWN of its frames."""
     cameras = capture.cameras
-    small = resize_cameras(cameras, _scale(cameras.width, cameras.height))
+    small = scale_cameras(cameras, _scale(cameras.width, cameras.height))
     picked = np.unique(np.linspace(0, len(capture.names) - 1, SHOWN).round().astype(int))
     image = np.concatenate([resize_frame(np.asarray(capture.frames[t]), small) for t in picked], axis=1)
     words = f"Capture of {len(capture.names)} frames of {cameras.width}x{cameras.height}, "

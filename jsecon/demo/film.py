@@ -11,7 +11,7 @@ from jsecon.app.ask import Answer
 from jsecon.app.pictures import Renderer
 from jsecon.demo.capture import look_at
 from jsecon.files import atomic_write
-from jsecon.fit.schedule import resize_cameras
+from jsecon.fit.resize import scale_cameras
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, LanguageField
 
@@ -44,7 +44,7 @@ def write_film(field: LanguageField, answers: Sequence[Answer], file: Path) -> i
     """
     count = SECONDS * FRAMES_PER_SECOND
     long_side = max(field.cameras.width, field.cameras.height)
-    cameras = resize_cameras(orbit(field.cameras, count), min(LONG_SIDE_PX / long_side, 2.0))
+    cameras = scale_cameras(orbit(field.cameras, count), min(LONG_SIDE_PX / long_side, 2.0))
     renderer = Renderer(field.gaussians, cameras)
     colours = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh, np.float32)[:, 0], 0, 1)
     dark = np.repeat(DIM * colours.mean(1, keepdims=True), 3, axis=1)

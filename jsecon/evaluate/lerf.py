@@ -17,6 +17,7 @@ import numpy as np
 from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, in_any_box, iou, mean_iou
+from jsecon.fit.resize import resize_camera
 from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
 from jsecon.types import Camera, Gaussians, Selection
 
@@ -134,14 +135,6 @@ def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> lis
         remedy = "Evaluate on the very label files of the protocol, all of them."
         raise InputError("labels", f"{len(pairs)} (frame, query) pairs", f"{expected or 'at least one'}", remedy)
     return pairs
-
-
-def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view at another size, px: focal lengths and principal point scaled."""
-    x, y = width / camera.width, height / camera.height
-    return dataclasses.replace(
-        camera, fx=camera.fx * x, cx=camera.cx * x, fy=camera.fy * y, cy=camera.cy * y, width=width, height=height
-    )
 
 
 def _rows(

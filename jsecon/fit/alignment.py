@@ -15,8 +15,8 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from jsecon.fit.schedule import resize_cameras
-from jsecon.fit.view import cameras_extent
+from jsecon.fit.resize import shrink_cameras
+from jsecon.fit.step import cameras_extent
 from jsecon.types import Camera, Capture
 
 LEVELS = ((80, 8), (160, 6), (240, 4))
@@ -125,7 +125,7 @@ def align_cameras(
 def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level:
     """The chosen frames with a longer side of at most `side` px."""
     whole = capture.cameras[chosen]
-    cameras = resize_cameras(whole, min(1.0, side / max(whole.width, whole.height)))
+    cameras = shrink_cameras(whole, side)
     shape = len(chosen), cameras.height, cameras.width
     grey, slopes, planes = (np.zeros((*shape, *own), np.float32) for own in ((), (2,), (3,)))
     points, shades = np.ones((len(chosen), POINTS, 3)), np.zeros((len(chosen), POINTS))

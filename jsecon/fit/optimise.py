@@ -1,14 +1,13 @@
-"""Fits Gaussians to a capture's frames: Adam on the photometric loss (Kerbl et al. 2023), as its schedule says.
+"""Photometric fit of Gaussians to the frames of a capture, by Adam and a schedule (Kerbl et al. 2023). Host code.
 
-The state between chunks of steps is a record of arrays, so a fit can be stopped after any chunk and gone on with, to
-the same result.
+The state between chunks of steps is a record of arrays: a fit can stop after any chunk and resume to the same result.
 """
 
 import functools
 import math
 import time
 from collections.abc import Callable
-from typing import cast
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -18,43 +17,67 @@ from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionState, RefineOptions, init_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows, padded_row_count
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
-from jsecon.fit.view import TrainingViews
+from jsecon.fit.step import StepConfig, StepRunner, TrainingViews, TrainState, put_on_devices, to_host
 from jsecon.parallel import host_mesh
 from jsecon.types import Array, Capture, Gaussians, record
+
+_RATES, _SCHEDULE = LearningRates(), Schedule()
+ALLOCATED_AT_START = 1 << 16
+"""Number of Gaussians up to which a fit allocates all rows at its start; larger fits allocate half. Each doubling costs
+a compilation, as long as hundreds of steps over free rows."""
+MAX_PENDING_STEPS = 2
+"""Steps that are dispatched before the oldest is done; each holds a scene and its moments."""
 
 
 @record
 class FitState:
-    """All that a fit needs to go on."""
+    """State of a fit between two chunks of steps."""
 
     gaussians: Gaussians
-    """as fitted so far; rows may be free (growth.py)"""
+    """Scene so far; rows may be free (growth.py)."""
     first_moment: Gaussians
-    """Adam's running mean of the gradient"""
+    """Adam's running mean of the gradient."""
     second_moment: Gaussians
-    """Adam's running mean of its square"""
+    """Adam's running mean of the squared gradient."""
     votes: Array
-    """(N,) alpha T times the pixel's mean absolute error, over the pixels of the last views"""
+    """(N,) sum of alpha T times the mean absolute error of the pixel, over the views since the last growth."""
     done: Array
-    """() share of the fit that is done"""
+    """() share of the fit that is done."""
     pace: Array
-    """() share of the fit that a step is"""
+    """() share of the fit that one step takes."""
     seconds: Array
-    """() spent so far"""
+    """() time spent so far."""
     started: Array
-    """() Gaussians at the start"""
+    """() number of Gaussians at the start."""
     losses: Array
-    """(steps,) loss of each step's view before the step"""
-    refined: CorrectionState | None = None
-    """corrections of the capture's T frames, or None where nothing is refined"""
+    """(steps,) loss of the view of each step, before the step."""
+    corrections: CorrectionState | None = None
+    """Corrections of the T frames of the capture; None if they are not refined."""
+
+
+class FitResult(NamedTuple):
+    """Result of a fit."""
+
+    gaussians: Gaussians
+    losses: Float[np.ndarray, " steps"]
+    """Loss of the view of each step, before the step."""
 
 
 def view_order(key: PRNGKeyArray, views: int, first: int, last: int) -> Int[np.ndarray, " s"]:
-    """The views of steps first..last-1: each round of `views` steps takes all of them once, in an order of `key`'s."""
+    """Draws the views of the steps first .. last - 1; each round of `views` steps visits every view once.
+
+    Args:
+      key: Key of the random order.
+      views: Number of views.
+      first: First step.
+      last: Step after the last.
+
+    Returns:
+      (last - first,) indices of views.
+    """
     rounds = [np.asarray(_round(key, r, views)) for r in range(first // views, -(-last // views))]
-    start = first % views
-    return np.concatenate([np.zeros(0, np.int64), *rounds])[start : start + last - first]
+    offset = first % views
+    return np.concatenate([np.zeros(0, np.int64), *rounds])[offset : offset + last - first]
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -62,41 +85,33 @@ def _round(key: PRNGKeyArray, index: Array | int, views: int) -> Array:
     return jax.random.permutation(jax.random.fold_in(key, index), views)
 
 
-def init_fit_state(gaussians: Gaussians, refined: int | None = None, *, at_least: int = 0) -> FitState:
-    """The state before the first step, with rows for `at_least` Gaussians; `refined` is the number of frames that
-    corrections are kept of."""
+def init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *, min_rows: int = 0) -> FitState:
+    """Makes the state before the first step.
+
+    Args:
+      gaussians: Initial scene.
+      corrected_frames: Number of frames whose corrections are refined, or None.
+      min_rows: Number of Gaussians to allocate rows for.
+
+    Returns:
+      The state.
+    """
     count = np.asarray(gaussians.count)
-    rows = padded_row_count(max(int(count), at_least))
+    rows = padded_row_count(max(int(count), min_rows))
     gaussians = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
     zeros, zero = jax.tree.map(np.zeros_like, gaussians), np.zeros((), np.float64)
-    corrections = None if refined is None else init_corrections(refined)
-    numbers = zero, zero, zero, count, np.zeros(0, np.float32)
-    return FitState(gaussians, zeros, zeros, zeros.opacity_logits, *numbers, corrections)
-
-
-_RATES, _SCHEDULE = LearningRates(), Schedule()
-AT_ONCE = 1 << 16
-"""Gaussians that a fit has rows for from its start; where more are allowed, for half of them"""
-AHEAD = 2
-"""steps that are dispatched before one is done; each holds a scene and its moments"""
-
-
-def _chunk(
-    current: TrainState, steps: StepRunner, order: np.ndarray, first: int, done: np.ndarray, way: StepConfig
-) -> tuple[TrainState, list]:
-    """A step on each view of `order`, taken again with more room where one overflowed; and their losses."""
-    while True:
-        after, losses, overflow = current, [], []
-        for n, view in enumerate(order):
-            after, loss, missing = steps.take(after, int(view), first + n, float(done[n]), way)
-            losses.append(loss)
-            overflow.append(missing)
-            if n >= AHEAD:
-                jax.block_until_ready(losses[n - AHEAD])
-        most = int(max(jax.device_get(overflow)))
-        if not most:
-            return after, jax.device_get(losses)
-        steps.widen(current, most)
+    return FitState(
+        gaussians,
+        zeros,
+        zeros,
+        votes=zeros.opacity_logits,
+        done=zero,
+        pace=zero,
+        seconds=zero,
+        started=count,
+        losses=np.zeros(0, np.float32),
+        corrections=None if corrected_frames is None else init_corrections(corrected_frames),
+    )
 
 
 def fit_gaussians(
@@ -113,65 +128,76 @@ def fit_gaussians(
     chunk: int = 50,
     on_checkpoint: Callable[[FitState], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Gaussians, Float[np.ndarray, " steps"]]:
-    """Fits `start` (or goes on from `state`) to the frames that are not held out; returns the Gaussians and the losses.
+) -> FitResult:
+    """Fits Gaussians to the training frames of a capture.
 
-    Either `steps` of one view each, to the same result on the same devices, or as many as `seconds` allow, without the
-    time that jax takes to compile them the first time on a machine. With `refine` each view's pose or exposure is
-    corrected on the way (corrections.py; FitState.refined). All views are taken once before any comes again, in
-    an order drawn by `key`; the background is black. After every `chunk` steps Gaussians are added as `schedule` says,
-    and `on_checkpoint` is given the state. A chunk in which a view overflowed its tile lists is taken again with more
-    room, so the result does not depend on the capacity. All devices of this process take part in every step.
-    Raises ValueError where not exactly one of `steps` and `seconds`, or of `start` and `state`, is given, or the state
-    is of another fit; InputError where every frame is held out or the numbers stop being finite.
+    Each step takes one view; all views are visited once before any is visited again. The background is black. All
+    devices of this process share every step. A chunk in which a view overflowed its tile lists is repeated with more
+    capacity, so the result does not depend on the capacity.
+
+    Args:
+      capture: Frames and cameras.
+      key: Key of the order of the views and of growth.
+      steps: Number of steps; the same steps on the same devices give the same result.
+      seconds: Time limit in place of `steps`, without compilation.
+      start: Initial scene.
+      state: State of a stopped fit, in place of `start`.
+      schedule: Sizes of the frames, growth and degree of colour over time.
+      rates: Learning rates.
+      refine: Which corrections of the views to optimise too (`FitState.corrections`), or None.
+      chunk: Number of steps between checkpoints; Gaussians are added only then.
+      on_checkpoint: Called with the state after every chunk.
+      progress: Called with the number of steps (or seconds) done and of all.
+
+    Returns:
+      The fitted Gaussians and the loss of each step.
+
+    Raises:
+      ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`, is given, or the state is of
+        another fit.
+      InputError: Every frame is held out, or the fit diverges.
     """
-    given, exclusive = (steps, seconds), (steps is None) != (seconds is None)
-    require(exclusive, "steps, seconds", given, "exactly one of the two", "A fit ends after so many of either.")
-    given, exclusive = (start is not None, state is not None), (start is None) != (state is None)
-    require(exclusive, "start, state", given, "exactly one of the two", "Give state to go on with a fit.")
+    given = steps, seconds
+    require(given.count(None) == 1, "steps, seconds", given, "exactly one of the two", "Choose one limit.")
+    exclusive = (start is None) != (state is None)
+    got = start is not None, state is not None
+    require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")
     views, mesh = TrainingViews(capture), host_mesh()
-    taking = StepRunner(views, mesh)
+    runner = StepRunner(views, mesh)
     if start is not None:
-        # A doubling is one more program to compile, which takes as long as hundreds of steps over free rows.
-        divisor = 1 if schedule.max_gaussians <= AT_ONCE else 2
-        room = schedule.max_gaussians // divisor if schedule.grows(start.count) else 0
-        state = init_fit_state(start, None if refine is None else len(capture.names), at_least=room)
+        divisor = 1 if schedule.max_gaussians <= ALLOCATED_AT_START else 2
+        min_rows = schedule.max_gaussians // divisor if schedule.grows(start.count) else 0
+        state = init_fit_state(start, None if refine is None else len(capture.names), min_rows=min_rows)
     assert state is not None
-    given, alike = state.refined is not None, (state.refined is None) == (refine is None)
-    require(alike, "state with corrections", given, f"{refine is not None}", "Go on with the options of its start.")
-    if steps is not None:
-        own = abs(float(state.done) * steps - len(state.losses)) < 1e-6
-        found = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
-        require(own, "state", found, f"a fit of {steps} steps", "Go on with the options of its start.")
+    _check_resumable(state, steps, refine)
     seed = int(jax.random.bits(key))
-    fitted = TrainState(state.gaussians, state.first_moment, state.second_moment, state.votes, state.refined)
-    current = put_on_devices(fitted, mesh)
+    train_state = put_on_devices(_train_state(state), mesh)
     while float(state.done) < 1:
         first, done = len(state.losses), float(state.done)
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
-        # A fit that is gone on with takes the same chunks.
+        # A resumed fit has the same chunks.
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
-        views.at(schedule.size(done))
-        order, dones = view_order(key, len(views.used), first, first + count), done + pace * np.arange(count)
+        views.set_size(schedule.size(done))
+        order = view_order(key, len(views.frame_indices), first, first + count)
         count_votes = schedule.grows(int(state.started)) and done <= schedule.growth_end
-        way = StepConfig(schedule.degree(done), count_votes, rates, refine)
-        taking.compile(current, int(order[0]), first, done, way)  # which is not the fit's time
+        config = StepConfig(schedule.degree(done), count_votes, rates, refine)
+        runner.compile(train_state, int(order[0]), first, done, config)  # not counted as time of the fit
         began = time.monotonic()
-        current, taken = _chunk(current, taking, order, first, dones, way)
-        losses = np.concatenate([state.losses, np.asarray(taken, np.float32)])
-        host = to_host(current, state.gaussians.count)
-        # A Gaussian that is not finite is invisible, so the loss alone would not tell.
-        moved = jax.tree.leaves((losses[-1], host.gaussians, host.refined))
-        if not all(np.isfinite(array).all() for array in moved):
-            found = f"numbers that are not finite after step {len(losses)}"
-            remedy = "Check the start, the poses and the intrinsics, or lower the learning rates."
-            raise InputError("fit", found, "a fit that converges", remedy)
+        train_state, new_losses = _run_chunk(train_state, runner, order, first, done + pace * np.arange(count), config)
+        losses = np.concatenate([state.losses, np.asarray(new_losses, np.float32)])
+        host = to_host(train_state, state.gaussians.count)
+        # A Gaussian that is not finite is invisible: the loss alone does not show it.
+        arrays = jax.tree.leaves((losses[-1], host.gaussians, host.corrections))
+        if not all(np.isfinite(array).all() for array in arrays):
+            problem = f"the fit has numbers that are not finite after step {len(losses)}"
+            remedy = "Check the initial points, the poses and the intrinsics, or lower the learning rates."
+            raise InputError("", problem, remedy=remedy)
         target = schedule.count(done, int(state.started))
         if target is not None and len(losses) % chunk == 0:
-            host = _grown(host, schedule, target, [seed, len(losses)])
-            current = put_on_devices(host, mesh)
-        spent = float(state.seconds) + time.monotonic() - began
-        now = len(losses) / steps if steps is not None else min(spent / cast(float, seconds), 1.0)
+            host = _densify(host, schedule, target, [seed, len(losses)])
+            train_state = put_on_devices(host, mesh)
+        elapsed = float(state.seconds) + time.monotonic() - began
+        now = len(losses) / steps if steps is not None else min(elapsed / cast(float, seconds), 1.0)
         state = FitState(
             gaussians=host.gaussians,
             first_moment=host.first_moment,
@@ -179,20 +205,53 @@ def fit_gaussians(
             votes=host.votes,
             done=np.asarray(now),
             pace=np.asarray((now - done) / count),
-            seconds=np.asarray(spent),
+            seconds=np.asarray(elapsed),
             started=state.started,
             losses=losses,
-            refined=host.refined,
+            corrections=host.corrections,
         )
         if on_checkpoint:
             on_checkpoint(state)
         if progress:
-            progress(*((len(losses), steps) if steps is not None else (round(spent), round(cast(float, seconds)))))
-    return drop_free_rows(state.gaussians), np.asarray(state.losses)
+            progress(*((len(losses), steps) if steps is not None else (round(elapsed), round(cast(float, seconds)))))
+    return FitResult(drop_free_rows(state.gaussians), np.asarray(state.losses))
 
 
-def _grown(current: TrainState, schedule: Schedule, target: int, seed: list[int]) -> TrainState:
-    """With up to `target` Gaussians, on the host; the votes are counted anew."""
-    moments = current.first_moment, current.second_moment
-    gaussians, moments = grow(current.gaussians, moments, current.votes, target, schedule.max_gaussians, seed)
-    return TrainState(gaussians, *moments, np.zeros_like(current.votes, shape=gaussians.count), current.refined)
+def _check_resumable(state: FitState, steps: int | None, refine: RefineOptions | None) -> None:
+    """Raises ValueError if a state was made with other options."""
+    remedy = "Resume with the options of the first run."
+    got = state.corrections is not None
+    require(got == (refine is not None), "state with corrections", got, f"{refine is not None}", remedy)
+    if steps is not None:
+        same = abs(float(state.done) * steps - len(state.losses)) < 1e-6
+        got = f"{len(state.losses)} steps, {float(state.done):.1%} of its fit"
+        require(same, "state", got, f"a fit of {steps} steps", remedy)
+
+
+def _train_state(state: FitState) -> TrainState:
+    return TrainState(state.gaussians, state.first_moment, state.second_moment, state.votes, state.corrections)
+
+
+def _run_chunk(
+    state: TrainState, runner: StepRunner, order: np.ndarray, first: int, done: np.ndarray, config: StepConfig
+) -> tuple[TrainState, list]:
+    """Takes a step on each view of `order`, repeated with more capacity if one overflowed; and returns their losses."""
+    while True:
+        after, losses, overflow = state, [], []
+        for n, view in enumerate(order):
+            after, loss, missing = runner.take(after, int(view), first + n, float(done[n]), config)
+            losses.append(loss)
+            overflow.append(missing)
+            if n >= MAX_PENDING_STEPS:
+                jax.block_until_ready(losses[n - MAX_PENDING_STEPS])
+        most = int(max(jax.device_get(overflow)))
+        if not most:
+            return after, jax.device_get(losses)
+        runner.widen(state, most)
+
+
+def _densify(state: TrainState, schedule: Schedule, target: int, seed: list[int]) -> TrainState:
+    """Adds Gaussians up to `target` on the host and resets the votes."""
+    moments = state.first_moment, state.second_moment
+    gaussians, moments = grow(state.gaussians, moments, state.votes, target, schedule.max_gaussians, seed)
+    return TrainState(gaussians, *moments, np.zeros_like(state.votes, shape=gaussians.count), state.corrections)

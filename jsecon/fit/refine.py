@@ -1,25 +1,25 @@
-"""A capture put right before anything is made of it: poses, exposures, and frames that nothing explains.
+"""Refines the poses and exposures of a capture before a fit, and drops frames that nothing explains. Host code.
 
-A probe, a short fit with corrections (corrections.py), says how far each frame is off. What comes of it is a capture
-again, its cameras where they stood and its frames as one exposure shows them, for all that follows.
+A probe is a short fit with corrections (corrections.py); it measures how far each frame is off. The result is a capture
+again, in the same world, with its frames as under one exposure.
 
-Where frames have depth, the cameras are first aligned to each other by colour and depth (alignment.py), if that makes
-the frames agree: then one probe is enough. Otherwise points from depth stand where their own frame's wrong pose puts
-them, and hold it there: so a probe has few of them, which several frames must share, and after each of the first probes
-the next starts from points made anew with the poses found. The first probes see small frames and end as soon as the
-poses settle; the last sees larger ones.
+If the frames have depth, the cameras are first aligned to each other by colour and depth (alignment.py), provided that
+the frames then agree better: one probe is enough after that. Otherwise points from depth lie where the wrong pose of
+their own frame puts them, and hold it there. So such a probe starts from few points, which several frames must share,
+and each further probe starts from points made with the poses of the one before. The first probes see small frames and
+end as soon as the poses are stable; the last sees larger ones.
 
-Whether corrections help is decided by `decide` on training frames kept aside: a first probe with corrections and one
-without, both fitted to the other training frames, are compared on them. A kept-aside frame is aligned to either probe,
-frozen, on half of its pixels, and compared on the other half: so alignment alone wins nothing. Frames held out have no
-part in the probes or in that decision; they are aligned to the last probe once it is frozen, each by its own pose and
-exposure alone, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
+`decide` corrects only if it helps, measured on training frames kept aside: a first probe with corrections and one
+without are fitted to the other training frames and compared on these. A frame kept aside is aligned to either frozen
+probe on half of its pixels and compared on the other half, so that alignment alone gains nothing. Held-out frames have
+no part in the probes or in the decision. They are aligned to the last probe once it is frozen, each by its own pose and
+exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
 """
 
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -39,62 +39,67 @@ from jsecon.fit.corrections import (
 )
 from jsecon.fit.optimise import FitState, fit_gaussians
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
-from jsecon.fit.schedule import LearningRates, Schedule, resize_cameras, resize_frame
+from jsecon.fit.resize import resize_frame, scale_cameras
+from jsecon.fit.schedule import LearningRates, Schedule
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.view import cameras_extent
+from jsecon.fit.step import cameras_extent
 from jsecon.splat.render import render_rgb
 from jsecon.types import Array, Camera, Capture, Gaussians
 
-VISITS, PROBES = 30, 4
-"""of each frame by a probe, and probes one after the other at most"""
-POINTS = 12_000
-"""that a probe starts from at most, where it has more than the capture's sparse ones"""
-ALIGNING_VISITS = 120
-"""of each frame held out, by its alignment to the last probe"""
-DECIDING_VISITS = 24
-"""of each frame kept aside, by its alignment to a probe of the decision"""
-FINE = 0.5
-"""size of the frames in the last probe, which measures as well as all of it here, in half the time"""
-COARSE_PX, COARSE_LEAST = 100, 0.25
-"""longer side of the frames in the probes before it, px, and their least size as a share of the frames' own"""
-SETTLED_PX = 0.25
-"""median movement of the picture by a probe, px of the frames' own size, from which on the poses have settled"""
-GAIN_DB = 0.5
-"""that corrections must win on the frames kept aside. In the demo's room they win 0.1 dB where nothing is wrong, 0.9
-where poses are off by 3 mm and 0.15 degrees, 2 to 3 by three times as much (experiments/rough_capture.py)"""
-ASIDE = 2, 8
-"""training frames kept aside for the decision at least (of three times as many), and at most"""
-PLACED_RATE = 1e-4
-"""radians, of the first steps of poses that depth has placed already: what is left is small"""
-FEWEST_VISITS = 6
-"""of each frame by a probe: with fewer the poses do not come to rest"""
-SQUARES = 8
-"""of the chequerboard on which frames kept aside are compared, along each side of a frame"""
+VISITS = 30
+"""Visits of each frame by a probe."""
+MIN_VISITS = 6
+"""Visits below which poses do not become stable."""
+PROBES = 4
+"""Maximum number of probes, one after the other."""
+PROBE_POINTS = 12_000
+"""Maximum number of points from depth that a probe starts from."""
+ALIGN_VISITS = 120
+"""Visits of each held-out frame while it is aligned to the last probe."""
+DECIDE_VISITS = 24
+"""Visits of each frame kept aside while it is aligned to a probe of the decision."""
+FINE_SIZE = 0.5
+"""Size of the frames in the last probe, which measures as well as full size in half the time."""
+COARSE_PX = 100
+"""Longer side in px of the frames in the probes before the last."""
+MIN_COARSE_SIZE = 0.25
+"""Smallest size of the frames in these probes."""
+STABLE_PX = 0.25
+"""Median movement of the image by a probe, px at full size, below which the poses are stable."""
+MIN_GAIN_DB = 0.5
+"""PSNR that corrections must gain on the frames kept aside. In the demo's room they gain 0.1 dB if nothing is wrong,
+0.9 if poses are off by 3 mm and 0.15 degrees, and 2 to 3 at three times as much (experiments/rough_capture.py)."""
+MIN_ASIDE, MAX_ASIDE = 2, 8
+"""Number of training frames kept aside for the decision, a third of all at most."""
+ALIGNED_POSE_RATE = 1e-4
+"""First step of poses that depth has aligned already, radians: what is left is small."""
+CHESS_SQUARES = 8
+"""Squares of the chessboard on which frames kept aside are compared, along each side of a frame."""
 TOO_MANY = (
     "{} frames are too many to correct them within half of the fit's time (use more --steps, fewer --frames, or "
     "--refine both, which takes longer)"
 )
-_STEP_PIXELS, _STEP_ONCE = 0.46, 0.072
-"""time of a probe's step, in steps of the fit: for frames of the fit's size, and for its Gaussians"""
-_PLACING_STEPS = 1.0
-"""time of aligning a frame by colour and depth, in steps of the fit"""
+_STEP_COST_PIXELS, _STEP_COST_GAUSSIANS = 0.46, 0.072
+"""Time of a step of a probe in steps of the fit: for frames of full size, and for its Gaussians."""
+_DEPTH_ALIGNMENT_COST = 1.0
+"""Time to align a frame by colour and depth, in steps of the fit."""
 _REFINE = RefineOptions()
-_STILL = RefineOptions(poses=False, exposure=False)
-"""of a probe without corrections that shares the program of one with them"""
+_NO_CORRECTION = RefineOptions(poses=False, exposure=False)
+"""Options of a probe without corrections that shares the program of a probe with them."""
 _FROZEN = LearningRates(means=0.0, means_last=0.0, log_scales=0.0, quaternions=0.0, opacity_logits=0.0, colors=0.0)
 
 
 class _Plan(NamedTuple):
-    """How the probes go."""
+    """Sizes and lengths of the probes."""
 
-    coarse: float
-    """size of the frames in all probes but the last"""
+    coarse_size: float
+    """Size of the frames in all probes but the last."""
     probes: int
     visits: int
-    """of each frame by each probe"""
+    """Visits of each frame by each probe."""
 
 
-def _planned(
+def _plan_probes(
     capture: Capture,
     refine: RefineOptions | None,
     *,
@@ -103,23 +108,91 @@ def _planned(
     decide: bool,
     max_fit_steps: float | None,
 ) -> _Plan | None:
-    """The probes, with as many visits as fit into the time of `max_fit_steps` steps; None where those are fewer than
-    FEWEST_VISITS."""
-    held = np.asarray(capture.held_out)
-    train, out = int((~held).sum()), int(held.sum()) if refine is not None else 0
-    coarse = min(FINE, max(COARSE_LEAST, COARSE_PX / max(capture.cameras.width, capture.cameras.height)))
+    """Plans as many visits as fit into the time of `max_fit_steps` steps; None if these are below MIN_VISITS."""
+    held_out = np.asarray(capture.held_out)
+    train = int((~held_out).sum())
+    aligned = int(held_out.sum()) if refine is not None else 0
+    coarse_size = min(FINE_SIZE, max(MIN_COARSE_SIZE, COARSE_PX / max(capture.cameras.width, capture.cameras.height)))
     probes = probes if refine is not None and refine.poses else 1
-    small, large = (_STEP_PIXELS * size**2 + _STEP_ONCE for size in (coarse, FINE))
-    # The decision takes a probe more, which sees no corrections; where there is one alone, two.
-    each = train * (large + small * (probes - 1 + decide + (decide and probes == 1)))
-    fixed = ALIGNING_VISITS * out * large + DECIDING_VISITS * min(ASIDE[1], train // 3) * small * 2 * decide
+    coarse, fine = (_STEP_COST_PIXELS * size**2 + _STEP_COST_GAUSSIANS for size in (coarse_size, FINE_SIZE))
+    # The decision takes one probe more, without corrections; two more if there is only one otherwise.
+    per_visit = train * (fine + coarse * (probes - 1 + decide + (decide and probes == 1)))
+    fixed = ALIGN_VISITS * aligned * fine + DECIDE_VISITS * min(MAX_ASIDE, train // 3) * coarse * 2 * decide
     if capture.depths is not None:
-        fixed += _PLACING_STEPS * len(held) * (1 + decide)
-    # Alignments are not cut short: a frame held out would be measured by a pose on its way.
-    allowed = visits if max_fit_steps is None else min(visits, int((max_fit_steps - fixed) / each))
-    if allowed < min(FEWEST_VISITS, visits):
+        fixed += _DEPTH_ALIGNMENT_COST * len(held_out) * (1 + decide)
+    # Alignments are never shortened: an unfinished pose would spoil the measurement of a held-out frame.
+    allowed = visits if max_fit_steps is None else min(visits, int((max_fit_steps - fixed) / per_visit))
+    if allowed < min(MIN_VISITS, visits):
         return None
-    return _Plan(coarse, probes, max(1, allowed))
+    return _Plan(coarse_size, probes, max(1, allowed))
+
+
+@dataclasses.dataclass
+class _Prober:
+    """Runs the probes of one capture and reports their progress."""
+
+    key: PRNGKeyArray
+    start: Gaussians | None
+    total: int
+    progress: Callable[[int, int], None] | None
+    done: int = 0
+
+    def initial(self, capture: Capture) -> Gaussians:
+        """Gaussians that a probe of this capture starts from."""
+        return starting_gaussians(capture, max_points=PROBE_POINTS)[0] if self.start is None else self.start
+
+    def report(self, done: int) -> None:
+        if self.progress is not None:
+            self.progress(min(done, self.total), self.total)
+
+    def fit(
+        self,
+        capture: Capture,
+        start: Gaussians,
+        refine: RefineOptions | None,
+        size: float,
+        steps: int,
+        rates: LearningRates | None = None,
+    ) -> tuple[Gaussians, Corrections]:
+        """A short fit to frames of this size, and the corrections of all frames; identity if none are refined."""
+        states: list[FitState] = []
+        # Soft Gaussians render a depth before the surface: as a target, depth would push every camera back.
+        capture = capture if refine is None else dataclasses.replace(capture, depths=None)
+        if capture.ignored is None:  # one program serves probes and alignments on parts of a frame
+            ignored = np.broadcast_to(False, np.shape(capture.frames)[:3])
+            capture = dataclasses.replace(capture, ignored=ignored)
+        before, self.done = self.done, self.done + steps
+        scene, _ = fit_gaussians(
+            capture,
+            key=self.key,
+            steps=steps,
+            start=start,
+            refine=refine,
+            rates=LearningRates() if rates is None else rates,
+            schedule=Schedule(sizes=((size, 1.0),), max_gaussians=0),
+            on_checkpoint=lambda state: states.__setitem__(slice(None), [state]),
+            progress=lambda done, _: self.report(before + done),
+        )
+        corrections = states[0].corrections
+        if corrections is None:
+            return scene, identity_corrections(len(capture.names))
+        return scene, jax.tree.map(np.asarray, corrections.current)
+
+    def align(
+        self,
+        capture: Capture,
+        scene: Gaussians,
+        corrections: Corrections,
+        frames: Bool[np.ndarray, " t"],
+        refine: RefineOptions | None,
+        size: float,
+        visits: int,
+    ) -> Corrections:
+        """The corrections, with those of `frames` replaced by alignment to the frozen scene."""
+        only = dataclasses.replace(capture, held_out=~frames)
+        _, aligned = self.fit(only, scene, refine, size, visits * int(frames.sum()), _FROZEN)
+        pick = lambda a, b: np.where(frames.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+        return jax.tree.map(pick, corrections, aligned)
 
 
 def refine_capture(
@@ -135,28 +208,27 @@ def refine_capture(
     probes: int = PROBES,
     progress: Callable[[int, int], None] | None = None,
 ) -> Capture:
-    """Corrects a capture's poses and exposures by short fits, and leaves out frames that these do not explain.
+    """Corrects the poses and exposures of a capture by short fits, and drops frames that these do not explain.
 
-    The world stays where it was: of all corrections the rigid motion that brings the training cameras nearest to where
-    they were told to stand is taken back, and colours are such that the mean correction is none. A corrected frame is
-    clipped to 8 bits; pixels that were white and come out darker are `ignored`.
+    The world stays the same: the rigid motion that brings the training cameras nearest to their given places is
+    removed from all corrections, and the mean colour map becomes the identity. A corrected frame is clipped to 8 bits;
+    white pixels that become darker are `ignored`.
 
     Args:
-      capture: Frames with the poses to correct. Frames held out have no part in the probes.
-      start: Gaussians that each probe starts from. Without, points made with the poses of the probe before.
-      key: Draws the order of the frames.
+      capture: Frames with the poses to correct. Held-out frames have no part in the probes.
+      start: Gaussians that each probe starts from. By default points made with the poses of the probe before.
+      key: Key of the order of the frames.
       refine: What to correct, or None.
-      drop_weak: Leave out training frames that the last probe does not explain (`quality.is_weak`).
-      decide: Correct only where that lowers the error of training frames kept aside. Otherwise the frames and the
-        poses stay as they are.
-      max_fit_steps: The probes take at most about the time of so many steps of the fit: fewer visits. Where that
-        leaves too few of them, nothing is refined.
+      drop_weak: Whether to drop training frames that the last probe does not explain (`quality.is_weak`).
+      decide: Whether to correct only if that lowers the error of training frames kept aside.
+      max_fit_steps: Limits the probes to about the time of so many steps of the fit, by fewer visits. If that leaves
+        too few of them, nothing is refined.
       visits: Visits of each frame by each probe.
-      probes: Maximum number of probes; one where no pose is refined.
+      probes: Maximum number of probes; one if no pose is refined.
       progress: Called with the number of steps done and of all.
 
     Returns:
-      The corrected capture, whose notes say what was done and why. Without `refine` and `drop_weak` the capture itself.
+      The corrected capture; its notes say what was done and why. Without `refine` and `drop_weak` the capture itself.
 
     Raises:
       ValueError: `visits` or `probes` is below 1.
@@ -166,73 +238,60 @@ def refine_capture(
         return capture
     require(visits > 0, "visits", visits, "at least 1", f"{VISITS} are usual.")
     require(probes > 0, "probes", probes, "at least 1", f"{PROBES} are usual.")
-    told, train, notes = capture, ~np.asarray(capture.held_out), []
-    placed = None
+    original, train, notes = capture, ~np.asarray(capture.held_out), []
+    aligned = None
     if refine is not None and refine.poses and capture.depths is not None:
-        placed = _placed(capture, train, ~train)
-    if placed is not None:
-        assert refine is not None
-        probes, refine = 1, dataclasses.replace(refine, pose_rate=PLACED_RATE)
-    plan = _planned(capture, refine, visits=visits, probes=probes, decide=decide, max_fit_steps=max_fit_steps)
+        aligned = _align_by_depth(capture, train, ~train)
+    by_depth = aligned is not None
+    if refine is not None and by_depth:
+        probes, refine = 1, dataclasses.replace(refine, pose_rate=ALIGNED_POSE_RATE)
+    plan = _plan_probes(capture, refine, visits=visits, probes=probes, decide=decide, max_fit_steps=max_fit_steps)
     if plan is None:
-        refine, plan = None, _Plan(FINE, 1, visits)
+        refine, plan = None, _Plan(FINE_SIZE, 1, visits)
         notes.append(f"poses and exposures stay as they are: {TOO_MANY.format(len(capture.names))}")
-    steps, out = plan.visits * int(train.sum()), int((~train).sum()) if refine is not None else 0
-    total, done = steps * (plan.probes + 2 * decide) + ALIGNING_VISITS * out, 0
-
-    def probed(capture: Capture, start: Gaussians, refine: RefineOptions | None, size: float, steps: int, **given: Any):
-        nonlocal done
-        before, done = done, done + steps
-
-        def tell(taken: int, _: int) -> None:
-            if progress is not None:
-                progress(min(before + taken, total), total)
-
-        return _probed(capture, start, refine, key=key, steps=steps, size=size, progress=tell, **given)
-
-    def begun(capture: Capture) -> Gaussians:
-        return starting_gaussians(capture, max_points=POINTS)[0] if start is None else start
-
-    left = plan.probes
+    steps = plan.visits * int(train.sum())
+    held_out = int((~train).sum()) if refine is not None else 0
+    prober = _Prober(key, start, steps * (plan.probes + 2 * decide) + ALIGN_VISITS * held_out, progress)
+    remaining = plan.probes
     if decide and refine is not None:
-        found, better, plain = _compared(capture, begun, refine, plan, probed, by_depth=placed is not None)
-        notes.append(_decision(found, better, plain))
-        if found is None:
-            refine, left = None, 1
-        elif left > 1:
-            moved = dataclasses.replace(refine, exposure=False)
-            capture, left = _corrected(capture, found, moved), left - 1
+        decision = _decide(capture, prober, refine, plan, by_depth=by_depth)
+        notes.append(decision.note)
+        if decision.corrections is None:
+            refine, remaining = None, 1
+        elif remaining > 1:
+            capture = _apply(capture, decision.corrections, dataclasses.replace(refine, exposure=False))
+            remaining -= 1
     if refine is None and not drop_weak:
-        return dataclasses.replace(told, notes=(*told.notes, *notes))
-    capture = capture if placed is None or refine is None else placed
-    while refine is not None and left > 1:
-        scene, found = probed(capture, begun(capture), refine, plan.coarse, steps)
-        before, capture = capture, _corrected(capture, found, dataclasses.replace(refine, exposure=False))
-        still = _moved_px(scene, before.cameras[train], capture.cameras[train]) < SETTLED_PX
-        left = 1 if still else left - 1
-    probe, found = probed(capture, begun(capture), refine, FINE, steps)
-    if out:
-        found = _with_aligned(capture, probe, found, ~train, refine, FINE, ALIGNING_VISITS, probed)
-    # In the probe's own world and colours.
-    left_out = weak_frames(probe, _corrected(capture, found, refine, at_home=False)) if drop_weak else np.zeros(0, int)
-    better = _corrected(capture, found, refine)
-    if progress is not None:
-        progress(total, total)
-    notes = (*told.notes, *notes, *_told(told, better, found, refine, by_depth=placed is not None))
-    return _without(dataclasses.replace(better, notes=notes), left_out)
+        return dataclasses.replace(original, notes=(*original.notes, *notes))
+    capture = aligned if aligned is not None and refine is not None else capture
+    while refine is not None and remaining > 1:
+        scene, corrections = prober.fit(capture, prober.initial(capture), refine, plan.coarse_size, steps)
+        before, capture = capture, _apply(capture, corrections, dataclasses.replace(refine, exposure=False))
+        stable = _median_shift_px(scene, before.cameras[train], capture.cameras[train]) < STABLE_PX
+        remaining = 1 if stable else remaining - 1
+    scene, corrections = prober.fit(capture, prober.initial(capture), refine, FINE_SIZE, steps)
+    if held_out:
+        corrections = prober.align(capture, scene, corrections, ~train, refine, FINE_SIZE, ALIGN_VISITS)
+    # In the world and the colours of the probe.
+    as_probed = _apply(capture, corrections, refine, keep_world=False)
+    dropped = weak_frames(scene, as_probed) if drop_weak else np.zeros(0, int)
+    refined = _apply(capture, corrections, refine)
+    prober.report(prober.total)
+    notes = (*original.notes, *notes, *_describe(original, refined, corrections, refine, by_depth=by_depth))
+    return _without_frames(dataclasses.replace(refined, notes=notes), dropped)
 
 
-def _placed(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
-    """With the cameras of `train` aligned to each other by colour and depth, in the world that they had, and each of
-    the `others` to these; None where that does not bring them nearer to each other (`align_cameras`)."""
-    given = np.asarray(capture.cameras.world_to_camera, np.float64)
+def _align_by_depth(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
+    """Aligns the training cameras to each other by colour and depth, in the same world, and then the others to them;
+    None if they do not agree better so."""
+    poses = np.asarray(capture.cameras.world_to_camera, np.float64)
     moved = align_cameras(capture, train)
     if moved is None:
         return None
-    moved = moved @ _rigid_drift(moved[train], given[train], cameras_extent(capture.cameras[train]))
-    placed = _with_poses(capture, moved)
-    moved = align_cameras(placed, others, train)
-    return placed if moved is None else _with_poses(placed, moved)
+    moved = moved @ rigid_drift(moved[train], poses[train], cameras_extent(capture.cameras[train]))
+    aligned = _with_poses(capture, moved)
+    moved = align_cameras(aligned, others, train)
+    return aligned if moved is None else _with_poses(aligned, moved)
 
 
 def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
@@ -240,173 +299,145 @@ def _with_poses(capture: Capture, poses: Float[np.ndarray, "t 4 4"]) -> Capture:
     return dataclasses.replace(capture, cameras=cameras)
 
 
-def _probed(
-    capture: Capture, start: Gaussians, refine: RefineOptions | None, *, size: float, **given: Any
-) -> tuple[Gaussians, Corrections]:
-    """A short fit to frames of this size, and its frames' corrections: none where nothing is refined."""
-    last: list[FitState] = []
-    # What is rendered of soft Gaussians lies before a surface, and depth as a teacher would push every camera back.
-    capture = capture if refine is None else dataclasses.replace(capture, depths=None)
-    if capture.ignored is None:  # one program serves probes and alignments on parts of a frame
-        capture = dataclasses.replace(capture, ignored=np.broadcast_to(False, np.shape(capture.frames)[:3]))
-    keep = lambda state: last.__setitem__(slice(None), [state])
-    schedule = Schedule(sizes=((size, 1.0),), max_gaussians=0)
-    found, _ = fit_gaussians(capture, start=start, refine=refine, schedule=schedule, on_checkpoint=keep, **given)
-    refined = last[0].refined
-    return found, identity_corrections(len(capture.names)) if refined is None else jax.tree.map(np.asarray, refined.now)
+class _Decision(NamedTuple):
+    """Whether corrections help."""
+
+    corrections: Corrections | None
+    """Corrections of the training frames; None if they do not help."""
+    note: str
 
 
-def _with_aligned(
-    capture: Capture,
-    probe: Gaussians,
-    found: Corrections,
-    which: Bool[np.ndarray, " t"],
-    refine: RefineOptions | None,
-    size: float,
-    visits: int,
-    probed: Callable[..., tuple[Gaussians, Corrections]],
-) -> Corrections:
-    """`found`, with the corrections of the frames `which` by alignment to the frozen probe."""
-    others = dataclasses.replace(capture, held_out=~which)
-    _, aligned = probed(others, probe, refine, size, visits * int(which.sum()), rates=_FROZEN)
-    pick = lambda a, b: np.where(which.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-    return jax.tree.map(pick, found, aligned)
-
-
-def _compared(
-    capture: Capture,
-    start: Callable[[Capture], Gaussians],
-    refine: RefineOptions,
-    plan: _Plan,
-    probed: Callable[..., tuple[Gaussians, Corrections]],
-    *,
-    by_depth: bool,
-) -> tuple[Corrections | None, float, float]:
-    """Corrections of the training frames, or None where they do not help; and the mean PSNR (dB) of frames kept aside,
-    aligned to a probe with corrections and to one without (NaN where there are too few frames to keep any aside)."""
+def _decide(capture: Capture, prober: _Prober, refine: RefineOptions, plan: _Plan, *, by_depth: bool) -> _Decision:
+    """Compares a probe with corrections and one without on training frames kept aside."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    count = min(ASIDE[1], len(train) // 3)
-    if count < ASIDE[0]:
-        return None, math.nan, math.nan
+    count = min(MAX_ASIDE, len(train) // 3)
+    if count < MIN_ASIDE:
+        note = "poses and exposures stay as they are: there are too few training frames to test on some of them"
+        return _Decision(None, note)
     aside = np.zeros(len(capture.names), bool)
     aside[train[((np.arange(count) + 0.5) * len(train) / count).astype(int)]] = True
-    # Aligned on the squares of one colour of a chequerboard, compared on the others.
-    rows, columns = (np.arange(length) * SQUARES // length for length in np.shape(capture.frames)[1:3])
+    # Frames kept aside are aligned on the squares of one colour of a chessboard, and compared on the others.
+    rows, columns = (np.arange(length) * CHESS_SQUARES // length for length in np.shape(capture.frames)[1:3])
     even = np.add.outer(rows, columns) % 2 == 0
     ignored = np.zeros(np.shape(capture.frames)[:3], bool) if capture.ignored is None else np.asarray(capture.ignored)
     held_out = np.asarray(capture.held_out) | aside
     half = dataclasses.replace(capture, ignored=ignored | (even & aside[:, None, None]), held_out=held_out)
     steps = plan.visits * int((~held_out).sum())
-    placed = (_placed(half, ~held_out, aside) if by_depth else None) or half
-    scene, found = probed(placed, start(placed), refine, plan.coarse, steps)
-    plain, _ = probed(half, start(half), _STILL, plan.coarse, steps)
-    found = _with_aligned(placed, scene, found, aside, refine, plan.coarse, DECIDING_VISITS, probed)
-    alike = _with_aligned(
-        half, plain, identity_corrections(len(aside)), aside, refine, plan.coarse, DECIDING_VISITS, probed
+    aligned = (_align_by_depth(half, ~held_out, aside) if by_depth else None) or half
+    size = plan.coarse_size
+    scene, corrections = prober.fit(aligned, prober.initial(aligned), refine, size, steps)
+    plain_scene, _ = prober.fit(half, prober.initial(half), _NO_CORRECTION, size, steps)
+    corrections = prober.align(aligned, scene, corrections, aside, refine, size, DECIDE_VISITS)
+    plain = prober.align(half, plain_scene, identity_corrections(len(aside)), aside, refine, size, DECIDE_VISITS)
+    counted = even & ~ignored
+    corrected_db = _mean_psnr(scene, aligned, corrections, aside, counted, size)
+    plain_db = _mean_psnr(plain_scene, capture, plain, aside, counted, size)
+    helps = corrected_db >= plain_db + MIN_GAIN_DB
+    verdict = "are corrected" if helps else "stay as they are"
+    note = (
+        f"poses and exposures {verdict}: training frames kept aside have {corrected_db:.1f} dB in a short fit with "
+        f"corrections, {plain_db:.1f} dB in one without"
     )
-    seen = even & ~ignored
-    better = _mean_psnr(scene, placed, found, aside, seen, plan.coarse)
-    without = _mean_psnr(plain, capture, alike, aside, seen, plan.coarse)
-    return found if better >= without + GAIN_DB else None, better, without
+    return _Decision(corrections if helps else None, note)
 
 
 def _mean_psnr(
     scene: Gaussians,
     capture: Capture,
-    found: Corrections,
-    which: Bool[np.ndarray, " t"],
-    seen: Bool[np.ndarray, "t h w"],
+    corrections: Corrections,
+    frames: Bool[np.ndarray, " t"],
+    counted: Bool[np.ndarray, "t h w"],
     size: float,
 ) -> float:
-    """Mean PSNR (dB) of the frames `which` on the pixels `seen`, rendered with their corrections at this size."""
-    cameras, values = resize_cameras(capture.cameras, size), []
+    """Mean PSNR (dB) of the chosen frames on the counted pixels, rendered with their corrections at this size."""
+    cameras, values = scale_cameras(capture.cameras, size), []
     scene = jax.device_put(scene)
-    for t in np.flatnonzero(which):
-        own = jax.tree.map(lambda a, t=t: jnp.asarray(a[t]), found)
-        camera = corrected_camera(jax.tree.map(jnp.asarray, cameras[int(t)]), own.twists)
-        image = np.clip(apply_exposure(render_rgb(scene, camera).features, own.colours), 0, 1)
+    for t in np.flatnonzero(frames):
+        correction = jax.tree.map(lambda a, t=t: jnp.asarray(a[t]), corrections)
+        camera = corrected_camera(jax.tree.map(jnp.asarray, cameras[int(t)]), correction.twists)
+        image = np.clip(apply_exposure(render_rgb(scene, camera).features, correction.colours), 0, 1)
         frame = resize_frame(np.asarray(capture.frames[t]), cameras) / 255.0
-        share = cv2.resize(seen[t].astype(np.float32), frame.shape[1::-1], interpolation=cv2.INTER_AREA)
+        share = cv2.resize(counted[t].astype(np.float32), frame.shape[1::-1], interpolation=cv2.INTER_AREA)
         squares = ((image - frame) ** 2)[share > 0.999]
         if len(squares):
             values.append(-10 * math.log10(max(float(squares.mean()), 1e-10)))
     return float(np.mean(values)) if values else math.nan
 
 
-def _decision(found: Corrections | None, better: float, without: float) -> str:
-    """Whether poses and exposures are corrected, and why."""
-    what = "are corrected" if found is not None else "stay as they are"
-    if math.isnan(better):
-        return f"poses and exposures {what}: there are too few training frames to test on some of them"
-    told = f"training frames kept aside have {better:.1f} dB in a short fit with corrections"
-    return f"poses and exposures {what}: {told}, {without:.1f} dB in one without"
-
-
-def _moved_px(scene: Gaussians, before: Camera, after: Camera) -> float:
-    """Median over the cameras of the median distance, px, by which their move shifts the scene's Gaussians in view."""
-    points, moved = np.asarray(scene.means, np.float64), []
+def _median_shift_px(scene: Gaussians, before: Camera, after: Camera) -> float:
+    """Median over the cameras of the median distance, px, by which their move shifts the Gaussians in view."""
+    points, shifts = np.asarray(scene.means, np.float64), []
     for t in range(len(before.fx)):
-        (u, v), (other_u, other_v) = (_projected(points, cameras, t) for cameras in (before, after))
+        (u, v), (moved_u, moved_v) = (_project_points(points, cameras, t) for cameras in (before, after))
         inside = (u >= 0) & (u <= before.width) & (v >= 0) & (v <= before.height)
-        shifts = np.hypot(other_u - u, other_v - v)[inside]
-        moved.append(np.nanmedian(shifts) if np.isfinite(shifts).any() else 0.0)
-    return float(np.median(moved))
+        distances = np.hypot(moved_u - u, moved_v - v)[inside]
+        shifts.append(np.nanmedian(distances) if np.isfinite(distances).any() else 0.0)
+    return float(np.median(shifts))
 
 
-def _projected(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where points appear in camera t, px; NaN behind it."""
+def _project_points(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows (px) of points in camera t; NaN behind it."""
     pose = np.asarray(cameras.world_to_camera[t], np.float64)
     x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
     z = np.where(z > 0, z, np.nan)
     return cameras.fx[t] * x / z + cameras.cx[t], cameras.fy[t] * y / z + cameras.cy[t]
 
 
-def _corrected(capture: Capture, found: Corrections, refine: RefineOptions | None, *, at_home: bool = True) -> Capture:
-    """Cameras moved, frames with their exposures undone; `at_home`: in the world and the colours that were given."""
+def _apply(
+    capture: Capture, corrections: Corrections, refine: RefineOptions | None, *, keep_world: bool = True
+) -> Capture:
+    """Moves the cameras and undoes the exposures; `keep_world` keeps the given world and the mean colours."""
     if refine is None:
         return capture
     train, cameras = ~np.asarray(capture.held_out), capture.cameras
     if refine.poses:
-        given = np.asarray(cameras.world_to_camera, np.float64)
-        moved = np.asarray(jax.vmap(se3_exp)(found.twists), np.float64) @ given
-        if at_home:
-            moved = moved @ _rigid_drift(moved[train], given[train], cameras_extent(cameras[train]))
+        poses = np.asarray(cameras.world_to_camera, np.float64)
+        moved = np.asarray(jax.vmap(se3_exp)(corrections.twists), np.float64) @ poses
+        if keep_world:
+            moved = moved @ rigid_drift(moved[train], poses[train], cameras_extent(cameras[train]))
         capture = _with_poses(capture, moved)
     if refine.exposure:
-        squared = lambda maps: np.concatenate([maps, np.broadcast_to(np.eye(4)[3:], (len(maps), 1, 4))], axis=1)
-        maps = squared(np.asarray(found.colours, np.float64))
-        maps = maps @ np.linalg.inv(maps[train].mean(axis=0)) if at_home else maps
+        maps = np.asarray(corrections.colours, np.float64)
+        maps = np.concatenate([maps, np.broadcast_to(np.eye(4)[3:], (len(maps), 1, 4))], axis=1)
+        maps = maps @ np.linalg.inv(maps[train].mean(axis=0)) if keep_world else maps
         frames = np.asarray(capture.frames)
         ignored = np.zeros(frames.shape[:3], bool) if capture.ignored is None else np.array(capture.ignored)
-        settled = np.empty_like(frames)
-        for t, back in enumerate(np.linalg.inv(maps)):
-            shown = frames[t] @ back[:3, :3].T + 255 * back[:3, 3]
-            settled[t] = np.rint(np.clip(shown, 0, 255)).astype(np.uint8)
-            ignored[t] |= ((frames[t] == 255) & (settled[t] < 255)).any(axis=-1)
-        kept = ignored if ignored.any() else None
-        capture = dataclasses.replace(capture, frames=settled, ignored=kept)
+        corrected = np.empty_like(frames)
+        for t, inverse in enumerate(np.linalg.inv(maps)):
+            colours = frames[t] @ inverse[:3, :3].T + 255 * inverse[:3, 3]
+            corrected[t] = np.rint(np.clip(colours, 0, 255)).astype(np.uint8)
+            ignored[t] |= ((frames[t] == 255) & (corrected[t] < 255)).any(axis=-1)
+        capture = dataclasses.replace(capture, frames=corrected, ignored=ignored if ignored.any() else None)
     return capture
 
 
-def _rigid_drift(moved: Float[Array, "t 4 4"], given: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion of the world that brings the `moved` cameras nearest to the `given` ones: their centres, and
-    their axes as points an extent away (Umeyama 1991). Maps points of the given world to that of the moved ones."""
+def rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
+    """Computes the rigid motion of the world that brings moved cameras nearest to their given poses (Umeyama 1991).
+
+    Args:
+      moved: (T, 4, 4) moved world-to-camera poses.
+      poses: (T, 4, 4) given world-to-camera poses.
+      extent: Length of the cameras' axes in world units, whose ends are matched beside the centres.
+
+    Returns:
+      (4, 4) map from points of the given world to the world of the moved cameras.
+    """
     centre = lambda poses: -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
-    a, b = centre(moved), centre(given)
+    a, b = centre(moved), centre(poses)
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    axes = np.einsum("tki,tkj->ij", moved[:, :3, :3], given[:, :3, :3])
+    axes = np.einsum("tki,tkj->ij", moved[:, :3, :3], poses[:, :3, :3])
     u, _, vt = np.linalg.svd((a - mean_a).T @ (b - mean_b) + max(extent, 1e-6) ** 2 * axes)
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = turn, mean_a - turn @ mean_b
+    motion[:3, :3], motion[:3, 3] = rotation, mean_a - rotation @ mean_b
     return motion
 
 
-def _told(
-    before: Capture, after: Capture, found: Corrections, refine: RefineOptions | None, *, by_depth: bool
+def _describe(
+    before: Capture, after: Capture, corrections: Corrections, refine: RefineOptions | None, *, by_depth: bool
 ) -> list[str]:
     """How far the frames were off, a sentence each."""
-    notes, out = [], np.asarray(before.held_out)
+    notes: list[str] = []
     if refine is None:
         return notes
     if refine.poses:
@@ -414,32 +445,32 @@ def _told(
         shift = np.linalg.norm(np.asarray(after.cameras.centres) - np.asarray(before.cameras.centres), axis=1)
         cosine = (np.einsum("tij,tij->t", a[:, :3, :3], b[:, :3, :3]) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        far = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
+        median = f"{np.median(shift):.3g} world units and {np.median(turn):.2g} degrees in the median"
         by = "by colour and depth of their frames, then by a probe fit" if by_depth else "by probe fits"
-        notes.append(f"poses refined {by}: {far}, {shift.max():.3g} and {turn.max():.2g} at most")
+        notes.append(f"poses refined {by}: {median}, {shift.max():.3g} and {turn.max():.2g} at most")
     if refine.exposure:
-        gains = np.asarray(found.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain
+        gains = np.asarray(corrections.colours).sum(axis=(1, 2)) / 3  # of white: an affine map may spread a gain
         notes.append(f"exposures evened out: frames were {gains.min():.2f} to {gains.max():.2f} times as bright")
-    if out.any():
-        what = " and ".join(["pose"] * refine.poses + ["exposure"] * refine.exposure)
-        notes.append(f"each frame held out has its {what} by alignment to the frozen probe, which never saw it")
+    if np.asarray(before.held_out).any():
+        parts = " and ".join(["pose"] * refine.poses + ["exposure"] * refine.exposure)
+        notes.append(f"each held-out frame has its {parts} by alignment to the frozen probe, which never saw it")
     return notes
 
 
 def weak_frames(gaussians: Gaussians, capture: Capture) -> np.ndarray:
-    """Indices of the training frames that a scene fitted to them does not explain (`quality.is_weak`)."""
+    """Returns the indices of the training frames that a scene fitted to them does not explain (`is_weak`)."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     result = measure_quality(gaussians, capture, frames=train, long_side=QUICK_LONG_SIDE)
     return np.asarray(result.frames)[is_weak(np.asarray(result.psnr))]
 
 
-def _without(capture: Capture, left: np.ndarray) -> Capture:
-    """The capture without the frames `left`."""
-    if not len(left):
+def _without_frames(capture: Capture, dropped: np.ndarray) -> Capture:
+    """The capture without the frames at these indices."""
+    if not len(dropped):
         return capture
-    keep = np.setdiff1d(np.arange(len(capture.names)), left)
+    keep = np.setdiff1d(np.arange(len(capture.names)), dropped)
     take = lambda a: None if a is None else np.asarray(a)[keep]
-    told = ", ".join(capture.names[t] for t in left)
+    names = ", ".join(capture.names[t] for t in dropped)
     return dataclasses.replace(
         capture,
         frames=take(capture.frames),
@@ -449,5 +480,5 @@ def _without(capture: Capture, left: np.ndarray) -> Capture:
         ignored=take(capture.ignored),
         names=tuple(capture.names[t] for t in keep),
         files=tuple(capture.files[t] for t in keep) if capture.files else (),
-        notes=(*capture.notes, f"left out, as a probe fit does not explain them: {told}"),
+        notes=(*capture.notes, f"frames dropped, as a probe fit does not explain them: {names}"),
     )

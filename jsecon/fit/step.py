@@ -1,86 +1,252 @@
-"""One step of a fit: a view's loss, its gradients, and Adam, on all devices of this process."""
+"""One optimisation step of a fit: training view, loss, gradients and Adam, on all devices of this process."""
 
 from typing import Any, NamedTuple, cast
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jsecon.fit.corrections import CorrectionState, RefineOptions, update_corrections
+from jsecon.errors import InputError
+from jsecon.fit.corrections import (
+    Corrections,
+    CorrectionState,
+    RefineOptions,
+    apply_exposure,
+    corrected_camera,
+    correction_penalty,
+    update_corrections,
+)
 from jsecon.fit.growth import pad_rows, pad_with_free_rows
+from jsecon.fit.photometric import photometric_loss
+from jsecon.fit.resize import resize_frame, resize_mask, scale_cameras
 from jsecon.fit.schedule import LearningRates, rates_at
-from jsecon.fit.view import TrainingView, TrainingViews, view_loss
 from jsecon.parallel import AXIS, MESH_OPTIONS, map_rows
 from jsecon.splat.capacity import default_capacity, enough_capacity
-from jsecon.types import Array, Gaussians
+from jsecon.splat.render import render
+from jsecon.splat.sh import colours_from_sh
+from jsecon.types import Array, Camera, Capture, Gaussians, record
 
+DEPTH_WEIGHT = 0.2
+"""Weight of the mean relative depth error in the loss, for captures with depth."""
+MAX_DEPTH_SPREAD = 0.05
+"""Largest spread of the depths under one pixel of a smaller frame, as a share of their mean; above it the pixel covers
+several surfaces."""
+MIN_DEPTH_ALPHA = 0.5
+"""Alpha from which the rendered depth of a pixel is compared."""
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
+@record
+class TrainingView:
+    """One view that a step fits to."""
+
+    camera: Camera
+    frame: Array
+    """(H, W, 3) uint8."""
+    depth: Array | None
+    """(H, W) float32 z-depth, world units, 0 = unknown; or None."""
+    ignored: Array | None
+    """(H, W) bool: pixels without influence; or None."""
+
+
+class TrainingViews:
+    """Training frames of a capture, read one at a time at the current size. Host code.
+
+    Raises:
+      InputError: Every frame is held out.
+    """
+
+    def __init__(self, capture: Capture):
+        self.frame_indices = np.flatnonzero(~np.asarray(capture.held_out))
+        if not len(self.frame_indices):
+            raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
+        self._capture, self.size = capture, 1.0
+        # NumPy arrays: indexing them compiles no program.
+        self._full_size = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.frame_indices])
+        self.cameras = self._full_size
+        self.extent = np.asarray(cameras_extent(self._full_size), np.float32)
+
+    def set_size(self, size: float) -> None:
+        """Sets the size of the frames, as a share of their full size."""
+        if size != self.size:
+            self.size, self.cameras = size, scale_cameras(self._full_size, size)
+
+    def __getitem__(self, index: int) -> TrainingView:
+        """Returns a view by its position among the training frames."""
+        capture, t = self._capture, self.frame_indices[index]
+        size = self.cameras.width, self.cameras.height
+        depth = ignored = None
+        if capture.depths is not None:
+            depth = np.asarray(capture.depths[t], np.float32)
+            depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+            depth = depth if depth.shape == size[::-1] else _shrink_depth(depth, size)
+        if capture.ignored is not None:
+            ignored = resize_mask(np.asarray(capture.ignored[t]), self.cameras)
+        frame = resize_frame(np.asarray(capture.frames[t]), self.cameras)
+        return TrainingView(self.cameras[index], frame, depth, ignored)
+
+
+def _shrink_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Mean depth over each pixel of a smaller frame; 0 if a part is unknown or several surfaces meet there."""
+    shrink = lambda a: cv2.resize(a, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+    mean, square, known = shrink(depth), shrink(depth.astype(np.float64) ** 2), shrink(np.float32(depth > 0))
+    one_surface = square - mean**2 <= (MAX_DEPTH_SPREAD * mean) ** 2
+    return np.where((known > 0.999) & one_surface, mean, 0).astype(np.float32)
+
+
+def cameras_extent(cameras: Camera) -> float:
+    """Computes the extent of a batch of cameras as INRIA's `spatial_lr_scale`.
+
+    Args:
+      cameras: Batch of T cameras.
+
+    Returns:
+      1.1 times the largest distance of a camera centre from their mean, world units.
+    """
+    centres = jax.tree.map(lambda a: np.asarray(a, np.float64), cameras).centres
+    return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+
+def view_loss(
+    gaussians: Gaussians,
+    vote_channel: Array,
+    correction: Corrections | None,
+    view: TrainingView,
+    extent: Array,
+    capacity: int | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[Array, tuple[Array, Array]]:
+    """Computes the loss of one view. Pure.
+
+    It is the photometric loss of the rendering, plus DEPTH_WEIGHT times the mean of |rendered - known| / known depth
+    over the pixels of the view (zero where the depth is unknown or little is rendered), plus the regulariser of the
+    corrections. Ignored pixels have no gradient and no votes.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      vote_channel: (N, 1) zeros. Its gradient is the votes: the weights alpha T of each Gaussian times the mean
+        absolute error of the pixels. (N, 0) if they are not needed.
+      correction: Corrections of this view, or None.
+      view: Camera, frame, depth and ignored pixels.
+      extent: () cameras' extent, world units.
+      capacity: As for `render`.
+      mesh: As for `render`.
+
+    Returns:
+      The value to descend; and the loss without votes, and the number of pairs that overflowed.
+    """
+    camera = view.camera if correction is None else corrected_camera(view.camera, correction.twists)
+    colours = map_rows(colours_from_sh, gaussians, camera, mesh)
+    # The votes are the gradient of a fourth channel of zeros: they need no pass of their own.
+    features = jnp.concatenate([colours, vote_channel], axis=1)
+    rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)
+    image, votes = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)
+    image = image if correction is None else apply_exposure(image, correction.colours)
+    target = view.frame.astype(image.dtype) / 255.0
+    if view.ignored is not None:  # both show the rendering there: exact, as SSIM's windows reach across the border
+        ignored, rendered = view.ignored[..., None], jax.lax.stop_gradient(image)
+        image, target = jnp.where(ignored, rendered, image), jnp.where(ignored, rendered, target)
+    value = photometric_loss(image, target, mesh)
+    if view.depth is not None and rendering.depth is not None:
+        known = (view.depth > 0) & (rendering.alpha > MIN_DEPTH_ALPHA)
+        relative = jnp.abs(rendering.depth - view.depth) / jnp.where(known, view.depth, 1.0)
+        value = value + DEPTH_WEIGHT * jnp.mean(jnp.where(known, relative, 0.0))
+    if correction is not None:
+        value = value + correction_penalty(correction, extent)
+    error = jax.lax.stop_gradient(jnp.abs(image - target).mean(-1))
+    return value + jnp.sum(error * votes), (value, rendering.overflow)
+
+
 class TrainState(NamedTuple):
-    """What a step moves."""
+    """Arrays that a step updates."""
 
     gaussians: Gaussians
     first_moment: Gaussians
     second_moment: Gaussians
     votes: Array
-    """(N,) see FitState."""
-    refined: CorrectionState | None
-    """the corrections of all frames, where they are refined"""
+    """(N,) see `FitState`."""
+    corrections: CorrectionState | None
+    """Corrections of all frames, or None."""
 
 
 class StepConfig(NamedTuple):
-    """How a step goes, beside its view."""
+    """Settings of a step."""
 
     degree: int
-    """the highest of the spherical harmonics that learns"""
+    """Highest degree of the spherical harmonics that learns."""
     count_votes: bool
     """Whether the step adds up the votes that growth follows."""
     rates: LearningRates
     refine: RefineOptions | None
 
 
+class StepInputs(NamedTuple):
+    """Numbers of a step; traced, so that one program serves all steps."""
+
+    step: Any
+    """() int32 index of the step."""
+    frame: Any
+    """() int32 index of the frame in the capture."""
+    visits: Any
+    """() int32 number of earlier steps on this frame."""
+    done: Any
+    """() float32 share of the fit that is done."""
+    degree: Any
+    """() int32, see `StepConfig`."""
+    extent: Any
+    """() float32 cameras' extent, world units."""
+    rates: LearningRates
+    correction_rates: Corrections | None
+
+
 def step(
-    current: TrainState,
-    view: TrainingView,
-    numbers: dict[str, Any],
-    capacity: int,
-    mesh: Mesh | None,
-    count_votes: bool,
+    state: TrainState, view: TrainingView, inputs: StepInputs, capacity: int, mesh: Mesh | None, count_votes: bool
 ) -> tuple[TrainState, Array, Array]:
-    """One Adam step on one view. Returns what is current after it, the loss before it, the pairs that overflowed. Over
-    a mesh, projection, compositing, loss and update are each shared out among its devices.
+    """Takes one Adam step on one view. Pure.
 
-    `numbers`: the step, the view's frame, how often that was taken before, the share of the fit that is done, the
-    degree, the extent, the rates, those of the corrections.
+    Over a mesh, projection, compositing, loss and update are each divided among its devices.
+
+    Args:
+      state: Scene, moments, votes and corrections.
+      view: View to fit to.
+      inputs: Numbers of this step.
+      capacity: As for `render`.
+      mesh: As for `render`.
+      count_votes: Whether to add up votes.
+
+    Returns:
+      The state after the step, the loss before it, and the number of pairs that overflowed.
     """
-    gaussians, first, second, votes, refined = current
-    nothing = jnp.zeros((gaussians.count, 1 if count_votes else 0))
-    own = None if refined is None else jax.tree.map(lambda a: a[numbers["frame"]], refined.now)
-    fixed = {"view": view, "extent": numbers["extent"], "capacity": capacity, "mesh": mesh}
+    gaussians, first, second, votes, corrections = state
+    vote_channel = jnp.zeros((gaussians.count, 1 if count_votes else 0))
+    correction = None if corrections is None else jax.tree.map(lambda a: a[inputs.frame], corrections.current)
 
-    def loss(gaussians, nothing, own):
-        return view_loss(gaussians, nothing, own, **fixed)
+    def loss(gaussians, vote_channel, correction):
+        return view_loss(gaussians, vote_channel, correction, view, inputs.extent, capacity, mesh)
 
-    by = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, nothing, own)
-    (_, (value, overflow)), (gradient, by_error, by_own) = by
+    gradients = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(gaussians, vote_channel, correction)
+    (_, (value, overflow)), (gradient, vote_gradient, correction_gradient) = gradients
 
     def update(rows, common):
-        (gaussians, gradient, first, second), (step, rate) = rows, common
-        moments: Any = optax.ScaleByAdamState(*cast(Any, (step, first, second)))
-        change, moments = _ADAM.update(gradient, moments)
-        return jax.tree.map(lambda p, u, r: p - r * u, gaussians, change, rate), moments.mu, moments.nu
+        (gaussians, gradient, first, second), (index, rate) = rows, common
+        moments: Any = optax.ScaleByAdamState(*cast(Any, (index, first, second)))
+        direction, moments = _ADAM.update(gradient, moments)
+        return jax.tree.map(lambda p, u, r: p - r * u, gaussians, direction, rate), moments.mu, moments.nu
 
-    rate = rates_at(numbers["done"], numbers["rates"], gaussians, numbers["extent"], numbers["degree"])
+    rate = rates_at(inputs.done, inputs.rates, gaussians, inputs.extent, inputs.degree)
     rows = gaussians, gradient, first, second
-    gaussians, first, second = map_rows(update, rows, (numbers["step"], rate), mesh)
-    if refined is not None:
-        refined = update_corrections(refined, numbers["frame"], by_own, numbers["taken"], numbers["refine_rates"])
-    after = TrainState(gaussians, first, second, votes + by_error.sum(1), refined)
-    if mesh is not None:  # as it came: one program serves every step
-        after = TrainState(*map(jax.lax.with_sharding_constraint, after, _places(mesh)))
+    gaussians, first, second = map_rows(update, rows, (inputs.step, rate), mesh)
+    if corrections is not None:
+        assert inputs.correction_rates is not None
+        corrections = update_corrections(
+            corrections, inputs.frame, correction_gradient, inputs.visits, inputs.correction_rates
+        )
+    after = TrainState(gaussians, first, second, votes + vote_gradient.sum(1), corrections)
+    if mesh is not None:  # the same shardings as before: one program serves every step
+        after = TrainState(*map(jax.lax.with_sharding_constraint, after, _shardings(mesh)))
     return after, value, overflow
 
 
@@ -91,74 +257,71 @@ step_compiled = [
 ]
 
 
-def _places(mesh: Mesh) -> TrainState:
-    """How what is current lies on the devices: each has its own rows of the scene, the moments and the votes, and all
-    of the corrections. A scene that every device held whole would take as many times its memory, and every step would
-    send all of it to each."""
-    whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    return cast(TrainState, TrainState(*cast(Any, (rows, rows, rows, rows, whole))))
+def _shardings(mesh: Mesh) -> TrainState:
+    """How the state lies on the devices: rows of the scene, the moments and the votes are divided among them, as copies
+    would take as many times the memory and be exchanged at every step; corrections are replicated."""
+    replicated, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
+    return cast(TrainState, TrainState(*cast(Any, (rows, rows, rows, rows, replicated))))
 
 
-def put_on_devices(current: TrainState, mesh: Mesh | None) -> TrainState:
-    """What is current, where the devices of a step want it; over a mesh filled up with free rows, so that each device
-    has as many."""
+def put_on_devices(state: TrainState, mesh: Mesh | None) -> TrainState:
+    """Moves a state to the devices of a mesh, padded with free rows so that all devices have the same number."""
     if mesh is None:
-        return jax.device_put(current)
-    rows = -(-current.gaussians.count // mesh.size) * mesh.size
-    if rows > current.gaussians.count:
-        others = current.first_moment, current.second_moment, current.votes
-        first, second, votes = pad_rows(others, rows)
-        current = TrainState(pad_with_free_rows(current.gaussians, rows), first, second, votes, current.refined)
-    return TrainState(*map(jax.device_put, current, _places(mesh)))
+        return jax.device_put(state)
+    rows = -(-state.gaussians.count // mesh.size) * mesh.size
+    if rows > state.gaussians.count:
+        first, second, votes = pad_rows((state.first_moment, state.second_moment, state.votes), rows)
+        state = TrainState(pad_with_free_rows(state.gaussians, rows), first, second, votes, state.corrections)
+    return TrainState(*map(jax.device_put, state, _shardings(mesh)))
 
 
-def to_host(current: TrainState, rows: int) -> TrainState:
-    """What is current as NumPy's arrays, without the rows that `put_on_devices` added to `rows`."""
-    host = jax.tree.map(np.asarray, current)
-    return jax.tree.map(lambda a: a[:rows], host._replace(refined=None))._replace(refined=host.refined)
+def to_host(state: TrainState, rows: int) -> TrainState:
+    """Copies a state to NumPy arrays, without the rows beyond `rows` that `put_on_devices` added."""
+    host = jax.tree.map(np.asarray, state)
+    return jax.tree.map(lambda a: a[:rows], host._replace(corrections=None))._replace(corrections=host.corrections)
 
 
 class StepRunner:
-    """Steps on the views of a capture: the programs that there are, and the room that views of a size need."""
+    """Runs steps on the views of a capture; keeps track of compiled programs and of the capacity of each size."""
 
     def __init__(self, views: TrainingViews, mesh: Mesh | None):
         self.views, self.mesh = views, mesh
         self._capacity: dict[tuple[int, float], int] = {}
         self._compiled: set[tuple] = set()
 
-    def _shape(self, current: TrainState) -> tuple[int, float]:
-        return current.gaussians.count, self.views.size
+    def _shape(self, state: TrainState) -> tuple[int, float]:
+        return state.gaussians.count, self.views.size
 
     def take(
-        self, current: TrainState, view: int, number: int, done: float, way: StepConfig
+        self, state: TrainState, view: int, index: int, done: float, config: StepConfig
     ) -> tuple[TrainState, Array, Array]:
-        """`step`, the `number`-th, on that view."""
+        """Takes step number `index` on the view at that position; see `step`."""
         views, cameras, strips = self.views, self.views.cameras, 1 if self.mesh is None else self.mesh.size
-        fresh = default_capacity(current.gaussians.count, cameras.width, cameras.height, strips=strips)
-        capacity = self._capacity.setdefault(self._shape(current), fresh)
-        numbers = {
-            "step": np.int32(number),
-            "frame": np.int32(views.used[view]),
-            "taken": np.int32(number // len(views.used)),
-            "done": np.float32(done),
-            "degree": np.int32(way.degree),
-            "extent": views.extent,
-            "rates": way.rates,
-            "refine_rates": None if way.refine is None else way.refine.rates(done, float(views.extent)),
-        }
-        place = None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec())
-        given = jax.device_put((views[view], numbers), place)
+        initial = default_capacity(state.gaussians.count, cameras.width, cameras.height, strips=strips)
+        capacity = self._capacity.setdefault(self._shape(state), initial)
+        inputs = StepInputs(
+            step=np.int32(index),
+            frame=np.int32(views.frame_indices[view]),
+            visits=np.int32(index // len(views.frame_indices)),
+            done=np.float32(done),
+            degree=np.int32(config.degree),
+            extent=views.extent,
+            rates=config.rates,
+            correction_rates=None if config.refine is None else config.refine.rates(done, float(views.extent)),
+        )
+        sharding = None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec())
+        arguments = jax.device_put((views[view], inputs), sharding)
         run = step_compiled[self.mesh is not None]
-        return run(current, *given, capacity=capacity, mesh=self.mesh, count_votes=way.count_votes)
+        return run(state, *arguments, capacity=capacity, mesh=self.mesh, count_votes=config.count_votes)
 
-    def compile(self, current: TrainState, view: int, number: int, done: float, way: StepConfig) -> None:
-        """Makes the program of such a step, where there is none."""
-        program = *self._shape(current), way.count_votes
+    def compile(self, state: TrainState, view: int, index: int, done: float, config: StepConfig) -> None:
+        """Compiles the program of such a step unless it exists."""
+        program = *self._shape(state), config.count_votes
         if program not in self._compiled:
-            jax.block_until_ready(self.take(current, view, number, done, way))
+            jax.block_until_ready(self.take(state, view, index, done, config))
             self._compiled.add(program)
 
-    def widen(self, current: TrainState, overflow: int) -> None:
-        """Gives room for `overflow` pairs more in views of this size."""
-        shape = self._shape(current)
+    def widen(self, state: TrainState, overflow: int) -> None:
+        """Raises the capacity of views of this size by `overflow` pairs."""
+        shape = self._shape(state)
         self._capacity[shape] = enough_capacity(self._capacity[shape], np.array([overflow]))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jsecon.data.frames import evenly_spaced
 from jsecon.fit.quality import QUICK_LONG_SIDE
-from jsecon.fit.schedule import resize_cameras, resize_frame
+from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.splat.render import render_rgb
 from jsecon.types import Capture, Gaussians
 
@@ -58,9 +58,7 @@ def photo_similarity(gaussians: Gaussians, capture: Capture) -> PhotoSimilarity:
     """How much Gaussians in the capture's world look like its training frames."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     views = train[evenly_spaced(len(train), VIEWS)]
-    cameras = resize_cameras(
-        capture.cameras, min(1.0, QUICK_LONG_SIDE / max(capture.cameras.width, capture.cameras.height))
-    )
+    cameras = shrink_cameras(capture.cameras, QUICK_LONG_SIDE)
     gaussians = jax.device_put(gaussians)
     rendered, photos, psnr = [], [], []
     for t in views.tolist():

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require_shape
-from jsecon.fit.schedule import resize_cameras
+from jsecon.fit.resize import scale_cameras
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.process import cores
 from jsecon.query.render import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
@@ -110,7 +110,7 @@ def views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camer
     good = np.flatnonzero(count >= 0.5 * count.max())
     picked = good[np.round(np.linspace(0, len(good) - 1, min(VIEWS, len(good)))).astype(int)]
     size = min(LONG_SIDE / max(cameras.width, cameras.height), 1.0)
-    return resize_cameras(jax.tree.map(np.asarray, cameras)[picked], size)
+    return scale_cameras(jax.tree.map(np.asarray, cameras)[picked], size)
 
 
 def footprints(
