@@ -26,7 +26,7 @@ paper)"""
 CONTRAST_THRESHOLD = 0.12
 """on the contrast: below it nothing in the scene answers the text. A low one: with simulated CLIP it refuses 63 to 82 %
 of the texts of what is not there and 0 to 6 % of the others; 0.15 refuses 86 to 97 % and 0 to 14 %; no cosine does so
-(experiments/retrieval.py)"""
+(experiments/retired.md)"""
 RETRIEVAL_THRESHOLD = 0.2
 """The paper's "low threshold to filter invalid prompts" on the cosine, which it does not state. In CLIP ViT-B/16 an
 image has a cosine of about 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with one that does not; spaces without
@@ -105,7 +105,7 @@ def contrasts(
     with the first as in `scene_residuals`, t the unit text and c the direction of the mean canonical phrase (C, E),
     each of unit length; phrases that are zero or not finite are left out, and without any c is zero. Removing what two
     sets of embeddings have in common before they are compared is an old remedy for hubs and for the modality gap;
-    experiments/retrieval.py measures it here against the cosine and LERF's relevancy. A text along c is like no region.
+    experiments/retired.md measures it here against the cosine and LERF's relevancy. A text along c is like no region.
     """
     apart, known = scene_residuals(embeddings, pixels)
     found, measured = similarities(apart, phrase_residuals(text, canonical))

@@ -45,7 +45,7 @@ def render(
     A jit of your own around it is faster with `compiler_options=jsecon.parallel.MESH_OPTIONS`. Without it, one device.
 
     Features in bfloat16 are read as such, which halves what a wide walk gathers, and summed in the Gaussians' dtype,
-    that of the image: the error is that of rounding the features (experiments/work_precision_render.py), the time the
+    that of the image: the error is that of rounding the features (experiments/retired.md), the time the
     same on a CPU. `background` (D,) is added with weight 1 - alpha. With `depth` the same pass also gives `.depth`, the
     expected z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
     """
