@@ -142,6 +142,7 @@ def test_any_number_of_regions(count):
         np.testing.assert_allclose(share_of(votes, chosen).share, exact_share(votes, chosen), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_jit_is_eager():
     votes = known_votes(300)
     for chosen in (np.arange(REGIONS) < 3, np.zeros(REGIONS, bool)):

@@ -136,6 +136,7 @@ def test_equals_the_slow_twin(seed):
     np.testing.assert_array_equal(got, slow_twin(found, views, taken, weights))
 
 
+@pytest.mark.long
 def test_jit_is_eager():
     found, views, taken = made_up(0, count=2)
     with jax.disable_jit():
