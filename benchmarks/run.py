@@ -1,7 +1,7 @@
 """Where a run's seconds go: each stage, cold and warm, the programs compiled and the memory.
 
     python benchmarks/run.py CAPTURE [--out FOLDER] [--steps N] [--warm]
-    python benchmarks/run.py rgbd                  (a made-up room: 100 RGB-D frames of 400x300, 100,000 Gaussians)
+    PYTHONPATH=. python benchmarks/run.py rgbd     (a made-up room: 100 RGB-D frames of 400x300, 100,000 Gaussians)
 
 Two processes, one after the other: cold, nothing cached, no program compiled before; warm, the frames and the Gaussians
 kept from the first, its programs on disk. `--warm` leaves out the first where FOLDER holds a run already.
@@ -49,7 +49,8 @@ def rgbd_room(folder: Path, *, seed: int = 0, views: int = 100, width: int = 400
     import cv2
     import numpy as np
 
-    from jsecon.demo import make_room, render_views, room_cameras
+    from experiments.datasets.plain_room import make_room
+    from jsecon.demo import render_views, room_cameras
 
     if (folder / "transforms.json").exists():
         return folder

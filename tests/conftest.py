@@ -191,11 +191,12 @@ def made_once(tmp_path_factory):
 @pytest.fixture(scope="session")
 def room(made_once) -> Path:
     """The demo room on disk, as small as it can be and still have objects to find: 8 views of 160x120, 2 held out."""
+    from experiments.datasets.plain_room import make_room
     from jsecon.demo import write_room
 
     with made_once("room") as folder:
         if not (folder / "written").exists():
-            write_room(folder / "capture", 0, views=8, width=160, height=120, holdout=4, points=1200)
+            write_room(folder / "capture", make_room(0), views=8, width=160, height=120, holdout=4, points=1200)
             (folder / "written").touch()
     return folder / "capture"
 

@@ -22,11 +22,12 @@ from experiments.datasets.benchmark import TWIN_FILE
 from experiments.datasets.mesh import SURROUNDINGS, Mesh, mesh_of, surfaces_of
 from experiments.datasets.mesh_files import write_mesh
 from experiments.datasets.ovs3d import write_poses_bounds, write_segmentations
+from experiments.datasets.plain_room import make_room
 from jsecon.data.colmap import write_colmap
 from jsecon.data.images import write_image
 from jsecon.data.labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.capture import label_frame, look_at, render_capture, room_cameras, write_label_image
-from jsecon.demo.room import TABLE_WOOD, Part, Room, make_room, srgb_to_linear
+from jsecon.demo.room import TABLE_WOOD, Part, Room, srgb_to_linear
 from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
 

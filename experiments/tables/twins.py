@@ -22,6 +22,7 @@ from experiments.datasets.feature_files import write_features, write_text_featur
 from experiments.datasets.lerf_ovs import load_lerf_ovs
 from experiments.datasets.mesh import SURROUNDINGS, surfaces_of
 from experiments.datasets.ovs3d import load_ovs3d
+from experiments.datasets.plain_room import make_room
 from experiments.datasets.replica import load_replica
 from experiments.simulated_vision.embeddings import (
     SimulatedEmbedder,
@@ -35,7 +36,6 @@ from experiments.simulated_vision.worlds import Seen, World, seen_in, world_of
 from jsecon.data.masks import LEVELS
 from jsecon.demo.capture import write_label_image
 from jsecon.demo.raycast import trace_rays
-from jsecon.demo.room import make_room
 from jsecon.files import write_text
 from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.reference_words import REFERENCE_WORDS

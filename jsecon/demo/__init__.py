@@ -2,6 +2,6 @@
 
 from jsecon.demo.capture import room_cameras, room_capture, write_room
 from jsecon.demo.raycast import render_views
-from jsecon.demo.room import make_room
+from jsecon.demo.room import crowded_room
 
-__all__ = ["make_room", "render_views", "room_cameras", "room_capture", "write_room"]
+__all__ = ["crowded_room", "render_views", "room_cameras", "room_capture", "write_room"]

@@ -15,7 +15,7 @@ from jsecon.data.colmap import write_colmap
 from jsecon.data.frames import check_capture_options, holdout_mask
 from jsecon.data.labels import LabelledFrame, write_lerf_labels
 from jsecon.demo.raycast import render_views
-from jsecon.demo.room import Room, crowded_room, make_room
+from jsecon.demo.room import Room
 from jsecon.errors import require
 from jsecon.files import atomic_write, write_text
 from jsecon.types import Camera, Capture
@@ -61,32 +61,28 @@ def look_at(centre, target, up=(0, 0, 1)):
 
 
 def room_capture(
-    seed: int,
+    room: Room,
     *,
     views: int = 30,
     width: int = 320,
     height: int = 240,
     holdout: int = 5,
     points: int = 6000,
-    num_objects: int = 12,
-    crowded: bool | int = False,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Capture, Int16[np.ndarray, "t h w"], tuple[str, ...]]:
-    """Makes the capture of a room.
+) -> tuple[Capture, Int16[np.ndarray, "t h w"]]:
+    """Makes the capture of a room from cameras around its table.
 
     Args:
-      seed: Seed of the room.
+      room: The room.
       views: Number of frames T.
       width: Width of the frames, px.
       height: Height of the frames, px.
       holdout: Every `holdout`-th frame from the first on is held out; 0 holds out no frame.
       points: Number of sparse points. They come from frames that are not held out.
-      num_objects: Number of objects of a plain room.
-      crowded: Use `crowded_room`, in which names can repeat or be "", and ignore `num_objects`.
       progress: Called with the number of finished frames and T.
 
     Returns:
-      The capture, its instances (index into the names, -1 = background) and the names of the objects.
+      The capture and its instances (index of the object, -1 = background).
 
     Raises:
       InputError: The options of the frames are invalid.
@@ -96,11 +92,10 @@ def room_capture(
     is_held_out = holdout_mask(views, holdout)
     got, remedy = f"{views} with every {holdout}. held out", "Sparse points are those that two views see: take more."
     require(int((~is_held_out).sum()) >= 2, "views", got, "2 that are not held out", remedy)
-    room = crowded_room(seed) if crowded else make_room(seed, num_objects=num_objects)
     cameras = room_cameras(room, views=views, width=width, height=height)
     names = tuple(f"frame_{view + 1:05d}" for view in range(views))
     capture, instances = render_capture(room, cameras, names, is_held_out, points=points, progress=progress)
-    return dataclasses.replace(capture, depths=None), instances, room.names
+    return dataclasses.replace(capture, depths=None), instances
 
 
 def render_capture(
@@ -171,7 +166,7 @@ def _sees(pose, depth, focal, middle, world):
 
 def write_room(
     folder: str | Path,
-    seed: int,
+    room: Room,
     *,
     holdout: int = 5,
     progress: Callable[[int, int], None] | None = None,
@@ -185,7 +180,7 @@ def write_room(
 
     Args:
       folder: Where to write. Files of an earlier room there are replaced.
-      seed: Seed of the room.
+      room: The room.
       holdout: Every `holdout`-th frame is held out.
       progress: Called with the number of finished frames and of all.
       **options: Further options of `room_capture`.
@@ -198,22 +193,22 @@ def write_room(
     """
     folder = Path(folder)
     _clear(folder)
-    capture, instances, names = room_capture(seed, holdout=holdout, progress=progress, **options)
+    capture, instances = room_capture(room, holdout=holdout, progress=progress, **options)
     write_colmap(capture, folder)
     for name, instance in zip(capture.names, instances):
         write_label_image(folder / "masks" / f"{name}.png", (instance + 1).astype(np.uint8))
     test_frames = np.flatnonzero(capture.held_out)
-    labels = [label_frame(capture.names[t], instances[t], names, MIN_LABEL_PIXELS) for t in test_frames]
+    labels = [label_frame(capture.names[t], instances[t], room.names, MIN_LABEL_PIXELS) for t in test_frames]
     write_lerf_labels(folder / "label", labels)
     scene = {
-        "seed": seed,
+        "seed": room.seed,
         "views": len(capture.names),
         "width": capture.cameras.width,
         "height": capture.cameras.height,
         "holdout": holdout,
         "points": len(capture.points),
         "held_out": [capture.names[t] for t in test_frames],
-        "objects": {str(k + 1): name for k, name in enumerate(names)},
+        "objects": {str(k + 1): name for k, name in enumerate(room.names)},
     }
     write_text(folder / "scene.json", json.dumps(scene, indent=2) + "\n")
     return folder

@@ -18,6 +18,7 @@ from jsecon.app.outputs import answer_masks, write_answer
 from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.demo import write_room
 from jsecon.demo.film import write_film
+from jsecon.demo.room import crowded_room
 from jsecon.evaluate.lerf import Row
 from jsecon.files import atomic_write, write_text
 from jsecon.pipeline import networks, pipeline
@@ -28,9 +29,6 @@ from jsecon.process import peak_memory_mib
 
 HOLDOUT = 5
 """Every `HOLDOUT`-th frame is held out."""
-PLAIN_ROOM: dict[str, int] = {"crowded": False}
-"""Room options of experiments that need one object of each colour on a bare table."""
-
 Results: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
 """Rows and summary of the evaluation by kind of query."""
 
@@ -48,7 +46,7 @@ def run_demo(
       seed: Seed of the room.
       steps: Number of optimisation steps of the photometric fit.
       listener: Receives messages and progress.
-      room: Options of `write_room` that differ from the default room.
+      room: Options of `write_room` that differ from its defaults.
 
     Returns:
       The metrics.
@@ -57,7 +55,7 @@ def run_demo(
       InputError: The folder cannot be written.
     """
     require_writable(out)
-    capture = _write_capture(out / "capture", seed, {"holdout": HOLDOUT, "crowded": True} | (room or {}), listener)
+    capture = _write_capture(out / "capture", seed, {"holdout": HOLDOUT} | (room or {}), listener)
     options = Options(capture, holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
     run = pipeline.run(options, out, listener=listener)
     true_options = dataclasses.replace(options, masks=capture / "masks")
@@ -107,7 +105,7 @@ def _write_capture(folder: Path, seed: int, room: dict[str, int], listener: List
     if not (marker.exists() and marker.read_text() == description):
         marker.unlink(missing_ok=True)
         with listener.progress("room") as progress:
-            write_room(folder, seed, progress=progress, **room)
+            write_room(folder, crowded_room(seed), progress=progress, **room)
         write_text(marker, description)
     listener.say(f"the room of seed {seed}: {folder}")
     return folder

@@ -1,51 +1,17 @@
-"""Contents of the made-up rooms: objects with shapes, colours and textures, the table and the walls.
+"""Contents of made-up rooms: objects with shapes, colours and textures, the table and the walls.
 
-`make_room` puts one object of each colour on a bare table. `crowded_room` is harder: it adds what makes kinds of query
-differ. A room is a function of its seed. World: metres, z up, origin in the middle of the table's top.
+`crowded_room` is the room of the demo, a function of its seed. World: metres, z up, origin in the middle of the table's
+top.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from jsecon.demo.shapes import SHAPES, Body, Solid, box, place, radius_about_axis, rotation
-from jsecon.errors import require
-
-PALETTE = {
-    "dark green": (18, 92, 42),
-    "light green": (142, 222, 132),
-    "dark blue": (24, 44, 140),
-    "light blue": (132, 192, 240),
-    "red": (208, 28, 38),
-    "orange": (247, 130, 18),
-    "yellow": (250, 216, 32),
-    "purple": (124, 48, 158),
-    "pink": (250, 148, 186),
-    "brown": (118, 70, 34),
-    "white": (236, 236, 236),
-    "black": (30, 29, 32),
-}
-"""sRGB of each colour name. The first four are two hues in two lightnesses each."""
-
-_SHAPES_BY_COLOUR = {
-    "dark green": ("bottle", "bottle", "book", "ball", "mug"),
-    "light green": ("cup", "ball", "mug", "box", "bowl"),
-    "dark blue": ("book", "mug", "ball", "box", "vase"),
-    "light blue": ("box", "cup", "mug", "ball", "toy car"),
-    "red": ("mug", "toy car", "ball", "box", "book"),
-    "orange": ("ball", "ball", "cone", "bowl", "box"),
-    "yellow": ("duck", "duck", "ball", "cup", "box"),
-    "purple": ("vase", "ball", "box", "mug", "bowl"),
-    "pink": ("pig", "pig", "cone", "ball", "cup"),
-    "brown": ("teddy", "teddy", "bowl", "box", "bottle"),
-    "white": ("plate", "bowl", "vase", "mug"),
-    "black": ("lamp", "lamp", "toy car", "box"),
-}
-"""Shapes that an object of each colour can have; repeated shapes are more likely."""
 
 TABLE_HALF = (0.68, 0.56)
 """Half the width and depth of the table top, m."""
@@ -90,7 +56,7 @@ class RoomObject:
     """One named object."""
 
     name: str
-    """Colour and shape, such as "dark green bottle". Unique in rooms of `make_room`; "" for clutter."""
+    """Colour and shape, such as "dark green bottle". Empty for clutter."""
     colour: str
     shape: str
     centre: np.ndarray
@@ -139,48 +105,12 @@ def srgb_to_linear(srgb) -> np.ndarray:
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def make_room(seed: int, *, num_objects: int = 12) -> Room:
-    """Builds a room with one object of each of the first colours of PALETTE on a bare table.
-
-    Args:
-      seed: Seed of the room.
-      num_objects: Number of objects, 2 to 12. They do not touch each other.
-
-    Returns:
-      The room.
-
-    Raises:
-      ValueError: `num_objects` is out of range.
-    """
-    fits = 2 <= num_objects <= len(PALETTE)
-    require(fits, "num_objects", num_objects, f"2 to {len(PALETTE)}", "There is one object per colour name.")
-    draw = np.random.default_rng([seed, 2])
-    colours = list(PALETTE)[:num_objects]
-    shapes = _draw_shapes(draw, colours)
-    bodies = [SHAPES[shape](draw) for shape in shapes]
-    radii = [footprint_radius(body) for body in bodies]
-    spots = scatter_circles(draw, radii)
-    rows = zip(colours, shapes, map(PALETTE.__getitem__, colours), bodies, radii, spots)
-    objects = tuple(place_object(draw, k, *row) for k, row in enumerate(rows))
-    return build_room(draw, objects, seed)
-
-
 def build_room(draw: np.random.Generator, objects: tuple[RoomObject, ...], seed: int, *, cloth: bool = False) -> Room:
     """Puts walls, a lamp and a table around the objects."""
     half = np.array([draw.uniform(2.25, 2.5), draw.uniform(2.1, 2.35)], np.float32)
     aside, turn = draw.uniform(0.8, 1.1), draw.uniform(0, 2 * np.pi)
     light = np.array([aside * np.cos(turn), aside * np.sin(turn), 1.85], np.float32)
     return Room(objects, _table(), half, 1.9, light, 0.3, seed, cloth)
-
-
-def _draw_shapes(draw, colours):
-    """Draws a shape for each colour. Some shapes occur twice or three times, none more often."""
-    while True:
-        shapes = [str(draw.choice(_SHAPES_BY_COLOUR[colour])) for colour in colours]
-        counts = sorted(Counter(shapes).values(), reverse=True)
-        alike = sum(count >= 2 for count in counts)
-        if counts[0] <= 3 and min(3, len(colours) // 4) <= alike <= 3:
-            return shapes
 
 
 def footprint_radius(body: Body) -> float:

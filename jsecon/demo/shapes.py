@@ -229,17 +229,6 @@ def _box(draw):
     return [(box(draw.uniform(0.13, 0.19), draw.uniform(0.11, 0.15), draw.uniform(0.09, 0.15)), None, 1.0)]
 
 
-def _book(draw):
-    w, d, h = draw.uniform(0.21, 0.25), draw.uniform(0.15, 0.18), draw.uniform(0.045, 0.065)
-    cover = 0.008
-    return [
-        (box(w, d, cover), None, 1.0),
-        (place(box(w, d, cover), (0, 0, h - cover)), None, 1.0),
-        (place(box(cover, d, h - 2 * cover), (-w / 2 + cover / 2, 0, cover)), None, 1.0),
-        (place(box(w - 2 * cover, d - 0.014, h - 2 * cover), (0, 0, cover)), None, 1.35),
-    ]
-
-
 def _vessel(bottom, top, height, wall):
     """Solid and hollow of an open cup with walls and floor of thickness `wall`. The hollow ends above the rim."""
     slope = (top - bottom) / height
@@ -338,38 +327,6 @@ def _vase(draw):
     return [(body, None, 1.0), (place(outer, (0, 0, at)), place(hollow, (0, 0, at)), 1.0)]
 
 
-def _cone(draw):
-    r, h = draw.uniform(0.075, 0.085), draw.uniform(0.2, 0.24)
-    side = 2.3 * r
-    return [(box(side, side, 0.014), None, 0.85), (place(frustum(r, 0.014, h), (0, 0, 0.014)), None, 1.0)]
-
-
-def _duck(draw):
-    s = draw.uniform(0.95, 1.15)
-    return [
-        (place(ellipsoid(0.095 * s, 0.066 * s, 0.062 * s, above=-0.055 * s), (0, 0, 0.055 * s)), None, 1.0),
-        (place(ellipsoid(0.05 * s, 0.048 * s, 0.05 * s), (0.055 * s, 0, 0.142 * s)), None, 1.0),
-        (place(ellipsoid(0.032 * s, 0.024 * s, 0.011 * s), (0.105 * s, 0, 0.136 * s)), None, 0.55),
-        (place(ellipsoid(0.045 * s, 0.026 * s, 0.02 * s), (-0.09 * s, 0, 0.085 * s), rotation(pitch=0.6)), None, 1.0),
-    ]
-
-
-def _pig(draw):
-    s = draw.uniform(0.95, 1.15)
-    leg = frustum(0.017 * s, 0.019 * s, 0.05 * s)
-    legs = [(place(leg, (x * s, y * s, 0)), None, 1.0) for x in (-0.05, 0.05) for y in (-0.032, 0.032)]
-    ear = frustum(0.018 * s, 0.002 * s, 0.032 * s)
-    ears = [(place(ear, (0.085 * s, y * s, 0.15 * s), rotation(roll=-8 * y)), None, 0.85) for y in (-0.03, 0.03)]
-    snout = place(frustum(0.024 * s, 0.021 * s, 0.026 * s), (0.125 * s, 0, 0.108 * s), rotation(pitch=np.pi / 2))
-    return [
-        (place(ellipsoid(0.095 * s, 0.066 * s, 0.064 * s), (0, 0, 0.095 * s)), None, 1.0),
-        (place(ellipsoid(0.052 * s, 0.05 * s, 0.05 * s), (0.085 * s, 0, 0.115 * s)), None, 1.0),
-        (snout, None, 0.8),
-        *legs,
-        *ears,
-    ]
-
-
 def _teddy(draw):
     s = draw.uniform(0.95, 1.1)
     limbs = []  # feet, arms, ears
@@ -389,30 +346,9 @@ def _teddy(draw):
     ]
 
 
-def _lamp(draw):
-    r, h = draw.uniform(0.09, 0.1), draw.uniform(0.12, 0.14)
-    return [
-        (frustum(0.075, 0.06, 0.022), None, 1.0),
-        (place(frustum(0.016, 0.016, h), (0, 0, 0.02)), None, 1.0),
-        (place(frustum(r, r * 0.55, 0.11), (0, 0, h)), None, 1.0),
-    ]
-
-
-def _toy_car(draw):
-    s = draw.uniform(0.95, 1.1)
-    wheel, turn = frustum(0.027 * s, 0.027 * s, 0.02 * s), rotation(roll=np.pi / 2)
-    places = [(x * s, (y + 0.01) * s, 0.027 * s) for x in (-0.06, 0.06) for y in (-0.052, 0.052)]
-    return [
-        (place(box(0.2 * s, 0.1 * s, 0.05 * s), (0, 0, 0.025 * s)), None, 1.0),
-        (place(box(0.1 * s, 0.086 * s, 0.045 * s), (-0.01 * s, 0, 0.075 * s)), None, 1.0),
-        *((place(wheel, at, turn), None, 0.5) for at in places),
-    ]
-
-
 SHAPES: dict[str, Callable[[np.random.Generator], Body]] = {
     "ball": _ball,
     "box": _box,
-    "book": _book,
     "mug": _mug,
     "pot": _pot,
     "kettle": _kettle,
@@ -421,10 +357,5 @@ SHAPES: dict[str, Callable[[np.random.Generator], Body]] = {
     "plate": _plate,
     "bottle": _bottle,
     "vase": _vase,
-    "cone": _cone,
-    "duck": _duck,
-    "pig": _pig,
     "teddy": _teddy,
-    "lamp": _lamp,
-    "toy car": _toy_car,
 }

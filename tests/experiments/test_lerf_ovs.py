@@ -11,7 +11,7 @@ from capture_files import refused
 from twin_files import lerf_twin, rooms_instances
 
 from experiments.datasets.lerf_ovs import LERF_FRAMES, LERF_PAIRS, load_lerf_ovs
-from jsecon.demo import make_room
+from experiments.datasets.plain_room import make_room
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from capture_files import refused, ring_poses
 from twin_files import ovs3d_twin, rooms_instances
 
 from experiments.datasets.ovs3d import OVS3D_PAIRS, box_of, load_ovs3d, read_poses_bounds, write_poses_bounds
-from jsecon.demo import make_room
+from experiments.datasets.plain_room import make_room
 
 
 @pytest.fixture(scope="module")

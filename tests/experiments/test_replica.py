@@ -10,8 +10,9 @@ from capture_files import refused
 from twin_files import replica_twin
 
 from experiments.datasets.mesh import SURROUNDINGS
+from experiments.datasets.plain_room import make_room
 from experiments.datasets.replica import REPLICA_SCENES, load_replica, vertex_classes
-from jsecon.demo import make_room, room_cameras
+from jsecon.demo import room_cameras
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from experiments.test_simulated import NONE, frames, space  # noqa: F401
 from hypothesis import given, settings, strategies as st
 
 from experiments import worlds
+from experiments.datasets.plain_room import make_room
 from experiments.datasets.twins import by_kind, camouflaged
 from experiments.simulated_vision.embeddings import (
     CONFUSED,
@@ -22,7 +23,7 @@ from experiments.simulated_vision.worlds import World, seen_in, world_of
 from experiments.tables import twins
 from experiments.tables.rows import TRAINED
 from jsecon.data.labels import LabelledFrame
-from jsecon.demo.room import TABLE_WOOD, make_room, srgb_to_linear
+from jsecon.demo.room import TABLE_WOOD, srgb_to_linear
 from jsecon.errors import InputError
 
 TABLE = 7

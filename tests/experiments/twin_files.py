@@ -23,7 +23,8 @@ def replica_twin(root, scene="room0"):
 
 def rooms_instances(seed, cameras):
     """(T, H, W) the objects that ray casting finds, asked for again from the room itself."""
-    from jsecon.demo import make_room, render_views
+    from experiments.datasets.plain_room import make_room
+    from jsecon.demo import render_views
 
     return render_views(make_room(seed, num_objects=SMALL["num_objects"]), cameras)
 
