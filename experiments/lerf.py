@@ -50,11 +50,11 @@ WHY = {
     "and VALA at 0.692; ours, asked for a share of the votes of 0.9 in place of 0.5, at 0.742, and then at 0.514 at "
     "alpha > 0.7.",
 }
-"""why the row held against the others does not lead in a figure where it does not"""
+"""Reasons why our row does not lead in a figure."""
 
 
 def beside(plan: Plan, name: str, methods: Iterable[str]) -> Plan:
-    """The plan of a table `name` of other rows on the same settings, beside this one's: common rows share cells."""
+    """Plan of another table on the same settings; common rows share cells."""
     place = Path(plan.out)
     cells = str(place / "cells.jsonl")
     return dataclasses.replace(plan, methods=tuple(methods), out=str(place.parent / name), cells=cells)

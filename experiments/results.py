@@ -1,4 +1,4 @@
-"""Where an experiment leaves what it found: results/<name>/{config.json, metrics.json, table.md, figure.png}."""
+"""Writes the results of an experiment: results/<name>/{config.json, metrics.json, table.md, figure.png}."""
 
 import dataclasses
 import json
@@ -10,12 +10,19 @@ from jsecon.files import atomic_write, write_text
 
 HOME = Path(__file__).resolve().parent
 CAPTURES = HOME.parent.parent / "shared" / "captures"
-"""the real captures beside the checkout"""
+"""Real captures, beside the checkout."""
 
 
 def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = None) -> None:
-    """Writes the options (a dataclass), the metrics, a table in Markdown and a matplotlib figure into `folder`. Paths
-    are written by `portable`, so that results look alike wherever they were made."""
+    """Writes options, metrics, table and figure.
+
+    Args:
+      folder: Folder of the results.
+      options: Dataclass of options. Its paths are written by `portable`.
+      metrics: Figures for metrics.json.
+      table: Table in Markdown.
+      figure: Optional matplotlib figure.
+    """
     config = {name: portable(value) for name, value in dataclasses.asdict(options).items()}
     write_text(folder / "config.json", json.dumps(config, indent=2) + "\n")
     write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
@@ -26,8 +33,11 @@ def save(folder: Path, options: Any, metrics: dict, table: str, figure: Any = No
 
 
 def portable(value: Any) -> Any:
-    """A value for JSON that tells nothing of this machine. Each absolute path in it is written from the checkout on if
-    it lies there or in `shared` beside it, from ~ on if it lies in the home, and else as `.../` and its last part."""
+    """Converts a value to one for JSON that does not depend on the machine.
+
+    Absolute paths become relative to the checkout if they lie in it or in `shared` beside it, or to the home (~). Of
+    other paths the last part remains.
+    """
     if isinstance(value, dict):
         return {key: portable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -41,7 +51,7 @@ def portable(value: Any) -> Any:
 
 
 def table(header: tuple[str, ...], rows: list[tuple]) -> str:
-    """A Markdown table; floats with three decimals."""
+    """Formats a Markdown table; floats have three decimals."""
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     for row in rows:
         lines.append("| " + " | ".join(f"{v:.3f}" if isinstance(v, float) else str(v) for v in row) + " |")
@@ -49,7 +59,7 @@ def table(header: tuple[str, ...], rows: list[tuple]) -> str:
 
 
 def bars(labels: list[str], series: dict[str, list[float]], ylabel: str):
-    """Grouped bars, one group per label and one colour per series: numbers only, nothing of a capture."""
+    """Draws grouped bars, one group per label and one colour per series."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(1.6 * len(labels) + 2, 3.2))
@@ -65,6 +75,6 @@ def bars(labels: list[str], series: dict[str, list[float]], ylabel: str):
 
 
 def save_picture(folder: Path, name: str, figure: Any) -> None:
-    """A picture that shows a capture's own pixels, points or labels: into folder/pictures, which git ignores."""
+    """Writes a picture that shows data of a capture to folder/pictures, which git ignores."""
     with atomic_write(folder / "pictures" / name) as temporary:
         figure.savefig(temporary, dpi=110, bbox_inches="tight")

@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments import fair, lerf, results
 from experiments.simulated_vision.worlds import World
-from experiments.tables.fill import Plan, fill, place_of, twins_asked
+from experiments.tables.fill import Plan, fill, results_folder, twins_parser
 from experiments.tables.readings import SHARP
 from experiments.tables.rows import TRAINED, WITH_PARTS, rows_of
 
@@ -187,7 +187,7 @@ def main(asked: Asked, processes: int) -> str:
 
 
 if __name__ == "__main__":
-    parser = twins_asked("worlds", "one tiny scene, two faults")
+    parser = twins_parser("worlds", "one tiny scene, two faults")
     parser.add_argument("--choosing", nargs="+", type=int, default=[0], help="that readings are chosen on")
     parser.add_argument("--only", nargs="+", default=list(FAULTS), choices=FAULTS)
     parser.add_argument("--values", nargs="+", type=float, default=[HARD, HALF], help="how hard, 0 to 1")
@@ -199,5 +199,8 @@ if __name__ == "__main__":
         seeds, choosing, only = (1,), (0,), ("parts", "kinds")
     values = (HARD,) if given.quick else tuple(given.values)
     there = tuple(given.scenes_trained), tuple(given.seeds_trained) or seeds[:1]
-    asked = Asked(tuple(given.scenes), seeds, choosing, only, values, *there, given.quick, place_of(given, "worlds"))
+    out = results_folder(given, "worlds")
+    asked = Asked(
+        tuple(given.scenes), seeds, choosing, only, values, *there, given.quick, results_folder(given, "worlds")
+    )
     main(asked, given.processes)

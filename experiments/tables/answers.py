@@ -1,4 +1,4 @@
-"""What a method of the tables is: trained on a setting for so many steps, it answers queries by selecting Gaussians."""
+"""Methods of the tables: a method trains on a setting and answers queries by selecting Gaussians."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,13 +11,15 @@ from jsecon.types import Array, Gaussians, Selection
 
 @dataclasses.dataclass(frozen=True)
 class Steps:
-    """How long the trained methods train. The papers' schedules are 30,000 steps and more at small rates; these are
-    shorter at larger rates, started from random codes: from zero, LangSplat's own start, Adam needs some 18,000
-    steps."""
+    """Lengths of the trainings.
+
+    The papers' schedules take 30,000 steps and more at small rates. These are shorter, at larger rates and from random
+    codes: from zero, which is LangSplat's start, Adam needs about 18,000 steps.
+    """
 
     langsplat: int = 1500
     epochs: int | None = None
-    """of the autoencoders; None: LangSplat's."""
+    """Epochs of the autoencoders; None: LangSplat's."""
     grouping: int = 800
     grouping_rates: tuple[float, float] = (0.025, 0.005)
     instance: int = 800
@@ -42,41 +44,40 @@ QUICK_STEPS = Steps(
     opengaussian_rate=0.05,
     paper=60,
 )
-"""for a look at every row in two minutes: too short for the trained methods to be judged by"""
+"""Steps of a quick run, too few to judge the trained methods by."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Answers:
-    """The answers of a trained method."""
+    """Answers of a trained method."""
 
     select: Callable[[int], Selection | None]
-    """k -> the Gaussians that the k-th of the benchmark's queries selects; None: no answer."""
+    """Gaussians that the k-th query of the benchmark selects; None: no answer."""
     classes: Callable[[], np.ndarray]
-    """() -> (N,) the query that fits each Gaussian best, -1 = none: for datasets whose truth is at the points."""
+    """(N,) query that fits each Gaussian best, -1 = no query; for datasets with truth at the points."""
     beside: dict[str, float] = dataclasses.field(default_factory=dict)
-    """figures under another protocol, to stand beside the table's."""
+    """Figures under another protocol."""
     gaussians: Gaussians | None = None
-    """that are selected from, where they are not the setting's."""
+    """Gaussians that are selected from, if they are not those of the setting."""
     features: Array | None = None
-    """(N, F) what was learnt of each Gaussian, for pictures."""
+    """(N, F) learnt features of the Gaussians, for pictures."""
 
 
 Method = Callable[[Setting, Steps], Answers]
-"""trains on a setting"""
+"""Trains on a setting and returns its answers."""
 
 
 def by_selection(setting: Setting, select: Callable[[int], Selection | None], features: Array | None = None) -> Answers:
-    """Answers of `select`; a Gaussian's class is, of the queries that select it, the one of the highest score."""
+    """Answers of `select`. The class of a Gaussian is the query with the highest score that selects it."""
 
     def classes() -> np.ndarray:
-        # Where several texts select a Gaussian, the one that fits its anchor best: all may share that anchor.
         best = np.full(setting.evidence.gaussians.count, -np.inf)
-        found = np.full(len(best), -1)
+        query = np.full(len(best), -1)
         for k in range(len(setting.texts)):
             answer = select(k)
             if answer is not None:
                 better = np.asarray(answer.mask) & (float(answer.score) > best)
-                best[better], found[better] = float(answer.score), k
-        return found
+                best[better], query[better] = float(answer.score), k
+        return query
 
     return Answers(select, classes, features=features)

@@ -1,4 +1,4 @@
-"""Tables of methods over scenes and seeds: every cell computed once and kept, so that a stopped run goes on."""
+"""Fills tables of methods over scenes and seeds. Every cell is computed once and kept, so that a run resumes."""
 
 import argparse
 import dataclasses
@@ -21,8 +21,9 @@ from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_th
 from jsecon.process import clear_programs, cores, peak_memory_mib
 
 DIGITS = 4
-"""of the IoU of single texts and frames"""
+"""Decimal places of the IoU of single texts and frames."""
 KEPT = ("miou", "macc", "acc_50", "loc_acc", "loc_mask", "loc_box", "pairs", "missing", "accuracy")
+"""Figures that a cell keeps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,81 +35,88 @@ class Plan:
     steps: Steps = dataclasses.field(default_factory=Steps)
     fit_steps: int = 700
     level: str = "medium"
-    """of the twins' simulated vision; unused for real data."""
+    """Level of noise of the simulated vision of twins; unused for real data."""
     sweep: tuple[str, ...] = ("perfect", "low", "medium", "high")
-    """levels at which the first scene and seed are run once more."""
+    """Levels of noise at which the first scene and seed run once more."""
     out: str = ""
     cells: str = ""
-    """the file of the cells; empty: OUT/cells.jsonl. Tables of the same data have rows in common: one file spares the
-    second its training."""
+    """File of the cells; empty: OUT/cells.jsonl. Tables with common rows share a file, and so the training."""
     processes: int = 1
-    """that share the settings, each on cores of its own. 0: this one is one of them, which computes what it finds free,
-    waits for the others, and ends; 1: this one computes all, with all cores."""
+    """Processes that share the settings, each on its own cores. 1: this process computes all on all cores. 0: this
+    process is a helper, which computes free settings and ends."""
 
 
 def options_of(plan: Plan, quick: Plan, words: list[str] | None = None) -> Plan:
-    """The plan that the command line, or `words` of it, asks for."""
+    """Reads the plan of a table from the command line, or from `words`."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--quick", action="store_true", help="one tiny scene, a few steps: at most two minutes")
-    parser.add_argument("--root", default="", help="the real dataset; without it twins are made")
-    parser.add_argument("--seeds", type=int, nargs="+", help="of the twins and their vision")
-    parser.add_argument("--out", default="", help="where the results go")
-    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
-    given = parser.parse_args(words)
-    chosen = dataclasses.replace(quick if given.quick else plan, processes=given.processes)
-    if given.seeds:
-        chosen = dataclasses.replace(chosen, data=dataclasses.replace(chosen.data, seeds=tuple(given.seeds)))
-    if given.root:
-        data = dataclasses.replace(chosen.data, root=given.root, seeds=chosen.data.seeds[:1])
+    parser.add_argument("--quick", action="store_true", help="run one tiny scene with few steps (two minutes)")
+    parser.add_argument("--root", default="", help="folder of the real dataset; without it twins are made")
+    parser.add_argument("--seeds", type=int, nargs="+", help="seeds of the twins and of their simulated vision")
+    parser.add_argument("--out", default="", help="folder of the results")
+    parser.add_argument("--processes", type=int, default=cores(), help="number of processes (default: one per core)")
+    options = parser.parse_args(words)
+    chosen = dataclasses.replace(quick if options.quick else plan, processes=options.processes)
+    if options.seeds:
+        chosen = dataclasses.replace(chosen, data=dataclasses.replace(chosen.data, seeds=tuple(options.seeds)))
+    if options.root:
+        data = dataclasses.replace(chosen.data, root=options.root, seeds=chosen.data.seeds[:1])
         chosen = dataclasses.replace(chosen, data=data)
-    return dataclasses.replace(chosen, out=given.out, cells="") if given.out else chosen
+    return dataclasses.replace(chosen, out=options.out, cells="") if options.out else chosen
 
 
-def twins_asked(name: str, quick: str) -> argparse.ArgumentParser:
-    """Options of experiments that report a few scenes and seeds of twins; OUT is results/`name`, or quick/`name`."""
+def twins_parser(name: str, quick: str) -> argparse.ArgumentParser:
+    """Parser of experiments that report a few scenes and seeds of twins in results/`name`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--scenes", nargs="+", default=["figurines", "teatime"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11], help="that are reported")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 11], help="seeds to report")
     parser.add_argument("--quick", action="store_true", help=quick)
-    parser.add_argument("--out", default="", help=f"where the results go (default: results/{name})")
-    parser.add_argument("--processes", type=int, default=cores(), help="that share the settings; default: one per core")
+    parser.add_argument("--out", default="", help=f"folder of the results (default: results/{name})")
+    parser.add_argument("--processes", type=int, default=cores(), help="number of processes (default: one per core)")
     return parser
 
 
-def place_of(given: argparse.Namespace, name: str) -> str:
-    """The folder of the results that `twins_asked` asked for."""
-    return given.out or str(results.HOME / "results" / (f"quick/{name}" if given.quick else name))
+def results_folder(options: argparse.Namespace, name: str) -> str:
+    """Folder of the results of an experiment with `twins_parser`."""
+    return options.out or str(results.HOME / "results" / (f"quick/{name}" if options.quick else name))
 
 
 def fill(plan: Plan, methods: Mapping[str, Method], *, tell: Callable[[str], None]) -> list[dict]:
-    """All cells: {"scene", "seed", "level", "method", figures, "seconds", "peak_memory_mib", "twin"}.
+    """Computes the missing cells of a table.
 
-    A cell that an earlier run with the same options left in the plan's file of cells is read. A setting is computed
-    by one process at a time, so the same command may run more than once, and does, `plan.processes` times. `seconds`
-    are of training and all queries, without loading and fitting, what methods share charged to each; the memory is the
-    process's highest so far, so later rows hide behind earlier ones.
+    The cells of earlier runs with the same options are read. One process computes a setting at a time, so that the
+    same command may run several times.
+
+    Args:
+      plan: The table.
+      methods: Methods by the names of the rows.
+      tell: Prints a line per finished cell.
+
+    Returns:
+      Cells {"scene", "seed", "level", "method", figures, "seconds", "peak_memory_mib", "twin"}. `seconds` are those of
+      training and all queries without loading and fitting; work that methods share is charged to each. The memory is
+      the peak of the process so far.
     """
-    wanted = [(scene, seed, plan.level) for scene in plan.data.scenes for seed in plan.data.seeds]
+    settings = [(scene, seed, plan.level) for scene in plan.data.scenes for seed in plan.data.seeds]
     if not plan.data.root:
         first = plan.data.scenes[0], plan.data.seeds[0]
-        wanted += [(*first, level) for level in plan.sweep if level != plan.level]
-    keys = {where: {name: _key(plan, *where, name) for name in plan.methods} for where in wanted}
+        settings += [(*first, level) for level in plan.sweep if level != plan.level]
+    keys = {where: {name: _key(plan, *where, name) for name in plan.methods} for where in settings}
     known = read_cells(_file(plan))
-    todo = [where for where in wanted if not known.keys() >= set(keys[where].values())]
+    todo = [where for where in settings if not known.keys() >= set(keys[where].values())]
     if plan.processes == 0:
-        for where in todo:  # what is free: what another process is at, or leaves undone, the caller sees to
+        for where in todo:  # The caller computes what a failed helper leaves undone.
             _complete(plan, methods, where, keys[where], tell, wait=False)
         raise SystemExit(0)
     if min(plan.processes, len(todo)) > 1:
         run_helpers(min(plan.processes, len(todo)))
-    for where in todo:  # of one process all; of several what another command took, or a helper left undone
+    for where in todo:
         _complete(plan, methods, where, keys[where], tell, wait=True)
     known = read_cells(_file(plan))
-    return [known[key] for where in wanted for key in keys[where].values()]
+    return [known[key] for where in settings for key in keys[where].values()]
 
 
 def _complete(plan: Plan, methods: Mapping[str, Method], where: tuple, keys: dict[str, str], tell, *, wait: bool):
-    """Computes the missing cells of a setting; none where another process is at it, unless that one is waited for."""
+    """Computes the missing cells of a setting, unless another process computes it and `wait` is False."""
     scene, seed, level = where
     file = _file(plan)
     with exclusive_lock(file.with_name(f"{scene}-{seed}-{level}.lock"), wait=wait) as free:
@@ -133,8 +141,8 @@ def _file(plan: Plan) -> Path:
 
 
 def _key(plan: Plan, scene: str, seed: int, level: str, method: str) -> str:
-    """Of a cell: its setting, and a digest of all that its value depends on but the code."""
-    given = [
+    """Key of a cell: its setting and a digest of all options that its value depends on."""
+    options = [
         plan.data.dataset,
         plan.data.root,
         plan.data.size,
@@ -144,21 +152,32 @@ def _key(plan: Plan, scene: str, seed: int, level: str, method: str) -> str:
         plan.fit_steps,
         dataclasses.asdict(plan.steps),
     ]
-    digest = hashlib.sha1(json.dumps([*given, scene, seed, level, method], default=str).encode()).hexdigest()[:12]
+    digest = hashlib.sha1(json.dumps([*options, scene, seed, level, method], default=str).encode()).hexdigest()[:12]
     return f"{scene}-{seed}-{level}-{digest}"
 
 
 def totals(cells: list[dict]) -> list[dict]:
-    """The cells without the figures of single texts, which the file of cells keeps."""
-    return [{name: told for name, told in cell.items() if name != "texts"} for cell in cells]
+    """The cells without the figures of single texts."""
+    return [{name: value for name, value in cell.items() if name != "texts"} for cell in cells]
 
 
 def measure(setting: Setting, answers: Answers) -> dict:
-    """The figures of one method on one setting, under the dataset's protocol; denominators checked."""
+    """Measures a method on a setting under the protocol of the dataset.
+
+    Args:
+      setting: The setting.
+      answers: The answers of the trained method.
+
+    Returns:
+      Figures, and the IoU of each text.
+
+    Raises:
+      InputError: The number of pairs or classes differs from that of the protocol.
+    """
     bench: Benchmark = setting.bench
     if not bench.frames:
         opacity = 1 / (1 + np.exp(-np.asarray(setting.evidence.gaussians.opacity_logits)))
-        rows, told = evaluate_points(
+        rows, figures = evaluate_points(
             answers.classes(),
             bench.point_classes,
             bench.queries,
@@ -166,7 +185,7 @@ def measure(setting: Setting, answers: Answers) -> dict:
             opacities=opacity,
         )
         texts = {row.query: [round(row.iou, DIGITS)] for row in rows}
-        return {name: told[name] for name in KEPT if name in told} | {"texts": texts}
+        return {name: figures[name] for name in KEPT if name in figures} | {"texts": texts}
     both = evaluate_at_thresholds(
         answers.gaussians or setting.evidence.gaussians,
         setting.cameras,

@@ -1,4 +1,4 @@
-"""A table of methods over scenes and seeds, written: means with deviations, levels of noise, and who leads where."""
+"""Writes a table of methods over scenes and seeds: means with deviations, levels of noise, and which row leads."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,8 +11,11 @@ from experiments.tables.fill import Plan, fill, totals
 
 
 def summarise(cells: list[dict], scenes: tuple[str, ...], level: str, figures: tuple[str, ...]) -> str:
-    """A Markdown table: a row per method, the figures of each scene as mean over the seeds +- deviation, then the mean
-    of the scenes with the deviation of the seeds' means, seconds and memory."""
+    """Formats a Markdown table with a row per method.
+
+    Columns are the figures of each scene (mean over the seeds ± deviation), their means over the scenes, seconds and
+    peak memory.
+    """
     names = list(dict.fromkeys(cell["method"] for cell in cells))
     header = ["method", *(f"{scene} {figure}" for scene in scenes for figure in figures)]
     header += [f"mean {figure}" for figure in figures] + ["seconds", "peak MiB so far"]
@@ -36,7 +39,7 @@ def _spread(values: list[float]) -> str:
 
 
 def means(cells: list[dict], level: str, figure: str = "miou") -> dict[str, float]:
-    """Mean over scenes and seeds of a figure, per method."""
+    """Mean of a figure over scenes and seeds by method."""
     names = list(dict.fromkeys(cell["method"] for cell in cells))
     chosen = [cell for cell in cells if cell["level"] == level]
     return {name: float(np.mean([c[figure] for c in chosen if c["method"] == name])) for name in names}
@@ -45,14 +48,16 @@ def means(cells: list[dict], level: str, figure: str = "miou") -> dict[str, floa
 def leaders(
     cells: list[dict], scenes: tuple[str, ...], level: str, *, ours: str, why: str = "", figure: str = "miou"
 ) -> str:
-    """Where another method's `figure` of a scene is above that of the row `ours`, a line each, and `why`. Rows whose
-    names start with "ours" are not others: the best of several of one's own would be chosen by the answer."""
+    """Lists the scenes on which another method has a larger `figure` than the row `ours`, and then `why`.
+
+    Other rows whose names start with "ours" do not count as other methods.
+    """
     lines, compared = [], False
     for scene in scenes:
-        held = _held_against([cell for cell in cells if cell["scene"] == scene], level, ours, figure)
-        if held is None:
+        comparison = _compare([cell for cell in cells if cell["scene"] == scene], level, ours, figure)
+        if comparison is None:
             continue
-        compared, (mine, best, value) = True, held
+        compared, (mine, best, value) = True, comparison
         if not mine >= value:
             lines.append(f"* {scene}: {best} leads with {value:.3f} ({ours}: {mine:.3f}).")
     if not lines:
@@ -61,31 +66,31 @@ def leaders(
     return "\n".join([*lines, "", why] if why else lines)
 
 
-def _held_against(cells: list[dict], level: str, ours: str, figure: str) -> tuple[float, str, float] | None:
-    """The figure of the row `ours` at a level of noise, and the name and figure of the best other (none: None)."""
-    found = means(cells, level, figure)
-    others = {name: value for name, value in found.items() if not name.startswith("ours")}
+def _compare(cells: list[dict], level: str, ours: str, figure: str) -> tuple[float, str, float] | None:
+    """The figure of the row `ours`, and the name and figure of the best other method; None without others."""
+    by_method = means(cells, level, figure)
+    others = {name: value for name, value in by_method.items() if not name.startswith("ours")}
     if not others:
         return None
     best = max(others, key=lambda name: others[name])
-    return found.get(ours, float("nan")), best, others[best]
+    return by_method.get(ours, float("nan")), best, others[best]
 
 
 def noise(cells: list[dict], plan: Plan, ours: str = "") -> str:
-    """A Markdown table of mIoU over the levels of noise, on the first scene and seed, and a line for each level at
-    which the row `ours` (none: no such comparison) does not lead."""
+    """Formats mIoU over the levels of noise on the first scene and seed; lists those at which `ours` does not lead."""
     scene, seed = plan.data.scenes[0], plan.data.seeds[0]
     here = [cell for cell in cells if (cell["scene"], cell["seed"]) == (scene, seed)]
     levels = [level for level in plan.sweep if any(cell["level"] == level for cell in here)]
     rows = []
     for name in plan.methods:
-        found = {cell["level"]: cell["miou"] for cell in here if cell["method"] == name}
-        rows.append((name, *(f"{found[level]:.3f}" for level in levels)))
+        by_level = {cell["level"]: cell["miou"] for cell in here if cell["method"] == name}
+        rows.append((name, *(f"{by_level[level]:.3f}" for level in levels)))
     lines = []
     for level in levels if ours else ():
-        held = _held_against(here, level, ours, "miou")
-        if held is not None and not held[0] >= held[2]:
-            lines.append(f"* noise {level}: {held[1]} leads with {held[2]:.4f} ({ours}: {held[0]:.4f}).")
+        comparison = _compare(here, level, ours, "miou")
+        if comparison is not None and not comparison[0] >= comparison[2]:
+            mine, best, value = comparison
+            lines.append(f"* noise {level}: {best} leads with {value:.4f} ({ours}: {mine:.4f}).")
     return "\n".join([results.table(("method", *levels), rows), *([""] if lines else []), *lines])
 
 
@@ -99,7 +104,7 @@ def make(
     why: dict[str, str] | None = None,
     published: str = "",
 ) -> str:
-    """Fills the table, writes it, prints it, returns it."""
+    """Fills, writes and prints a table; returns its text."""
     cells = fill(plan, methods, tell=lambda line: print(line, flush=True))
     text = write(plan, cells, figures, notes=notes, ours=ours, why=why, published=published)
     print(text)
@@ -116,9 +121,20 @@ def write(
     why: dict[str, str] | None = None,
     published: str = "",
 ) -> str:
-    """Writes results/<name>/{config.json, metrics.json, table.md, figure.png}; returns the table. `ours` is the row
-    that the others are held against (none: no such comparison) in each figure of `why`, which says why it does not lead
-    where it does not."""
+    """Writes the results of a table.
+
+    Args:
+      plan: The table.
+      cells: Its cells.
+      figures: Names of the columns.
+      notes: How the figures are measured.
+      ours: Row that is compared with the other methods; empty: no comparison.
+      why: Figures in which it is compared, and the reason where it does not lead.
+      published: Published numbers that stand beneath.
+
+    Returns:
+      The text of table.md.
+    """
     twin = any(cell["twin"] for cell in cells)
     source = f"made-up twins in {plan.data.dataset}'s layout, simulated vision ({plan.level})" if twin else "real data"
     parts = [f"Measured on {source}. {notes}", "", summarise(cells, plan.data.scenes, plan.level, figures), ""]

@@ -1,4 +1,4 @@
-"""The rows of Tables 1 to 3: the other methods, trained on a setting and asked as their papers ask them, and ours."""
+"""The rows of Tables 1 to 3: the other methods, queried as their papers do, and ours."""
 
 import dataclasses
 from collections.abc import Callable
@@ -118,6 +118,6 @@ METHODS: dict[str, Method] = {
     "ours, tracks": asked("votes", pieces=True),
     "ours, consensus": asked("votes", by="consensus", pieces=True),
 }
-"""the rows of Tables 1 to 3"""
+"""Rows of Tables 1 to 3."""
 RECOMMENDED = "ours, consensus"
-"""what jsecon does by default with masks of single frames: the row to hold against the others"""
+"""Row that the others are compared with: what jsecon does by default with masks of single frames."""
