@@ -1,12 +1,11 @@
-"""Two sentences of the paper that its tables do not show: averages over views vary less, and are easier to compress;
-and how far retraining moves the paper's path.
+"""Claims of the paper beside its tables: averages over views vary less and compress better, retraining moves little.
 
     python -m experiments.claims [--seeds 10 11 12] [--retrained 5] [--quick] [--out FOLDER]
 
-Twins of LERF's figurines at medium noise, regions by the tracker's ids. Spread: 1 - cosine between the mean of one half
-of a region's views and an embedding that has no part in it: one view's, or the mean of the other half. Compression:
-LangSplat's autoencoder to 3 numbers, trained on each view's masks or on the regions' averages; the cosine of what comes
-back of the regions' averages, and the texts whose region (by the cosine) is still the same.
+Twins of LERF's figurines at medium noise, regions by the ids of the tracker. Spread: 1 - cosine between the mean of
+half of a region's views and a view of the other half, or the mean of the other half. Compression: LangSplat's
+autoencoder to 3 numbers, trained on the masks of all views or on the averages of the regions; cosine of the decoded
+averages, and share of texts whose region (by the cosine) stays the same.
 """
 
 import argparse
@@ -27,7 +26,9 @@ from jsecon.language.autoencoder import Autoencoder, train_autoencoder
 from jsecon.numerics import cosine, cosine_matrix
 
 LATENT = 3
+"""Size of the autoencoder's code."""
 LEAST_VIEWS = 6
+"""Views that a region needs to count."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +44,10 @@ class Options:
 
 
 def views_of_regions(setting: Setting) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(V, E) embeddings and (V,) pixels of the masks of each region that has LEAST_VIEWS of them or more; a mask is of
-    the region that most of its pixels belong to."""
+    """(V, E) embeddings and (V,) pixels of the masks of each region with at least LEAST_VIEWS masks.
+
+    A mask belongs to the region that most of its pixels belong to.
+    """
     evidence = setting.evidence
     inside = overlaps(np.asarray(evidence.tracks), np.asarray(evidence.masks), len(evidence.embeddings))
     region, pixels = inside.argmax(0), inside.max(0)
@@ -53,7 +56,7 @@ def views_of_regions(setting: Setting) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def spread(regions: list[tuple[np.ndarray, np.ndarray]], seed: int) -> tuple[float, float]:
-    """1 - cosine of a single view, and of the mean of half of the views, to the mean of the other half; mean of all."""
+    """Mean 1 - cosine to the mean of half of the views: of a view of the other half, and of the mean of that half."""
     draw, single, half = np.random.default_rng(seed), [], []
     mean = lambda rows, weights: unit((weights[:, None] * rows).sum(0, keepdims=True))[0]
     for rows, weights in regions:
@@ -66,14 +69,14 @@ def spread(regions: list[tuple[np.ndarray, np.ndarray]], seed: int) -> tuple[flo
 
 
 def compressed(coder: Autoencoder, averages: np.ndarray, texts: np.ndarray) -> tuple[float, float]:
-    """Cosine of the averages that come back, and the share of texts that still find the same region."""
+    """Cosine of the decoded averages, and share of texts that match the same region as before."""
     back = coder.decode(coder.encode(jnp.asarray(averages)))
     before, after = (np.asarray(cosine_matrix(jnp.asarray(texts), rows)).argmax(1) for rows in (averages, back))
     return float(cosine(back, jnp.asarray(averages)).mean()), float((before == after).mean())
 
 
 def main(options: Options) -> str:
-    """The table, written."""
+    """Measures, writes the results and returns the table."""
     table = lerf.QUICK if options.quick else lerf.PLAN
     steps = table.steps if options.quick else Steps()
     rows, metrics = [], {}

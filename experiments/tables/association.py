@@ -15,30 +15,37 @@ from jsecon.association.consensus import consensus_masklets
 from jsecon.association.views import SceneViews
 
 ROWS = 64
-"""regions are counted in multiples of this, the last without pixels and embedding: scenes share compiled programs"""
+"""The number of regions is padded to a multiple of this, so that scenes share compiled programs."""
 
 COVERED = 0.5
-"""part of a region that must lie in masks: what a group of Gaussians claims beside them has not been embedded"""
+"""Share of a region in a view that must lie in masks, since only masks have embeddings."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Association:
-    """Regions that are alike in all frames, and what is known of each."""
+    """Regions with the same ids in all frames, and their embeddings."""
 
     labels: np.ndarray
     """(T, H, W) int32 region, -1 = none."""
     embeddings: np.ndarray
-    """(R, E) unit, of each region the mean of its masks' embeddings weighted by their pixels (phi_bar)."""
+    """(R, E) unit; mean of the embeddings of a region's masks, weighted by pixels (phi_bar)."""
     uniform_embeddings: np.ndarray
-    """(R, E) the same with each view counting alike."""
+    """(R, E) The same with equal weights of views."""
     pixels: np.ndarray
-    """(R, T) int32."""
+    """(R, T) int32 pixels in each view."""
 
 
 def associated(levels: Sequence[Evidence], labels: np.ndarray) -> Association:
-    """The regions of `labels` (T, H, W): a mask, of whichever level, counts for a region by the pixels that both hold,
-    in the views where masks hold at least `COVERED` of the region's pixels. A region that is hardly in any mask has no
-    embedding."""
+    """Embeds the regions of label images.
+
+    Args:
+      levels: Masks and embeddings of each level.
+      labels: (T, H, W) region ids, -1 where a pixel belongs to no region.
+
+    Returns:
+      The regions. A mask weighs by the pixels that it shares with a region, in views where masks cover at least COVERED
+      of the region. A region without such a view has no embedding.
+    """
     inside = np.concatenate([overlaps(labels, np.asarray(e.masks), len(e.embeddings)) for e in levels], axis=1)
     inside = np.pad(inside, ((0, -len(inside) % ROWS), (0, 0)))
     frame, embeddings = (np.concatenate([np.asarray(getattr(e, k)) for e in levels]) for k in ("frame", "embeddings"))
@@ -60,9 +67,19 @@ def by_consensus(
     centre: float = 0.0,
     **how: Any,
 ) -> Association:
-    """jsecon's own association, without tracks: the pixels of each frame go to groups of Gaussians that lie in one mask
-    in most views; `silent` as for `mask_signatures`, `centre` as for `SceneViews`, `how` as for
-    `consensus_masklets`."""
+    """Associates masks by jsecon's consensus of the views.
+
+    Args:
+      levels: Masks and embeddings of each level.
+      frames: (T, H, W, 3) uint8.
+      seed: Seed of the clustering.
+      silent: As for `mask_signatures`.
+      centre: As for `SceneViews`.
+      **how: Options of `consensus_masklets`.
+
+    Returns:
+      The regions.
+    """
     given = jax.tree.map(jnp.asarray, (levels[0].gaussians, levels[0].cameras))
     scene = SceneViews(*given, lambda t: proposals(levels, t), centre=centre)
     return associated(levels, clean_masklets(consensus_masklets(frames, scene, silent=silent, seed=seed, **how)))
@@ -89,14 +106,14 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 class Shared:
-    """What several methods of one setting need, computed once; its cost is charged to each that asks for it."""
+    """Values that several methods of a setting need, computed once. Each method that uses one is charged its cost."""
 
     def __init__(self):
         self._kept: dict[Any, tuple[Any, float]] = {}
         self._borrowed: dict[Any, float] = {}
 
     def get(self, key: Any, compute: Callable[[], Any]) -> Any:
-        """The value of `key`, which `compute` gives the first time."""
+        """The value of `key`, computed at the first call."""
         if key not in self._kept:
             began = time.perf_counter()
             value = jax.block_until_ready(compute())
@@ -107,7 +124,7 @@ class Shared:
         return self._kept[key][0]
 
     def settle(self) -> float:
-        """Seconds that others spent on what was asked for since the last call."""
+        """Seconds that other methods spent on the values used since the last call."""
         seconds = sum(self._borrowed.values())
         self._borrowed = {}
         return seconds
