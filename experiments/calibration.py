@@ -1,6 +1,6 @@
 """The confidence of an answer against how often it is right: fitted on some simulated rooms, measured on others.
 
-    python -m experiments.calibration [--scenes NAME ...] [--fitted 0 1 2] [--seeds 10 11 ...]
+    python -m experiments.calibration [--scenes NAME ...] [--fitted 0 1] [--seeds 10 11 ...]
                                       [--levels medium high shared ...] [--quick] [--out FOLDER]
 
 Twins of LERF, regions of the simulated tracker. Every name of a thing in the room is asked, and 200 names that nothing
@@ -21,12 +21,15 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 
 from experiments import lerf, results
+from experiments.cells import append_cell, read_cells
 from experiments.shared_errors import pooled
 from experiments.tables import twins
 from jsecon.query.confidence import OFFSET, SLOPE, answer_confidence
 from jsecon.query.match import QUANTILE, anchor_of, answers, evidence, quantile_among, unrelated_similarities
 
 BINS = 10
+PADDED = 64
+"""regions of a room are padded to multiples of this number"""
 
 
 class Bin(NamedTuple):
@@ -45,7 +48,7 @@ class Options:
 
     data: twins.Data = lerf.PLAN.data
     scenes: tuple[str, ...] = lerf.PLAN.data.scenes
-    fitted: tuple[int, ...] = (0, 1, 2)
+    fitted: tuple[int, ...] = (0, 1)
     seeds: tuple[int, ...] = (10, 11, 12, 13, 14)
     levels: tuple[str, ...] = ("medium", "high", "medium+shared=0.5", "shared")
     out: str = str(results.HOME / "results" / "calibration")
@@ -83,30 +86,35 @@ def calibration_error(
 
 
 @jax.jit
-def _ask(embeddings, text, canonical, pixels, words, similar):
-    similarity, known = answers(embeddings, text, canonical, words, pixels, "apart")
-    standing = evidence(pixels).astype(similarity.dtype)
-    quantile = quantile_among(jnp.max(jnp.where(known, similarity, -jnp.inf)), text, words, similar)
-    return anchor_of(similarity, known, standing), quantile, answer_confidence(similarity, known, standing, similar)
+def _ask(embeddings, texts, canonical, pixels, words):
+    similar = unrelated_similarities(embeddings, words, canonical, pixels, "apart")
+    weight = evidence(pixels).astype(embeddings.dtype)
+
+    def ask(text):
+        similarity, known = answers(embeddings, text, canonical, words, pixels, "apart")
+        quantile = quantile_among(jnp.max(jnp.where(known, similarity, -jnp.inf)), text, words, similar)
+        return anchor_of(similarity, known, weight), quantile, answer_confidence(similarity, known, weight, similar)
+
+    return jax.vmap(ask)(texts)
 
 
-def answered(options: Options, scene: str, seed: int, level: str) -> Answered:
-    """The answers of one room under simulated vision of a level."""
+def answered(options: Options, scene: str, seed: int, level: str) -> list[tuple[float, float, float]]:
+    """(confidence, right, weight) of each answer in one room under simulated vision of a level."""
     root = options.data.place(scene, seed, "medium")
     bench = options.data.load(root, scene)
     found = pooled(bench, root, level, seed)
-    words = jnp.asarray(twins.words_of(bench, root, level, seed).reference)
-    scene_of = [jnp.asarray(own, jnp.float32) for own in (found.embeddings, found.canonical, found.pixels)]
-    embeddings, canonical, pixels = scene_of
-    similar = unrelated_similarities(embeddings, words, canonical, pixels, "apart")
+    words = twins.words_of(bench, root, level, seed).reference
+    # Rooms share one program: regions without an embedding change nothing.
+    room = -len(found.embeddings) % PADDED
+    embeddings, pixels = (np.pad(own, ((0, room), (0, 0))) for own in (found.embeddings, found.pixels))
     rows = []
     for texts, objects in ((found.texts, np.arange(len(found.texts))), (found.absent, np.full(len(found.absent), -1))):
-        for text, thing in zip(texts, objects):
-            region, quantile, confidence = _ask(embeddings, jnp.asarray(text), canonical, pixels, words, similar)
+        given = (jnp.asarray(own, jnp.float32) for own in (embeddings, texts, found.canonical, pixels, words))
+        for region, quantile, confidence, thing in zip(*map(np.asarray, _ask(*given)), objects):
             if quantile >= QUANTILE:
-                right = thing >= 0 and found.objects[int(region)] == thing
+                right = thing >= 0 and found.objects[region] == thing
                 rows.append((float(confidence), float(right), 1 / len(texts)))
-    return Answered(*np.array(rows).reshape(-1, 3).T)
+    return rows
 
 
 def joined(parts: list[Answered]) -> Answered:
@@ -128,10 +136,16 @@ def fit(told: Answered) -> tuple[float, float]:
 
 def main(options: Options = Options()) -> dict:
     """Runs the experiment, writes its results and returns the figures."""
-    both = {}
+    file, both = Path(options.out) / "run" / "cells.jsonl", {}
     for seeds in (options.fitted, options.seeds):
         for level in options.levels:
-            both[seeds, level] = joined([answered(options, s, seed, level) for s in options.scenes for seed in seeds])
+            rows = []
+            for scene, seed in ((scene, seed) for scene in options.scenes for seed in seeds):
+                key = f"{scene}-{seed}-{level}-{dict(options.data.size)}"
+                if key not in read_cells(file):
+                    append_cell(file, key, answered(options, scene, seed, level))
+                rows += read_cells(file)[key]
+            both[seeds, level] = Answered(*np.array(rows).reshape(-1, 3).T)
     offset, slope = fit(joined([both[options.fitted, level] for level in options.levels]))
     kept, rows = {"fit": [offset, slope], "in jsecon": [OFFSET, SLOPE], "levels": {}}, []
     own = {level: both[options.seeds, level] for level in options.levels}
