@@ -67,12 +67,10 @@ CHOOSING = (("apc_bin", GIVEN), ("apc_bin", DEFAULT), ("bonsai", DEFAULT))
 """what crops and rules are chosen on"""
 REPORTED = (("replica_apartment_0", GIVEN), ("replica_apartment_0", DEFAULT))
 GIVEN_FLAT, DEFAULT_FLAT = (f"{name}, {masks}" for name, masks in REPORTED)
-VARIANTS = ("probability", "log-odds", "kernel")
+VARIANTS = ("probability", "log-odds")
 """of the embedder, see `variants_of`"""
-ALONE = ("probability", "kernel")
+ALONE = ("probability",)
 """variants that Gaussians are also asked alone with"""
-KERNEL = 0.05
-"""of the variant with one"""
 CLASS_LIST = "class list"
 """of the ways: each region under its best text"""
 RENDERED = 2
@@ -416,14 +414,9 @@ def measured_alone(options: Options, name: str, masks: str, variant: str, method
 
 
 def variants_of(options: Options) -> dict[str, Conse]:
-    """Embedders of one labeller: the paper's, by log-odds, and by a kernel over the classes."""
+    """Embedders of one labeller: the paper's, and by log-odds."""
     labeller, texts = Labeller(options.labeller), TextVectors(options.vectors, options.model or None)
-    how: dict[str, dict[str, Any]] = {
-        "probability": {},
-        "log-odds": {"weights": "log-odds"},
-        "kernel": {"kernel": KERNEL},
-    }
-    return {variant: Conse(labeller, texts, **own) for variant, own in how.items()}
+    return {variant: Conse(labeller, texts, weights=variant) for variant in VARIANTS}
 
 
 def main(options: Options = Options(), tell: Callable[[str], None] = print) -> dict:

@@ -243,7 +243,6 @@ class Conse:
         crop: Crop = Crop(),
         weights: str = "probability",
         top: int | None = TOP,
-        kernel: float = 0.0,
     ):
         """Opens the files and makes the space.
 
@@ -253,9 +252,6 @@ class Conse:
           crop: What the labeller sees of a region.
           weights: What weights a class's vector, one of WEIGHTS.
           top: Number of classes that an embedding is made of; None for all.
-          kernel: Where it is above 0, regions and texts are vectors over the classes instead: a region has its classes'
-            weights, a text exp((cosine with the class's name - 1) / kernel). A small kernel lets only names that mean
-            nearly the same count, where ConSE's own cosine lets all.
 
         Raises:
           InputError: A file is missing, or the table has no vector for a class of the labeller.
@@ -263,15 +259,13 @@ class Conse:
         require_one_of("weights", weights, WEIGHTS, "'probability' is the paper's.")
         self.labeller, self.texts = labeller or Labeller(), texts or TextVectors()
         self.crop, self.weights, self.top = crop, weights, top
-        self._names = self.texts.embed(list(self.labeller.names))
-        self.kernel = kernel
-        self.class_vectors = np.eye(len(self._names), dtype=np.float32) if kernel else self._names
+        self.class_vectors = self.texts.embed(list(self.labeller.names))
         self.canonical = self.embed_text(list(CANONICAL))
         # Without a model for the vectors the table lacks some of the words: those that it has are enough.
         self.reference = self.embed_text([word for word in REFERENCE_WORDS if word in self.texts])
         self.dim = self.class_vectors.shape[1]
-        digest = hashlib.sha256(self._names.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
-        told = f"{crop.margin:g}-{crop.shape}-{crop.surroundings}-{weights}-{top or 'all'}-{kernel:g}"
+        digest = hashlib.sha256(self.class_vectors.tobytes() + self.labeller.file.read_bytes()).hexdigest()[:12]
+        told = f"{crop.margin:g}-{crop.shape}-{crop.surroundings}-{weights}-{top or 'all'}"
         self.name = f"conse-{digest}-{told}"
 
     def scores(self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]) -> UInt8[np.ndarray, "m k"]:
@@ -291,8 +285,4 @@ class Conse:
 
     def embed_text(self, texts: list[str]) -> Float[np.ndarray, "q e"]:
         """Q texts -> (Q, E) float32 unit. Raises InputError on a text without a vector."""
-        vectors = self.texts.embed(texts)
-        if not self.kernel:
-            return vectors
-        near = np.exp((vectors.astype(np.float64) @ self._names.T.astype(np.float64) - 1) / self.kernel)
-        return (near / np.linalg.norm(near, axis=1, keepdims=True)).astype(np.float32)
+        return self.texts.embed(texts)

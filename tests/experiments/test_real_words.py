@@ -13,7 +13,7 @@ from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_we
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError
 from jsecon.query.baselines import relevancies
-from jsecon.query.match import contrasts
+from jsecon.query.match import answers
 from jsecon.vision.protocols import CANONICAL, Embedder
 
 SIDE = 8
@@ -209,27 +209,18 @@ def test_scores_of_all_texts_are_those_of_the_library():
     regions, texts, canonical = (unit(shape).astype(np.float32) for shape in ((6, 12), (3, 12), (4, 12)))
     pixels = rng.integers(0, 500, (6, 5)).astype(np.int32)
     regions[2] = 0
-    found = {kind: rules.scores(regions, texts, canonical, pixels, kind) for kind in rules.SCORES}
+    words = rules._units(rng.standard_normal((9, regions.shape[1]))).astype(np.float32)
+    found = {kind: rules.scores(regions, texts, canonical, words, pixels, kind) for kind in rules.SCORES}
     assert all((table[:, 2] == -np.inf).all() for table in found.values())
     known = np.arange(6) != 2
     for q, text in enumerate(texts):
-        contrast = np.asarray(contrasts(regions, text, canonical, pixels)[0])
+        apart = np.asarray(answers(regions, text, canonical, words, pixels, "apart")[0])
         relevancy = np.asarray(relevancies(regions, text, canonical)[0])
-        np.testing.assert_allclose(found["contrast"][q, known], contrast[known], atol=1e-5)
+        np.testing.assert_allclose(found["apart"][q, known], apart[known], atol=1e-5)
         np.testing.assert_allclose(found["relevancy"][q, known], relevancy[known], atol=1e-5)
         np.testing.assert_allclose(found["cosine"][q, known], (regions @ text)[known], atol=1e-5)
-
-
-def test_with_a_kernel_only_names_that_mean_the_same_count(embedder):
-    near = Conse(embedder.labeller, embedder.texts, crop=Crop(0.0), top=2, kernel=0.1)
-    assert near.dim == len(NAMES)
-    red, ink = near.embed_text(["red", "dark ink"])
-    np.testing.assert_allclose(red, [1, 0, 0], atol=1e-3)
-    like = np.exp((np.array([0, 0, 0.5**0.5]) - 1) / 0.1)
-    np.testing.assert_allclose(ink, _unit(like), atol=1e-5)
-    frame, masks = np.zeros((20, 30, 3), np.uint8), np.ones((1, 20, 30), bool)
-    frame[:] = 250, 10, 120
-    np.testing.assert_allclose(near.embed_regions(frame, masks)[0], _unit(np.array([250, 0, 120])), atol=5e-3)
+    moved = rules.scores(regions, rules._units(texts + canonical.mean(0)), canonical, words, pixels, "contrast")
+    np.testing.assert_allclose(moved[:, known], found["contrast"][:, known], atol=1e-5)  # phrases say nothing
 
 
 def test_minilm_reads_its_files_and_gives_units(tmp_path):
