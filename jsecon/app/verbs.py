@@ -200,7 +200,7 @@ class Query(FieldVerb):
     out: Option[Path]
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
-    quantile: Option[float] = 0.83
+    quantile: Option[float] = 0.82
     all: Option[bool] = False
     even: Option[bool] = False
     keep_outliers: Option[bool] = False
