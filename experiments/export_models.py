@@ -1,15 +1,12 @@
-"""Exports CLIP, SigLIP, SAM and SAM 2 from their official packages as ONNX graphs, and checks ONNX Runtime against
-PyTorch.
+"""Exports CLIP, SigLIP and SAM from their official packages as ONNX graphs, and checks ONNX Runtime against PyTorch.
 
-    pip install -e ".[export]"        (SAM 2 builds without its CUDA operator: SAM2_BUILD_CUDA=0)
-    python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k \\
-        --sam-weights sam_vit_b.pth --sam2-weights sam2.1_hiera_tiny.pt
+    pip install -e ".[export]"
+    python -m experiments.export_models --out models --clip-weights laion2b_s34b_b88k --sam-weights sam_vit_b.pth
 
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
-every graph's outputs, and a clip tracked by jsecon over the graphs against the official video predictor, frame by
-frame, forward and backward. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and
-crops to embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) also against transformers. `--only`
-takes some of the parts; figures of the others are kept.
+every graph's outputs. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and crops to
+embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) also against transformers. `--only` takes some of
+the parts; figures of the others are kept.
 """
 
 import argparse
@@ -24,7 +21,7 @@ TOLERANCE = 1e-3
 """of every output, masks as logits"""
 SAME_PIXELS = 0.999
 """of a mask"""
-PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images", "sam2", "tracking")
+PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +29,7 @@ class Options:
     """What is exported, and where to."""
 
     out: str = "models"
-    """folder of the graphs: clip/, sam/, and one of each SAM 2 configuration."""
+    """folder of the graphs: clip/, sam/, and one of each further model."""
     results: str = str(results.HOME / "results" / "export_models")
     only: tuple[str, ...] = PARTS
     clip: str = "ViT-B-16"
@@ -44,12 +41,6 @@ class Options:
     """of open_clip; random weights."""
     sam: str = "vit_b"
     sam_weights: str | None = None
-    sam2: tuple[str, ...] = ("sam2.1_hiera_t", "sam2_hiera_t")
-    """configurations; the first is tracked over `frames`, the others over `short`."""
-    sam2_weights: str | None = None
-    """of the first configuration."""
-    frames: int = 12
-    short: int = 4
     seed: int = 0
     threads: int = 1
 
@@ -119,38 +110,6 @@ def _sam_images(options: Options) -> dict[str, dict]:
     return {name: sam_images.export(model, Path(options.out) / name, seed=options.seed, threads=options.threads)}
 
 
-def _sam2(options: Options) -> dict[str, list[dict]]:
-    from experiments.export import sam2
-
-    return {
-        config: _rows(
-            sam2.export(
-                _sam2_model(options, config), Path(options.out) / config, seed=options.seed, threads=options.threads
-            )
-        )
-        for config in options.sam2
-    }
-
-
-def _tracking(options: Options) -> dict[str, dict]:
-    from experiments.export import tracking
-
-    found = {}
-    for config in options.sam2:
-        count = options.frames if config == options.sam2[0] else options.short
-        clip = tracking.moving_discs(count, first=(count - 1) // 2, seed=options.seed)
-        model, folder = _sam2_model(options, config), Path(options.out) / config
-        found[config] = tracking.compare(model, folder, clip, threads=options.threads)
-    return found
-
-
-def _sam2_model(options: Options, config: str):
-    from experiments.export import sam2
-
-    weights = options.sam2_weights if config == options.sam2[0] else None
-    return sam2.official(config, None if weights is None else Path(weights), seed=options.seed)
-
-
 def _rows(agreements) -> list[dict]:
     return [dataclasses.asdict(agreement) for agreement in agreements]
 
@@ -159,33 +118,27 @@ def _versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
     found = {}
-    for name in ("torch", "onnxruntime", "open_clip_torch", "timm", "transformers", "segment-anything", "sam2"):
+    for name in ("torch", "onnxruntime", "open_clip_torch", "timm", "transformers", "segment-anything"):
         with contextlib.suppress(PackageNotFoundError):  # of a part that was not asked for
             found[name] = version(name)
     return found
 
 
 def table(metrics: dict) -> str:
-    """Markdown: a row per graph, then a row per tracked clip."""
+    """Markdown: a row per graph."""
     rows = []
     groups = {"clip": metrics.get("clip", [])}
     for part in ("siglip", "mobileclip"):
         groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
     groups |= {"sam": metrics.get("sam", [])}
-    groups |= {name: found["graphs"] for name, found in metrics.get("sam_images", {}).items()} | metrics.get("sam2", {})
+    groups |= {name: found["graphs"] for name, found in metrics.get("sam_images", {}).items()}
     for model, graphs in groups.items():
         for graph in graphs:
             worst = max(graph["outputs"].values())
             same = min(graph["same_signs"].values())
             scale = max(graph["scales"].values())
             rows.append((model, graph["graph"], f"{worst:.1e}", f"{scale:.3g}", f"{same:.5%}", _verdict(worst, same)))
-    for model, clip in metrics.get("tracking", {}).items():
-        worst, same = max(clip["largest_difference"]), clip["masks_same_pixels_least"]
-        what = f"{clip['frames']} frames, {clip['objects']} objects, forward and backward"
-        rows.append(
-            (model, what, f"{worst:.1e}", f"{clip['largest_logit_present']:.3g}", f"{same:.5%}", _verdict(worst, same))
-        )
-    header = ("model", "graph or clip", "largest difference", "largest value", "same sign (least)", "within the bounds")
+    header = ("model", "graph", "largest difference", "largest value", "same sign (least)", "within the bounds")
     return results.table(header, rows)
 
 
@@ -195,8 +148,6 @@ _MADE = {
     "mobileclip": _mobileclip,
     "sam": _sam,
     "sam_images": _sam_images,
-    "sam2": _sam2,
-    "tracking": _tracking,
 }
 
 

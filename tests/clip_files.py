@@ -3,14 +3,15 @@ know four colours."""
 
 import functools
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from onnx_files import node, write_graph
 from tokenizers import pre_tokenizers
 
-from jsecon.networks.clip_folder import CLIP_MEAN, CLIP_STD
-from jsecon.networks.tokenizer import ClipTokenizer
+from jsecon.networks.clip import CLIP_MEAN, CLIP_STD
+from jsecon.networks.tokenizer import TextTokenizer
 
 
 @functools.cache
@@ -30,7 +31,12 @@ def write_tokenizer(path: Path) -> Path:
     """tokenizer.json as Hugging Face's fast tokenizers write CLIP's."""
     vocab = vocabulary()
     ends = [
-        {"id": vocab[name], "content": name, "special": True, "normalized": False}
+        {
+            "id": vocab[name],
+            "content": name,
+            "special": True,
+            **dict.fromkeys(("normalized", "single_word", "lstrip", "rstrip"), False),
+        }
         for name in ("<|startoftext|>", "<|endoftext|>")
     ]
     model = {
@@ -91,8 +97,9 @@ def write_textual(path: Path, names: tuple[str, str], batch: int | str, kind: st
 
 def load_tokens(texts: list[str]) -> list[int]:
     """The last id of each word: where the small vocabulary splits it, the others are shared with other words."""
-    tokenizer = ClipTokenizer(vocabulary(), [tuple(pair) for pair in fixture()["merges"]])
-    return [tokenizer.encode(text)[-1] for text in texts]
+    with tempfile.TemporaryDirectory() as folder:
+        tokenizer = TextTokenizer(write_tokenizer(Path(folder) / "tokenizer.json"))
+    return [row[tokenizer.count(text) - 2] for text, row in zip(texts, tokenizer(texts, LENGTH))]
 
 
 def write_clip(folder: Path, layout: str) -> Path:

@@ -11,7 +11,7 @@ import cv2
 import jax
 import numpy as np
 from capture_files import png, small_capture, transforms, write_images, write_text_model, write_transforms
-from clip_files import fixture as clip_tokens, vocabulary, write_clip, write_tokenizer
+from clip_files import write_clip, write_tokenizer
 from PIL import Image
 from sam2_files import write_sam2
 from sam3_files import KINDS as SAM3_KINDS, write_sam3
@@ -37,12 +37,11 @@ from jsecon.errors import InputError
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation
 from jsecon.language.field import check_field, load_field, save_field
-from jsecon.networks.clip import ClipEmbedder
-from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
-from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.networks.clip import MAX_BIAS, MAX_SCALE, ClipEmbedder
+from jsecon.networks.sam import SamSegmenter, SamSettings
+from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.networks.sam3 import PhraseMasks, Sam3
-from jsecon.networks.sigmoid import MOST_BIAS, MOST_SCALE
-from jsecon.networks.tokenizer import load_tokenizer
+from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
 from jsecon.pipeline import cache
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 from jsecon.vision.stores import EmbeddingStore, StoredSegmenter
@@ -570,23 +569,18 @@ def kept(folder: Path) -> Iterator[Case]:
 
 
 def tokenizer(folder: Path) -> Iterator[Case]:
-    """tokenizer.json, and vocab.json with merges.txt."""
+    """tokenizer.json of CLIP."""
     write_tokenizer(folder / "tokenizer.json")
-    (folder / "vocab.json").write_text(json.dumps(vocabulary()))
-    (folder / "merges.txt").write_text(
-        "#version: 0.2\n" + "\n".join(" ".join(pair) for pair in clip_tokens()["merges"])
-    )
 
-    def read(file: Path) -> np.ndarray:
-        return load_tokenizer(file)(["a red mug's 12 handles", "", "é<end_of_text>"])
+    def read() -> np.ndarray:
+        return TextTokenizer(folder / "tokenizer.json")(["a red mug's 12 handles", "", "é<end_of_text>"], CLIP_LENGTH)
 
     def whole(found: np.ndarray) -> None:
         assert found.shape == (3, 77)
         assert found.dtype == np.int64
         assert found.min() >= 0
 
-    yield Case([folder / "tokenizer.json"], lambda: read(folder / "tokenizer.json"), whole)
-    yield Case([folder / "vocab.json", folder / "merges.txt"], lambda: read(folder / "vocab.json"), whole)
+    yield Case([folder / "tokenizer.json"], read, whole)
 
 
 def _inputs_of(folder: Path) -> list[Path]:
@@ -614,7 +608,7 @@ def siglip(folder: Path) -> Iterator[Case]:
         return embedder.logits
 
     def whole(found: object) -> None:
-        assert found is None or (0 < found[0] <= MOST_SCALE and abs(found[1]) <= MOST_BIAS)
+        assert found is None or (0 < found[0] <= MAX_SCALE and abs(found[1]) <= MAX_BIAS)
 
     for layout in ("immich", "transformers.js"):
         write_siglip(folder / layout, layout)
@@ -634,7 +628,7 @@ def sam(folder: Path) -> Iterator[Case]:
         assert found.shape[1:] == (24, 32)
         assert found.dtype == bool
 
-    for name in ("segment-anything", "transformers.js", "sam2", "sam2 transformers.js"):
+    for name in ("sam", "sam2"):
         write_sam(folder / name, name, side=64)
         yield Case(_inputs_of(folder / name), lambda name=name: read(name), whole)
 
@@ -643,8 +637,8 @@ def sam2(folder: Path) -> Iterator[Case]:
     """SAM 2 folders, put to the test, then asked to follow a mask."""
     frames, prompt = np.zeros((2, 16, 16, 3), np.uint8), np.ones((1, 16, 16), bool)
 
-    def read(name: str) -> np.ndarray:
-        tracker = Sam2Tracker(folder / name, threads=1)
+    def read() -> np.ndarray:
+        tracker = Sam2Tracker(folder, threads=1)
         tracker.check()
         return tracker(frames, 0, prompt)
 
@@ -652,9 +646,8 @@ def sam2(folder: Path) -> Iterator[Case]:
         assert found.shape == (2, 16, 16)
         assert -1 <= found.min() <= found.max() < 1
 
-    for version in ("2.0", "2.1"):
-        write_sam2(folder / version, version=version)
-        yield Case(_inputs_of(folder / version), lambda version=version: read(version), whole)
+    write_sam2(folder)
+    yield Case(_inputs_of(folder), read, whole)
 
 
 def sam3(folder: Path) -> Iterator[Case]:

@@ -72,39 +72,11 @@ def write_textual(
     return write_graph(path, nodes, given, declared, {"table": table(), "axis": np.asarray([1])})
 
 
-def write_joint(path: Path, scale: float = SCALE, bias: float = BIAS, *, bent: float = 0.0) -> Path:
-    """Both encoders: logits of cosines, as transformers' SiglipModel gives them; `bent` adds the cosine's square."""
-    half = np.full((1, 3, 1, 1), 0.5, np.float32)
-    nodes = [
-        node("Mul", ["pixel_values", "half"], ["scaled"]),
-        node("Add", ["scaled", "half"], ["rgb"]),
-        node("ReduceMean", ["rgb"], ["colour"], axes=[2, 3], keepdims=0),
-        node("Add", ["colour", "little"], ["seen"]),  # black has no direction
-        node("Gather", ["table", "input_ids"], ["rows"]),
-        node("ReduceSum", ["rows", "one"], ["said"], keepdims=0),
-    ]
-    for side, name in (("seen", "image_embeds"), ("said", "text_embeds")):
-        nodes.append(node("ReduceL2", [side], [f"{side} length"], axes=[1], keepdims=1))
-        nodes.append(node("Div", [side, f"{side} length"], [name]))
-    nodes += [
-        node("Transpose", ["text_embeds"], ["turned"], perm=[1, 0]),
-        node("MatMul", ["image_embeds", "turned"], ["cosines"]),
-        node("Mul", ["cosines", "cosines"], ["squares"]),
-        node("Mul", ["squares", "bent"], ["bend"]),
-        node("Mul", ["cosines", "folded"], ["stretched"]),
-        node("Add", ["stretched", "bend"], ["curve"]),
-        node("Add", ["curve", "moved"], ["logits_per_image"]),
-    ]
-    constants = {"half": half, "little": np.float32(1e-3), "table": table(), "one": np.asarray([1])}
-    constants |= {"folded": np.float32(scale), "moved": np.float32(bias), "bent": np.float32(bent)}
-    given = {"pixel_values": ("float32", ["b", 3, SIZE, SIZE]), "input_ids": ("int64", ["q", "l"])}
-    told = {"logits_per_image": ("float32", ["b", "q"])}
-    told |= {"text_embeds": ("float32", ["q", 3]), "image_embeds": ("float32", ["b", 3])}
-    return write_graph(path, nodes, given, told, constants)
-
-
-def write_siglip(folder: Path, layout: str, *, joint: bool = True) -> Path:
-    """A SigLIP folder of immich's layout, with logits.json, or of that of transformers.js, with the joint graph."""
+def write_siglip(folder: Path, layout: str, *, logits: bool = True) -> Path:
+    """A SigLIP folder of immich's layout or of that of transformers.js, with logits.json."""
+    if logits:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})
     if layout == "immich":
         write_visual(folder / "visual" / "model.onnx", ("image", "image_embedding"), 1, HALF, HALF)
         write_textual(folder / "textual" / "model.onnx", "text", ("text_embedding",), 1, LENGTH, "int32")
@@ -112,8 +84,6 @@ def write_siglip(folder: Path, layout: str, *, joint: bool = True) -> Path:
         text = {"context_length": LENGTH, "hf_tokenizer_name": "x", "tokenizer_kwargs": {"clean": "canonicalize"}}
         write_json(folder / "config.json", {"init_logit_bias": -10, "text_cfg": text})
         write_json(folder / "visual" / "preprocess_cfg.json", {"size": [SIZE, SIZE], "mean": HALF, "std": HALF})
-        if joint:
-            write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})
         return folder
     outputs, onnx = ("last_hidden_state", "pooler_output"), folder / "onnx"
     write_visual(onnx / "vision_model.onnx", ("pixel_values", "pooler_output"), "batch", HALF, HALF)
@@ -122,8 +92,6 @@ def write_siglip(folder: Path, layout: str, *, joint: bool = True) -> Path:
     write_json(folder / "config.json", {"model_type": "siglip", "text_config": {"max_position_embeddings": LENGTH}})
     images = {"do_rescale": True, "rescale_factor": 1 / 255, "image_mean": HALF, "image_std": HALF}
     write_json(folder / "preprocessor_config.json", images | {"size": {"height": SIZE, "width": SIZE}})
-    if joint:
-        write_joint(onnx / "model.onnx")
     return folder
 
 

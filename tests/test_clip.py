@@ -9,8 +9,7 @@ from clip_files import COLOURS, write_clip, write_textual, write_visual
 from onnx_files import node, write_graph
 
 from jsecon.errors import InputError
-from jsecon.networks.clip import ClipEmbedder, masked_crop
-from jsecon.networks.clip_folder import ClipFiles, find_clip, read_preprocessing
+from jsecon.networks.clip import ClipEmbedder, ClipFiles, find_clip, masked_crop, read_preprocessing
 from jsecon.vision.protocols import CANONICAL, Embedder
 from jsecon.vision.reference_words import REFERENCE_WORDS, cached_reference
 

@@ -16,7 +16,7 @@ def folders(tmp_path_factory):
     base = tmp_path_factory.mktemp("models")
     return {
         "CLIP": write_clip(base / "clip", "immich"),
-        "SAM": write_sam(base / "sam", "transformers.js"),
+        "SAM": write_sam(base / "sam"),
         "SAM 2": write_sam2(base / "sam2"),
         "SAM 3": write_sam3(base / "sam3"),
     }
@@ -26,8 +26,8 @@ def folders(tmp_path_factory):
     ("model", "words"),
     [
         ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
-        ("SAM", ["decoder of transformers.js, 64 prompts per call", "images of 256 px", "--segmenter"]),
-        ("SAM 2", ["2.1", "--tracker"]),
+        ("SAM", ["decoder of SAM, 64 prompts per run", "images of 256 px", "--segmenter"]),
+        ("SAM 2", ["images of 64 px", "--tracker"]),
         ("SAM 3", ["a phrase of 32 tokens", "raw decoder, images of 112 px", "--phrases"]),
     ],
 )

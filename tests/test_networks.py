@@ -20,8 +20,8 @@ from jsecon.data.gaussians.ply import load_ply, save_ply
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
-from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
-from jsecon.networks.sam2.tracker import Sam2Tracker
+from jsecon.networks.sam import SamSegmenter, SamSettings
+from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.pipeline import networks, pipeline, stages
 from jsecon.pipeline.language_stages import parts, regions
 from jsecon.pipeline.masklet_stages import masklets
@@ -36,7 +36,7 @@ from jsecon.vision.stores import StoredSegmenter
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
     base = tmp_path_factory.mktemp("models")
-    return write_sam(base / "sam", "transformers.js"), write_clip(base / "clip", "transformers.js")
+    return write_sam(base / "sam"), write_clip(base / "clip", "transformers.js")
 
 
 @pytest.fixture(scope="module")

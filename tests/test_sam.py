@@ -11,19 +11,24 @@ from sam_files import IOUS, write_decoder, write_encoder, write_sam
 from scipy import ndimage
 
 from jsecon.errors import InputError
-from jsecon.networks.sam.graphs import MEAN, STD, SamFiles, SamGraphs, find_sam
-from jsecon.networks.sam.masks import box_nms, box_of, crops_of, cut_by_crop, langsplat_nms, point_grid
-from jsecon.networks.sam.segmenter import TOKENS, SamSegmenter, SamSettings
+from jsecon.networks.sam import (
+    MEAN_STD,
+    TOKENS,
+    SamFiles,
+    SamGraphs,
+    SamSegmenter,
+    SamSettings,
+    box_nms,
+    box_of,
+    crops_of,
+    cut_by_crop,
+    find_sam,
+    langsplat_nms,
+    point_grid,
+)
 from jsecon.vision.protocols import Segmenter
 
-KINDS = [
-    ("segment-anything", 1),
-    ("segment-anything", "batch"),
-    ("segment-anything", 7),
-    ("transformers.js", "batch"),
-    ("sam2", "batch"),
-    ("sam2 transformers.js", "batch"),
-]
+KINDS = [("sam", 1), ("sam", "batch"), ("sam", 7), ("sam2", "batch")]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +48,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def segmenter(folders):
-    return SamSegmenter(folders["segment-anything", "batch"], SamSettings(points_per_side=8), threads=1)
+    return SamSegmenter(folders["sam", "batch"], SamSettings(points_per_side=8), threads=1)
 
 
 def by_definition(folder, frame, token_of_level, side=8):
@@ -92,7 +97,7 @@ def by_definition(folder, frame, token_of_level, side=8):
 @pytest.mark.parametrize("level", ["l", "default"])
 def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
     masks, scores = segmenter.levels(frame, (level,))[level]
-    expected, expected_scores = by_definition(folders["segment-anything", "batch"], frame, TOKENS[level])
+    expected, expected_scores = by_definition(folders["sam", "batch"], frame, TOKENS[level])
     assert len(masks) >= 3
     np.testing.assert_array_equal(masks, expected)
     np.testing.assert_allclose(scores, expected_scores, rtol=1e-6)
@@ -112,33 +117,33 @@ def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter
         np.testing.assert_array_equal(masks, segmenter(frame, 0))
 
 
-def test_sam_2_1_for_transformers_js_is_sam_2_asked_one_prompt_a_call(folders, frame, tmp_path):
-    first, second = (folders[kind, "batch"] for kind in ("sam2", "sam2 transformers.js"))
-    one, other = (SamGraphs(find_sam(folder), threads=1) for folder in (first, second))
-    assert (other.batch, other.side, other.dialect.stretched) == (1, one.side, True)
-    points = np.float32([[40, 40], [120, 80], [5, 5]])
-    masks, scores = zip(*one.decode(one.encode(frame), points))
-    others, rated = zip(*other.decode(other.encode(frame), points))
-    assert len(others) == 3
-    np.testing.assert_array_equal(np.concatenate(others), np.concatenate(masks))
-    np.testing.assert_array_equal(np.concatenate(rated), np.concatenate(scores))
+def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders, frame):
+    graphs = SamGraphs(find_sam(folders["sam2", "batch"]), threads=1)
+    assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)
+    encoded = graphs.encode(frame)
+    assert encoded.scaled == (256, 256)
+    cells = encoded.features["image_embeddings.2"][0, :3] * MEAN_STD[1][:, None, None] + MEAN_STD[0][:, None, None]
+    np.testing.assert_allclose(cells[:, 5, 5], frame[40, 50], atol=1)  # (5.5 / 16) of height and width
+    found = list(graphs.decode(encoded, np.float32([[40, 40], [120, 80], [5, 5]])))
+    assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
 
 
 def test_sam_3_scales_colours_as_its_configuration_says(frame, tmp_path):
-    folder = write_sam(tmp_path / "sam3", "sam2 transformers.js", side=64)
+    folder = write_sam(tmp_path / "sam3", "sam2", side=64)
     plain, name = SamGraphs(find_sam(folder), threads=1).encode(frame), SamSegmenter(folder).name
     config = folder / "preprocessor_config.json"
     content = json.loads(config.read_text())
     config.write_text(json.dumps(content | {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}))
     assert SamSegmenter(folder).name != name
     found = SamGraphs(find_sam(folder), threads=1).encode(frame).features["image_embeddings.2"][0, :3]
-    expected = plain.features["image_embeddings.2"][0, :3] * STD[:, None, None] + MEAN[:, None, None]
+    mean, std = MEAN_STD[:, :, None, None]
+    expected = plain.features["image_embeddings.2"][0, :3] * std + mean
     np.testing.assert_allclose(found, (expected / 255 - 0.5) / 0.5, atol=1e-5)
     config.write_text(json.dumps({key: content[key] for key in content if key != "image_mean"}))
     with pytest.raises(InputError, match=r"preprocessor_config\.json.*cannot be read"):
         find_sam(folder)
     config.unlink()
-    with pytest.raises(InputError, match=r"decoder\.onnx: a decoder of SAM 2\.1 and SAM 3.*Fetch preprocessor_conf"):
+    with pytest.raises(InputError, match=r"decoder\.onnx: a decoder of SAM 2.*Fetch preprocessor_conf"):
         SamGraphs(find_sam(folder))
 
 
@@ -158,14 +163,6 @@ def test_without_crops_the_frame_is_encoded_once(folders, frame, monkeypatch):
     assert calls == [(120, 160, 3)]
 
 
-def test_an_encoder_that_prepares_the_image_itself_gives_the_same(tmp_path, folders, frame, segmenter):
-    encoder = write_encoder(tmp_path / "encoder.onnx", 1024, raw=True)
-    decoder = write_decoder(tmp_path / "decoder.onnx", 1024, "segment-anything", "batch")
-    normalised = write_encoder(tmp_path / "other" / "encoder.onnx", 1024)
-    one, other = (SamGraphs(SamFiles(e, decoder), threads=1).encode(frame) for e in (encoder, normalised))
-    np.testing.assert_allclose(one.features["image_embeddings"], other.features["image_embeddings"], atol=1e-4)
-
-
 def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
     masks = segmenter(frame, 0)
     segmenter.close()
@@ -173,9 +170,7 @@ def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
 
 
 def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
-    strict = SamSegmenter(
-        folders["transformers.js", "batch"], SamSettings(points_per_side=4, predicted_iou=0.999), threads=1
-    )
+    strict = SamSegmenter(folders["sam", "batch"], SamSettings(points_per_side=4, predicted_iou=0.999), threads=1)
     assert strict(frame, 0).shape == (0, 120, 160)
 
 
@@ -183,7 +178,7 @@ def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
 
 
 def test_folders_without_sam_say_what_they_hold(tmp_path):
-    with pytest.raises(InputError, match=r"no \.onnx file.*expected an image encoder"):
+    with pytest.raises(InputError, match=r"no \.onnx file.*expected SAM's graphs"):
         find_sam(tmp_path)
     write_clip(tmp_path / "clip", "transformers.js")
     with pytest.raises(InputError, match=r"onnx/text_model\.onnx, onnx/vision_model\.onnx") as caught:
@@ -192,7 +187,7 @@ def test_folders_without_sam_say_what_they_hold(tmp_path):
 
 
 def test_variants_beside_the_plain_graph_are_left_alone(tmp_path):
-    folder = write_sam(tmp_path, "transformers.js")
+    folder = write_sam(tmp_path)
     (folder / "onnx" / "vision_encoder_quantized.onnx").write_bytes(b"not looked at")
     (folder / "onnx" / "prompt_encoder_mask_decoder_fp16.onnx").write_bytes(b"not looked at")
     files = find_sam(folder)
@@ -201,39 +196,40 @@ def test_variants_beside_the_plain_graph_are_left_alone(tmp_path):
 
 
 def test_tensors_that_do_not_fit_are_named(tmp_path):
-    encoder = write_encoder(tmp_path / "encoder.onnx", 256)
-    decoder = write_decoder(tmp_path / "decoder.onnx", 256, "segment-anything", "batch")
+    names = ("image_embeddings", "image_positional_embeddings")
+    encoder = write_encoder(tmp_path / "encoder.onnx", 256, names)
+    decoder = write_decoder(tmp_path / "decoder.onnx", 256, "sam", "batch")
 
-    with pytest.raises(InputError, match=r"decoder\.onnx, input 'image_embeddings'.*point_coords"):
+    with pytest.raises(InputError, match=r"decoder\.onnx, input 'pixel_values'.*input_points"):
         SamGraphs(SamFiles(decoder, decoder))
-    with pytest.raises(InputError, match=r"encoder\.onnx, input 'point_coords': no such input"):
+    with pytest.raises(InputError, match=r"encoder\.onnx, input 'input_points': no such input"):
         SamGraphs(SamFiles(encoder, encoder))
 
-    smaller = write_encoder(tmp_path / "small.onnx", 128)
+    smaller = write_encoder(tmp_path / "small.onnx", 128, names)
     with pytest.raises(InputError, match=r"small\.onnx, output 'image_embeddings': .*8, 8\], expected .*16, 16\]"):
         SamGraphs(SamFiles(smaller, decoder))
 
-    single = write_decoder(tmp_path / "single.onnx", 256, "segment-anything", "batch", masks=1)
-    with pytest.raises(InputError, match=r"output 'low_res_masks'.*3 or 4 masks.*return-single-mask"):
+    single = write_decoder(tmp_path / "single.onnx", 256, "sam", "batch", masks=1)
+    with pytest.raises(InputError, match=r"output 'pred_masks'.*3 or 4 masks"):
         SamGraphs(SamFiles(encoder, single))
 
-    other = write_decoder(tmp_path / "other.onnx", 256, "sam2", "batch", masks=3)
-    with pytest.raises(InputError, match=r"other\.onnx, input 'image_embed': no such output of encoder\.onnx"):
-        SamGraphs(SamFiles(encoder, other))
+    other = write_encoder(tmp_path / "other.onnx", 256)
+    with pytest.raises(InputError, match=r"input 'image_positional_embeddings': no such output of other"):
+        SamGraphs(SamFiles(other, decoder))
 
     flat = write_graph(
         tmp_path / "flat.onnx",
-        [node("Identity", ["x"], ["y"])],
-        {"x": ("float32", [1, 5])},
+        [node("Identity", ["pixel_values"], ["y"])],
+        {"pixel_values": ("float32", [1, 5])},
         {"y": ("float32", [1, 5])},
     )
-    with pytest.raises(InputError, match=r"flat\.onnx, input 'x': x float32\[1, 5\], expected one image"):
+    with pytest.raises(InputError, match=r"flat\.onnx, input 'pixel_values': pixel_values float32\[1, 5\], expected"):
         SamGraphs(SamFiles(flat, decoder))
 
 
 def test_a_truncated_graph_is_named(tmp_path, frame):
     folder = write_sam(tmp_path, "sam2")
-    decoder = folder / "sam2_tiny.decoder.onnx"
+    decoder = folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
     decoder.write_bytes(decoder.read_bytes()[:-300])
-    with pytest.raises(InputError, match=r"sam2_tiny\.decoder\.onnx: ONNX Runtime"):
+    with pytest.raises(InputError, match=r"prompt_encoder_mask_decoder\.onnx: ONNX Runtime"):
         SamSegmenter(folder)(frame, 0)

@@ -27,8 +27,8 @@ from sam_files import write_sam
 from scipy.special import expit
 
 from jsecon.errors import InputError
-from jsecon.networks.onnx_graph import Graph
 from jsecon.networks.sam3 import MASK_IOU, SCORE_THRESHOLD, Sam3, find_sam3
+from jsecon.networks.session import Graph
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_the_published_sizes_are_read_from_the_graphs(tmp_path, frame):
     sam3 = Sam3(write_sam3(tmp_path, **TRUE), threads=1)
     found = sam3(frame, "red mug")
     assert found.masks.sum((1, 2)).tolist() == pytest.approx([550, 500, 1050], abs=60)
-    assert sam3.told == "masks of what a phrase of 32 tokens names; raw decoder, images of 1008 px"
+    assert sam3.summary == "masks of what a phrase of 32 tokens names; raw decoder, images of 1008 px"
     image = Graph(sam3.files.image, optimise=False)
     assert str(image.inputs["image"]) == "image uint8[3, 1008, 1008]"
     assert image.outputs["backbone_fpn_0"].shape == (1, 256, 288, 288)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 from scipy import ndimage
 
-from jsecon.networks.sam.masks import (
+from jsecon.networks.sam import (
     Crop,
     box_nms,
     box_of,
@@ -13,9 +13,9 @@ from jsecon.networks.sam.masks import (
     cut_by_crop,
     langsplat_nms,
     point_grid,
+    remove_small_regions,
     shared_areas,
     stability,
-    tidied,
 )
 
 
@@ -81,7 +81,7 @@ def test_small_holes_are_filled_then_small_islands_removed(seed, least, density)
     islands, count = ndimage.label(expected, np.ones((3, 3)))
     areas = [(islands == label).sum() for label in range(1, count + 1)]
     largest = max(areas, default=0)
-    clean, changed = tidied(mask, least)
+    clean, changed = remove_small_regions(mask, least)
     # Where every island is small one of the largest stays: of several alike, any.
     chosen = [area == largest and clean[islands == label].all() for label, area in enumerate(areas, 1)]
     stays = 1 + chosen.index(True) if any(chosen) else 0

@@ -9,8 +9,7 @@ import jax
 import numpy as np
 import pytest
 from clip_files import COLOURS, write_clip
-from onnx_files import node, write_graph
-from siglip_files import BIAS, LENGTH, SCALE, embedded, write_joint, write_json, write_siglip, write_unigram
+from siglip_files import BIAS, LENGTH, SCALE, embedded, write_json, write_siglip, write_unigram
 from small_field import make_field, unit_rows
 
 from experiments.export.vocabulary import write_vocabulary
@@ -18,9 +17,8 @@ from jsecon.app import cli
 from jsecon.app.ask import ask_text
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
-from jsecon.networks.clip import ClipEmbedder
-from jsecon.networks.clip_folder import find_clip, read_preprocessing
-from jsecon.networks.file_tokenizer import FileTokenizer, TextRules
+from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
+from jsecon.networks.tokenizer import TextRules, TextTokenizer
 from jsecon.pipeline import networks
 from jsecon.pipeline.models import inspect_models
 from jsecon.query.anchored import query_anchored
@@ -60,7 +58,7 @@ def test_texts_are_cleaned_as_the_configurations_say(folders):
         "whitespace": "Tea & MILK, d\u00e9j\u00e0_vu!",
     }
     for clean, text in expected.items():
-        assert FileTokenizer(path, TextRules(LENGTH, "</s>", clean)).clean(said) == text
+        assert TextTokenizer(path, TextRules(LENGTH, "</s>", clean)).clean(said) == text
 
 
 def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):
@@ -70,7 +68,7 @@ def test_siglip_2_has_another_vocabulary_padding_and_case(tmp_path):
         (tmp_path / "model" / name).write_bytes((tmp_path / name).read_bytes())
     rules = find_clip(tmp_path / "model").rules
     assert rules == TextRules(LENGTH, "<pad>", "lower")
-    tokenizer = FileTokenizer(path, rules)
+    tokenizer = TextTokenizer(path, rules)
     short, long, foreign = tokenizer(["Red Mug,", "mug " * 40, "\u8336"], 8)
     numbers = json.loads(path.read_text())["model"]["vocab"]
     assert short[-1] == numbers["<pad>"] == 0
@@ -115,16 +113,16 @@ def test_mobileclip_s_images_are_not_normalised(tmp_path):
 @pytest.mark.parametrize(
     ("layout", "name", "change", "words"),
     [
-        ("immich", "visual/preprocess_cfg.json", None, "does not say how it takes images.*huggingface"),
+        ("immich", "visual/preprocess_cfg.json", None, "does not state how it takes images.*huggingface"),
         ("immich", "visual/preprocess_cfg.json", {"mean": None}, r"preprocess_cfg\.json.*cannot be read"),
         ("immich", "textual/tokenizer_config.json", None, r"tokenizer_config\.json: No such file"),
-        ("immich", "textual/tokenizer_config.json", {"pad_token": None}, "pad_token None.*fills short texts"),
+        ("immich", "textual/tokenizer_config.json", {"pad_token": None}, "pad_token None.*pads short texts"),
         ("immich", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),
         ("immich", "config.json", [], "JSON of list"),
-        ("transformers.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' ids"),
+        ("transformers.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' tokens"),
         ("transformers.js", "preprocessor_config.json", {"rescale_factor": 1}, "pixels times 1, not 1/255"),
         ("transformers.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, "'BertTokenizer'.*Siglip"),
-        ("immich", "config.json", {"text_cfg": {}}, "no tokenizer of CLIP's kind.*with the model's config"),
+        ("immich", "config.json", {"text_cfg": {}}, "no tokenizer of this model.*config"),
     ],
 )
 def test_what_a_folder_leaves_open_is_named(tmp_path, layout, name, change, words):
@@ -141,7 +139,7 @@ def test_what_a_folder_leaves_open_is_named(tmp_path, layout, name, change, word
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ({"context_length": 0}, "texts of 0 ids"),
+        ({"context_length": 0}, "texts of 0 tokens"),
         ({"tokenizer_kwargs": {"clean": "upper"}}, "cleaned by 'upper'.*canonicalize"),
         ({"tokenizer_kwargs": {"strip_sep_token": True}}, "tokenizer_kwargs.*strip_sep_token"),
     ],
@@ -164,7 +162,7 @@ def test_a_length_that_is_left_out_is_transformers_own(tmp_path):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_scale_and_bias_are_found_where_the_layout_has_them(folders, layout):
+def test_scale_and_bias_are_read_in_every_layout(folders, layout):
     found = ClipEmbedder(folders[layout], threads=1).logits
     np.testing.assert_allclose(found, (SCALE, BIAS), rtol=1e-4)
     told = re.search(r"sigmoid\((\d+\.\d+) cosine (-\d+\.\d+)\), from", _told(folders[layout]))
@@ -172,7 +170,7 @@ def test_scale_and_bias_are_found_where_the_layout_has_them(folders, layout):
 
 
 def test_a_folder_without_them_says_so_and_has_no_probability(tmp_path):
-    folder = write_siglip(tmp_path / "model", "immich", joint=False)
+    folder = write_siglip(tmp_path / "model", "immich", logits=False)
     assert ClipEmbedder(folder).logits is None
     assert "refused by its contrast" in _told(folder)
     assert "logits.json" in _told(folder)
@@ -186,21 +184,6 @@ def test_numbers_that_are_no_scale_and_bias_are_refused(tmp_path, content):
     write_json(folder / "logits.json", content)
     with pytest.raises(InputError, match=r"logits\.json.*logit_bias"):
         _ = ClipEmbedder(folder).logits
-
-
-def test_a_joint_graph_of_another_kind_is_refused(tmp_path):
-    folder = write_siglip(tmp_path / "model", "transformers.js")
-    joint = write_joint(folder / "onnx" / "model.onnx", bent=300.0)
-    with pytest.raises(InputError, match=r"leave a line by.*Write logits\.json"):
-        _ = ClipEmbedder(folder, threads=1).logits
-    write_joint(joint, scale=-3.0)
-    with pytest.raises(InputError, match="scale -3"):
-        _ = ClipEmbedder(folder, threads=1).logits
-    write_graph(joint, [node("Identity", ["x"], ["y"])], {"x": ("int64", [1])}, {"y": ("int64", [1])})
-    with pytest.raises(InputError, match="input 'pixel_values'"):
-        _ = ClipEmbedder(folder, threads=1).logits
-    write_json(folder / "logits.json", {"scale": SCALE, "bias": BIAS})  # spares the graph
-    assert ClipEmbedder(folder, threads=1).logits == (SCALE, BIAS)
 
 
 def _told(folder) -> str:
@@ -303,5 +286,5 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
 def test_an_unreadable_vocabulary_is_named(tmp_path):
     path = write_unigram(tmp_path)
     path.write_text(path.read_text()[:200], encoding="utf-8")
-    with pytest.raises(InputError, match=r"tokenizer\.json: no such tokenizer"):
-        FileTokenizer(path, TextRules(LENGTH, "</s>", "lower"))
+    with pytest.raises(InputError, match=r"tokenizer\.json: it is no tokenizer of this model"):
+        TextTokenizer(path, TextRules(LENGTH, "</s>", "lower"))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from jsecon.files import atomic_write
-from jsecon.networks.onnx_graph import Graph
+from jsecon.networks.session import Graph
 
 OPSET = 17
 _DECLARED: list = []

@@ -1,10 +1,9 @@
-"""SAM's image encoder and two decoders as ONNX graphs: the package's own (one prompt) and one for many prompts."""
+"""SAM's image encoder and mask decoder as ONNX graphs of the layout of transformers.js, for many prompts at once."""
 
 from pathlib import Path
 from unittest import mock
 
 import torch
-import torch.nn.functional as F
 
 from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
 
@@ -34,65 +33,41 @@ def make_random(model: torch.nn.Module, seed: int) -> None:
 
 
 def export(model: torch.nn.Module, folder: Path, *, seed: int, threads: int) -> list[Agreement]:
-    """Writes encoder.onnx, mask_decoder.onnx (many prompts) and decoder.onnx (stock) into `folder`; each is compared.
+    """Writes onnx/vision_encoder.onnx and onnx/prompt_encoder_mask_decoder.onnx into `folder`, and compares both.
 
-    The decoders are compared on the features of a random image: the stock one against the package's own module, the
-    other on 7 prompts against its prompt encoder and mask decoder. jsecon.networks.sam.segmenter takes the latter where
-    both are.
+    The decoder is compared on the features of a random image and 7 prompts, with the package's prompt encoder and mask
+    decoder.
     """
-    from segment_anything.utils.onnx import SamOnnxModel
-
     generator = torch.Generator().manual_seed(seed)
     side = model.image_encoder.img_size
     image = torch.randn(1, 3, side, side, generator=generator)
+    outputs = ["image_embeddings", "image_positional_embeddings"]
     rows = [
         write_graph(
-            folder / "encoder.onnx", model.image_encoder, {"input_image": image}, ["image_embeddings"], threads=threads
+            folder / "onnx" / "vision_encoder.onnx", Encoder(model), {"pixel_values": image}, outputs, threads=threads
         )
     ]
     with torch.inference_mode():
-        features = model.image_encoder(image)
+        features = dict(zip(outputs, Encoder(model)(image)))
 
-    def prompts(batch: int, points: int) -> dict[str, torch.Tensor]:
-        labels = torch.ones(batch, points)
-        labels[:, -1] = -1
-        return {
-            "image_embeddings": features,
-            "point_coords": side * torch.rand(batch, points, 2, generator=generator),
-            "point_labels": labels,
-            "mask_input": torch.zeros(1, 1, side // 4, side // 4),
-            "has_mask_input": torch.zeros(1),
-        }
+    def prompts(batch: int) -> dict[str, torch.Tensor]:
+        points = side * torch.rand(1, batch, 1, 2, generator=generator)
+        return features | {"input_points": points, "input_labels": torch.ones(1, batch, 1, dtype=torch.int64)}
 
-    graph, eager = (SamOnnxModel(model, return_single_mask=False) for _ in range(2))
-    graph.mask_postprocessing = lambda masks, size: _at_frame(graph, masks, size)
-    stock = prompts(1, 2) | {"orig_im_size": torch.tensor([300.0, 400.0])}
-    rows.append(
-        write_graph(
-            folder / "decoder.onnx",
-            graph,
-            stock,
-            ["masks", "iou_predictions", "low_res_masks"],
-            free={"point_coords": {1: "points"}, "point_labels": {1: "points"}},
-            other=prompts(1, 3) | {"orig_im_size": torch.tensor([240.0, 135.0])},
-            reference=lambda given: eager(*given.values()),
-            threads=threads,
-        )
-    )
     with mock.patch("torch.repeat_interleave", _expanded):
         rows.append(
             write_graph(
-                folder / "mask_decoder.onnx",
-                BatchedDecoder(model),
-                prompts(3, 2),
-                ["iou_predictions", "low_res_masks"],
+                folder / "onnx" / "prompt_encoder_mask_decoder.onnx",
+                Decoder(model),
+                prompts(3),
+                ["iou_scores", "pred_masks"],
                 free={
-                    "point_coords": {0: "prompts", 1: "points"},
-                    "point_labels": {0: "prompts", 1: "points"},
-                    "iou_predictions": {0: "prompts"},
-                    "low_res_masks": {0: "prompts"},
+                    "input_points": {1: "prompts", 2: "points"},
+                    "input_labels": {1: "prompts", 2: "points"},
+                    "iou_scores": {1: "prompts"},
+                    "pred_masks": {1: "prompts"},
                 },
-                other=prompts(7, 2),
+                other=prompts(7),
                 reference=lambda given: _masks_and_scores(model, given),
                 threads=threads,
             )
@@ -100,8 +75,19 @@ def export(model: torch.nn.Module, folder: Path, *, seed: int, threads: int) -> 
     return rows
 
 
-class BatchedDecoder(torch.nn.Module):
-    """Prompts (B, P) on one image to four masks and scores each, at a quarter of the network's image."""
+class Encoder(torch.nn.Module):
+    """Image to its features and the code of their places."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, pixel_values):
+        return self.model.image_encoder(pixel_values), self.model.prompt_encoder.get_dense_pe()
+
+
+class Decoder(torch.nn.Module):
+    """Points (1, B, P) on one image to three masks and scores each, at a quarter of the network's image."""
 
     def __init__(self, model):
         super().__init__()
@@ -109,25 +95,18 @@ class BatchedDecoder(torch.nn.Module):
 
         self.stock = SamOnnxModel(model, return_single_mask=False)
 
-    def forward(self, image_embeddings, point_coords, point_labels, mask_input, has_mask_input):
+    def forward(self, image_embeddings, image_positional_embeddings, input_points, input_labels):
+        points, labels = input_points[0], input_labels[0].to(torch.float32)
+        points = torch.cat([points, torch.zeros_like(points[:, :1])], 1)  # the point that ends a prompt without a box
+        labels = torch.cat([labels, -torch.ones_like(labels[:, :1])], 1)
+        side = self.stock.model.image_encoder.img_size // 4
         masks, scores = self.stock.mask_decoder.predict_masks(
             image_embeddings=image_embeddings,
-            image_pe=self.stock.model.prompt_encoder.get_dense_pe(),
-            sparse_prompt_embeddings=self.stock._embed_points(point_coords, point_labels),
-            dense_prompt_embeddings=self.stock._embed_masks(mask_input, has_mask_input),
+            image_pe=image_positional_embeddings,
+            sparse_prompt_embeddings=self.stock._embed_points(points, labels),
+            dense_prompt_embeddings=self.stock._embed_masks(torch.zeros(1, 1, side, side), torch.zeros(1)),
         )
-        return scores, masks
-
-
-def _at_frame(module, masks: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
-    """Mask logits at the frame's size, its shape an input: segment-anything 1.0 on PyPI turns it into Python numbers,
-    which a trace keeps as they were."""
-    side = module.img_size
-    whole = F.interpolate(masks, size=(side, side), mode="bilinear", align_corners=False)
-    inside = module.resize_longest_image_size(size, side)
-    height, width = size.to(torch.int64)
-    whole = whole[..., : inside[0], : inside[1]]
-    return F.interpolate(whole, size=(height, width), mode="bilinear", align_corners=False)
+        return scores[None, :, 1:], masks[None, :, 1:]
 
 
 def _expanded(tensor: torch.Tensor, repeats: int, dim: int) -> torch.Tensor:
@@ -138,12 +117,13 @@ def _expanded(tensor: torch.Tensor, repeats: int, dim: int) -> torch.Tensor:
 
 def _masks_and_scores(model, given) -> list[torch.Tensor]:
     """The package's modules on the same prompts; they add the padding point themselves."""
-    points = (given["point_coords"][:, :-1], given["point_labels"][:, :-1])
-    sparse, dense = model.prompt_encoder(points=points, boxes=None, masks=None)
+    sparse, dense = model.prompt_encoder(
+        points=(given["input_points"][0], given["input_labels"][0]), boxes=None, masks=None
+    )
     masks, scores = model.mask_decoder.predict_masks(
         image_embeddings=given["image_embeddings"],
-        image_pe=model.prompt_encoder.get_dense_pe(),
+        image_pe=given["image_positional_embeddings"],
         sparse_prompt_embeddings=sparse,
         dense_prompt_embeddings=dense,
     )
-    return [scores, masks]
+    return [scores[None, :, 1:], masks[None, :, 1:]]

@@ -15,7 +15,7 @@ from experiments.export.embedder import regions
 from experiments.export.graph import Agreement, declare_missing_operators, shake, write_graph
 from experiments.export.sam import STRETCH
 from jsecon.files import write_text
-from jsecon.networks.sam.graphs import CONFIG, SamGraphs, find_sam
+from jsecon.networks.sam import CONFIG, SamGraphs, find_sam
 
 FEATURES = ["image_embeddings.0", "image_embeddings.1", "image_embeddings.2"]
 POINTS = np.array([[40, 40], [120, 60], [60, 95], [3, 110]], np.float32)

@@ -14,8 +14,7 @@ from experiments.export.embedder import FRAMES, TEXTS, agreements, told
 from experiments.export.graph import OPSET, Agreement, declare_missing_operators, shake, write_graph
 from experiments.export.vocabulary import write_vocabulary
 from jsecon.files import atomic_write, write_text
-from jsecon.networks.clip import ClipEmbedder
-from jsecon.networks.sigmoid import LOGITS
+from jsecon.networks.clip import LOGITS, ClipEmbedder
 
 SCALE, BIAS = 117.330795, -12.932437
 """put into the random model: about those of the published ones"""

@@ -1,18 +1,18 @@
-"""SAM 3 asked by a phrase, on ONNX Runtime: every thing in an image that a noun phrase names, a mask and a score each.
+"""SAM 3 prompted by a phrase, on ONNX Runtime: a mask and a score of everything in an image that a noun phrase names.
 
 The layout is that of vietanhdev/samexporter (export_sam3.py, sam3_onnx.py), three graphs:
     *image_encoder.onnx      image (3, 1008, 1008) uint8 RGB, the frame stretched to a square; scaled within the graph
                              -> backbone_fpn_0, _1, _2 and vision_pos_enc_0, _1, _2
     *language_encoder.onnx   tokens (1, 32), CLIP's, filled with 0
                              -> text_attention_mask (true where filled), text_memory, text_embeds
-    *decoder.onnx            those, as far as its exporter left them in, the size of the frame, and B boxes that show
-                             what is meant: box_coords (B, 1, 4), box_labels (B, 1), box_masks (1, B), true where unused
-Two kinds of decoder are known, told apart by their outputs:
+    *decoder.onnx            those, unless its exporter removed them, the size of the frame, and B example boxes:
+                             box_coords (B, 1, 4), box_labels (B, 1), box_masks (1, B), true for an unused box
+There are two kinds of decoder, which differ in their outputs:
     raw        pred_logits (1, Q, 1), presence_logit_dec (1, 1), pred_masks (1, Q, h, w): logits of Q queries
-    filtered   scores (N,), masks (N, 1, h, w): of an older samexporter, true or false at the frame's size, or of
-               wkentaro/sam3-onnx, probabilities at the decoder's own; N are left of the queries above 0.5
-The score of a query is sigmoid(pred_logits) sigmoid(presence_logit_dec), as facebookresearch/sam3 has it.
-No published weights could be had here: tested on small graphs of these signatures.
+    filtered   scores (N,), masks (N, 1, h, w) of the N queries above 0.5: of an older samexporter, true or false at the
+               frame's size, or of wkentaro/sam3-onnx, probabilities at the decoder's size
+The score of a query is sigmoid(pred_logits) sigmoid(presence_logit_dec), as in facebookresearch/sam3.
+It is tested on small graphs with these signatures, not on the published weights.
 """
 
 import dataclasses
@@ -26,16 +26,18 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
 from jsecon.errors import InputError, require
-from jsecon.networks.onnx_graph import Graph, Tensor, describe
-from jsecon.networks.sam.masks import shared_areas
-from jsecon.networks.tokenizer import ClipTokenizer, load_tokenizer
+from jsecon.networks.sam import shared_areas
+from jsecon.networks.session import Graph, Tensor, describe
+from jsecon.networks.tokenizer import TextTokenizer
 
-IMAGE_SIDE, PHRASE_LENGTH = 1008, 32
-"""px of the square image, and tokens of a phrase, where the graphs do not fix them"""
+IMAGE_SIDE = 1008
+"""px of the square image, if the graph does not fix it"""
+PHRASE_LENGTH = 32
+"""tokens of a phrase, if the graph does not fix it"""
 SCORE_THRESHOLD = 0.5
-"""a mask must have a higher score: the official processor's"""
+"""a mask needs a higher score, as in the official processor"""
 MASK_IOU = 0.7
-"""a mask of a higher IoU with a better one repeats it: samexporter's"""
+"""a mask with a higher IoU with a better one repeats it, as in samexporter"""
 PUBLISHED = (
     "nrl-ai/samexporter-onnx-models on huggingface.co has such a folder, sam3, and samexporter.export_sam3 of "
     "vietanhdev/samexporter on github.com writes one; put CLIP's tokenizer.json beside the graphs, such as that of "
@@ -61,55 +63,73 @@ _TOGETHER = "Take the three graphs from one export."
 
 @dataclasses.dataclass(frozen=True)
 class Sam3Files:
-    """The parts of a SAM 3 that is asked by phrases."""
+    """Files of a SAM 3 model.
+
+    Attributes:
+      image: Graph of frames.
+      language: Graph of phrases.
+      decoder: Graph of masks.
+      tokenizer: CLIP's tokenizer.json.
+    """
 
     image: Path
     language: Path
     decoder: Path
     tokenizer: Path
-    """tokenizer.json of CLIP, or vocab.json with merges.txt beside it."""
 
 
 class Sam3Frame(NamedTuple):
-    """A frame as the decoder wants it."""
+    """A frame as the decoder needs it."""
 
     features: dict[str, np.ndarray]
-    """by name."""
+    """by name"""
     height: int
     width: int
 
 
 class PhraseMasks(NamedTuple):
-    """What a phrase names in a frame: M things, best score first."""
+    """What a phrase names in a frame: M objects, best score first."""
 
     masks: Bool[np.ndarray, "m h w"]
-    """they may overlap."""
+    """they may overlap"""
     scores: Float32[np.ndarray, " m"]
-    """SCORE_THRESHOLD to 1."""
+    """SCORE_THRESHOLD to 1"""
 
 
 def find_sam3(folder: str | Path) -> Sam3Files:
-    """The parts of the SAM 3 in a folder. Raises InputError naming what was found instead."""
+    """Finds the files of the SAM 3 model in a folder.
+
+    Raises:
+      InputError: A file is missing, or there are several.
+    """
     folder = Path(folder)
     graphs = sorted(folder.glob("*.onnx"))
-    found = [[path for path in graphs if path.name.endswith(ending)] for ending in _GRAPHS]
-    if any(len(paths) != 1 for paths in found):
-        told = ", ".join(path.name for path in graphs) or ("no .onnx file" if folder.is_dir() else "no such folder")
-        raise InputError(folder, told, f"SAM 3's graphs, one *{', one *'.join(_GRAPHS)}", PUBLISHED)
-    tokenizer = next((folder / name for name in ("tokenizer.json", "vocab.json") if (folder / name).is_file()), None)
-    if tokenizer is None:
+    matches = [[path for path in graphs if path.name.endswith(ending)] for ending in _GRAPHS]
+    if any(len(paths) != 1 for paths in matches):
+        problem = ", ".join(path.name for path in graphs) or ("no .onnx file" if folder.is_dir() else "no such folder")
+        raise InputError(folder, problem, f"SAM 3's graphs, one *{', one *'.join(_GRAPHS)}", PUBLISHED)
+    tokenizer = folder / "tokenizer.json"
+    if not tokenizer.is_file():
         raise InputError(folder, "SAM 3's graphs without a tokenizer", "CLIP's tokenizer.json", PUBLISHED)
-    (image,), (language,), (decoder,) = found
+    (image,), (language,), (decoder,) = matches
     return Sam3Files(image, language, decoder, tokenizer)
 
 
 class Sam3:
-    """SAM 3 of a model folder, or its files, asked by phrases: `sam3(frame, "red mug")`.
+    """SAM 3 prompted by phrases: `sam3(frame, "red mug")`.
 
-    `threads` as for `Graph`. Graphs are opened when first needed and kept until `close`. With the published weights
-    samexporter's logs tell of 24 s to encode a frame and 3 s to ask it on eight cores, and of 8 to 13 GiB: encode a
-    frame once for all phrases. Raises InputError where the folder holds no such model, and later where a graph is of
-    another kind, naming the tensor.
+    Graphs are opened when first needed and stay open until `close`. With the published weights samexporter reports 24 s
+    to encode a frame and 3 s per phrase on eight cores, and 8 to 13 GiB: encode a frame once for all phrases.
+
+    Args:
+      model: The model folder, or its files.
+      threads: Number of cores of one run, as for `Graph`.
+
+    Attributes:
+      files: The model's files.
+
+    Raises:
+      InputError: The folder holds no such model. Methods raise it if a graph has other tensors than SAM 3.
     """
 
     def __init__(self, model: str | Path | Sam3Files, *, threads: int | None = None):
@@ -117,54 +137,76 @@ class Sam3:
         self._threads = threads
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], phrase: str) -> PhraseMasks:
-        """frame (H, W, 3) uint8 RGB, a noun phrase -> the masks of what it names. Raises InputError as `read` does."""
+        """Returns the masks of what a noun phrase names in a frame (H, W, 3) RGB.
+
+        Raises:
+          InputError: As by `read`.
+        """
         return self.masks(self.encode(frame), self.read(phrase))
 
     def read(self, phrase: str) -> dict[str, np.ndarray]:
-        """A phrase as the decoder wants it, by name. Raises InputError where it is empty or too long."""
+        """Encodes a noun phrase for the decoder, by name.
+
+        Raises:
+          InputError: It is empty or too long.
+        """
         if not phrase.strip():
             raise InputError("phrase", repr(phrase), "a noun phrase", 'Say what to find, for example "red mug".')
         length = self._language.inputs["tokens"].fixed(1) or PHRASE_LENGTH
-        count = len(self._tokenizer.encode(phrase)) + 2
+        count = self._tokenizer.count(phrase)
         if count > length:
-            found, expected = f"a phrase of {count} tokens", f"at most {length}, start and end among them"
-            raise InputError(phrase, found, expected, "Say it in fewer words.")
-        found = self._language.run({"tokens": self._tokenizer([phrase], length)}, list(_WORDS.values()))
-        return {name: found[output] for name, output in _WORDS.items()}
+            problem, expected = f"a phrase of {count} tokens", f"at most {length}, start and end among them"
+            raise InputError(phrase, problem, expected, "Say it in fewer words.")
+        outputs = self._language.run({"tokens": self._tokenizer([phrase], length)}, list(_WORDS.values()))
+        return {name: outputs[output] for name, output in _WORDS.items()}
 
     def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> Sam3Frame:
-        """frame (H, W, 3) uint8 RGB -> what the decoder needs of it. Resized by Pillow, which widens the kernel where
-        an image shrinks, as SAM 3 was trained."""
+        """Encodes a frame (H, W, 3) RGB for the decoder.
+
+        It is resized by Pillow, as in SAM 3's training: its kernel widens if an image shrinks.
+
+        Raises:
+          ValueError: The frame is no such image.
+        """
         fits = frame.ndim == 3 and frame.shape[2] == 3 and min(frame.shape) > 0 and frame.dtype == np.uint8
         require(fits, "frame", f"{frame.dtype} {frame.shape}", "uint8 (H, W, 3)", "Give an RGB image.")
         square = Image.fromarray(frame).resize((self.side, self.side), Image.Resampling.BILINEAR)
         image = np.ascontiguousarray(np.asarray(square).transpose(2, 0, 1))
-        wanted = [name for name in self._decoder.inputs if name in self._image.outputs]
-        return Sam3Frame(self._image.run({"image": image}, wanted), frame.shape[0], frame.shape[1])
+        names = [name for name in self._decoder.inputs if name in self._image.outputs]
+        return Sam3Frame(self._image.run({"image": image}, names), frame.shape[0], frame.shape[1])
 
     def masks(self, frame: Sam3Frame, phrase: dict[str, np.ndarray]) -> PhraseMasks:
-        """What a phrase that was read names in a frame that was encoded: masks (M, H, W) with a score above
-        SCORE_THRESHOLD, without those that repeat a better one. M may be 0. Raises InputError where the decoder gives
-        numbers that are not finite, or of other shapes than it declares."""
+        """Predicts the masks of a phrase in a frame.
+
+        Args:
+          frame: From `encode`.
+          phrase: From `read`.
+
+        Returns:
+          M masks with a score above SCORE_THRESHOLD, without those that repeat a better one; M may be 0.
+
+        Raises:
+          InputError: The decoder gives numbers that are not finite, or of other shapes than it declares.
+        """
         boxes = self._decoder.inputs["box_coords"].fixed(0) or 1
         unused = np.zeros((boxes, 1, 4), np.float32), np.ones((boxes, 1), np.int64), np.ones((1, boxes), bool)
         sizes = (np.asarray(size, np.int64) for size in (frame.height, frame.width))
         feeds = frame.features | phrase | dict(zip(_SIZE, sizes)) | dict(zip(_BOXES, unused))
-        found = self._decoder.run({name: feeds[name] for name in self._decoder.inputs}, list(self._outputs))
-        self._check_found(found)
+        outputs = self._decoder.run({name: feeds[name] for name in self._decoder.inputs}, list(self._outputs))
+        self._check_outputs(outputs)
         if self._outputs is _RAW:
             logits, presence = (
-                found[name].astype(np.float64).ravel() for name in ("pred_logits", "presence_logit_dec")
+                outputs[name].astype(np.float64).ravel() for name in ("pred_logits", "presence_logit_dec")
             )
-            scores, maps, level = _sigmoid(logits) * _sigmoid(presence), found["pred_masks"][0], 0.0
+            scores, maps, level = _sigmoid(logits) * _sigmoid(presence), outputs["pred_masks"][0], 0.0
         else:
-            scores, maps, level = found["scores"], found["masks"][:, 0], 0.5
+            scores, maps, level = outputs["scores"], outputs["masks"][:, 0], 0.5
         order = np.argsort(-scores, kind="stable")
         order = order[scores[order] > SCORE_THRESHOLD]
         size = (frame.width, frame.height)
         masks = [cv2.resize(np.asarray(maps[n], np.float32), size) > level for n in order]
         stack = np.stack(masks) if masks else np.zeros((0, frame.height, frame.width), bool)
-        kept = _unrepeated(stack)
+        kept = _without_repetitions(stack)
         return PhraseMasks(stack[kept], scores[order][kept].astype(np.float32))
 
     @property
@@ -173,26 +215,29 @@ class Sam3:
         return self._image.inputs["image"].fixed(2) or IMAGE_SIDE
 
     @property
-    def told(self) -> str:
-        """What the folder takes and gives, in words. Opens the graphs."""
+    def summary(self) -> str:
+        """What the model takes and gives, in words. Opens the graphs."""
         kind = "raw" if self._outputs is _RAW else "filtered"
         length = self._language.inputs["tokens"].fixed(1) or PHRASE_LENGTH
         return f"masks of what a phrase of {length} tokens names; {kind} decoder, images of {self.side} px"
 
     def check(self) -> None:
-        """Opens and closes the graphs, and reads the tokenizer. Raises InputError where they are damaged, or no SAM
-        3's."""
-        _ = self.told, self._tokenizer
+        """Opens and closes the graphs, and reads the tokenizer.
+
+        Raises:
+          InputError: A file is damaged, or not SAM 3's.
+        """
+        _ = self.summary, self._tokenizer
         self.close()
 
     def close(self) -> None:
-        """Drops the graphs and their memory; they are opened again when needed."""
+        """Closes the graphs and frees their memory; they are opened again when needed."""
         for name in ("_image", "_language", "_decoder"):
             self.__dict__.pop(name, None)
 
     @functools.cached_property
-    def _tokenizer(self) -> ClipTokenizer:
-        return load_tokenizer(self.files.tokenizer)
+    def _tokenizer(self) -> TextTokenizer:
+        return TextTokenizer(self.files.tokenizer)
 
     @functools.cached_property
     def _image(self) -> Graph:
@@ -200,7 +245,7 @@ class Sam3:
         tensor = graph.require("input", "image", (3, None, None), "SAM 3's image encoder")
         if tensor.dtype != "uint8" or tensor.fixed(1) != tensor.fixed(2):
             where, expected = f"{graph.path}, input 'image'", "image uint8[3, S, S], as SAM 3's image encoder has"
-            raise InputError(where, str(tensor), expected, "Export the graph with its own scaling of colours.")
+            raise InputError(where, str(tensor), expected, "Export the graph with its scaling of colours.")
         return graph
 
     @functools.cached_property
@@ -231,32 +276,32 @@ class Sam3:
     def _outputs(self) -> dict[str, tuple[int | None, ...]]:
         return _RAW if "pred_logits" in self._decoder.outputs else _FILTERED
 
-    def _check_found(self, found: dict[str, np.ndarray]) -> None:
-        """Raises InputError unless there are a score and a mask of each query, all finite."""
+    def _check_outputs(self, outputs: dict[str, np.ndarray]) -> None:
+        """Raises InputError unless each query has a score and a mask, all finite."""
         counts = set()
         for name, shape in self._outputs.items():
-            array, where = found[name], f"{self.files.decoder}, output {name!r}"
+            array, where = outputs[name], f"{self.files.decoder}, output {name!r}"
             if array.ndim != len(shape) or not Tensor(name, "", shape).fits(array.shape):
                 raise InputError(where, f"shape {array.shape}", str(Tensor(name, "", shape)), _TOGETHER)
             if not np.isfinite(array).all():
                 remedy = "Export the graph again, best in 32 bit floats."
                 raise InputError(where, "numbers that are not finite", "finite numbers", remedy)
             counts |= {array.shape[axis] for axis, size in enumerate(shape[:2]) if size is None}
-        if len(counts) != 1 or (counts != {0} and not all(array.size for array in found.values())):
-            told = ", ".join(f"{name} {found[name].shape}" for name in self._outputs)
-            raise InputError(self.files.decoder, told, "a score and a mask of each query", _TOGETHER)
+        if len(counts) != 1 or (counts != {0} and not all(array.size for array in outputs.values())):
+            shapes = ", ".join(f"{name} {outputs[name].shape}" for name in self._outputs)
+            raise InputError(self.files.decoder, shapes, "a score and a mask of each query", _TOGETHER)
 
 
 def _check_link(tensor: Tensor, decoder: Graph, encoder: Graph, output: str) -> None:
     """Raises InputError unless an encoder gives what an input of the decoder takes."""
-    given = encoder.outputs.get(output)
-    if given is None or not (tensor.shape is None or given.fits(tensor.shape)):
-        found = f"{encoder.path.name}, which gives {describe(encoder.outputs.values())}"
-        raise InputError(f"{decoder.path}, input {tensor.name!r}", found, str(tensor), _TOGETHER)
+    source = encoder.outputs.get(output)
+    if source is None or not (tensor.shape is None or source.fits(tensor.shape)):
+        problem = f"{encoder.path.name}, which gives {describe(encoder.outputs.values())}"
+        raise InputError(f"{decoder.path}, input {tensor.name!r}", problem, str(tensor), _TOGETHER)
 
 
-def _unrepeated(masks: Bool[np.ndarray, "m h w"]) -> np.ndarray:
-    """Indices (K,) of the masks (M, H, W), best first, that are not empty and repeat no better one that is kept."""
+def _without_repetitions(masks: Bool[np.ndarray, "m h w"]) -> np.ndarray:
+    """Indices (K,) of the masks (M, H, W), best first, that are not empty and repeat no better one."""
     shared = shared_areas(masks)
     area = np.diagonal(shared)
     kept: list[int] = []

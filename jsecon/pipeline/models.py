@@ -5,14 +5,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from jsecon.errors import InputError
-from jsecon.networks.clip import ClipEmbedder
-from jsecon.networks.onnx_graph import Graph, describe
-from jsecon.networks.sam import graphs as sam_graphs
-from jsecon.networks.sam2.graphs import open_sam2
+from jsecon.networks.clip import LOGITS_REMEDY, ClipEmbedder
+from jsecon.networks.sam import SamGraphs, find_sam
+from jsecon.networks.sam2 import open_sam2
 from jsecon.networks.sam3 import Sam3
-from jsecon.networks.sigmoid import REMEDY as LOGITS_REMEDY
-
-SAM2_PUBLISHED = "The same split of SAM 2 into graphs is that of axinc-ai/segment-anything-2 on github.com."
+from jsecon.networks.session import Graph, describe
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,26 +102,23 @@ def _sigmoid(embedder: ClipEmbedder) -> str:
 
 
 def _sam(folder: Path) -> str:
-    graphs = sam_graphs.SamGraphs(sam_graphs.find_sam(folder))
-    many = "one prompt per call" if graphs.batch == 1 else f"{graphs.batch} prompts per call"
-    made = f"masks of every frame; decoder of {graphs.dialect.name}, {many}, images of {graphs.side} px"
+    graphs = SamGraphs(find_sam(folder))
+    many = "one prompt per run" if graphs.batch == 1 else f"{graphs.batch} prompts per run"
+    kind = "SAM 2" if graphs.stretched else "SAM"
+    made = f"masks of every frame; decoder of {kind}, {many}, images of {graphs.side} px"
     return f"{made}: jsecon run --segmenter {folder}"
 
 
 def _sam2(folder: Path) -> str:
-    try:
-        graphs = open_sam2(folder)
-    except InputError as error:
-        remedy = f"{error.remedy} {SAM2_PUBLISHED}"
-        raise InputError(error.where, error.sentence, error.expected, remedy) from error
-    return f"SAM {graphs.version}: objects followed through the frames: jsecon run --tracker {folder}"
+    side = open_sam2(folder).sizes["S"]
+    return f"objects followed through the frames, images of {side} px: jsecon run --tracker {folder}"
 
 
 def _sam3(folder: Path) -> str:
     sam3 = Sam3(folder)
-    told = sam3.told
+    summary = sam3.summary
     sam3.check()
-    return f"{told}: jsecon query FIELD TEXT --phrases {folder}"
+    return f"{summary}: jsecon query FIELD TEXT --phrases {folder}"
 
 
 _KINDS: dict[str, Callable[[Path], str]] = {"CLIP": _clip, "SAM": _sam, "SAM 2": _sam2, "SAM 3": _sam3}

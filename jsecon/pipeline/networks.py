@@ -55,13 +55,13 @@ def open_networks(options: Options, store: Path) -> Networks:
     """
     segmenter = tracker = None
     if options.segmenter is not None:
-        from jsecon.networks.sam.segmenter import SamSegmenter, SamSettings
+        from jsecon.networks.sam import SamSegmenter, SamSettings
 
         level, side, layers = options.level, options.points_per_side, options.crop_layers
         settings = SamSettings(level=level, points_per_side=side, crop_layers=layers)
         segmenter = StoredSegmenter(SamSegmenter(options.segmenter, settings), store / "proposals")
     if options.tracker is not None:
-        from jsecon.networks.sam2.tracker import Sam2Tracker
+        from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(options.tracker)
     given = None
@@ -126,8 +126,7 @@ def field_embedder(field: LanguageField, folder: Path | None = None, *, template
 
 def _holds(folder: Path, name: str | None) -> bool:
     """Whether a folder holds the CLIP model of this name, which follows from the content of its files."""
-    from jsecon.networks.clip import clip_name
-    from jsecon.networks.clip_folder import find_clip
+    from jsecon.networks.clip import clip_name, find_clip
 
     try:
         return clip_name(find_clip(folder)) == name

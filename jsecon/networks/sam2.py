@@ -1,0 +1,574 @@
+"""Tracker by SAM 2.1 or EdgeTAM on ONNX Runtime: masks of one frame are followed through all frames.
+
+The model folder is the public export of five graphs with constants.json (square-zero-labs/sam2.1-tiny-video-onnx,
+jax-image-tools/edgetam-video-onnx), the graphs in it or in its subfolder `onnx`:
+    vision_encoder     a frame -> its features at three scales, the coarsest also as a prompted frame's (feats2_no_mem)
+    mask_decoder       features and points -> mask logits, score of the object's presence, object pointer
+    memory_encoder     features and mask -> K memory tokens of M numbers
+    memory_attention   features and 7 memories with 16 object pointers -> features conditioned on them
+    pointer_tpos       distances of the pointers in time -> their temporal codes
+The steps are those of the video predictor of facebookresearch/sam2. Two things follow from the export: empty slots of
+the memory repeat the newest memory and pointer, and a mask prompt gives its object pointer by its box.
+
+Frames are read one at a time, in the order of tracking. Each is encoded once for all objects, and each object is
+tracked by itself. Memory is bounded whatever the length of the sequence.
+"""
+
+import dataclasses
+import functools
+import hashlib
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from jsecon.errors import InputError, describe_error, require
+from jsecon.files import read_json
+from jsecon.networks.session import Graph, content_digest, graph_files
+from jsecon.numerics import is_finite_and_bounded
+
+SLOTS = 7
+"""memories that a frame attends to, the prompted one among them"""
+POINTERS = 16
+"""object pointers that a frame attends to, the prompted one among them"""
+MASK_LOGIT = 10.0
+"""logit of a pixel of a mask prompt; its negative outside"""
+CONSTANTS = "constants.json"
+PUBLISHED = (
+    "Folders of this kind are published on huggingface.co: square-zero-labs/sam2.1-tiny-video-onnx, "
+    "jax-image-tools/edgetam-video-onnx."
+)
+
+Shape = tuple[int | str | None, ...]
+# Letters are sizes that must agree across the files: S image, G grid of the coarsest features, T = G^2, C channels, M
+# numbers of a memory token; None is free.
+SIGNATURES: Mapping[str, tuple[Mapping[str, Shape], Mapping[str, Shape]]] = {
+    "vision_encoder": (
+        {"pixel_values": (1, 3, "S", "S")},
+        {
+            "feats0": (1, None, None, None),
+            "feats1": (1, None, None, None),
+            "feats2": (1, "C", "G", "G"),
+            "feats2_no_mem": (1, "C", "G", "G"),
+            "vision_pos_embed": (1, "C", "G", "G"),
+        },
+    ),
+    "mask_decoder": (
+        {
+            "feats0": (1, None, None, None),
+            "feats1": (1, None, None, None),
+            "feats2_cond": (1, "C", "G", "G"),
+            "input_points": (1, 1, None, 2),
+            "input_labels": (1, 1, None),
+        },
+        {"low_res_mask": (1, 1, None, None), "high_res_mask": (1, 1, "S", "S"), "object_pointer": (1, 1, "C")},
+    ),
+    "memory_encoder": (
+        {
+            "feats2": (1, "C", "G", "G"),
+            "high_res_mask": (1, 1, "S", "S"),
+            "object_score_logits": (1, 1),
+            "binarize": (),
+        },
+        {"memory_tokens": (None, 1, "M"), "memory_pos": (None, 1, "M")},
+    ),
+    "memory_attention": (
+        {
+            "current_vision_features": ("T", 1, "C"),
+            "current_vision_position_embeddings": ("T", 1, "C"),
+            "memory": (None, 1, "M"),
+            "memory_pos": (None, 1, "M"),
+        },
+        {"conditioned_feats": (1, "C", "G", "G")},
+    ),
+    "pointer_tpos": ({"normalized_diffs": (None,)}, {"pointer_pos": (None, "M")}),
+}
+"""graph -> inputs and outputs that are used, with their shapes"""
+
+
+class Constants(NamedTuple):
+    """Content of constants.json."""
+
+    mean: np.ndarray
+    """(3,) mean of RGB in 0..1"""
+    std: np.ndarray
+    """(3,) standard deviation of RGB in 0..1"""
+    temporal_code: np.ndarray
+    """(SLOTS, M) code of a memory by its distance in frames; the last row is the prompted frame's"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sam2Graphs:
+    """The graphs of one model.
+
+    Attributes:
+      graphs: By name, as in SIGNATURES.
+      constants: Content of constants.json.
+      sizes: Sizes of the letters of SIGNATURES.
+    """
+
+    graphs: Mapping[str, Graph]
+    constants: Constants
+    sizes: Mapping[str, int]
+
+    def run(self, name: str, **feeds: np.ndarray) -> dict[str, np.ndarray]:
+        """Runs a graph; returns its outputs by name."""
+        return self.graphs[name].run(feeds)
+
+
+def sam2_files(folder: Path) -> dict[str, Path]:
+    """Finds the five graphs and constants.json by name.
+
+    Raises:
+      InputError: A file is missing.
+    """
+    folder = Path(folder)
+    names = [*(f"{name}.onnx" for name in SIGNATURES), CONSTANTS]
+    files = {
+        path.name: path for place in (folder / "onnx", folder) for name in names if (path := place / name).is_file()
+    }
+    missing = [name for name in names if name not in files]
+    if missing:
+        problem = f"no {', '.join(missing)}"
+        raise InputError(folder, problem, "SAM 2's five graphs and constants.json", PUBLISHED)
+    return files
+
+
+def sam2_digest(folder: Path, *, extra: str = "") -> str:
+    """Returns 32 hex digits of the contents of the model's files, and of `extra`.
+
+    Raises:
+      InputError: A file is missing.
+    """
+    files = sam2_files(folder)
+    graphs = [part for name in SIGNATURES for part in graph_files(files[f"{name}.onnx"])]
+    return content_digest([*graphs, files[CONSTANTS]], extra=extra)
+
+
+def open_sam2(folder: Path, *, threads: int | None = None) -> Sam2Graphs:
+    """Opens the model in a folder.
+
+    Args:
+      folder: The folder.
+      threads: Number of cores of one run, as for `Graph`.
+
+    Raises:
+      InputError: A file is missing or damaged, or its tensors do not fit the rest of the folder.
+    """
+    files = sam2_files(folder)
+    constants = _read_constants(files[CONSTANTS])
+    graphs = {name: Graph(files[f"{name}.onnx"], threads=threads) for name in SIGNATURES}
+    encoder = graphs["vision_encoder"]
+    image = encoder.require("input", "pixel_values", (1, 3, None, None), "SAM 2's vision encoder")
+    features = encoder.require("output", "feats2", (1, None, None, None), "SAM 2's vision encoder")
+    side, channels, grid = image.fixed(2), features.fixed(1), features.fixed(2)
+    if side is None or channels is None or grid is None:
+        raise InputError(encoder.path, f"{image} and {features}", "an image and features of fixed sizes", PUBLISHED)
+    sizes = {"S": side, "C": channels, "G": grid, "T": grid * grid, "M": constants.temporal_code.shape[1]}
+    for name, graph in graphs.items():
+        for tensors, kind in zip(SIGNATURES[name], ("input", "output")):
+            for tensor, shape in tensors.items():
+                fixed = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
+                graph.require(kind, tensor, fixed, f"SAM 2's {name.replace('_', ' ')}")
+    return Sam2Graphs(graphs, constants, sizes)
+
+
+def _read_constants(path: Path) -> Constants:
+    expected = f"image_mean, image_std and memory_temporal_positional_encoding of {SLOTS} rows"
+    content = read_json(path, expected, PUBLISHED)
+    try:
+        names = ("image_mean", "image_std", "memory_temporal_positional_encoding")
+        constants = Constants(*(np.asarray(content[name], np.float32) for name in names))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(path, f"it cannot be read ({describe_error(error)})", expected, PUBLISHED) from error
+    shapes = [array.shape for array in constants]
+    fits = shapes[:2] == [(3,), (3,)] and len(shapes[2]) == 2 and shapes[2][0] == SLOTS and shapes[2][1] > 0
+    if not fits or not is_finite_and_bounded(*constants) or constants.std.min() <= 0:
+        raise InputError(path, f"shapes {shapes}, or numbers that are not finite", expected, PUBLISHED)
+    return constants
+
+
+class FrameFeatures(NamedTuple):
+    """Output of the vision encoder for a frame, shared by all objects."""
+
+    feats0: np.ndarray
+    """(1, C/8, 4 G, 4 G)"""
+    feats1: np.ndarray
+    """(1, C/4, 2 G, 2 G)"""
+    feats2: np.ndarray
+    """(1, C, G, G)"""
+    feats2_no_mem: np.ndarray
+    """(1, C, G, G) of a prompted frame"""
+    vision_pos_embed: np.ndarray
+    """(1, C, G, G), the same in every frame"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prompt:
+    """What points out an object in a frame: a mask, or points.
+
+    Attributes:
+      mask: (H, W) bool, or None.
+      points: (P, 2) x, y in px of the frame, or None.
+      labels: (P,) 1 inside, 0 outside, 2 and 3 the corners of a box (top left, bottom right).
+    """
+
+    mask: np.ndarray | None = None
+    points: np.ndarray | None = None
+    labels: np.ndarray | None = None
+
+    def __post_init__(self):
+        present = [value is not None for value in (self.mask, self.points, self.labels)]
+        fits = present in ([True, False, False], [False, True, True])
+        require(fits, "Prompt", f"mask, points, labels: {present}", "a mask, or points with labels", "Use one of both.")
+
+
+class Prediction(NamedTuple):
+    """An object in a frame."""
+
+    logits: np.ndarray
+    """(L, L) float32 mask logits"""
+    high_res: np.ndarray
+    """(S, S) float32 mask logits"""
+    pointer: np.ndarray
+    """(C,) float32 object pointer"""
+    score: np.ndarray
+    """(1, 1) float32 logit of the object's presence"""
+
+
+class Memory(NamedTuple):
+    """What a frame adds to the memory of an object."""
+
+    tokens: np.ndarray | None
+    """(K, M) bfloat16; None once no frame can reach it"""
+    pointer: np.ndarray
+    """(C,) float32"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bank:
+    """The memories of one object.
+
+    Attributes:
+      start: The prompted frame.
+      prompted: Its memory.
+      tracked: Memories of tracked frames that a later frame can still reach, by frame.
+    """
+
+    start: int
+    prompted: Memory
+    tracked: Mapping[int, Memory] = dataclasses.field(default_factory=dict)
+
+    def attended(
+        self, t: int, step: int, count: int
+    ) -> tuple[list[tuple[int, np.ndarray]], list[tuple[int, np.ndarray]]]:
+        """Lists what frame t attends to, filled up by repeating the newest entry.
+
+        Args:
+          t: The frame.
+          step: Direction of tracking: 1 forward, -1 backward.
+          count: Number of frames of the sequence.
+
+        Returns:
+          SLOTS pairs of a row of the temporal code and memory tokens (K, M), and POINTERS pairs of a distance in frames
+          and a pointer (C,). The prompted frame comes first, then the frames before t in the direction of tracking, the
+          nearest first.
+
+        Raises:
+          ValueError: A memory that is needed was dropped.
+        """
+        near = [(d, self.tracked[t - step * d]) for d in range(1, POINTERS) if t - step * d in self.tracked]
+        tokens = [(SLOTS - 1, self.prompted.tokens), *((d - 1, memory.tokens) for d, memory in near if d < SLOTS)]
+        pointers = [(abs(t - self.start), self.prompted.pointer)]
+        pointers += [(d, memory.pointer) for d, memory in near if d < count]
+        memories = [(row, array) for row, array in tokens if array is not None]
+        if len(memories) < len(tokens):
+            raise ValueError(f"frame {t} needs memories that were dropped")
+        newest = min(1, len(memories) - 1), min(1, len(pointers) - 1)
+        memories += [memories[newest[0]]] * (SLOTS - len(memories))
+        pointers += [pointers[newest[1]]] * (POINTERS - len(pointers))
+        return memories, pointers
+
+    def with_tracked(self, t: int, memory: Memory, step: int) -> "Bank":
+        """Adds frame t, and drops what no later frame can reach.
+
+        The backward pass begins before the prompted frame and reads what the forward pass left beyond it.
+        """
+        kept = {}
+        for frame, old in {**self.tracked, t: memory}.items():
+            distance = (t + step - frame) * step  # from the next frame
+            if step == 1 and self.start > 0:
+                distance = min(distance, frame - (self.start - 1))
+            if distance < POINTERS:
+                kept[frame] = old if distance < SLOTS else old._replace(tokens=None)
+        return dataclasses.replace(self, tracked=kept)
+
+
+class Sam2Tracker:
+    """Tracker (jsecon.vision.protocols) that runs SAM 2.1 or EdgeTAM.
+
+    The graphs are opened when first needed and stay open until `close`.
+
+    Args:
+      folder: The model folder.
+      hole_area: Holes of at most this many pixels of the low-resolution mask are filled.
+      keep: Number of frames whose features are kept for later calls, about 16 MiB each at 1024 px.
+      threads: Number of cores of one run, as for `Graph`.
+
+    Attributes:
+      name: Follows from the content of the files and the settings.
+
+    Raises:
+      InputError: A file is missing. Methods raise it if the files do not make one model.
+    """
+
+    def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
+        self.name = f"sam2-{sam2_digest(folder, extra=repr(hole_area))}"
+        self.hole_area = hole_area
+        self._folder = folder
+        self._keep = keep
+        self._threads = threads
+
+    @functools.cached_property
+    def graphs(self) -> Sam2Graphs:
+        """The open graphs."""
+        return open_sam2(self._folder, threads=self._threads)
+
+    @functools.cached_property
+    def _encode(self) -> "FrameEncoder":
+        return FrameEncoder(self.graphs, keep=self._keep)
+
+    def check(self) -> None:
+        """Opens the graphs.
+
+        Raises:
+          InputError: The files do not make one model.
+        """
+        open_sam2(self._folder, threads=self._threads)
+
+    def close(self) -> None:
+        """Closes the graphs and frees their memory; they are opened again when needed."""
+        self.__dict__.pop("_encode", None)
+        self.__dict__.pop("graphs", None)
+
+    def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
+        """Follows objects through all frames.
+
+        Args:
+          frames: (T, H, W, 3) uint8 RGB.
+          index: Frame of the prompts.
+          prompts: (B, H, W) bool masks of B objects in that frame; an empty one is not followed.
+
+        Returns:
+          (T, H, W) int16 index of the object, -1 for none. A pixel of several objects goes to the highest logit.
+
+        Raises:
+          ValueError: The shapes disagree, or there is no such frame.
+        """
+        height, width = frames.shape[1:3]
+        fits = prompts.ndim == 3 and prompts.shape[1:] == (height, width) and 0 <= index < len(frames)
+        expected = f"(B, {height}, {width}) and a frame below {len(frames)}"
+        require(fits, "Sam2Tracker", (prompts.shape, index), expected, "Give masks of the frames' size.")
+        labels = np.full(frames.shape[:3], -1, np.int16)
+        objects = [b for b, mask in enumerate(prompts) if mask.any()]
+        if not objects:
+            return labels
+        numbers = np.array([*objects, -1], np.int16)
+        masks = [Prompt(prompts[b]) for b in objects]
+        for t, logits in follow(self.graphs, frames, index, masks, hole_area=self.hole_area, encode=self._encode):
+            labels[t] = numbers[strongest(logits, (height, width))]
+        return labels
+
+
+class FrameEncoder:
+    """Encodes frames and keeps the features of the last ones by their pixels.
+
+    Args:
+      graphs: The model.
+      keep: Number of frames to keep.
+    """
+
+    def __init__(self, graphs: Sam2Graphs, *, keep: int = 1):
+        self._graphs = graphs
+        self._keep = max(keep, 1)
+        self._known: OrderedDict[bytes, FrameFeatures] = OrderedDict()
+
+    def __call__(self, frame: np.ndarray) -> FrameFeatures:
+        """Encodes a frame (H, W, 3), stretched to a square."""
+        key = hashlib.blake2b(np.ascontiguousarray(frame).data, digest_size=16).digest() + repr(frame.shape).encode()
+        if key not in self._known:
+            side, constants = self._graphs.sizes["S"], self._graphs.constants
+            small = np.asarray(Image.fromarray(frame).resize((side, side), Image.Resampling.BICUBIC))
+            image = ((small / 255.0).astype(np.float32) - constants.mean) / constants.std
+            outputs = self._graphs.run("vision_encoder", pixel_values=image.transpose(2, 0, 1)[None])
+            self._known[key] = FrameFeatures(*(outputs[name] for name in FrameFeatures._fields))
+        self._known.move_to_end(key)
+        while len(self._known) > self._keep:
+            self._known.popitem(last=False)
+        return self._known[key]
+
+
+def follow(
+    graphs: Sam2Graphs,
+    frames: np.ndarray,
+    start: int,
+    prompts: Sequence[Prompt],
+    *,
+    hole_area: int = 8,
+    encode: FrameEncoder | None = None,
+) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """Follows objects from a prompted frame to the last, then back to the first.
+
+    Args:
+      graphs: The model.
+      frames: (T, H, W, 3) uint8, anything that is indexed by frame and has a shape, such as a memory map.
+      start: The prompted frame.
+      prompts: One prompt of each object.
+      hole_area: As for `Sam2Tracker`.
+      encode: Encoder that keeps features of frames; by default a new one.
+
+    Yields:
+      A frame index and the mask logits (L, L) of each object, for every frame.
+
+    Raises:
+      ValueError: There is no such frame, or no prompt.
+    """
+    count = len(frames)
+    require(0 <= start < count, "follow", f"frame {start}", f"a frame below {count}", "Prompt a frame of the sequence.")
+    encode = encode or FrameEncoder(graphs)
+    features = encode(frames[start])
+    size = int(frames.shape[1]), int(frames.shape[2])
+    first = [_prompted(graphs, features, prompt, size) for prompt in prompts]
+    position, banks = None, []
+    for prediction in first:
+        memory, position = _memorize(graphs, features, prediction, binarize=True)
+        banks.append(Bank(start, memory))
+    require(position is not None, "follow", "no prompt", "at least one", "Prompt an object.")
+    yield start, [fill_holes(prediction.logits, hole_area) for prediction in first]
+    for step, order in ((1, range(start + 1, count)), (-1, range(start - 1, -1, -1))):
+        for t in order:
+            features = encode(frames[t])
+            logits = []
+            for number, bank in enumerate(banks):
+                prediction = _tracked(graphs, features, bank, t, step, count, position)
+                memory, _ = _memorize(graphs, features, prediction, binarize=False)
+                banks[number] = bank.with_tracked(t, memory, step)
+                logits.append(fill_holes(prediction.logits, hole_area))
+            yield t, logits
+
+
+def _prompted(graphs: Sam2Graphs, features: FrameFeatures, prompt: Prompt, size: tuple[int, int]) -> Prediction:
+    """Predicts the object of a prompt in a frame of size (H, W) from that frame alone."""
+    side = graphs.sizes["S"]
+    scale = np.array([side / size[1], side / size[0]], np.float32)
+    if prompt.mask is None:
+        points = np.asarray(prompt.points, np.float32) * scale
+        return _decode(graphs, features, features.feats2_no_mem, points, np.asarray(prompt.labels))
+    rows, columns = np.flatnonzero(prompt.mask.any(1)), np.flatnonzero(prompt.mask.any(0))
+    require(len(rows) > 0, "Prompt", "an empty mask", "at least one pixel", "Leave out empty masks.")
+    box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], np.float32) * scale
+    decoded = _decode(graphs, features, features.feats2_no_mem, box, np.array([2, 3]))
+    mask = np.where(_resize(prompt.mask.astype(np.float32), side) >= 0.5, MASK_LOGIT, -MASK_LOGIT).astype(np.float32)
+    return Prediction(
+        _resize(mask, len(decoded.logits)), mask, decoded.pointer, np.full((1, 1), MASK_LOGIT, np.float32)
+    )
+
+
+def _resize(image: np.ndarray, side: int) -> np.ndarray:
+    """(H, W) float32 to (side, side), bilinear with a kernel that widens as it shrinks, like PyTorch's antialias."""
+    return np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
+
+
+def _tracked(
+    graphs: Sam2Graphs,
+    features: FrameFeatures,
+    bank: Bank,
+    t: int,
+    step: int,
+    count: int,
+    position: np.ndarray | None,
+) -> Prediction:
+    """Predicts the object of a bank in frame t of `count`; `position` (K, M) is the spatial code of a memory."""
+    memories, pointers = bank.attended(t, step, count)
+    width = graphs.sizes["M"]
+    distances = np.array([distance for distance, _ in pointers], np.float32) / max(min(count, POINTERS) - 1, 1)
+    ages = graphs.run("pointer_tpos", normalized_diffs=distances)["pointer_pos"]
+    pointer_tokens = np.array([pointer for _, pointer in pointers], np.float32).reshape(-1, width)
+    tokens = [np.asarray(array, np.float32) for _, array in memories]
+    codes = [position + graphs.constants.temporal_code[row] for row, _ in memories]
+    conditioned = graphs.run(
+        "memory_attention",
+        current_vision_features=_as_tokens(features.feats2),
+        current_vision_position_embeddings=_as_tokens(features.vision_pos_embed),
+        memory=np.concatenate([*tokens, pointer_tokens])[:, None],
+        memory_pos=np.concatenate([*codes, np.repeat(ages, graphs.sizes["C"] // width, axis=0)])[:, None],
+    )["conditioned_feats"]
+    return _decode(graphs, features, conditioned, np.zeros((1, 2), np.float32), np.array([-1]))
+
+
+def _decode(
+    graphs: Sam2Graphs, features: FrameFeatures, image: np.ndarray, points: np.ndarray, labels: np.ndarray
+) -> Prediction:
+    """Runs the mask decoder with points (P, 2) in px of the square image; it chooses among its masks by itself."""
+    outputs = graphs.run(
+        "mask_decoder",
+        feats0=features.feats0,
+        feats1=features.feats1,
+        feats2_cond=image,
+        input_points=points[None, None],
+        input_labels=labels[None, None],
+    )
+    score = outputs["object_score_logits"].reshape(1, 1)
+    return Prediction(
+        outputs["low_res_mask"][0, 0], outputs["high_res_mask"][0, 0], outputs["object_pointer"][0, 0], score
+    )
+
+
+def _memorize(
+    graphs: Sam2Graphs, features: FrameFeatures, prediction: Prediction, *, binarize: bool
+) -> tuple[Memory, np.ndarray]:
+    """Encodes the memory of an object in a frame, binary if it was prompted there; also returns its spatial code."""
+    outputs = graphs.run(
+        "memory_encoder",
+        feats2=features.feats2,
+        high_res_mask=prediction.high_res[None, None],
+        object_score_logits=prediction.score,
+        binarize=np.float32(binarize),
+    )
+    tokens = outputs["memory_tokens"][:, 0].astype(jnp.bfloat16)
+    return Memory(tokens, prediction.pointer), outputs["memory_pos"][:, 0]
+
+
+def _as_tokens(grid: np.ndarray) -> np.ndarray:
+    """(1, C, G, G) to (G^2, 1, C)."""
+    return np.ascontiguousarray(grid.reshape(grid.shape[1], -1).T[:, None])
+
+
+def fill_holes(logits: np.ndarray, area: int) -> np.ndarray:
+    """Raises holes of at most `area` pixels (8-connected, logits at or below 0) of (L, L) to 0.1."""
+    if area <= 0:
+        return logits
+    number, labels, stats, _ = cv2.connectedComponentsWithStats((logits <= 0).astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] <= area
+    small[0] = False  # label 0 is the object itself
+    return np.where(small[np.asarray(labels, np.intp)], np.float32(0.1), logits) if number > 1 else logits
+
+
+def strongest(logits: Sequence[np.ndarray], size: tuple[int, int]) -> np.ndarray:
+    """Returns (H, W) int16: the object with the highest of the logits (L, L) at each pixel, -1 if none is above 0."""
+    best, label = np.zeros(size, np.float32), np.full(size, -1, np.int16)
+    for number, low in enumerate(logits):
+        resized = at_size(low, size)
+        above = resized > best
+        best[above], label[above] = resized[above], number
+    return label
+
+
+def at_size(logits: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Resizes logits (L, L) to (H, W) bilinearly."""
+    return cv2.resize(logits, size[::-1], interpolation=cv2.INTER_LINEAR)

@@ -1,1 +1,0 @@
-"""SAM 2: masks followed through the frames."""

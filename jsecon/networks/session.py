@@ -1,0 +1,279 @@
+"""Runs ONNX graphs with ONNX Runtime on the CPU.
+
+The number of threads is bounded, signatures are read from the file, and tensors are passed by name. Code that needs a
+graph states which tensors it passes and reads (`Graph.require`). A graph with other tensors raises an InputError that
+names the file and the tensor.
+"""
+
+import dataclasses
+import hashlib
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import onnxruntime
+
+from jsecon.errors import InputError
+from jsecon.process import cores
+
+_DTYPES = {
+    "tensor(float)": "float32",
+    "tensor(float16)": "float16",
+    "tensor(double)": "float64",
+    "tensor(int64)": "int64",
+    "tensor(int32)": "int32",
+    "tensor(uint8)": "uint8",
+    "tensor(int8)": "int8",
+    "tensor(bool)": "bool",
+}
+_KINDS = {"b": "bool", "i": "integer", "u": "integer", "f": "float"}
+_MISUSED = "This graph has another size or kind than the one that it is used as."
+MAX_INPUT_NUMBERS = 1 << 26
+"""size of an input; an image of 4096 x 4096 px has 2^25.6 numbers"""
+_LFS_POINTER = b"version https://git-lfs"
+Size = int | str | None
+"""size of an axis: a number if it is fixed, the name of a symbol or None if it is free"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tensor:
+    """An input or output of a graph, as its file declares it.
+
+    Attributes:
+      name: Name of the tensor.
+      dtype: NumPy's name of the type, or ONNX Runtime's if NumPy has no such type.
+      shape: Sizes of the axes; None if the file does not declare them.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[Size, ...] | None
+
+    def __str__(self) -> str:
+        if self.shape is None:
+            return f"{self.name} {self.dtype}"
+        return f"{self.name} {self.dtype}[{', '.join('?' if size is None else str(size) for size in self.shape)}]"
+
+    def fixed(self, axis: int) -> int | None:
+        """Returns the size of an axis if the file fixes it, else None."""
+        if self.shape is None or not -len(self.shape) <= axis < len(self.shape):
+            return None
+        size = self.shape[axis]
+        return size if isinstance(size, int) and size > 0 else None
+
+    def fits(self, shape: Sequence[Size]) -> bool:
+        """Returns whether an array of this shape could be the tensor; None and symbols fit every size."""
+        if self.shape is None:
+            return True
+        return len(self.shape) == len(shape) and all(
+            not (isinstance(mine, int) and mine > 0 and isinstance(size, int)) or mine == size
+            for mine, size in zip(self.shape, shape)
+        )
+
+
+class Graph:
+    """An ONNX graph, ready to run.
+
+    Threads never spin: an idle graph costs no time, only memory. Drop it when its stage is done.
+
+    Args:
+      path: The .onnx file.
+      threads: Number of cores that one run takes; by default all that this process may use.
+      optimise: Whether to optimise the graph; False opens it faster, for a look at its signature.
+
+    Attributes:
+      inputs: Input tensors by name, in the order of the file.
+      outputs: Output tensors by name, in the order of the file.
+
+    Raises:
+      InputError: The file is missing, empty, cut short or a Git LFS pointer, lacks its external data, declares an
+        input of more than MAX_INPUT_NUMBERS, or uses what the installed ONNX Runtime does not know.
+    """
+
+    def __init__(self, path: str | os.PathLike, *, threads: int | None = None, optimise: bool = True):
+        self.path = Path(path)
+        self._threads = threads or cores()
+        _check_bytes(self.path)
+        self._session = self._open(optimise=False)
+        self.inputs = {node.name: _tensor(node) for node in self._session.get_inputs()}
+        self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
+        for tensor in self.inputs.values():  # before the optimiser allocates constants of such sizes
+            sizes = [size for size in tensor.shape or () if isinstance(size, int) and size > 0]
+            if math.prod(sizes) > MAX_INPUT_NUMBERS:
+                problem = f"an input {tensor.name!r} of {' x '.join(map(str, sizes))} numbers"
+                raise InputError(self.path, problem, f"at most {MAX_INPUT_NUMBERS}", "Fetch or export the file again.")
+        if optimise:
+            self._session = self._open(optimise=True)
+        self._run_options = onnxruntime.RunOptions()
+        self._run_options.log_severity_level = 4
+
+    def _open(self, *, optimise: bool) -> onnxruntime.InferenceSession:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self._threads
+        options.inter_op_num_threads = 1
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 4
+        onnxruntime.set_default_logger_severity(4)
+        if not optimise:
+            options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        try:
+            return onnxruntime.InferenceSession(
+                str(self.path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
+        except Exception as error:  # ONNX Runtime's exceptions have no common base but this
+            problem = f"ONNX Runtime {onnxruntime.__version__} cannot open it ({_reason(error)})"
+            expected = "a whole ONNX graph, with its external data files beside it"
+            raise InputError(self.path, problem, expected, "Fetch or export the file again.") from error
+
+    def require(self, side: Literal["input", "output"], name: str, shape: Sequence[Size], what: str) -> Tensor:
+        """Returns a tensor of the graph after checking its shape.
+
+        Args:
+          side: Whether it is an input or an output.
+          name: Its name.
+          shape: Its shape; None fits any size.
+          what: What the graph should be, for the message.
+
+        Raises:
+          InputError: There is no such tensor, or it has another shape.
+        """
+        tensors = self.inputs if side == "input" else self.outputs
+        if name not in tensors or not tensors[name].fits(shape):
+            missing = f"no such {side}; the graph has {describe(tensors.values())}"
+            problem = str(tensors[name]) if name in tensors else missing
+            expected = f"{Tensor(name, '', tuple(shape))}, as {what} has".replace(" [", "[")
+            remedy = "Give the right file; `jsecon models check DIR` lists what each one is."
+            raise InputError(f"{self.path}, {side} {name!r}", problem, expected, remedy)
+        return tensors[name]
+
+    def run(self, feeds: Mapping[str, np.ndarray], outputs: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Runs the graph.
+
+        Numbers are converted to the declared type if their kind stays the same (float to float, integer to integer).
+
+        Args:
+          feeds: Arrays by the names of the inputs.
+          outputs: Names of the outputs to compute; by default all.
+
+        Returns:
+          Arrays by the names of the outputs.
+
+        Raises:
+          InputError: A tensor is missing, unknown, or of another shape or kind, or the graph fails.
+        """
+        names = list(self.outputs) if outputs is None else list(outputs)
+        unknown = [n for n in feeds if n not in self.inputs] + [n for n in names if n not in self.outputs]
+        missing = [n for n in self.inputs if n not in feeds]
+        if unknown or missing:
+            problem = f"inputs {describe(self.inputs.values())}; outputs {describe(self.outputs.values())}"
+            expected = f"inputs {', '.join(feeds)}; outputs {', '.join(names)}"
+            raise InputError(f"{self.path}, tensor {(unknown + missing)[0]!r}", problem, expected, _MISUSED)
+        ready = {name: self._converted(self.inputs[name], np.asarray(array)) for name, array in feeds.items()}
+        try:
+            arrays = self._session.run(names, ready, self._run_options)
+        except Exception as error:  # ONNX Runtime's exceptions have no common base but this
+            shapes = ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in ready.items())
+            problem = f"a graph that fails on {shapes} ({_reason(error)})"
+            expected = "one that runs on its declared inputs"
+            raise InputError(self.path, problem, expected, "Export the graph again.") from error
+        return dict(zip(names, (np.asarray(array) for array in arrays)))
+
+    def _converted(self, tensor: Tensor, array: np.ndarray) -> np.ndarray:
+        dtype = np.dtype(tensor.dtype) if tensor.dtype in _DTYPES.values() else None
+        same_kind = dtype is not None and _KINDS.get(array.dtype.kind) == _KINDS[dtype.kind]
+        if not same_kind or not tensor.fits(array.shape):
+            expected = f"{array.dtype}{list(array.shape)}"
+            raise InputError(f"{self.path}, input {tensor.name!r}", str(tensor), expected, _MISUSED)
+        return np.asarray(array, dtype, order="C")  # np.ascontiguousarray makes a row of a scalar
+
+
+def describe(tensors: Iterable[Tensor]) -> str:
+    """Lists name, type and shape of tensors on one line."""
+    return ", ".join(map(str, tensors)) or "no tensor"
+
+
+def batches(rows: np.ndarray, fixed: int | None, free: int) -> Iterator[tuple[np.ndarray, int]]:
+    """Cuts rows into batches.
+
+    Args:
+      rows: Array with any leading axis.
+      fixed: Batch size that a graph fixes, or None; the last batch is then padded with zeros.
+      free: Largest batch size if none is fixed.
+
+    Yields:
+      A batch, and the number of its rows that are not padding.
+    """
+    size = fixed or free
+    for start in range(0, len(rows), size):
+        part = rows[start : start + size]
+        count = len(part)
+        if fixed and count < fixed:
+            part = np.concatenate([part, np.zeros((fixed - count, *rows.shape[1:]), rows.dtype)])
+        yield part, count
+
+
+def graph_files(path: str | os.PathLike) -> tuple[Path, ...]:
+    """Lists the .onnx file and the external data files that it names beneath its folder.
+
+    Raises:
+      InputError: The .onnx file cannot be read.
+    """
+    path = Path(path)
+    _check_bytes(path)
+    content = path.read_bytes()
+    beside = (file for file in sorted(path.parent.rglob("*")) if file.is_file() and file.suffix != ".onnx")
+    return path, *(file for file in beside if os.fsencode(file.relative_to(path.parent).as_posix()) in content)
+
+
+def content_digest(files: Iterable[str | os.PathLike], *, extra: str = "") -> str:
+    """Hashes the contents of files; names, places and times do not count.
+
+    Args:
+      files: The files, in an order that counts.
+      extra: A text that is hashed too.
+
+    Returns:
+      32 hex digits.
+
+    Raises:
+      InputError: A file cannot be read.
+    """
+    digest = hashlib.blake2b(extra.encode(), digest_size=16)
+    for file in files:
+        try:
+            with open(file, "rb") as stream:
+                digest.update(hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).digest())
+        except OSError as error:
+            raise _unreadable(Path(file), error.strerror or "an error on reading") from error
+    return digest.hexdigest()
+
+
+def _check_bytes(path: Path) -> None:
+    """Checks that a file exists and is neither empty nor a Git LFS pointer."""
+    try:
+        with open(path, "rb") as stream:
+            head = stream.read(64)
+    except OSError as error:
+        raise _unreadable(path, error.strerror or "an error on reading") from error
+    if not head:
+        raise _unreadable(path, "an empty file")
+    if head.startswith(_LFS_POINTER):
+        raise _unreadable(path, "a Git LFS pointer in place of the file", "Fetch the content: git lfs pull.")
+
+
+def _unreadable(path: Path, problem: str, remedy: str = "Check the path, or fetch the file again.") -> InputError:
+    return InputError(path, problem, "a file of a model", remedy)
+
+
+def _reason(error: Exception) -> str:
+    """Returns ONNX Runtime's message on one line, without its preamble."""
+    text = " ".join(str(error).split())
+    return text.split(" : ", 3)[-1][:400] if text.startswith("[ONNXRuntimeError]") else text[:400]
+
+
+def _tensor(node: onnxruntime.NodeArg) -> Tensor:
+    shape = tuple(node.shape)  # ONNX Runtime shows a scalar and an undeclared shape alike, as no axes
+    return Tensor(node.name, _DTYPES.get(str(node.type), str(node.type)), shape or None)
