@@ -28,7 +28,7 @@ def measure(capture: Path, out: Path, steps: int) -> None:
     prepare_process()
     import numpy as np
 
-    from jsecon.pipeline import pipeline
+    from jsecon.pipeline import run as pipeline
     from jsecon.pipeline.options import Options
 
     run = pipeline.run(Options(capture, steps=steps), out)

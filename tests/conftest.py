@@ -204,7 +204,7 @@ def room(made_once) -> Path:
 @pytest.fixture(scope="session")
 def room_run(room, made_once, tmp_path_factory):
     """A finished run on that room with its true masks given, and a folder as it was written, this worker's own."""
-    from jsecon.pipeline import pipeline
+    from jsecon.pipeline import run as pipeline
 
     options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150)
     with made_once("run") as folder:

@@ -13,7 +13,7 @@ import pytest
 from jsecon.app import cli, verbs
 from jsecon.app.ask import BY_VOTES, METHODS
 from jsecon.data.gaussians.ply import load_ply
-from jsecon.pipeline import pipeline, progress
+from jsecon.pipeline import progress, run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib

@@ -99,8 +99,8 @@ def test_templates_are_averaged_as_unit_vectors(folders):
 def test_embeddings_are_kept_by_content(folders, frame, masks, tmp_path, monkeypatch):
     embedder = ClipEmbedder(folders["flat"], threads=1, store=tmp_path)
     crops = []
-    through = embedder._through_visual
-    monkeypatch.setattr(embedder, "_through_visual", lambda c: crops.append(len(c)) or through(c))
+    through = embedder._run_visual
+    monkeypatch.setattr(embedder, "_run_visual", lambda c: crops.append(len(c)) or through(c))
     rows = embedder.embed_regions(frame, masks[:3])
     assert sum(crops) == 3
     np.testing.assert_array_equal(embedder.embed_regions(frame, masks[[2, 1, 4]]), [*rows[[2, 1]].tolist(), [0, 0, 0]])

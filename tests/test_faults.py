@@ -18,11 +18,10 @@ from jsecon.data.gaussians.ply import save_ply
 from jsecon.data.images import write_image
 from jsecon.files import exclusive_lock, write_text
 from jsecon.language.field import save_field
-from jsecon.pipeline import cache, pipeline
-from jsecon.pipeline.processes import Coordinator
+from jsecon.pipeline import cache, run as pipeline
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import capture_stages
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.stages import capture_stages
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -105,8 +104,7 @@ def test_a_file_that_changes_while_it_is_read_is_told_and_nothing_of_it_is_kept(
     (tmp_path / "out").mkdir()
 
     def loaded_by(listener):
-        stages = capture_stages(work)
-        pipeline._computed(work, stages, tmp_path / "out" / "cache", listener, Coordinator(several=False))
+        pipeline.compute_stages(work, capture_stages(work), tmp_path / "out" / "cache", listener=listener)
         return listener.fresh["load"]
 
     with refused(capture, "files that changed while stage load read them", "same command again"):

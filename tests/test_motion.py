@@ -22,11 +22,11 @@ from jsecon.data import motion_steps, sfm
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_image
 from jsecon.data.sfm import find_poses, list_photographs
-from jsecon.pipeline import pipeline
+from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import capture_stages
-from jsecon.pipeline.stages import KEY_FILE, Checkpoint, RunContext
+from jsecon.pipeline.results import KEY_FILE, Checkpoint, RunContext
+from jsecon.pipeline.stages import capture_stages
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -246,7 +246,7 @@ def test_an_output_folder_among_the_photographs_is_no_input(photos, tmp_path):
         (folder / name / "poses" / "images" / "photo 00.png").symlink_to(folder / "photo 00.png")
         (folder / f"{name}.ply").touch()
     assert one.files_digest(work) == other.files_digest(other_work) == before
-    assert one.key(work, {}, before) == stage(folder / "f")[0].key(work, {}, before)
+    assert one.key({}, before) == stage(folder / "f")[0].key({}, before)
     (folder / "photo 08.png").touch()
     assert one.files_digest(work) != before
 

@@ -22,12 +22,11 @@ from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
 from jsecon.networks.sam import SamSegmenter, SamSettings
 from jsecon.networks.sam2 import Sam2Tracker
-from jsecon.pipeline import networks, pipeline, stages
-from jsecon.pipeline.language_stages import parts, regions
-from jsecon.pipeline.masklet_stages import masklets
+from jsecon.pipeline import networks, run as pipeline
 from jsecon.pipeline.networks import ExternalSpace
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import gaussians, load
+from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.stages import gaussians, load, masklets, parts, regions
 from jsecon.query.match import evidence
 from jsecon.vision.protocols import NamedSegmenter
 from jsecon.vision.stores import StoredSegmenter
@@ -118,7 +117,7 @@ def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
 @pytest.mark.long
 def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, splat, tmp_path, monkeypatch):
     options = Options(room, gaussians=splat, holdout=4, tracker=write_sam2(tmp_path / "sam2"), granularity="coarse")
-    monkeypatch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("jsecon.pipeline.results.CHECKPOINT_SECONDS", 0.0)
     own, called, stop = Sam2Tracker.__call__, [], []
 
     def counted(self, frames, index, prompts):
@@ -129,11 +128,12 @@ def test_a_run_that_is_stopped_while_sam_2_tracks_goes_on_at_its_frame(room, spl
 
     def tracked(folder):
         called.clear()
-        work, results = stages.RunContext(options, networks.open_networks(options, folder), folder), {}
+        work, results = RunContext(options, networks.open_networks(options, folder), folder), Results()
         for stage in (load(work), gaussians(work), masklets(work)):
-            record = stages.Checkpoint(folder / f"{stage.name}.safetensors")
-            results[stage.name] = stage.compute(results, lambda done, total: None, record).value
-        return results["masklets"]
+            checkpoint = Checkpoint(folder / f"{stage.name}.safetensors")
+            given = StageInput(work, results, lambda done, total: None, checkpoint)
+            results.add(stage.name, stage.compute(given).value)
+        return results.masklets
 
     monkeypatch.setattr(Sam2Tracker, "__call__", counted)
     whole, everywhere = tracked(tmp_path / "whole"), called.copy()
@@ -180,17 +180,17 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
         write_features(folder, name, labels, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
         rows += [] if capture.held_out[t] else list(np.load(folder / f"{name}_f.npy"))
     options = Options(room, gaussians=splat, holdout=4, masks=folder, features=folder)
-    work = stages.RunContext(options, networks.open_networks(options, tmp_path), tmp_path)
+    work = RunContext(options, networks.open_networks(options, tmp_path), tmp_path)
     assert work.networks.embedder.name == "given-3"
-    stage, none = regions(work), (lambda done, total: None, stages.Checkpoint(tmp_path / "none.safetensors"))
+    stage, results = regions(work), Results(load=capture, gaussians=load_ply(splat))
+    given = StageInput(work, results, lambda done, total: None, Checkpoint(tmp_path / "none.safetensors"))
     assert "read from language_features, level l" in stage.how
     assert "embedder" in stage.skipped
-    results = {"load": capture}
-    results["masklets"] = masklets(work).compute(results, *none).value
-    found = stage.compute(results, *none)
+    results.add("masklets", masklets(work).compute(given).value)
+    found = stage.compute(given)
     np.testing.assert_allclose(found.value.embeddings, rows, atol=1e-6)
     assert found.notes == (f"{len(rows)} embeddings in the files",)
-    of_masks = parts(work).compute({**results, "gaussians": load_ply(splat)}, *none).value
+    of_masks = parts(work).compute(given).value
     seen = of_masks.weight > 0
     np.testing.assert_allclose(np.linalg.norm(of_masks.embeddings[seen], axis=1), 1, atol=1e-5)
     assert of_masks.embeddings.shape[1] == 3
@@ -198,7 +198,7 @@ def test_regions_take_their_embeddings_from_langsplat_s_files(room, splat, model
     for name in capture.names:
         write_features(folder, name, np.full((120, 160), -1), np.zeros((0, 3)))
     with pytest.raises(InputError, match="no mask of level l"):
-        stage.compute(results, *none)
+        stage.compute(given)
     with_clip = networks.open_networks(dataclasses.replace(options, embedder=models[1]), tmp_path).embedder
     assert with_clip.name.startswith("clip-")
 

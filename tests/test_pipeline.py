@@ -23,10 +23,10 @@ from jsecon.errors import InputError
 from jsecon.files import write_arrays
 from jsecon.language import autoencoder, field as field_file
 from jsecon.language.field import load_field
-from jsecon.pipeline import cache, networks, pipeline, stages
+from jsecon.pipeline import cache, networks, results, run as pipeline
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import gaussians
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.stages import gaussians
 from jsecon.process import peak_memory_mib
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
@@ -347,7 +347,7 @@ def kill():
 def stop_by_error(run, out, victim, monkeypatch):
     """A run that an error ends while it writes a file of the stage `victim`, or the field."""
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(results, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(cache, "write_arrays", writer_that_stops(raise_killed, victim))
         patch.setattr(field_file, "write_arrays", field_writer_that_stops)
         with pytest.raises(Killed):
@@ -371,7 +371,7 @@ import compiling
 import test_pipeline as test
 compiling.install()
 room, out, victim, nth = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
-test.stages.CHECKPOINT_SECONDS = 0.0
+test.results.CHECKPOINT_SECONDS = 0.0
 test.cache.write_arrays = test.writer_that_stops(test.kill, victim, nth)
 test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, steps=150), out)
 """

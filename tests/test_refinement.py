@@ -18,11 +18,9 @@ from test_corrections import (
 from jsecon.app import cli
 from jsecon.fit import refine
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.pipeline import _computed
-from jsecon.pipeline.processes import Coordinator
-from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.scene_stages import capture_stages
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.run import compute_stages
+from jsecon.pipeline.stages import capture_stages
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -44,8 +42,8 @@ def load(folder, out, **options):
     """What the first stage of a run makes of a capture, and what it told."""
     given = Options(capture=folder, holdout=6, steps=2000, **options)
     work = RunContext(given, Networks(ColourEmbedder()), out)
-    done = _computed(work, capture_stages(work), out / "cache", Listener(), Coordinator(several=False))
-    return done.results["load"], " ".join(done.notes), done.steps[0].status
+    done = compute_stages(work, capture_stages(work), out / "cache")
+    return done.results.load, " ".join(done.notes), done.steps[0].status
 
 
 def alike(a, b):

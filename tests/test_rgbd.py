@@ -15,8 +15,8 @@ from jsecon.data.images import read_depth
 from jsecon.data.lens import Lens, resample_depth
 from jsecon.errors import InputError
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import capture_stages
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.stages import capture_stages
 from jsecon.types import Capture
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

@@ -14,8 +14,8 @@ from test_gaussian_files import gaussians
 from jsecon.data.gaussians.files import load_gaussians, save_gaussians
 from jsecon.data.nerfstudio import trained_to_source
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import gaussians as stage_of
-from jsecon.pipeline.stages import Checkpoint, RunContext
+from jsecon.pipeline.results import Checkpoint, Results, RunContext, StageInput
+from jsecon.pipeline.stages import gaussians as stage_of
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians, transform_gaussians_float64
 from jsecon.vision.colours import ColourEmbedder
@@ -30,7 +30,8 @@ def read(capture, file):
     """The outcome of the stage that reads `file`, and the stage."""
     work = RunContext(Options(capture=file.parent, gaussians=file), Networks(ColourEmbedder()), file.parent / "out")
     stage = stage_of(work)
-    return stage.compute({"load": capture}, lambda done, total: None, Checkpoint(work.out)), stage
+    stage_input = StageInput(work, Results(load=capture), lambda done, total: None, Checkpoint(work.out))
+    return stage.compute(stage_input), stage
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from capture_files import refused
 
 from jsecon.data.video import is_video, sharpest_frames, write_frames
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import capture_stages
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.stages import capture_stages
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks
 
@@ -64,5 +64,5 @@ def test_a_run_on_a_video_takes_as_many_frames_as_it_is_told(video, tmp_path):
         poses, load = capture_stages(work)
         assert f"the {frames or 150} sharpest frames of walk.avi" in poses.how
         assert load.after == ("poses",)
-        keys.append(poses.key(work, {}, poses.files_digest(work)))
+        keys.append(poses.key({}, poses.files_digest(work)))
     assert len(set(keys)) == 3

@@ -37,9 +37,9 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.votes import region_votes
-from jsecon.pipeline.masklet_stages import associate_masks, frame_proposals
 from jsecon.pipeline.options import Options as RunOptions
-from jsecon.pipeline.stages import RunContext
+from jsecon.pipeline.results import RunContext
+from jsecon.pipeline.stages import associate_masks, frame_proposals
 from jsecon.types import Camera, Capture, Gaussians, Regions, Votes
 from jsecon.vision.colours import ColourEmbedder
 from jsecon.vision.protocols import Networks

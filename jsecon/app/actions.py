@@ -12,8 +12,7 @@ from typing import Any
 
 from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, VerbResult, View
 from jsecon.errors import InputError
-from jsecon.pipeline.bare_stages import is_bare_scene
-from jsecon.pipeline.options import require_writable
+from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import worker_info
 
@@ -31,7 +30,7 @@ def _demo(verb: Demo, console: Console) -> VerbResult:
 def _run(verb: Run, console: Console) -> VerbResult:
     with console.progress("start"):
         from jsecon.app.run_report import write_run
-        from jsecon.pipeline import pipeline, processes
+        from jsecon.pipeline import processes, run as pipeline
 
     options = verb.options
     if verb.dry_run:
@@ -39,15 +38,15 @@ def _run(verb: Run, console: Console) -> VerbResult:
     place = worker_info()
     if place is None and (verb.processes, verb.coordinator, verb.process) != (1, None, None):
         raise SystemExit(processes.launch(sys.argv[1:], verb.processes, verb.coordinator, verb.process))
-    with processes.lost_touch():
+    with processes.exit_if_disconnected():
         if place is not None:
             processes.join(options, *place)
             if place[0] > 0:
                 pipeline.run_worker(options, verb.out)
                 return {}
-        first = processes.Coordinator(several=place is not None)
-        run = pipeline.run(options, verb.out, listener=console, first=first)
-        first.shutdown()
+        coordinator = processes.Coordinator(several=place is not None)
+        run = pipeline.run(options, verb.out, listener=console, coordinator=coordinator)
+        coordinator.shutdown()
     return {"written": [verb.out / name for name in _RUN_FILES]} | write_run(run, verb.out, console)
 
 
@@ -55,7 +54,7 @@ def _fit(verb: Fit, console: Console) -> VerbResult:
     with console.progress("start"):
         from jsecon.app.run_report import write_scene
         from jsecon.data.gaussians.files import require_writable_format
-        from jsecon.pipeline import pipeline
+        from jsecon.pipeline import run as pipeline
     require_writable_format(verb.out)
 
     folder = verb.out.with_suffix("")
@@ -113,7 +112,7 @@ def _query(verb: Query, console: Console) -> VerbResult:
 
 def _field_of_scene(verb: Query, console: Console) -> Path:
     """Returns the field of a scene without photographs, made in OUT/field if it is not there yet."""
-    from jsecon.pipeline import pipeline
+    from jsecon.pipeline import run as pipeline
     from jsecon.pipeline.options import Options
 
     options, folder = Options(verb.field, embedder=verb.embedder), verb.out / "field"

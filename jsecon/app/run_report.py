@@ -10,9 +10,9 @@ import numpy as np
 from jsecon.app import pictures, report
 from jsecon.data.gaussians.files import save_gaussians
 from jsecon.files import write_text
-from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.stages import WARNING
+from jsecon.pipeline.results import WARNING
+from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 from jsecon.types import Capture, Gaussians, Quality
 
@@ -163,7 +163,8 @@ def work_parts(run: Run) -> list[str]:
     )
     measured = "Wall time, also of what happened in an earlier run; and the programs that jax built for it now, in "
     measured += "brackets those that it read from disk."
-    built = {name: f"{told['all']} ({told['from_disk']})" if told["all"] else "" for name, told in run.built.items()}
+    counts = run.compilations
+    built = {name: f"{count['all']} ({count['from_disk']})" if count["all"] else "" for name, count in counts.items()}
     ran = "What ran, and what was left out because this scene does not need it."
     return [
         report.section("Seconds of each stage", measured, report.bars(run.seconds, built)),

@@ -21,10 +21,10 @@ from jsecon.demo.film import write_film
 from jsecon.demo.room import crowded_room
 from jsecon.evaluate.lerf import Row
 from jsecon.files import atomic_write, write_text
-from jsecon.pipeline import networks, pipeline
+from jsecon.pipeline import networks, run as pipeline
 from jsecon.pipeline.options import Options, require_writable
-from jsecon.pipeline.pipeline import Run
 from jsecon.pipeline.progress import Listener
+from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 
 HOLDOUT = 5

@@ -538,7 +538,7 @@ def _memorize(
         feats2=features.feats2,
         high_res_mask=prediction.high_res[None, None],
         object_score_logits=prediction.score,
-        binarize=np.float32(binarize),
+        binarize=np.asarray(binarize, np.float32),
     )
     tokens = outputs["memory_tokens"][:, 0].astype(jnp.bfloat16)
     return Memory(tokens, prediction.pointer), outputs["memory_pos"][:, 0]

@@ -36,8 +36,8 @@ from jsecon.files import (
 )
 
 PACKAGE = Path(jsecon.__file__).parent
-ROOMS = ("splat", "vision", "data", "fit", "networks", "language", "views", "association")
-"""subpackages that stages compute with, in import order: each imports only those before it"""
+PACKAGES = ("association", "data", "fit", "language", "networks", "pipeline", "splat", "views", "vision")
+"""subpackages that stages compute with"""
 MAPPED = 1 << 30
 """bytes; larger arrays are memory-mapped"""
 STALE_SECONDS = 600.0
@@ -107,26 +107,20 @@ def files_digest(paths: Iterable[Path], *, exclude: Path | None = None) -> str:
 
 
 @functools.cache
-def source_digest(room: str) -> str:
-    """Hashes the installed source files that results of a room of the package can depend on.
+def source_digest() -> str:
+    """Hashes the installed source files that a stage can depend on.
 
-    A room imports only the modules at the top of the package and the rooms before it in `ROOMS`, so these and the
-    pipeline are hashed. The rooms behind all stages (query, evaluate, app) are left out: a change of the viewer does
-    not recompute a fit.
-
-    Args:
-      room: Last room of `ROOMS` that a computation imports.
+    The packages behind all stages (query, evaluate, app, demo) are left out: a change of the viewer does not recompute
+    a fit.
 
     Returns:
       32 hex digits.
     """
     digest = hashlib.blake2b(digest_size=16)
-    folders = (PACKAGE, PACKAGE / "pipeline", *(PACKAGE / name for name in ROOMS[: ROOMS.index(room) + 1]))
-    for folder in folders:
-        files = folder.glob("*.py") if folder == PACKAGE else folder.rglob("*.py")
-        for file in sorted(files):
-            digest.update(file.relative_to(PACKAGE).as_posix().encode())
-            digest.update(hashlib.blake2b(file.read_bytes()).digest())
+    files = [*PACKAGE.glob("*.py"), *(file for name in PACKAGES for file in (PACKAGE / name).rglob("*.py"))]
+    for file in sorted(files):
+        digest.update(file.relative_to(PACKAGE).as_posix().encode())
+        digest.update(hashlib.blake2b(file.read_bytes()).digest())
     return digest.hexdigest()
 
 
@@ -151,13 +145,7 @@ def prepare(folder: Path) -> None:
             partial.unlink(missing_ok=True)
 
 
-def fetch(
-    path: Path,
-    compute: Callable[[], Any],
-    *,
-    note: Callable[[str], None] | None = None,
-    begin: Callable[[], None] | None = None,
-) -> CachedResult:
+def fetch(path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] | None = None) -> CachedResult:
     """Reads the result of a stage, or computes and stores it.
 
     A fresh result passes through the same packing as a stored one, so that later stages see the same arrays after a
@@ -167,10 +155,6 @@ def fetch(
       path: File of the result.
       compute: Computes the result if the file is missing or damaged.
       note: Receives a sentence about a damaged file.
-      begin: Called before `compute`.
-
-    Returns:
-      The result.
     """
     if path.exists():
         try:
@@ -181,15 +165,13 @@ def fetch(
                 stage = path.stem.partition("-")[0]
                 note(f"{path.name} cannot be read ({error}); {stage} is computed again")
     started = time.monotonic()
-    if begin is not None:
-        begin()
     value = compute()
     jax.block_until_ready(value)
     seconds = time.monotonic() - started
     tree, arrays = pack(value)
     _write(path, tree, arrays, seconds)
-    mapped = any(isinstance(array, np.memmap) for array in arrays.values())
-    return CachedResult(_read(path)[0] if mapped else unpack(tree, arrays), seconds, fresh=True)
+    is_mapped = any(isinstance(array, np.memmap) for array in arrays.values())
+    return CachedResult(_read(path)[0] if is_mapped else unpack(tree, arrays), seconds, fresh=True)
 
 
 def save(path: Path, value: Any) -> None:

@@ -17,10 +17,9 @@ from jsecon.data.sfm import check_photographs, list_photographs, require_pycolma
 from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, video_size
 from jsecon.errors import InputError
 from jsecon.pipeline import cache
-from jsecon.pipeline.bare_stages import is_bare_scene
-from jsecon.pipeline.options import Options
-from jsecon.pipeline.scene_stages import given_gaussians
-from jsecon.pipeline.stages import RunContext, require_training
+from jsecon.pipeline.options import Options, is_bare_scene
+from jsecon.pipeline.results import RunContext, require_training
+from jsecon.pipeline.scene_files import read_scene
 from jsecon.types import ImageFile
 
 
@@ -45,13 +44,13 @@ def check_inputs(work: RunContext, running: Collection[str], results: Mapping[st
             remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
             raise InputError(options.capture, "no frame that OpenCV can read", "a video", remedy)
     if is_bare_scene(options.capture):
-        given_gaussians(options.capture)
+        read_scene(options.capture)
         return
     extent = _extent(work, running, results)
     train = np.flatnonzero(~holdout_mask(extent.frames, options.holdout))
     require_training(len(train) if extent.frames > 1 else extent.frames, extent.frames)
     if options.gaussians is not None and "gaussians" in running:
-        given_gaussians(options.gaussians)
+        read_scene(options.gaussians)
     if extent.names:
         _check_masks(options, running, extent, [extent.names[t] for t in train])
 

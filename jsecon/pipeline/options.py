@@ -199,6 +199,15 @@ LEAST: dict[str, float] = {
 """smallest value of an option"""
 
 
+SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb")
+"""endings of files that are scenes of Gaussians"""
+
+
+def is_bare_scene(capture: Path) -> bool:
+    """Returns whether the input of a run is a file of Gaussians instead of a capture."""
+    return capture.suffix.lower() in SPLATS and not capture.is_dir()
+
+
 def require_inputs(options: Options) -> None:
     """Checks that the files and folders of a run exist and that its numbers are in their ranges.
 

@@ -1,171 +1,670 @@
-"""What a stage of a run is: its name, what its result depends on, what it leaves out and why, and its function.
+"""The stages of a run. A function without underscore plans a stage, the function below it computes the result.
 
-The stages themselves stand in `scene_stages` (load, gaussians, held_out), `masklet_stages` and `language_stages`
-(regions, codes, votes, distil), each made whole by one function of the run's `RunContext`.
+    poses, load, gaussians, masklets, regions, parts, codes, votes, distil, held_out
+
+Only `load`, `field_of` and the measurement of quality read held-out frames.
 """
 
-import contextlib
 import dataclasses
 import shutil
-import time
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jsecon.association.algorithm1 import clean_masklets, masklets as algorithm1
+from jsecon.association.consensus import consensus_masklets, pieces_on_masks
+from jsecon.association.run_lengths import memoized_masks
+from jsecon.association.tracker import GeometricTracker
+from jsecon.association.views import SceneViews
+from jsecon.data.capture import check_views_overlap, load_capture, may_have_depth, unposed_photographs
+from jsecon.data.langsplat import load_features
+from jsecon.data.masks import load_labels
+from jsecon.data.nerfstudio import trained_to_source
+from jsecon.data.proposals import load_proposals
+from jsecon.data.sfm import find_poses, list_photographs
+from jsecon.data.video import DEFAULT_VIDEO_FRAMES, is_video, write_frames
 from jsecon.errors import InputError
-from jsecon.pipeline import cache
-from jsecon.pipeline.options import Options
+from jsecon.files import write_text
+from jsecon.fit.corrections import RefineOptions
+from jsecon.fit.depth import points_from_depth
+from jsecon.fit.optimise import fit_gaussians
+from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
+from jsecon.fit.refine import refine_capture
+from jsecon.fit.schedule import Schedule, default_max_gaussians
+from jsecon.fit.start import starting_gaussians
+from jsecon.language.autoencoder import Autoencoder
+from jsecon.language.blocks import codes_in_blocks, region_votes_in_blocks
+from jsecon.language.codes import region_codes
+from jsecon.language.distill import distill_votes
+from jsecon.language.membership import finish_votes
+from jsecon.language.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.language.votes import region_votes, votes_memory
+from jsecon.pipeline.bare_stages import planned_views, scene_itself
+from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Progress
-from jsecon.types import Capture
-from jsecon.vision.protocols import Networks
+from jsecon.pipeline.results import (
+    KEY_FILE,
+    Checkpoint,
+    Results,
+    RunContext,
+    Stage,
+    StageInput,
+    StageResult,
+    training_frames,
+)
+from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
+from jsecon.process import memory_budget
+from jsecon.splat.render import render_depth
+from jsecon.types import Capture, Gaussians, LanguageField, Regions
+from jsecon.vision.classical import GRANULARITIES, ClassicalSegmenter
+from jsecon.vision.protocols import Embedder, Segmenter
+from jsecon.vision.reference_words import reference_of
+from jsecon.vision.surfaces import smooth_depth, surfaces_from_depth
 
-CHECKPOINT_SECONDS = 20.0
-"""between two records of a stage in progress: a stop loses at most this and one chunk of steps, or one tracked frame"""
+SECONDS_PER_STEP = 0.024
+"""s of a step of the fit, on two cores of an AMD EPYC; estimates how many steps --minutes allows"""
+SECONDS_PER_MEGAPIXEL = 0.2
+"""s more of a step per million pixels of a frame"""
+MAX_CLOUD_POINTS = 100_000
+"""points from depth whose normals are estimated"""
+MIN_CLOUD_SPACING = 0.02
+"""least distance between them, as a share of the median depth: closer points show a sensor's noise, not the surface"""
 
-WARNING = "WARNING: "
-"""begins a note on what makes answers wrong"""
-
-KEY_FILE = "made_by.txt"
-"""in a folder that a stage leaves beside its result: the name and key of that stage"""
-
-
-@dataclasses.dataclass(frozen=True)
-class StageResult:
-    """What a stage made."""
-
-    value: Any
-    """the result, a tree of arrays and records."""
-    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """part that was not needed -> why."""
-    notes: tuple[str, ...] = ()
-    """what the user should know, a sentence each."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RunContext:
-    """What the stages of one run share."""
-
-    options: Options
-    networks: Networks
-    out: Path
-    """the run's output folder, which does not count as input where it lies inside of an input folder."""
-    load: Callable[[], Capture] | None = None
-    """takes the loader's place for data whose layout is one of a kind."""
-
-    def key_options(self, *names: str) -> dict[str, Any]:
-        """The named options, as a part of a stage's key."""
-        return {name: getattr(self.options, name) for name in names}
+Refinement = Literal["none", "poses", "exposure", "both", "auto"]
 
 
-class Checkpoint:
-    """How far a stage in progress has come, on disk, so that it goes on there after a stop."""
-
-    def __init__(self, path: Path):
-        self._path, self._last = path, time.monotonic()
-
-    @property
-    def folder(self) -> Path:
-        """Where a stage that works on files may keep them: its name is the stage's and its key's."""
-        return self._path.with_suffix("")
-
-    def read(self) -> Any | None:
-        """What was last kept, or None. A file that cannot be read loses time and nothing else: the stage starts again,
-        to the same result."""
-        with contextlib.suppress(cache.CorruptCacheError):
-            return cache.load(self._path) if self._path.exists() else None
-        return None
-
-    def keep(self, state: Callable[[], Any]) -> None:
-        """Keeps `state()`, at most every CHECKPOINT_SECONDS."""
-        if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
-            cache.save(self._path, state())
-            self._last = time.monotonic()
-
-    def remove(self) -> None:
-        """Called when the stage's result is kept."""
-        self._path.unlink(missing_ok=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
+# Poses
 
 
-Results: TypeAlias = Mapping[str, Any]
-"""of the stages that are done, by name"""
-Compute: TypeAlias = Callable[[Results, Progress, Checkpoint], StageResult]
+def capture_stages(context: RunContext) -> list[Stage]:
+    """Plans the capture, and before it the poses if there are photographs or a video without poses."""
+    if context.load is None and is_bare_scene(context.options.capture):
+        return [planned_views(context)]
+    if context.load is not None or not _is_unposed(context.options.capture):
+        return [load(context)]
+    stage = poses(context)
+    assert stage.output_dir is not None
+    options = dataclasses.replace(context.options, capture=stage.output_dir)
+    posed = dataclasses.replace(context, options=options)
+    plan = load(posed)
+    # The stage computes from the posed capture, whatever the context of the run says.
+    compute = lambda given: plan.compute(given._replace(context=posed))
+    return [stage, dataclasses.replace(plan, compute=compute, after=("poses",), files=None)]
 
 
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """One stage of a run. Its key covers all that its result depends on: see `key`."""
+def _is_unposed(capture: Path) -> bool:
+    """Whether a path is a video, or a folder of photographs without a file of poses."""
+    return len(unposed_photographs(capture)) > 0 if capture.is_dir() else is_video(capture)
 
-    name: str
-    how: str
-    """what it will do, for the lines that a run prints first."""
-    compute: Compute
-    room: str
-    """the last room of `cache.ROOMS` that `compute` imports; the source up to there is a part of the key."""
-    after: tuple[str, ...] = ()
-    """the stages whose results it reads."""
-    key_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """options and models that its result depends on; models by their content, not by the place of their files."""
-    files: Path | Callable[[], Sequence[Path]] | None = None
-    """input file or folder, or what lists the input files."""
-    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """what the options alone make needless: part -> why."""
-    shared: bool = False
-    """whether several processes compute it together: its function then makes the same calls in each."""
-    output_dir: Path | None = None
-    """folder that it leaves for those after it, with its key in KEY_FILE; where another run left it, it runs again."""
 
-    def key(self, work: RunContext, keys: Mapping[str, str], files: str | None) -> str:
-        """Hashes all that the result depends on.
+def poses(context: RunContext) -> Stage:
+    """Plans the poses of photographs or of a video's frames, as a COLMAP capture in OUT/poses."""
+    capture, options = context.options.capture, context.options
+    if is_video(capture):
+        what = f"the {options.frames or DEFAULT_VIDEO_FRAMES} sharpest frames of {capture.name}, evenly spread"
+        key_options, files = context.key_options("frames"), capture
+    else:
+        photographs = list_photographs(capture)
+        what = f"{len(photographs)} photographs, which have none"
+        key_options = {"names": [photo.relative_to(capture).as_posix() for photo in photographs]}
+        files = lambda: list_photographs(capture)
+    how = f"found by structure from motion (pycolmap) for {what}"
+    return Stage("poses", how, _find_poses, key_options=key_options, files=files, output_dir=context.out / "poses")
 
-        Args:
-          work: The run.
-          keys: Keys of the stages before this one.
-          files: Digest of the input files, from `files_digest`.
 
-        Returns:
-          16 hex digits that cover source, options, input files and the results that the stage reads.
-        """
-        return cache.key_of(
-            self.name,
-            {
-                "source": cache.source_digest(self.room),
-                "after": [keys[other] for other in self.after],
-                "given": dict(self.key_options),
-                "files": files,
-            },
+def _find_poses(stage: StageInput) -> StageResult:
+    context, folder = stage.context, stage.checkpoint.folder
+    capture, out = context.options.capture, context.out / "poses"
+    video = is_video(capture)
+    if video:
+        frames = context.options.frames
+        photos = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
+    else:
+        photos = list_photographs(capture)
+    report, posed = find_poses(photos, folder, where=capture, progress=stage.progress)
+    if video:
+        shutil.rmtree(posed / "images")
+        (folder / "frames").rename(posed / "images")
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.move(posed, out)
+    write_text(out / KEY_FILE, folder.name)
+    return StageResult(report, notes=(*report.notes(), f"The poses are in {out}: COLMAP opens them."))
+
+
+# The capture
+
+
+def load(context: RunContext) -> Stage:
+    """Plans the capture at the size that the options ask for, corrected if they ask for that."""
+    options = context.options
+    key_options = context.key_options("downscale", "long_side", "frames", "holdout")
+    count = "all frames" if options.frames is None else f"at most {options.frames} frames"
+    held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
+    how = f"{count}, {_size_words(options)}, {held_out}"
+    key_options["loader"] = getattr(context.load, "__qualname__", None)
+    refine = refinement(context)
+    if refine != "none" or options.drop_frames != "none":
+        key_options |= context.key_options("drop_frames", "seed") | {"refine": refine}
+        if refine == "auto":
+            key_options |= context.key_options("steps", "minutes")
+            how += ", poses and exposures corrected where that helps, in about half of the fit's time at most "
+            how += "(--refine auto)"
+        elif refine != "none":
+            how += f", corrected by short fits (--refine {refine})"
+        if options.drop_frames == "auto":
+            how += ", frames that a short fit does not explain left out"
+    return Stage("load", how, _load, key_options=key_options, files=options.capture)
+
+
+def _size_words(options: Options) -> str:
+    """How the options scale the frames, in words."""
+    if options.downscale is None:
+        return f"long side at most {options.long_side} px"
+    return "full size" if options.downscale == 1 else f"{options.downscale:g} times smaller"
+
+
+def refinement(context: RunContext) -> Refinement:
+    """What a run corrects of poses and exposures: "auto" only if depth and the data can still decide it."""
+    options = context.options
+    if options.refine != "auto":
+        return options.refine
+    if options.gaussians is not None:  # they belong to the poses as they are
+        return "none"
+    return "auto" if context.load is not None or may_have_depth(options.capture) else "none"
+
+
+def _load(stage: StageInput) -> StageResult:
+    context, options = stage.context, stage.context.options
+    size = "by its adapter"
+    if context.load is not None:
+        capture = context.load()
+    else:
+        size = _size_words(options)
+        sizes = context.key_options("downscale", "long_side", "frames", "holdout")
+        capture = load_capture(options.capture, **sizes, progress=stage.progress)
+    train = training_frames(capture)
+    check_views_overlap(capture)
+    count, height, width = capture.frames.shape[:3]
+    frames = f"{count} frames of {width}x{height} ({size}), {count - len(train)} of them held out"
+    points = f"{len(capture.points)} sparse points{'' if capture.depths is None else ', depth'}"
+    notes = (f"{frames}, {points}", *capture.notes)
+    refine = refinement(context)
+    if refine == "none" and options.drop_frames == "none":
+        return StageResult(capture, notes=notes)
+    better = _refine(capture, options, refine, stage.progress)
+    training_frames(better)
+    return StageResult(better, notes=(*notes, *better.notes[len(capture.notes) :]))
+
+
+def _refine(capture: Capture, options: Options, refine: Refinement, progress: Progress) -> Capture:
+    """Corrects poses and exposures by short fits, and leaves out the frames that these do not explain."""
+    what, max_fit_steps = None, None
+    if refine == "auto" and capture.depths is not None:
+        what, max_fit_steps = RefineOptions(), _fit_steps(options, capture) / 2
+    elif refine not in ("auto", "none"):
+        what = RefineOptions(refine in ("poses", "both"), refine in ("exposure", "both"))
+    return refine_capture(
+        capture,
+        key=jax.random.key(options.seed),
+        refine=what,
+        drop_weak=options.drop_frames == "auto",
+        decide=refine == "auto",
+        max_fit_steps=max_fit_steps,
+        progress=progress,
+    )
+
+
+def _fit_steps(options: Options, capture: Capture) -> float:
+    """Steps of the photometric fit; those that `minutes` allow are estimated."""
+    if options.minutes is None:
+        return float(options.steps)
+    megapixels = capture.cameras.width * capture.cameras.height / 1e6
+    return 60 * options.minutes / (SECONDS_PER_STEP + SECONDS_PER_MEGAPIXEL * megapixels)
+
+
+# The Gaussians
+
+
+def gaussians(context: RunContext) -> Stage:
+    """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
+    if context.load is None and is_bare_scene(context.options.capture):
+        return scene_itself(context)
+    options, path = context.options, context.options.gaussians
+    if path is not None:
+        transform = path.parent / "dataparser_transforms.json"
+        key_options = {"trained": transform.read_text(errors="replace")} if transform.is_file() else {}
+        skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
+        how = f"read from {path.name}"
+        return Stage(
+            "gaussians", how, _read_gaussians, after=("load",), key_options=key_options, files=path, skipped=skipped
         )
-
-    def files_digest(self, work: RunContext) -> str | None:
-        """Digest of the names, sizes and times of its files."""
-        if self.files is None:
-            return None
-        paths = [self.files] if isinstance(self.files, Path) else self.files()
-        return cache.files_digest(paths, exclude=work.out)
-
-    def computed(self, work: RunContext, files: str | None, *given: Any) -> StageResult:
-        """What it makes of its files. Raises InputError where they are no longer those of the digest `files`: its key
-        would stand for a result of others, or of some of each."""
-        found = self.compute(*given)
-        if files != self.files_digest(work):
-            remedy = "Give the same command again when nothing writes there; what is done is kept."
-            told = f"files that changed while stage {self.name} read them"
-            where = self.files if isinstance(self.files, Path) else work.options.capture
-            raise InputError(where, told, "files that stay as they are during a run", remedy)
-        return found
+    skipped = {"view-dependent colour": "SH degree 0"} if options.sh_degree == 0 else {}
+    length = f"{options.steps} steps" if options.minutes is None else f"{options.minutes:g} minutes"
+    most = options.gaussians_at_most
+    limit = "" if most is None else f", at most {most} Gaussians"
+    how = f"fitted to the frames in {length}, SH degree {options.sh_degree}{limit}"
+    names = ("steps", "minutes", "sh_degree", "gaussians_at_most", "seed")
+    return Stage(
+        "gaussians", how, _fit_gaussians, after=("load",), key_options=context.key_options(*names), skipped=skipped
+    )
 
 
-def training_frames(capture: Capture) -> np.ndarray:
-    """Indices of the frames that may be fitted to. Raises InputError where there are fewer than two."""
+def _read_gaussians(stage: StageInput) -> StageResult:
+    path, capture = stage.context.options.gaussians, stage.results.load
+    assert path is not None
+    scene, read_notes = read_scene(path)
+    transform = path.parent / "dataparser_transforms.json"
+    trained = trained_to_source(transform) if transform.is_file() else None
+    placed, notes = place_in_capture(scene, capture, path, trained, stage.progress)
+    check_overlap(placed, capture.cameras[training_frames(capture)], str(path))
+    return StageResult(placed, notes=(*notes, *read_notes))
+
+
+def _fit_gaussians(stage: StageInput) -> StageResult:
+    options, capture, state = stage.context.options, stage.results.load, stage.checkpoint.read()
+    start, notes = None, ()
+    if state is None:
+        start, origin = starting_gaussians(capture, sh_degree=options.sh_degree, progress=stage.progress)
+        check_overlap(start, capture.cameras[training_frames(capture)], str(options.capture))
+        notes = (f"start of the fit: {origin}",)
+    pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
+    most = options.gaussians_at_most or default_max_gaussians(pixels, steps=options.steps, minutes=minutes)
+    fitted, losses = fit_gaussians(
+        capture,
+        key=jax.random.key(options.seed),
+        steps=options.steps if minutes is None else None,
+        seconds=None if minutes is None else 60 * minutes,
+        start=start,
+        state=state,
+        schedule=Schedule(max_gaussians=most),
+        on_checkpoint=lambda current: stage.checkpoint.keep(lambda: current),
+        progress=stage.progress,
+    )
+    return StageResult(fitted, notes=(*notes, f"{fitted.count} Gaussians after {len(losses)} steps"))
+
+
+def held_out(context: RunContext) -> Stage:
+    """Plans PSNR and SSIM of the held-out frames."""
+    how = "PSNR and SSIM of the rendered colours"
+    return Stage("held_out", how, _measure, after=("load", "gaussians"), distributed=True)
+
+
+def _measure(stage: StageInput) -> StageResult:
+    capture, scene = stage.results.load, stage.results.gaussians
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    require_training(len(train), len(capture.names))
-    return train
+    fitted = measure_quality(scene, capture, frames=train, long_side=QUICK_LONG_SIDE, progress=stage.progress)
+    weak = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
+    notes = ()
+    if len(weak):
+        names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak[:5])
+        more = f" and {len(weak) - 5} more" if len(weak) > 5 else ""
+        note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
+        notes = (note + "something moved (--drop-frames auto leaves them out)",)
+    return StageResult(measure_quality(scene, capture, progress=stage.progress), notes=notes)
 
 
-def require_training(count: int, of: int) -> None:
-    """Raises InputError where fewer than two frames may be fitted to."""
-    if count < 2:
-        found = f"{count} of {of} frames to work with"
-        raise InputError("frames", found, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
+# The masklets
+
+
+def masklets(context: RunContext) -> Stage:
+    """Plans the labels of the training frames: from mask files, or proposals associated over the frames."""
+    options, networks, folder = context.options, context.networks, context.options.masks
+    if folder is not None:
+        reason = f"masks are given ({folder.name})"
+        skipped = {"segmenter": reason, "association": reason}
+        return Stage(
+            "masklets",
+            f"read from {folder.name}",
+            _read_masklets,
+            after=("load",),
+            key_options=context.key_options("level"),
+            files=folder,
+            skipped=skipped,
+        )
+    if options.proposals is not None:
+        how, key_options = f"proposals read from {options.proposals.name}", context.key_options("level")
+    elif networks.segmenter is not None:
+        assert options.segmenter is not None
+        crops = f" and {options.crop_layers} layers of crops" if options.crop_layers else ""
+        grid = f"{options.points_per_side}x{options.points_per_side}"
+        how = f"proposals of level {options.level} by {options.segmenter.name}, asked at {grid} points{crops}"
+        key_options = {"model": networks.segmenter.name}
+    else:
+        how = f"{options.granularity} proposals by colour and texture"
+        key_options = context.key_options("granularity")
+    if options.associated_by == "consensus":
+        how += ", what the views agree on"
+        key_options |= context.key_options("agreement", "seed", "centre")
+    else:
+        by = "through the Gaussians" if options.tracker is None else f"by the SAM 2 of {options.tracker.name}"
+        how += f", followed {by}"
+        key_options |= context.key_options("iou_threshold")
+    key_options["association"] = options.associated_by
+    key_options["tracker"] = None if networks.tracker is None else networks.tracker.name
+    return Stage(
+        "masklets",
+        how,
+        _find_masklets,
+        after=("load", "gaussians"),
+        key_options=key_options,
+        files=options.proposals,
+        distributed=options.associated_by == "consensus",
+    )
+
+
+def _read_masklets(stage: StageInput) -> StageResult:
+    options, capture = stage.context.options, stage.results.load
+    assert options.masks is not None
+    names = [capture.names[t] for t in training_frames(capture)]
+    layout = _mask_layout(options, capture)
+    loaded = load_labels(options.masks, names, capture.frames.shape[1:3], **layout, progress=stage.progress)
+    _require_regions(loaded.labels, str(options.masks))
+    return StageResult(loaded.labels, notes=(f"{len(loaded.ids)} regions in the masks", *loaded.notes))
+
+
+def _mask_layout(options: Options, capture: Capture) -> dict[str, Any]:
+    """How files of masks belong to the frames, for their readers."""
+    return {"level": options.level, "order": capture.names, "files": dict(zip(capture.names, capture.files))}
+
+
+def _find_masklets(stage: StageInput) -> StageResult:
+    context, capture, scene = stage.context, stage.results.load, stage.results.gaussians
+    proposals, notes = frame_proposals(context, capture, scene)
+    labels = associate_masks(context, capture, scene, proposals, stage.progress, stage.checkpoint)
+    context.networks.close()
+    _require_regions(labels, str(context.options.capture))
+    return StageResult(labels, notes=notes)
+
+
+def frame_proposals(
+    context: RunContext, capture: Capture, gaussians: Gaussians
+) -> tuple[Callable[[int], np.ndarray], tuple[str, ...]]:
+    """Opens the proposals of the frames: from files, by a segmenter, or by colour and texture.
+
+    Returns:
+      A function of t that gives the masks (M, H, W) of the t-th training frame, and notes.
+    """
+    options, train = context.options, training_frames(capture)
+    frames = np.asarray(capture.frames)[train]
+    if options.proposals is not None:
+        names = [capture.names[t] for t in train]
+        return load_proposals(options.proposals, names, frames.shape[1:3], **_mask_layout(options, capture))
+    segmenter = context.networks.segmenter
+    if segmenter is not None:  # it stores its masks on disk
+        lock = threading.Lock()  # a network takes all cores for one frame
+
+        def segment(t: int) -> np.ndarray:
+            with lock:
+                return segmenter(frames[t], t)
+
+        return segment, ()
+    classical = _classical_segmenter(options.granularity, capture, gaussians)
+    return memoized_masks(lambda t: classical(frames[t], t)), ()
+
+
+def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussians) -> Segmenter:
+    """Opens the segmenter without weights for the training frames.
+
+    Surfaces come from the capture's depth. Without depth, the coarse granularity takes the depth that the Gaussians
+    render; the finer ones do not, as rendered depth costs them more outline than it tells.
+    """
+    train = training_frames(capture)
+    setting = GRANULARITIES[granularity]
+    depths = None if capture.depths is None else np.asarray(capture.depths)[train]
+    if depths is not None and depths[:, ::4, ::4].any():
+        known = depths[:, ::4, ::4]
+        spacing = MIN_CLOUD_SPACING * float(np.median(known[known > 0]))
+        cloud = points_from_depth(capture, voxel=spacing, stride=4)
+        if len(cloud.points) > MAX_CLOUD_POINTS:
+            cloud = points_from_depth(capture, max_points=MAX_CLOUD_POINTS, stride=4)
+        surfaces = surfaces_from_depth(depths, capture.cameras[train], cloud.points)
+        return ClassicalSegmenter(**setting, surfaces=surfaces)
+    if granularity != "coarse":
+        return ClassicalSegmenter(**setting)
+    cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
+
+    def rendered(t: int) -> np.ndarray:
+        depth, alpha = (np.asarray(image) for image in render_depth(gaussians, cameras[t]))
+        return smooth_depth(np.where(alpha > 0.5, depth, 0.0).astype(np.float32))
+
+    return ClassicalSegmenter(**setting, depths=rendered)
+
+
+def associate_masks(
+    context: RunContext,
+    capture: Capture,
+    gaussians: Gaussians,
+    proposals: Callable[[int], np.ndarray],
+    progress: Progress,
+    checkpoint: Checkpoint | None = None,
+) -> np.ndarray:
+    """Associates the proposals of the training frames as the options ask: by consensus or by a tracker.
+
+    Args:
+      context: The run.
+      capture: The capture.
+      gaussians: The scene.
+      proposals: From `frame_proposals`.
+      progress: Callback.
+      checkpoint: A tracker resumes behind its last frame.
+
+    Returns:
+      (T, H, W) int16 labels of the training frames, -1 for none.
+    """
+    options, train = context.options, training_frames(capture)
+    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    if options.associated_by == "consensus":
+        scene = SceneViews(gaussians, cameras, proposals, centre=options.centre)
+        labels = consensus_masklets(frames, scene, agreement=options.agreement, seed=options.seed, progress=progress)
+        return clean_masklets(labels)
+    tracker = context.networks.tracker or GeometricTracker(gaussians, cameras, proposals)
+    labels = algorithm1(
+        frames,
+        lambda frame, index: proposals(index),
+        tracker,
+        iou_threshold=options.iou_threshold,
+        state=None if checkpoint is None else checkpoint.read(),
+        on_checkpoint=None if checkpoint is None else checkpoint.keep,
+        progress=progress,
+    )
+    if isinstance(tracker, GeometricTracker):
+        labels = tracker.consistent(frames, labels)
+    return clean_masklets(labels)
+
+
+def _require_regions(labels: np.ndarray, where: str) -> None:
+    if labels.max(initial=-1) < 0:
+        remedy = "Give masks (--masks DIR), or frames with more contrast."
+        raise InputError(where, "no region in any frame", "at least one", remedy)
+
+
+# The regions
+
+
+def regions(context: RunContext) -> Stage:
+    """Plans an embedding of each region: by the embedder, or from files."""
+    options, embedder = context.options, context.networks.embedder
+    after, key_options = ("load", "masklets"), context.key_options("weighting")
+    if options.features is None:
+        how = f"embedded by {embedder.name!r}, views weighted by {options.weighting}"
+        key_options |= {"embedder": embedder.name}
+        return Stage("regions", how, _embed_regions, after=after, key_options=key_options, distributed=True)
+    name = options.features.name
+    how = f"embeddings read from {name}, level {options.level}, views weighted by {options.weighting}"
+    return Stage(
+        "regions",
+        how,
+        _read_regions,
+        after=after,
+        key_options=key_options | context.key_options("level"),
+        files=options.features,
+        skipped={"embedder": f"embeddings are given ({name})"},
+    )
+
+
+def _embed_regions(stage: StageInput) -> StageResult:
+    context, capture = stage.context, stage.results.load
+    frames = np.asarray(capture.frames)[training_frames(capture)]
+    embed = context.networks.embedder.embed_regions
+    weighting = context.options.weighting
+    embedded = region_embeddings(frames, stage.results.masklets, embed, weighting=weighting, progress=stage.progress)
+    context.networks.close()
+    return StageResult(embedded)
+
+
+def _read_regions(stage: StageInput) -> StageResult:
+    options, capture, labels = stage.context.options, stage.results.load, stage.results.masklets
+    assert options.features is not None
+    names = [capture.names[t] for t in training_frames(capture)]
+    features = load_features(options.features, names, labels.shape[1:], **_mask_layout(options, capture))
+    if not len(features.embeddings):
+        problem = f"no mask of level {options.level} in any frame"
+        remedy = "Take another --level, or write the files again."
+        raise InputError(options.features, problem, "masks with their embeddings", remedy)
+    embedded = embeddings_of_masks(
+        labels, features.labels, features.embeddings, weighting=options.weighting, progress=stage.progress
+    )
+    missing = int((~embedded.embeddings.any(1)).sum())
+    notes = (f"{len(features.embeddings)} embeddings in the files",)
+    if missing:
+        notes = (*notes, f"{missing} regions lie on no mask with one")
+    return StageResult(embedded, notes=notes)
+
+
+def parts(context: RunContext) -> Stage:
+    """Plans small parts of the scene, each with the embeddings of all single-frame masks that contain it."""
+    key_options = context.key_options("seed", "level", "granularity", "centre")
+    return Stage(
+        "parts",
+        "of the scene, by what single masks say of them",
+        _find_parts,
+        after=("load", "gaussians", "masklets"),
+        key_options=key_options | {"embedder": context.networks.embedder.name},
+        files=context.options.features,
+    )
+
+
+def _find_parts(stage: StageInput) -> StageResult:
+    context, capture = stage.context, stage.results.load
+    options, train = context.options, training_frames(capture)
+    frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
+    masks, embed = _masks_with_embeddings(context, stage.results)
+    views = SceneViews(stage.results.gaussians, cameras, masks, centre=options.centre)
+    piece, weights = pieces_on_masks(frames, views, seed=options.seed, progress=stage.progress)
+    rows = np.concatenate([embed(t, masks(t)) for t in range(len(train))])
+    context.networks.close()
+    return StageResult(scene_parts(piece, weights, rows))
+
+
+def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Callable[[int], np.ndarray], Embed]:
+    """Masks (M, H, W) of the t-th training frame and their embeddings: of --features, of --masks, or proposals."""
+    options, capture = context.options, results.load
+    train = training_frames(capture)
+    frames = np.asarray(capture.frames)[train]
+    by_model: Embed = lambda t, masks: context.networks.embedder.embed_regions(frames[t], masks)
+    if options.features is not None:
+        names = [capture.names[t] for t in train]
+        features = load_features(options.features, names, frames.shape[1:3], **_mask_layout(options, capture))
+        rows = lambda t: np.flatnonzero(np.asarray(features.frame) == t)
+        masks = lambda t: features.labels[t][None] == rows(t)[:, None, None]
+        return masks, lambda t, masks: features.embeddings[rows(t)]
+    if options.masks is not None:
+        labels = results.masklets
+        return lambda t: labels[t][None] == np.unique(labels[t][labels[t] >= 0])[:, None, None], by_model
+    return frame_proposals(context, capture, results.gaussians)[0], by_model
+
+
+# The codes
+
+
+def codes(context: RunContext) -> Stage:
+    """Plans the codes of the regions: their embeddings, compressed if they are longer than a code."""
+    latent = context.options.latent
+    auto = "as few numbers per region as keep them apart"
+    how = auto if latent == "auto" else f"at most {latent} numbers per region"
+    return Stage("codes", how, _encode, after=("regions",), key_options=context.key_options("latent", "seed"))
+
+
+def _encode(stage: StageInput) -> StageResult:
+    options, embeddings = stage.context.options, stage.results.regions.embeddings
+    key = jax.random.key(options.seed)
+    table, coder, reason = region_codes(embeddings, latent=options.latent, key=key, progress=stage.progress)
+    reason = reason.partition(": ")[2] or reason
+    if isinstance(coder, Autoencoder):
+        return StageResult((table, coder), notes=(f"autoencoder: {reason}",))
+    return StageResult((table, coder), {"autoencoder": reason})
+
+
+def votes(context: RunContext) -> Stage:
+    """Plans the weight of each region on each Gaussian over the training frames, with each frame's total."""
+    return Stage(
+        "votes",
+        f"the {context.options.top} strongest regions of each Gaussian",
+        _accumulate_votes,
+        after=("load", "gaussians", "masklets"),
+        key_options=context.key_options("top", "centre"),
+        distributed=True,
+    )
+
+
+def _accumulate_votes(stage: StageInput) -> StageResult:
+    """Accumulates votes; in blocks on disk if they do not fit into memory, to the same up to float32's rounding."""
+    options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
+    labels, folder = stage.results.masklets, stage.checkpoint.folder
+    cameras = capture.cameras[training_frames(capture)]
+    count = int(labels.max()) + 1
+    settings = {"top": options.top, "centre": options.centre, "by_view": True, "progress": stage.progress}
+    needed, budget = votes_memory(scene.count, len(labels), count), memory_budget()
+    notes = ()
+    if needed > budget and jax.process_count() == 1:  # several processes accumulate them together, in memory
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was stopped
+        accumulated = region_votes_in_blocks(scene, cameras, labels, count, folder=folder, **settings)
+        sizes = f"{needed / 2**30:.2g} GiB otherwise, where memory has room for {budget / 2**30:.2g}"
+        notes = (f"votes are cast in blocks: {sizes}",)
+    else:
+        accumulated = region_votes(scene, cameras, labels, count, **settings)
+    unseen = int((np.asarray(accumulated.views) == 0).sum())
+    skipped = {"unseen Gaussians": f"{unseen} of {scene.count} that no frame sees get no code"} if unseen else {}
+    return StageResult(accumulated, skipped, notes)
+
+
+def distil(context: RunContext) -> Stage:
+    """Plans the codes of the Gaussians, from their votes."""
+    how = f"a Gaussian's code is its votes' {context.options.reduce}"
+    return Stage("distil", how, _distil, after=("votes", "codes"), key_options=context.key_options("reduce"))
+
+
+def _distil(stage: StageInput) -> StageResult:
+    (table, _), cast, reduce = stage.results.codes, stage.results.votes, stage.context.options.reduce
+    if isinstance(cast.regions, np.memmap):
+        return StageResult(codes_in_blocks(cast, table, stage.checkpoint.folder / "codes.npy", reduce))
+    return StageResult(distill_votes(cast, table, reduce=reduce))
+
+
+def field_of(results: Results, embedder: Embedder, provenance: str) -> LanguageField:
+    """Joins the results to a field. It has all views; in held-out frames no region has any pixels."""
+    capture, embedded = results.load, results.regions
+    pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
+    pixels[:, training_frames(capture)] = embedded.pixels
+    table, coder = results.codes
+    return LanguageField(
+        gaussians=results.gaussians,
+        codes=results.distil,
+        votes=finish_votes(results.votes, embedded),
+        regions=Regions(embedded.embeddings, pixels),
+        region_codes=table,
+        autoencoder=coder,
+        cameras=capture.cameras,
+        canonical=np.asarray(embedder.canonical, np.float32),
+        to_source=np.asarray(capture.to_source),
+        names=capture.names,
+        embedder=embedder.name,
+        provenance=provenance,
+        parts=results.parts,
+        reference=reference_of(embedder).astype(np.float16),
+    )

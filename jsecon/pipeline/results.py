@@ -1,0 +1,244 @@
+"""What the stages of a run share: their results, what a stage is, and how it resumes after a stop.
+
+The stages themselves are in `stages`.
+"""
+
+import contextlib
+import dataclasses
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jsecon.errors import InputError
+from jsecon.language.codes import Coder
+from jsecon.pipeline import cache
+from jsecon.pipeline.options import Options
+from jsecon.pipeline.progress import Progress
+from jsecon.types import Array, Capture, Gaussians, Parts, Quality, Regions, Votes
+from jsecon.vision.protocols import Networks
+
+CHECKPOINT_SECONDS = 20.0
+"""s between two checkpoints of a stage; a stop loses at most this and one chunk of steps, or one tracked frame"""
+WARNING = "WARNING: "
+"""begins a note on what makes answers wrong"""
+KEY_FILE = "made_by.txt"
+"""file with the name and key of a stage, in the folder that the stage writes beside its result"""
+
+
+class Results:
+    """Results of the finished stages, by the names of the stages. Reading one that is missing raises AttributeError."""
+
+    load: Capture
+    """the capture, corrected if the options ask for that"""
+    gaussians: Gaussians
+    """N Gaussians, read or fitted"""
+    masklets: np.ndarray
+    """(T, H, W) int16 labels of the training frames, -1 for none"""
+    regions: Regions
+    """R regions of the training frames"""
+    parts: Parts | None = None
+    """parts of the scene, if the options ask for them"""
+    codes: tuple[Array, Coder]
+    """(R, d) codes of the regions, and their coder"""
+    votes: Votes
+    """weight of each region on each Gaussian"""
+    distil: Array
+    """(N, d) codes of the Gaussians"""
+    held_out: Quality
+    """PSNR and SSIM of the held-out frames"""
+    poses: Any
+    """report of structure from motion, if the capture had no poses"""
+
+    def __init__(self, **results: Any):
+        for name, value in results.items():
+            self.add(name, value)
+
+    def add(self, stage: str, value: Any) -> None:
+        """Adds the result of a stage."""
+        assert stage in Results.__annotations__, stage
+        setattr(self, stage, value)
+
+    def select(self, names: Sequence[str]) -> dict[str, Any]:
+        """Returns the results of the named stages."""
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclasses.dataclass(frozen=True)
+class StageResult:
+    """Output of a stage.
+
+    Attributes:
+      value: The result, a tree of arrays and records.
+      skipped: Parts that were not needed, each with the reason.
+      notes: What the user should know, a sentence each.
+    """
+
+    value: Any
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class RunContext:
+    """What the stages of one run share.
+
+    Attributes:
+      options: Options of the run.
+      networks: Models of the run.
+      out: Output folder. It does not count as input if it lies inside of an input folder.
+      load: Replaces the loader of captures, for data with a layout of its own.
+    """
+
+    options: Options
+    networks: Networks
+    out: Path
+    load: Callable[[], Capture] | None = None
+
+    def key_options(self, *names: str) -> dict[str, Any]:
+        """Returns the named options, for the key of a stage."""
+        return {name: getattr(self.options, name) for name in names}
+
+
+class Checkpoint:
+    """State of a stage in progress on disk, so that it resumes there after a stop.
+
+    Args:
+      path: File of the state.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._last = time.monotonic()
+
+    @property
+    def folder(self) -> Path:
+        """Folder for a stage that works on files; its name is the stage's and its key's."""
+        return self._path.with_suffix("")
+
+    def read(self) -> Any | None:
+        """Returns the last state, or None.
+
+        A file that cannot be read costs only time: the stage starts again, to the same result.
+        """
+        with contextlib.suppress(cache.CorruptCacheError):
+            return cache.load(self._path) if self._path.exists() else None
+        return None
+
+    def keep(self, state: Callable[[], Any]) -> None:
+        """Writes `state()`, at most every CHECKPOINT_SECONDS."""
+        if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
+            cache.save(self._path, state())
+            self._last = time.monotonic()
+
+    def remove(self) -> None:
+        """Removes the state once the result of the stage is stored."""
+        self._path.unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class StageInput(NamedTuple):
+    """What a stage computes from."""
+
+    context: RunContext
+    results: Results
+    progress: Progress
+    checkpoint: Checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One stage of a run, as it is planned.
+
+    Attributes:
+      name: Name of the stage, and of its result in `Results`.
+      how: What it will do, for the plan that a run prints first.
+      compute: Computes the result.
+      after: Stages whose results it reads.
+      key_options: Options and models that the result depends on; models by their content, not by the place of files.
+      files: Input file or folder, or a function that lists the input files.
+      skipped: Parts that the options make needless, each with the reason.
+      distributed: Whether several processes compute it together, each a part of the views.
+      output_dir: Folder that it writes for later stages, with its key in KEY_FILE; it runs again if another run wrote
+        that folder.
+    """
+
+    name: str
+    how: str
+    compute: Callable[[StageInput], StageResult]
+    after: tuple[str, ...] = ()
+    key_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    files: Path | Callable[[], Sequence[Path]] | None = None
+    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    distributed: bool = False
+    output_dir: Path | None = None
+
+    def key(self, keys: Mapping[str, str], files: str | None) -> str:
+        """Hashes all that the result depends on.
+
+        Args:
+          keys: Keys of the stages before this one.
+          files: Digest of the input files, from `files_digest`.
+
+        Returns:
+          16 hex digits that cover source, options, input files and the results that the stage reads.
+        """
+        return cache.key_of(
+            self.name,
+            {
+                "source": cache.source_digest(),
+                "after": [keys[other] for other in self.after],
+                "options": dict(self.key_options),
+                "files": files,
+            },
+        )
+
+    def files_digest(self, context: RunContext) -> str | None:
+        """Digest of names, sizes and times of the input files."""
+        if self.files is None:
+            return None
+        paths = [self.files] if isinstance(self.files, Path) else self.files()
+        return cache.files_digest(paths, exclude=context.out)
+
+    def run(self, stage_input: StageInput, files: str | None) -> StageResult:
+        """Computes the result.
+
+        Args:
+          stage_input: What it computes from.
+          files: Digest of the input files that is part of the key.
+
+        Raises:
+          InputError: The input files changed meanwhile, so that the key does not describe the result.
+        """
+        result = self.compute(stage_input)
+        if files != self.files_digest(stage_input.context):
+            where = self.files if isinstance(self.files, Path) else stage_input.context.options.capture
+            problem = f"files that changed while stage {self.name} read them"
+            remedy = "Run the same command again when no program writes there; finished stages are kept."
+            raise InputError(where, problem, "files that stay as they are during a run", remedy)
+        return result
+
+
+def training_frames(capture: Capture) -> np.ndarray:
+    """Returns the indices of the frames that may be fitted to.
+
+    Raises:
+      InputError: There are fewer than two.
+    """
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    require_training(len(train), len(capture.names))
+    return train
+
+
+def require_training(count: int, total: int) -> None:
+    """Checks that at least two of `total` frames may be fitted to.
+
+    Raises:
+      InputError: There are fewer.
+    """
+    if count < 2:
+        problem = f"{count} of {total} frames to work with"
+        raise InputError("frames", problem, "at least 2", "Hold out fewer frames (--holdout), or use more (--frames).")
