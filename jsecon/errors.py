@@ -1,10 +1,10 @@
-"""The one error that a user sees for bad input: what is wrong, where, and what to do about it."""
+"""The error for bad input, and checks of arguments. Each message says what is wrong, where, and what to do."""
 
 from collections.abc import Iterable
 from typing import Any
 
-LONGEST = 600
-"""characters of a place, and of what is wrong there, that an error quotes: of more, the beginning and the end"""
+MAX_QUOTED = 600
+"""characters of `where` and of `problem` in a message; longer texts are cut in the middle"""
 
 
 class InputError(ValueError):
@@ -21,19 +21,25 @@ class InputError(ValueError):
     """
 
     def __init__(self, where: object, problem: str, expected: str = "", remedy: str = ""):
-        half = LONGEST // 2
-        where, problem = (t if len(t) <= LONGEST else f"{t[:half]} ... {t[-half:]}" for t in (str(where), problem))
-        self.where, self.problem, self.expected, self.remedy = where, problem, expected, remedy
-        super().__init__(f"{where}: {self.sentence} {remedy}".removeprefix(": ").rstrip())
+        half = MAX_QUOTED // 2
+        texts = [t if len(t) <= MAX_QUOTED else f"{t[:half]} ... {t[-half:]}" for t in (str(where), problem)]
+        self.where, self.problem = texts
+        self.expected = expected
+        self.remedy = remedy
+        super().__init__(f"{self.where}: {self.sentence} {remedy}".removeprefix(": ").rstrip())
 
     @property
     def sentence(self) -> str:
-        """What is wrong, as a sentence, without where and without the remedy."""
+        """The problem as a sentence, without the place and the remedy."""
         return f"{self.problem.rstrip('.')}{f', expected {self.expected}' if self.expected else ''}."
 
 
 def describe_error(error: BaseException) -> str:
-    """Why something failed, in words that a user knows: without the name of a Python exception, on one line."""
+    """Describes an exception on one line, without its Python name.
+
+    Args:
+      error: Any exception of a reader or writer.
+    """
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.partition(" (")[0]
     if isinstance(error, KeyError) and error.args:
@@ -48,22 +54,52 @@ def describe_error(error: BaseException) -> str:
 
 
 def require(condition: bool, name: str, got: object, expected: str, remedy: str) -> None:
-    """Raise ValueError(got, expected, remedy) unless `condition`: for what is known at trace time (shapes, dtypes,
-    options)."""
+    """Checks what is known at trace time: shapes, dtypes, options.
+
+    Args:
+      condition: What must hold.
+      name: Name of the argument or function.
+      got: The value.
+      expected: What it should be.
+      remedy: What to do about it, a sentence.
+
+    Raises:
+      ValueError: The condition is false.
+    """
     if not condition:
         raise ValueError(f"{name}: got {got}, expected {expected}. {remedy}")
 
 
 def require_shape(name: str, array: Any, expected: tuple[Any, ...], remedy: str) -> None:
-    """Raise ValueError unless an array has the expected shape: numbers, letters for any size, ... for leading axes."""
+    """Checks the shape of an array.
+
+    Args:
+      name: Name of the argument.
+      array: The array.
+      expected: Its shape: numbers, letters for any size, ... first for any leading axes.
+      remedy: What to do about it, a sentence.
+
+    Raises:
+      ValueError: The array has another shape.
+    """
     got = tuple(array.shape)
-    wanted = (*got[: len(got) - len(expected) + 1], *expected[1:]) if expected[0] is ... else expected
-    fits = len(got) == len(wanted) and all(isinstance(size, str) or size == own for own, size in zip(got, wanted))
-    told = ", ".join("..." if size is ... else str(size) for size in expected)
-    require(fits, name, got, f"({told}{',' * (len(expected) == 1)})", remedy)
+    shape = (*got[: len(got) - len(expected) + 1], *expected[1:]) if expected[0] is ... else expected
+    fits = len(got) == len(shape) and all(isinstance(size, str) or size == actual for actual, size in zip(got, shape))
+    sizes = ", ".join("..." if size is ... else str(size) for size in expected)
+    require(fits, name, got, f"({sizes}{',' * (len(expected) == 1)})", remedy)
 
 
 def require_one_of(name: str, got: object, choices: Iterable[str], remedy: str) -> None:
-    """Raise ValueError unless an option is one of its choices."""
+    """Checks that an option is one of its choices.
+
+    Args:
+      name: Name of the option.
+      got: Its value.
+      choices: The choices.
+      remedy: What to do about it, a sentence.
+
+    Raises:
+      ValueError: It is not.
+    """
     choices = tuple(choices)
     require(got in choices, name, repr(got), " or ".join(map(repr, choices)), remedy)

@@ -1,7 +1,8 @@
 """Atomic writes, and files of arrays.
 
-A file gets its final name when it is complete. Arrays are kept as safetensors, with a JSON description and checksums;
-`pack_tree` describes a tree of records so. Reading takes no more memory than the file's bytes fill, and runs no code.
+A file gets its final name when it is complete. Arrays are stored as safetensors, with a JSON description and checksums;
+`pack_tree` describes a tree of records in this way. Reading takes no more memory than the file's bytes, and runs no
+code.
 """
 
 import codecs
@@ -30,11 +31,11 @@ READ_ERRORS = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError),
     *(ArithmeticError, zipfile.BadZipFile, zlib.error, SafetensorError),
 )
-"""what readers of damaged files raise"""
-LONGEST_NAME = 80
-"""characters of a name that a message quotes"""
+"""exceptions that readers of damaged files raise"""
+MAX_NAME = 80
+"""characters of a name in a message"""
 _WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
-"""what the system says of a file system that has no locks"""
+"""errors of a file system that has no locks"""
 _HEADER = (
     rb"['\"]descr['\"] *: *['\"]([<>|=]?[biuf]\d+)['\"]",
     rb"['\"]fortran_order['\"] *: *(True|False)",
@@ -46,20 +47,22 @@ _DTYPES = {"BOOL": np.dtype(bool)} | {
     for letter, sizes in {"F": (2, 4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}.items()
     for size in sizes
 }
-"""types of numbers by safetensors' names for them"""
+"""NumPy's types by safetensors' names"""
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 
 
 class ForeignFileError(ValueError):
-    """A safetensors file that `write_arrays` did not write."""
+    """Raised for a safetensors file that `write_arrays` did not write."""
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; on leaving it is renamed to `path`, or removed if the body raised.
+    """Yields a temporary path beside `path`, which is renamed to `path` at the end, or removed if the body raised.
 
-    The temporary name keeps `path`'s ending, for writers that choose the format by it. Raises InputError where the
-    folder cannot be written, or has no room.
+    The temporary name keeps the ending of `path`, for writers that choose the format by it.
+
+    Raises:
+      InputError: The folder cannot be written, or the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}.partial{path.suffix}")
@@ -77,13 +80,17 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 def _unwritten(path: Path, error: OSError) -> InputError:
     remedy = "Choose another, mend its permissions, or free some room."
-    found = f"{describe_error(error)} on writing to {path.parent}"
-    return InputError(path, found, "a folder that can be written", remedy)
+    problem = f"{describe_error(error)} on writing to {path.parent}"
+    return InputError(path, problem, "a folder that can be written", remedy)
 
 
 @contextlib.contextmanager
 def exclusive_lock(folder: Path) -> Iterator[None]:
-    """While it is open, `folder` is this caller's to write to. Raises InputError where it is another's, or is full."""
+    """Locks a folder for this process.
+
+    Raises:
+      InputError: Another run has locked it, or it cannot be written.
+    """
     lock = FileLock(folder / ".lock", timeout=0)
     try:
         lock.acquire()
@@ -102,43 +109,52 @@ def exclusive_lock(folder: Path) -> Iterator[None]:
 
 
 def path_within(folder: Path, name: str) -> Path:
-    """The path of what a file names beneath a folder. Raises InputError for a name that leads out of the folder."""
+    """Returns the path of a name that a file gives, beneath a folder.
+
+    Raises:
+      InputError: The name leads out of the folder.
+    """
     first = Path(os.path.normpath(name)).parts[:1]
     if "\0" in name or os.path.splitdrive(name)[0] or os.path.isabs(name) or first == ("..",):
-        found = f"the name {name[:LONGEST_NAME]!r} leads out of the folder"
-        raise InputError(folder, found, remedy="Rename it: names must lie beneath the folder.")
+        problem = f"the name {name[:MAX_NAME]!r} leads out of the folder"
+        raise InputError(folder, problem, remedy="Rename it: names must lie beneath the folder.")
     return folder / name
 
 
 def is_output_folder(folder: Path) -> bool:
-    """Whether a folder is the output folder of a run or of a query, and so no input, wherever it lies."""
+    """Returns whether a folder is the output folder of a run or a query, which is never input."""
     return (folder / "cache" / "CACHEDIR.TAG").is_file() or (folder / "answers.html").is_file()
 
 
 def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
-    """Yields the files beneath a folder in name order, through links too.
+    """Yields the files beneath a folder in the order of their names, through links too.
 
-    Hidden files are left out, the folders in it that are output of jsecon, and `exclude`.
+    Hidden files and output folders of jsecon are skipped.
+
+    Args:
+      root: The folder.
+      exclude: A folder to skip.
     """
-    own = None if exclude is None else exclude.resolve()
-    found, visited = [], set()
+    excluded = None if exclude is None else exclude.resolve()
+    files, visited = [], set()
     for place, folders, names in os.walk(root, followlinks=True):
         folder, home = Path(place), os.path.realpath(place)
         kept = () if home in visited else sorted(name for name in folders if not name.startswith("."))
         visited.add(home)  # a link to a folder above would lead round and round
-        folders[:] = [name for name in kept if not is_output_folder(folder / name) and (folder / name).resolve() != own]
-        found += [folder / name for name in names if not name.startswith(".")]
-    yield from (file for file in sorted(found) if file.is_file())
+        inputs = [name for name in kept if not is_output_folder(folder / name)]
+        folders[:] = [name for name in inputs if (folder / name).resolve() != excluded]
+        files += [folder / name for name in names if not name.startswith(".")]
+    yield from (file for file in sorted(files) if file.is_file())
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Writes `text` (UTF-8) to `path`, whole or not at all; bytes of file names that are no UTF-8 as \\udcxx."""
+    """Writes a text (UTF-8) atomically; bytes of file names that are no UTF-8 become \\udcxx."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def read_text(path: Path) -> str:
-    """Reads a text file as UTF-8, or as UTF-16 where it begins with that byte order mark.
+    """Reads a text file as UTF-8, or as UTF-16 if it begins with that byte order mark.
 
     Bytes that are no UTF-8 become surrogates, as in file names: a path made of them finds its file.
     """
@@ -149,7 +165,11 @@ def read_text(path: Path) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a JSON text holds, whole numbers of 300 digits and more as floats. Raises ValueError."""
+    """Parses JSON; whole numbers of 300 digits and more become floats.
+
+    Raises:
+      ValueError: It is not JSON.
+    """
     try:
         return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 300 else float(digits))
     except RecursionError as error:
@@ -157,7 +177,16 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: Path, expected: str, remedy: str) -> Any:
-    """What a JSON file holds, as `parse_json` has it. Raises InputError where it cannot be read."""
+    """Reads a JSON file, as `parse_json` does.
+
+    Args:
+      path: The file.
+      expected: What it should hold, for the message.
+      remedy: What to do about it, a sentence.
+
+    Raises:
+      InputError: It cannot be read.
+    """
     try:
         return parse_json(path.read_bytes())
     except OSError as error:
@@ -227,7 +256,7 @@ def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], desc
     Raises:
       OSError: The file cannot be written.
     """
-    # safetensors.numpy.save_file makes files of mode 600, and hides a full disk behind an error of its own kind.
+    # safetensors.numpy.save_file makes files of mode 600, and hides a full disk behind another error.
     # The widest first, as there, so that every array is aligned to its type.
     ordered = sorted(arrays.items(), key=lambda item: (-item[1].dtype.itemsize, item[0]))
     parts = {name: np.asarray(array, array.dtype.newbyteorder("<"), order="C") for name, array in ordered}
@@ -243,16 +272,6 @@ def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], desc
         file.write(len(header).to_bytes(8, "little") + header)
         for part in parts.values():
             file.write(part.data if part.size else b"")
-
-
-def read_zip(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Reads all arrays of a NumPy archive (.npz), whose checksums are compared; none of Python's objects.
-
-    Raises:
-      OSError, ValueError, ...: One of READ_ERRORS. The file is damaged, or holds objects.
-    """
-    with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
 
 
 def read_arrays(
@@ -271,7 +290,7 @@ def read_arrays(
     Raises:
       OSError, ValueError, ...: One of READ_ERRORS. The file is missing, is damaged, or was not written by jsecon.
     """
-    with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, nothing behind the end
+    with safe_open(path, framework="numpy"):  # checks sizes and places: no gap, no overlap, no bytes behind the end
         pass
     arrays = {}
     with open(path, "rb") as file:
@@ -282,7 +301,7 @@ def read_arrays(
             raise ForeignFileError("it is a safetensors file of another program")
         if metadata.get("crc32") != str(zlib.crc32(metadata["jsecon"].encode())):
             raise ValueError("its description does not match its checksum")
-        told = parse_json(metadata["jsecon"])
+        contents = parse_json(metadata["jsecon"])
         for name, entry in layout.items():
             dtype, shape, (begin, end) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
             is_mapped = end - begin > memory_map_above
@@ -291,10 +310,10 @@ def read_arrays(
             else:
                 file.seek(8 + length + begin)
                 array = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
-            if (verify or not is_mapped) and _crc32(array) != told["crc32"][name]:
+            if (verify or not is_mapped) and _crc32(array) != contents["crc32"][name]:
                 raise ValueError(f"{name} does not match its checksum")
             arrays[name] = array
-    return told["description"], arrays
+    return contents["description"], arrays
 
 
 def _crc32(array: np.ndarray) -> int:
@@ -302,11 +321,22 @@ def _crc32(array: np.ndarray) -> int:
 
 
 def pack_tree(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Callable[[type], str | None]) -> dict:
-    """JSON that describes a tree of plain values, arrays, dicts, lists, tuples and records; its arrays go to `arrays`,
-    by their path. name_of: what a type of record is called, None for any other. Raises ValueError on anything else.
+    """Describes a tree of plain values, arrays, dicts, lists, tuples and records as JSON.
 
     A node is one of: {"value": JSON value}, a list of them for a tuple; {"list": [...]}, {"tuple": [...]}, {"dict":
     {...}}, {"record": name, "fields": {...}}, {"array": path, "shape", "dtype"}.
+
+    Args:
+      node: The tree.
+      path: Path of its root.
+      arrays: Receives the arrays by their paths.
+      name_of: Returns the name of a type of record, None for any other type.
+
+    Returns:
+      The description.
+
+    Raises:
+      ValueError: The tree holds another kind of object.
     """
 
     def inner(parts: Any) -> dict:
@@ -324,23 +354,31 @@ def pack_tree(node: Any, path: str, arrays: dict[str, np.ndarray], name_of: Call
     if isinstance(node, Mapping) and all(isinstance(name, str) for name in node):
         return {"dict": inner(node.items())}
     array = np.asarray(node, None if hasattr(node, "__array__") else object)
-    told = f"{kind.__module__}.{kind.__qualname__} of type {array.dtype}"
+    got = f"{kind.__module__}.{kind.__qualname__} of type {array.dtype}"
     is_plain = array.dtype.newbyteorder("<") in _CODES
-    require(is_plain, path, told, "plain numbers", "Convert it to float32 or an integer type.")
+    require(is_plain, path, got, "plain numbers", "Convert it to float32 or an integer type.")
     arrays[path] = array
     return {"array": path, "shape": list(array.shape), "dtype": array.dtype.name}
 
 
 def unpack_tree(node: Any, arrays: Mapping[str, np.ndarray], kind_of: Callable[[str], type]) -> Any:
-    """The tree that `pack_tree` described, of NumPy's arrays; kind_of: the type of record of a name. Raises one of
-    READ_ERRORS on what `pack_tree` did not write."""
+    """Builds the tree that `pack_tree` described.
+
+    Args:
+      node: The description.
+      arrays: NumPy arrays by their paths.
+      kind_of: Returns the type of record of a name.
+
+    Raises:
+      OSError, ValueError, ...: One of READ_ERRORS. `pack_tree` did not write the description.
+    """
     if "value" in node:
         return tuple(node["value"]) if isinstance(node["value"], list) else node["value"]
     if "array" in node:
         array = arrays[node["array"]]
         if "shape" in node and [*array.shape, array.dtype.name] != [*node["shape"], node["dtype"]]:
-            told = f"{node['dtype']}{tuple(node['shape'])}"
-            raise ValueError(f"{node['array']} is {array.dtype}{array.shape}, header says {told}")
+            expected = f"{node['dtype']}{tuple(node['shape'])}"
+            raise ValueError(f"{node['array']} is {array.dtype}{array.shape}, its header declares {expected}")
         return array
     for kind in (list, tuple):
         if kind.__name__ in node:

@@ -25,18 +25,16 @@ FRUSTUM_MARGIN = 1.3
 NEAR = 0.01
 """near plane, world units (0.2 reproduces INRIA)"""
 FULL_PRECISION = jax.lax.Precision.HIGHEST
-"""of products of matrices: all of float32. A GPU left to itself keeps 10 bits of each factor (TF32; cosines off by
+"""precision of matrix products, all of float32. By default a GPU keeps 10 bits of each factor (TF32; cosines off by
 5e-4 on an H100). A CPU computes the same digits either way"""
-
-
 MAX_MAGNITUDE = 1e18
-"""of a coordinate, focal length or coefficient in a file: float32 holds its square"""
+"""largest coordinate, focal length or coefficient in a file: float32 holds its square"""
 
 
 @np.errstate(invalid="ignore")  # a signalling NaN
 def is_finite_and_bounded(*numbers: Any) -> bool:
-    """Whether all numbers are finite and none is above MAX_MAGNITUDE."""
-    return all(bool((np.abs(np.asarray(own, np.float64)) <= MAX_MAGNITUDE).all()) for own in numbers)
+    """Returns whether all numbers are finite and at most MAX_MAGNITUDE in size."""
+    return all(bool((np.abs(np.asarray(values, np.float64)) <= MAX_MAGNITUDE).all()) for values in numbers)
 
 
 def safe_scale(size: Array) -> Array:
@@ -104,16 +102,25 @@ def all_finite(*arrays: Array) -> Array:
 
 
 def is_traced(tree: Any = ()) -> bool:
-    """Whether any leaf of `tree` is being traced (jit, grad, vmap), or whatever is computed now is: inside a jit also
-    arrays that its function closes over."""
+    """Returns whether a leaf of `tree` is being traced (jit, grad, vmap), or all that is computed now is: inside a jit
+    also arrays that its function closes over."""
     return any(isinstance(leaf, Tracer) for leaf in [*jax.tree.leaves(tree), jnp.zeros(())])
 
 
 def require_labels(labels: Any, num_regions: int) -> None:
-    """Raises ValueError unless an array of labels holds integers, all below `num_regions`. Inside a trace the numbers
-    are not known: there a label of `num_regions` and more counts as none, as -1 does."""
+    """Checks that an array of labels holds integers, all below `num_regions`.
+
+    Inside a trace the numbers are not known: there a label of `num_regions` or more belongs to no region, like -1.
+
+    Args:
+      labels: Array of any shape.
+      num_regions: R.
+
+    Raises:
+      ValueError: They do not.
+    """
     remedy = "Convert them, for example by labels.astype(np.int32)."
-    integers = "integers, -1 where a pixel belongs to no region"
+    integers = "integers, -1 for a pixel of no region"
     require(np.dtype(labels.dtype).kind in "iu", "labels", f"{labels.dtype}", integers, remedy)
     if not is_traced(labels):
         highest = int(np.asarray(labels).max()) if math.prod(labels.shape) else -1

@@ -1,11 +1,11 @@
-"""All cores: the views, or one view's strips, spread over jax's local devices.
+"""Runs work on all cores: views, or the strips of one view, are spread over jax's local devices.
 
-A CPU is one device to jax unless the program says otherwise before jax starts (`process.prepare_process`); the command
-line does. The library only uses what it finds.
+A CPU is one device to jax unless the program asks for more before jax starts (`process.prepare_process`), as the
+command line does. The library only uses the devices that it has.
 
-One view over all devices, under jit: `render(..., mesh=host_mesh())`. Many views: `accumulate_over_views`, one view on
-each device, which needs no exchange and so scales better, and over several processes too. Work that is no program of
-jax, frame by frame: `map_over_processes`. Each works with any number of devices, and compiles once for all of them.
+One view on all devices, under jit: `render(..., mesh=host_mesh())`. Many views: `accumulate_over_views`, one view on
+each device, which needs no exchange and so scales better, also over several processes. Work on the host, frame by
+frame: `map_over_processes`. Each works with any number of devices, and compiles once for all of them.
 """
 
 import io
@@ -24,63 +24,93 @@ from jsecon.files import pack_tree, unpack_tree
 from jsecon.types import Array
 
 AXIS = "devices"
-"""the mesh's one axis"""
+"""name of the only axis of the mesh"""
 MESH_OPTIONS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
-"""`compiler_options` of jax.jit for a program over a host's mesh. Without them XLA's CPU backend also cuts the kernels
-of each device into parts for the threads of all, and such kernels take up to three times as long: projecting 111,785
-Gaussians 7.4 instead of 2.6 ms. Programs of one device are better off with the parts."""
+"""`compiler_options` of jax.jit for a program on a host's mesh. Without them XLA's CPU backend also cuts the kernels of
+each device into parts for the threads of all, and such kernels take up to three times as long: projecting 111,785
+Gaussians 7.4 instead of 2.6 ms. Programs on one device are faster with the parts."""
 
 LANES = 8
-"""of `accumulate_over_views`: the sums that views are added up in side by side"""
+"""number of partial sums of `accumulate_over_views`"""
 _LANES_BYTES = 1 << 30
-"""that the sums of all lanes at once may take, where there are more than two"""
+"""bytes of the states of all lanes at once, if there are more than two"""
 _AHEAD = 2
 """steps that are dispatched before one is done"""
 _TREE = "__tree__"
 _PIECE = 1 << 26
-"""bytes that `allgather_bytes` sends at once"""
+"""bytes of one exchange of `allgather_bytes`"""
 
 
 def host_mesh() -> Mesh | None:
-    """All of this process's devices for one view's tiles, or None where there is but one. A constant to jit."""
+    """Returns a mesh of this process's devices for the strips of one view, or None for a single device.
+
+    It is a constant to jit.
+    """
     devices = jax.local_devices()
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None
 
 
 def map_over_devices(local: Callable, dealt: Any, common: Any, mesh: Mesh, *, total: bool = False) -> Any:
-    """`local(index of the device, dealt, common)` on every device of `mesh`, each with its equal part of the arrays
-    `dealt` along their leading axes, and the whole of `common`. The results are joined along their leading axes, or
-    added up where `total`."""
+    """Runs a function on every device of a mesh.
+
+    Args:
+      local: Called as `local(index of the device, its part of dealt, common)`.
+      dealt: Tree of arrays; each device gets an equal part along their leading axes.
+      common: Tree of arrays that each device gets whole.
+      mesh: The devices.
+      total: Whether to add up the results, instead of joining them along their leading axes.
+
+    Returns:
+      The results of all devices.
+    """
 
     def run(dealt, common):
         out = local(jax.lax.axis_index(AXIS), dealt, common)
         return jax.lax.psum(out, AXIS) if total else out
 
-    part, whole = PartitionSpec(AXIS), PartitionSpec()
-    # The carries of a walk start as constants, which the check of varying axes would have to be told of one by one.
-    spread = jax.shard_map(run, mesh=mesh, in_specs=(part, whole), out_specs=whole if total else part, check_vma=False)
-    return spread(dealt, common)
+    part, replicated = PartitionSpec(AXIS), PartitionSpec()
+    # The check of varying axes would need a declaration for each carry of a walk, as they start as constants.
+    shard = jax.shard_map(
+        run, mesh=mesh, in_specs=(part, replicated), out_specs=replicated if total else part, check_vma=False
+    )
+    return shard(dealt, common)
 
 
 def map_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
-    """`local(rows, common)`, row by row independent in every array of `rows` and of the result, each device taking an
-    equal part of them; the last part is filled up with zeros, which `local` must bear."""
+    """Runs a function that treats rows independently, each device with an equal part of them.
+
+    Args:
+      local: Called as `local(rows, common)`. The last part is padded with zeros, which it must accept.
+      rows: Tree of arrays with rows along their leading axes.
+      common: Tree of arrays that each device gets whole.
+      mesh: The devices, or None.
+
+    Returns:
+      The results, row by row.
+    """
     if mesh is None:
         return local(rows, common)
     count = jax.tree.leaves(rows)[0].shape[0]
-    fill = lambda a: jnp.pad(a, [(0, -count % mesh.size)] + [(0, 0)] * (a.ndim - 1))
-    out = map_over_devices(lambda _, rows, common: local(rows, common), jax.tree.map(fill, rows), common, mesh)
+    pad = lambda a: jnp.pad(a, [(0, -count % mesh.size)] + [(0, 0)] * (a.ndim - 1))
+    out = map_over_devices(lambda _, rows, common: local(rows, common), jax.tree.map(pad, rows), common, mesh)
     return jax.tree.map(lambda a: a[:count], out)
 
 
 def concurrent_lanes(views: int, state_bytes: int) -> int:
-    """How many lanes of `accumulate_over_views` this process works on at a time: no more than there are devices, the
-    same number in every turn, and above two no more than _LANES_BYTES hold, each with a state of `state_bytes`."""
+    """Returns how many lanes of `accumulate_over_views` this process works on at a time.
+
+    They are at most as many as devices, the same number in every turn, and above two no more than fit into
+    _LANES_BYTES.
+
+    Args:
+      views: Number of views.
+      state_bytes: Size of the state of a lane.
+    """
     world = jax.process_count()
-    own = -(-_lane_count(views) // world)
+    lanes = -(-_lane_count(views) // world)
     devices = min(sum(device.process_index == p for device in jax.devices()) for p in range(world))
-    turns = -(-own // max(1, min(devices, own, max(2, _LANES_BYTES // max(state_bytes, 1)))))
-    return -(-own // turns)
+    turns = -(-lanes // max(1, min(devices, lanes, max(2, _LANES_BYTES // max(state_bytes, 1)))))
+    return -(-lanes // turns)
 
 
 def _lane_count(views: int) -> int:
@@ -98,17 +128,26 @@ def accumulate_over_views(
     static: tuple = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, Any]:
-    """Accumulates `state, out = step(state, common, view, *static)` over the leading axis of `views`. Returns the
-    state, and each view's `out`, stacked, in NumPy. With `prepare`, the step gets `prepare(common, view, *static)` in
-    place of the view, from a program of its own, which states of other sizes share.
+    """Accumulates a state over views, several at a time. A host function; dispatch is asynchronous.
 
-    View t is added up in lane t mod LANES, and `merge`, whose neutral state is `start`, joins the lanes in their order.
-    So the number of devices and of processes (up to LANES) changes no bit of the sum. A device works on one lane at a
-    time (`concurrent_lanes`); all run one program, which jax compiles once. `step` is a pure function, traced under
-    shard_map. Host code; dispatch is asynchronous. `progress(done, total)` is called as views finish.
+    View t is added up in lane t mod LANES, and the lanes are merged in order, so the number of devices and of processes
+    (up to LANES) changes no bit of the sum. A device works on one lane at a time (`concurrent_lanes`); all run one
+    program, which jax compiles once. Over several processes (`jax.distributed.initialize`) that make the same call,
+    process p of P takes lanes p, p + P, ...; all end with the same result.
 
-    Over several processes (`jax.distributed.initialize`), each given the same arguments, process p of P takes lanes p,
-    p + P, ...; all end with the same result.
+    Args:
+      step: Pure function `state, out = step(state, common, view, *static)`, traced under shard_map.
+      start: Neutral state of `merge`.
+      merge: Joins the states of two lanes.
+      common: Tree of arrays that each step gets whole.
+      views: Tree of arrays with the views along their leading axes.
+      prepare: If present, the step gets `prepare(common, view, *static)` in place of the view, from a separate program
+        that states of other sizes share.
+      static: Hashable arguments.
+      progress: Called as `progress(done, total)` as views finish.
+
+    Returns:
+      The state, and the `out` of each view, stacked (NumPy).
     """
     rank, world = jax.process_index(), jax.process_count()
     common, start, views = jax.tree.map(np.asarray, (common, start, views))
@@ -116,51 +155,51 @@ def accumulate_over_views(
     lanes = _lane_count(count)
     width = concurrent_lanes(count, sum(leaf.nbytes for leaf in jax.tree.leaves(start)))
     mesh = Mesh(np.array(jax.local_devices()[:width]), (AXIS,), axis_types=(AxisType.Auto,))
-    whole, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
-    # Where half of the cores and more have no lane, XLA cuts the kernels of the others for them.
+    replicated, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
+    # If half of the cores or more have no lane, XLA cuts the kernels of the others for them.
     crowded = width > 1 and jax.local_device_count() < 2 * width
-    # XLA reads NumPy's memory in place where it is aligned as its own is: all devices share one copy.
+    # XLA reads NumPy's memory in place if it is aligned like its memory: all devices share one copy.
     common = jax.tree.map(lambda a: np.asarray(jax.device_put(a, may_alias=True)), common)
-    common = jax.device_put(common, whole)
-    merged = jax.device_put(start, may_alias=False)  # joining takes it
-    outs: list[Any] = []  # of all views, once a step has told their shape
+    common = jax.device_put(common, replicated)
+    merged = jax.device_put(start, may_alias=False)  # merging donates it
+    outs: list[Any] = []  # of all views, once the first step has given their shape
     dispatched: deque[tuple[list[int], Any]] = deque()
     done = 0
 
-    def keep(most: int) -> None:
-        """Takes over what the steps gave, but for the last `most`, which may still run."""
+    def collect(most: int) -> None:
+        """Stores the outputs of all dispatched steps but the last `most`, which may still run."""
         while len(dispatched) > most:
             chosen, out = dispatched.popleft()
             out = jax.tree.map(np.asarray, out)
             if not outs:
                 outs.append(jax.tree.map(lambda a: np.zeros((count, *a.shape[1:]), a.dtype), out))
-            there = np.array(chosen) < count
+            is_view = np.array(chosen) < count
             for of_all, part in zip(jax.tree.leaves(outs), jax.tree.leaves(out), strict=True):
-                of_all[np.array(chosen)[there]] = part[there]
+                of_all[np.array(chosen)[is_view]] = part[is_view]
 
     for turn in range(0, -(-lanes // world), width):
-        own = [rank + world * (turn + place) for place in range(width)]
+        my_lanes = [rank + world * (turn + place) for place in range(width)]
         states = jax.tree.map(lambda a: np.broadcast_to(a, (width, *a.shape)), start)
-        states = jax.device_put(states, rows, may_alias=False)  # a step takes it
+        states = jax.device_put(states, rows, may_alias=False)  # a step donates it
         for first in range(0, count, lanes):
-            chosen = [min(first + lane, count) if lane < lanes else count for lane in own]
+            chosen = [min(first + lane, count) if lane < lanes else count for lane in my_lanes]
             if min(chosen) == count:
                 continue
             wave = jax.tree.map(lambda a, chosen=chosen: a[np.minimum(chosen, count - 1)], views)
-            there, wave = jax.device_put((np.array(chosen) < count, wave), rows)
+            is_view, wave = jax.device_put((np.array(chosen) < count, wave), rows)
             if prepare is not None:
                 wave = _prepare[crowded](wave, common, prepare, static, mesh)
-            states, out = _advance[crowded](states, (there, wave), common, step, static, mesh)
+            states, out = _advance[crowded](states, (is_view, wave), common, step, static, mesh)
             dispatched.append((chosen, out))
-            keep(_AHEAD)
+            collect(_AHEAD)
             done += sum(t < count for t in chosen)
             if progress is not None:
                 jax.block_until_ready(states)
                 progress(min(done * world, count), count)
-        keep(0)
+        collect(0)
         for place in range(width):
             state = jax.tree.map(lambda a, place=place: np.asarray(a.addressable_data(place))[0], states)
-            for part in [state] if world == 1 else _of_all(state):
+            for part in [state] if world == 1 else _states_of_all(state):
                 merged = merge(merged, jax.device_put(part, may_alias=True))
         del states
     if not outs:  # a process without views
@@ -171,14 +210,10 @@ def accumulate_over_views(
         outs.append(jax.tree.map(lambda a: np.zeros((count, *a.shape), a.dtype), blank))
     if world > 1:
         rank_of = np.arange(count) % lanes % world
-        most = int(np.bincount(rank_of, minlength=world).max())
-        mine = np.flatnonzero(rank_of == rank)
-        for of_all in jax.tree.leaves(outs):
-            own_rows = np.zeros((most, *of_all.shape[1:]), of_all.dtype)
-            own_rows[: len(mine)] = of_all[mine]
-            for p, part in enumerate(process_allgather(own_rows)):
-                theirs = np.flatnonzero(rank_of == p)
-                of_all[theirs] = part[: len(theirs)]
+        leaves = jax.tree.leaves(outs)
+        for p, part in enumerate(allgather_tree([leaf[rank_of == rank] for leaf in leaves])):
+            for leaf, rows_of_p in zip(leaves, part, strict=True):
+                leaf[rank_of == p] = rows_of_p
     return merged, outs[0]
 
 
@@ -193,22 +228,22 @@ def _prepare_lanes(wave: Any, common: Any, prepare: Callable, static: tuple, mes
 
 
 def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Callable, static: tuple, mesh: Mesh):
-    """Each lane's state after its view of the wave, and what its step gave; the same where it has none."""
+    """Each lane's state after its view of the wave, and the output of its step; the same state if it has no view."""
 
     def local(_, dealt, common):
-        state, (there, view) = jax.tree.map(lambda a: a[0], dealt)
-        taken = lambda: step(state, common, view, *static)
-        if mesh.size == 1:  # with no view there is no wave
-            found = taken()
+        state, (is_view, view) = jax.tree.map(lambda a: a[0], dealt)
+        take_step = lambda: step(state, common, view, *static)
+        if mesh.size == 1:  # without a view there is no wave
+            result = take_step()
         else:
-            blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(taken)[1])
-            found = jax.lax.cond(there, taken, lambda: (state, blank))
-        return jax.tree.map(lambda a: a[None], found)
+            blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(take_step)[1])
+            result = jax.lax.cond(is_view, take_step, lambda: (state, blank))
+        return jax.tree.map(lambda a: a[None], result)
 
     return map_over_devices(local, (states, wave), common, mesh)
 
 
-# where lanes leave cores idle, and where they do not
+# for lanes that leave cores idle, and for lanes that do not
 _prepare = [jax.jit(_prepare_lanes, static_argnums=(2, 3, 4), compiler_options=o) for o in (None, MESH_OPTIONS)]
 _advance = [
     jax.jit(_advance_lanes, static_argnums=(3, 4, 5), donate_argnums=0, compiler_options=options)
@@ -216,8 +251,8 @@ _advance = [
 ]
 
 
-def _of_all(state: Any) -> list[Any]:
-    """Every process's, in their order."""
+def _states_of_all(state: Any) -> list[Any]:
+    """The states of all processes, in their order."""
     parts = process_allgather(state)
     return [jax.tree.map(lambda a, p=p: np.asarray(a[p]), parts) for p in range(jax.process_count())]
 
@@ -227,37 +262,45 @@ def map_over_processes(
     rows: Callable[[Sequence[int]], Iterable[Any]],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Any]:
-    """What `rows` yields for 0 .. count - 1, one after the other: trees of NumPy's arrays and plain values.
+    """Maps a host function over indices, each process with its part of them.
 
-    Over several processes that all make the same call (`jax.distributed`), process p of P is asked for p, p + P, ...
-    and all end with all rows; in one, it is asked for them all.
+    Over several processes that make the same call (`jax.distributed.initialize`), process p of P computes
+    p, p + P, ...; all end with all results. One process computes them all.
+
+    Args:
+      count: Number of indices.
+      rows: Yields the results of a sequence of indices, one after the other: trees of NumPy arrays and plain values.
+      progress: Called as `progress(done, total)`.
+
+    Returns:
+      The results of 0 .. count - 1.
     """
     rank, world = jax.process_index(), jax.process_count()
-    found = []
+    results = []
     for row in rows(range(rank, count, world)):
-        found.append(row)
+        results.append(row)
         if progress is not None:
-            progress(min(len(found) * world, count), count)
+            progress(min(len(results) * world, count), count)
     if world == 1:
-        return found
-    parts = [deserialize_tree(part) for part in allgather_bytes(serialize_tree(found))]
+        return results
+    parts = allgather_tree(results)
     return [parts[t % world][t // world] for t in range(count)]
 
 
 def cache_worker_programs() -> None:
-    """Lets this process, one of several, keep its compiled programs on disk, if it has a folder for them.
+    """Lets this process, one of several, store its compiled programs on disk, if there is a folder for them.
 
-    jax leaves that to the first (jax/_src/compiler.py, `_cache_write`). But a program is kept for its device, and every
-    process has its own: the others would compile all of theirs at every run.
+    jax leaves that to the first process (jax/_src/compiler.py, `_cache_write`). But a program is stored for its device,
+    and every process has its own device: the others would compile all programs in every run.
     """
     from jax._src import distributed
 
-    jax.local_devices()  # from here on jax knows the process by its devices' number
+    jax.local_devices()  # from here on jax identifies the process by the number of its devices
     distributed.global_state.process_id = 0
 
 
 def serialize_tree(tree: Any) -> bytes:
-    """A tree of arrays, plain values, dicts, lists and tuples as one string of bytes, without pickle."""
+    """Packs a tree of arrays, plain values, dicts, lists and tuples into bytes, without pickle."""
     arrays: dict[str, np.ndarray] = {}
     description = json.dumps(pack_tree(tree, "root", arrays, lambda kind: None)).encode()
     stream = io.BytesIO()
@@ -265,29 +308,34 @@ def serialize_tree(tree: Any) -> bytes:
     return stream.getvalue()
 
 
-def deserialize_tree(held: bytes) -> Any:
-    """The tree of a `serialize_tree`."""
-    with np.load(io.BytesIO(held)) as file:
+def deserialize_tree(data: bytes) -> Any:
+    """Unpacks what `serialize_tree` packed."""
+    with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name] for name in file.files}
     return unpack_tree(json.loads(arrays.pop(_TREE).tobytes()), arrays, lambda name: dict)
 
 
-def allgather_bytes(own: bytes) -> list[bytes]:
-    """Of each process the bytes that it gave; all processes call it. They may come minutes apart.
+def allgather_tree(tree: Any) -> list[Any]:
+    """Exchanges trees, as `allgather_bytes` exchanges bytes."""
+    return [deserialize_tree(part) for part in allgather_bytes(serialize_tree(tree))]
 
-    By all_gather, in pieces of at most `_PIECE` bytes, whose lengths are powers of two: jax compiles for each length.
-    (Gloo's psum_scatter fails where one comes 30 s after the other: jax issue 40831.)
+
+def allgather_bytes(data: bytes) -> list[bytes]:
+    """Exchanges bytes: all processes call it, minutes apart if need be, and get the bytes of each.
+
+    It uses all_gather in pieces of at most _PIECE bytes, whose lengths are powers of two, as jax compiles for each
+    length. (Gloo's psum_scatter fails if one process comes 30 s after the other: jax issue 40831.)
     """
     if jax.process_count() == 1:
-        return [own]
-    sizes = process_allgather(np.array(divmod(len(own), 1 << 31), np.int32))
+        return [data]
+    sizes = process_allgather(np.array(divmod(len(data), 1 << 31), np.int32))
     lengths = [int(high) * (1 << 31) + int(low) for high, low in sizes]
     parts = [bytearray() for _ in lengths]
     for begin in range(0, max(lengths), _PIECE):
         size = min(_PIECE, max(1 << 16, 1 << (max(lengths) - begin - 1).bit_length()))
         piece = np.zeros(size, np.uint8)
-        held = np.frombuffer(own[begin : begin + size], np.uint8)
-        piece[: len(held)] = held
+        mine = np.frombuffer(data[begin : begin + size], np.uint8)
+        piece[: len(mine)] = mine
         for part, row, length in zip(parts, process_allgather(piece), lengths):
             part += row[: max(0, min(size, length - begin))].tobytes()
     return [bytes(part) for part in parts]

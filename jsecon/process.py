@@ -1,13 +1,13 @@
-"""What only a program may do to its process: the library itself never touches the one it lives in.
+"""Settings of the process, which only a program may change: the library never changes the process that it runs in.
 
-Before jax starts, once: `jsecon` on the command line calls `prepare_process` first. A program of your own that wants
-both cores and the speed of benchmarks/results.md does the same:
+Before jax starts, once: `jsecon` on the command line calls `prepare_process` first. A program that needs
+all cores and the speed of benchmarks/results.md does the same:
 
     from jsecon.process import prepare_process
     prepare_process()
     import jsecon
 
-From time to time, where it lives long and sees many scenes: `clear_programs()`.
+A program that runs long and sees many scenes calls `clear_programs()` from time to time.
 """
 
 import _thread
@@ -31,22 +31,26 @@ from jsecon.errors import InputError
 # kernel, whose pages cost more to touch anew than a kernel of XLA takes to fill them.
 _MALLOPT = {-3: (1 << 31) - 1, -1: (1 << 31) - 1, -2: 1 << 26}
 _OPENCV = {"OPENCV_LOG_LEVEL": "OFF", "OPENCV_FFMPEG_LOGLEVEL": "-8", "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 27)}
-"""what OpenCV says of a damaged file is said in an InputError; and the largest image that it makes room for"""
+"""no messages of OpenCV, as an InputError reports damaged files; and the largest image that it allocates"""
 WORKER = "JSECON_WORKER"
-"""environment variable of a process that is one of several (pipeline/processes.py), see `worker_info`"""
+"""environment variable of a process that is one of several (pipeline/processes.py)"""
 MEMORY = "JSECON_MEMORY"
-"""environment variable: GiB that a scene's columns may take, in place of half of the memory that is free"""
+"""environment variable: GiB for a scene's columns, in place of half of the free memory"""
 AGAIN_SECONDS = 0.05
-"""after which a stop that Python dropped is raised again: the destructor has ended"""
-_UNKEPT = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
-"""how jax warns of a program that it cannot read from disk, or keep there"""
-_built: dict[str, int] = {}
+"""s after which a stop that Python dropped is raised again: the destructor has ended"""
+_CACHE_WARNING = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
+"""jax's warning of a program that it cannot read from disk or write there"""
+_counts: dict[str, int] = {}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
-    """Sets XLA's flags (see `settings`), silences OpenCV and keeps freed memory for the next request (glibc only). Call
-    it before jax makes its first array and OpenCV is imported. What the user has set in the environment stays; without
-    `keep_programs`, compiled programs are not kept on disk."""
+    """Sets XLA's flags (see `settings`), silences OpenCV and keeps freed memory for the next request (glibc only).
+
+    Call it before jax makes its first array and OpenCV is imported. Variables that the user has set stay.
+
+    Args:
+      keep_programs: Whether to store compiled programs on disk.
+    """
     chosen = settings(os.environ, cores(), _cpu_features())
     if not keep_programs:
         chosen.pop("JAX_COMPILATION_CACHE_DIR", None)
@@ -60,34 +64,36 @@ def prepare_process(*, keep_programs: bool = True) -> None:
 
 
 def _remove_damaged_programs(folder: Path) -> None:
-    """From now on, where jax warns of a program in `folder`, the files of that name go, and nothing is said.
+    """From now on removes the files of a program in `folder` that jax warns of, without printing the warning.
 
-    jax writes to a program's final name: a full disk, or a stop amid the writing, leaves a part there, of which it
-    would warn for ever, and never write it anew. `jsecon doctor` tells of a disk without room for programs.
+    jax writes to a program's final name: a full disk, or a stop during the writing, leaves a part there. It would warn
+    of that forever, and never write the program again. `jsecon doctor` reports a disk without room for programs.
     """
     show = warnings.showwarning
 
-    def shown(message: Warning | str, *rest: Any, **given: Any) -> None:
-        told = re.match(_UNKEPT, str(message))
-        if told is None:
-            return show(message, *rest, **given)
-        for file in folder.glob(f"{told[1]}-*-cache"):
+    def shown(message: Warning | str, *args: Any, **kwargs: Any) -> None:
+        match = re.match(_CACHE_WARNING, str(message))
+        if match is None:
+            return show(message, *args, **kwargs)
+        for file in folder.glob(f"{match[1]}-*-cache"):
             with contextlib.suppress(OSError):
                 file.unlink()
 
     warnings.showwarning = shown
-    warnings.filterwarnings("always", _UNKEPT)  # of each, also where two are called alike
+    warnings.filterwarnings("always", _CACHE_WARNING)  # each time, also for programs of the same name
 
 
 def worker_info() -> tuple[int, int, str] | None:
-    """(index, count, HOST:PORT of the first) where this is one of the processes of a run, else None."""
-    told = os.environ.get(WORKER, "").split()
-    return (int(told[0]), int(told[1]), told[2]) if told else None
+    """Returns (index, count, HOST:PORT of the first) if this is one of the processes of a run, else None."""
+    words = os.environ.get(WORKER, "").split()
+    return (int(words[0]), int(words[1]), words[2]) if words else None
 
 
 def prepare_worker() -> None:
-    """A member keeps to the cores that WORKER names last ("0,2"); what C++ writes to the terminal is dropped: pages,
-    where another process of the run dies. What Python writes stays. Before `prepare_process`."""
+    """Limits a worker to the cores that WORKER names last ("0,2"), and drops what C++ code prints.
+
+    That is pages if another process of the run dies. What Python prints stays. Call it before `prepare_process`.
+    """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(core) for core in os.environ[WORKER].split()[3].split(",")})
     for number, name in ((1, "stdout"), (2, "stderr")):
@@ -98,8 +104,10 @@ def prepare_worker() -> None:
 
 
 def stop_by_signals() -> None:
-    """SIGTERM raises KeyboardInterrupt, as Ctrl-C does, so that what is half written is removed. One that Python drops
-    (it fell into a destructor, or a callback of the garbage collector, as jax has one) is raised again soon after."""
+    """Makes SIGTERM raise KeyboardInterrupt, as Ctrl-C does, so that half-written files are removed.
+
+    One that Python drops, in a destructor or a callback of the garbage collector such as jax's, is raised again.
+    """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     show = sys.unraisablehook
 
@@ -114,7 +122,7 @@ def stop_by_signals() -> None:
 
 
 def _stop_main() -> None:
-    """Sends SIGTERM to the main thread; SIGINT may be ignored, as in a shell's background."""
+    """Sends SIGTERM to the main thread; a shell's background jobs ignore SIGINT."""
     if hasattr(signal, "pthread_kill"):  # it also ends a call that waits, such as a sleep
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
     else:
@@ -122,13 +130,15 @@ def _stop_main() -> None:
 
 
 def cores() -> int:
-    """The CPU cores that this process may run on."""
+    """Returns the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def available_memory() -> tuple[int | None, int | None]:
-    """Bytes that are free, and the limit of this process's cgroup, which what is free counts in; None where the system
-    does not tell, or sets none."""
+    """Returns the free memory and the limit of this process's cgroup in bytes; None for what the system does not state.
+
+    The limit counts in the free memory.
+    """
     try:
         import psutil
 
@@ -143,7 +153,7 @@ def available_memory() -> tuple[int | None, int | None]:
 
 
 def peak_memory_mib() -> float:
-    """Largest resident memory of this process so far, MiB; 0 where the system does not tell."""
+    """Returns the largest resident memory of this process so far in MiB; 0 if the system does not state it."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -157,64 +167,83 @@ def peak_memory_mib() -> float:
 
 
 def memory_budget() -> float:
-    """Bytes that a scene's columns may take, above which they are read in blocks: half of what is free, as reading
-    takes twice what it reads, or what MEMORY says. Raises InputError where that is no number."""
-    told = os.environ.get(MEMORY)
-    if told is None:
+    """Returns the bytes for a scene's columns, above which they are read in blocks.
+
+    It is half of the free memory, as reading takes twice the size of the columns, or the value of MEMORY.
+
+    Raises:
+      InputError: MEMORY is not a number.
+    """
+    text = os.environ.get(MEMORY)
+    if text is None:
         return float("inf") if (free := available_memory()[0]) is None else free / 2
     try:
-        return float(told) * 2**30
+        return float(text) * 2**30
     except ValueError:
-        raise InputError(MEMORY, repr(told), "GiB, a number", f"For example: export {MEMORY}=4") from None
+        raise InputError(MEMORY, repr(text), "GiB, a number", f"For example: export {MEMORY}=4") from None
 
 
 def read_cgroup(new: str, old: str) -> list[str]:
-    """The words of a file of this process's cgroup, of version 2 or else 1; none where there is none."""
+    """Reads a file of this process's cgroup, split into words.
+
+    Args:
+      new: Name of the file in version 2.
+      old: Its path in version 1, controller first.
+
+    Returns:
+      The words; empty if there is no such file.
+    """
     try:
-        own = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
+        groups = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
     except (OSError, ValueError):
         return []
     kind, _, name = old.partition("/")
-    group = own.get(kind, "/").lstrip("/")
-    top, at = Path("/sys/fs/cgroup"), own.get("", "/").lstrip("/")
+    group = groups.get(kind, "/").lstrip("/")
+    top, at = Path("/sys/fs/cgroup"), groups.get("", "/").lstrip("/")
     places = (top / at / new, top / new, top / kind / group / name, top / kind / name)
     return next((path.read_text().split() for path in places if path.is_file()), [])
 
 
 def compilation_counts() -> dict[str, int]:
-    """How many programs jax has built since this was first called: all of them, and those read from disk."""
+    """Counts the programs that jax has compiled since the first call: "all", and those that it read "from_disk"."""
     import jax
 
-    if not _built:
-        _built.update(all=0, from_disk=0)
+    if not _counts:
+        _counts.update(all=0, from_disk=0)
 
         def count(event: str, *_: object, **__: object) -> None:
             name = {"backend_compile_duration": "all", "cache_hits": "from_disk"}.get(event.rpartition("/")[2])
             if name is not None:
-                _built[name] += 1
+                _counts[name] += 1
 
         jax.monitoring.register_event_listener(count)
         jax.monitoring.register_event_duration_secs_listener(count)
-    return dict(_built)
+    return dict(_counts)
 
 
 def show_full_tracebacks() -> None:
-    """Errors keep jax's own frames; call it before jax is imported."""
+    """Keeps jax's frames in tracebacks; call it before jax is imported."""
     os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")
 
 
 def clear_programs(*, above: int = 25_000) -> bool:
-    """Forgets jax's compiled programs where the process holds more than `above` memory maps; whether it did.
+    """Frees jax's compiled programs if the process has many memory maps.
 
-    Linux grants a process 65,530 of them and XLA takes several a program: one that sees scene after scene, each with
+    Linux allows a process 65,530 of them and XLA takes several a program: one that sees scene after scene, each with
     sizes of its own, ends in "Unable to allocate section memory". Programs are compiled again, or read from disk, when
-    they are next called. Where the maps can't be counted (not Linux) nothing is forgotten.
+    they are next called. Without Linux the maps cannot be counted, and the programs stay.
+
+    Args:
+      above: Number of memory maps.
+
+    Returns:
+      Whether the programs were freed.
     """
     try:
-        held = Path("/proc/self/maps").read_bytes().count(b"\n")
+        maps = Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:
         return False
-    if held <= above:
+    if maps <= above:
         return False
     import jax
 
@@ -224,16 +253,21 @@ def clear_programs(*, above: int = 25_000) -> bool:
 
 
 def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:
-    """The variables to set: one host device per core, full-width vectors, compiled programs kept between runs.
+    """Returns environment variables for one host device per core, full-width vectors and stored programs.
 
-    Flags already in XLA_FLAGS stay as they are. 512-bit vectors are asked for only where the CPU has them. The folder
-    of compiled programs carries a digest of the CPU's features, so that a home shared by unlike machines stays safe.
+    Flags already in XLA_FLAGS stay. 512-bit vectors are used only if the CPU has them. The folder of compiled programs
+    is named by a digest of the CPU's features, so that different machines can share a home folder.
+
+    Args:
+      environ: Environment variables.
+      cores: Number of cores.
+      cpu_features: Names of the CPU's features.
     """
     flags = environ.get("XLA_FLAGS", "").split()
-    given = {flag.split("=")[0] for flag in flags}
-    if "--xla_force_host_platform_device_count" not in given:
+    present = {flag.split("=")[0] for flag in flags}
+    if "--xla_force_host_platform_device_count" not in present:
         flags.append(f"--xla_force_host_platform_device_count={cores}")
-    if "avx512f" in cpu_features and "--xla_cpu_prefer_vector_width" not in given:
+    if "avx512f" in cpu_features and "--xla_cpu_prefer_vector_width" not in present:
         flags.append("--xla_cpu_prefer_vector_width=512")
     chosen = {"XLA_FLAGS": " ".join(flags)}
     if "JAX_COMPILATION_CACHE_DIR" not in environ and (home := cache_home(environ)) is not None:
@@ -245,7 +279,7 @@ def settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str
 
 
 def cache_home(environ: Mapping[str, str]) -> Path | None:
-    """Returns the user's cache folder, or None where it cannot be written: a program must run without one."""
+    """Returns the user's cache folder, or None if it cannot be written: a program must run without one."""
     home = Path(environ["HOME"]) / ".cache" if "HOME" in environ else None
     base = environ.get("XDG_CACHE_HOME") or home or environ.get("LOCALAPPDATA")  # the last on Windows
     if base is None:
@@ -258,10 +292,10 @@ def cache_home(environ: Mapping[str, str]) -> Path | None:
 
 
 def _cpu_features() -> frozenset[str]:
-    """The CPU's feature names where Linux tells them, else none."""
+    """Names of the CPU's features; empty without Linux."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return frozenset()
-    told = (line.split(":", 1)[1].split() for line in lines if line.startswith(("flags", "Features")))
-    return frozenset(next(told, ()))
+    features = (line.split(":", 1)[1].split() for line in lines if line.startswith(("flags", "Features")))
+    return frozenset(next(features, ()))

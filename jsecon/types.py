@@ -57,7 +57,7 @@ class Gaussians:
     means: Array
     """(N, 3) centres, world."""
     log_scales: Array
-    """(N, 3) natural logarithm of the standard deviations along the Gaussian's own axes, world units."""
+    """(N, 3) natural logarithm of the standard deviations along the Gaussian's axes, world units."""
     quaternions: Array
     """(N, 4) wxyz rotation of the Gaussian's axes into the world; any length but zero."""
     opacity_logits: Array
@@ -136,11 +136,11 @@ class Capture(_Shown):
     point_colors: Array
     """(P, 3) uint8 RGB."""
     held_out: Array
-    """(T,) bool: frames that nothing may be fitted to."""
+    """(T,) bool: frames that are only measured, never fitted to."""
     depths: Array | None
     """(T, H, W) float32 z-depth in world units, 0 = unknown; or None."""
     to_source: Array
-    """(4, 4) float64 similarity from this world to the files' own world (identity where nothing was normalised)."""
+    """(4, 4) float64 similarity from this world to the files' world (identity if it was not normalised)."""
     names: tuple[str, ...] = static()
     """T file names without folder or ending, in frame order."""
     notes: tuple[str, ...] = static(default=())
@@ -148,9 +148,9 @@ class Capture(_Shown):
     ignored: Array | None = None
     """(T, H, W) bool: what a fit shall not look at, as what moved; or None."""
     files: tuple[ImageFile, ...] = static(default=())
-    """T images, or () where the frames were made of none. Masks, proposals and depth follow their folders."""
+    """T images, or () if the frames have no files. Masks, proposals and depth follow their folders."""
     to_poses: Array | None = None
-    """(4, 4) similarity from this world to the one that the poses are given in by the files, before any that they name
+    """(4, 4) similarity from this world to that of the poses in the files, before any transform that they name
     (applied_transform) is undone; None: it is the same."""
 
 
@@ -159,13 +159,13 @@ class Rendering:
     """One rendered view."""
 
     features: Array
-    """(H, W, D) sum of alpha T f over the Gaussians (+ (1 - alpha) background where one is given)."""
+    """(H, W, D) sum of alpha T f over the Gaussians (+ (1 - alpha) background if there is one)."""
     alpha: Array
     """(H, W) sum of alpha T, in [0, 1); 0 on pixels that no Gaussian covers."""
     overflow: Array
     """() int32: pairs that did not fit the capacity and were left out; 0 means the image is exact."""
     depth: Array | None = None
-    """(H, W) expected z-depth, world units, 0 where nothing is covered; or None where it was not asked for."""
+    """(H, W) expected z-depth, world units, 0 on uncovered pixels; or None if it was not asked for."""
 
 
 @record
@@ -185,9 +185,9 @@ class Votes:
     """The weight that each region casts on each Gaussian: the K strongest regions of W^T onto one-hot labels."""
 
     regions: Array
-    """(N, K) int32 region ids, strongest first, -1 = none."""
+    """(N, K) int32 region ids, strongest first, -1 in empty places."""
     weights: Array
-    """(N, K) float32 sum of alpha T over the region's pixels in all views, 0 where none."""
+    """(N, K) float32 sum of alpha T over the region's pixels in all views, 0 in empty places."""
     labelled: Array
     """(N,) sum of alpha T over labelled pixels, all regions."""
     total: Array
@@ -239,7 +239,7 @@ class Parts:
     """Small parts of a scene, each with what all masks that hold it say of it."""
 
     part: Array
-    """(N,) int32 part of each Gaussian, 0 .. P-1, -1 = none."""
+    """(N,) int32 part of each Gaussian, 0 .. P-1, or -1."""
     embeddings: Array
     """(P, E) unit; zero for a part that lies in no mask."""
     weight: Array
@@ -274,7 +274,7 @@ class LanguageField(_Shown):
     parts: Parts | None = None
     """what single masks say of small parts of the scene, where the run was asked for it."""
     reference: Array | None = None
-    """(W, E) embeddings of words that have nothing to do with the scene, W may be 0: what a text's similarity is
+    """(W, E) embeddings of words unrelated to the scene, W may be 0: what a text's similarity is
     measured against (jsecon.query.match). None: a field of an earlier version."""
 
 
@@ -287,7 +287,7 @@ class Selection(_Shown):
     similarity: Array
     """(N,) float: cosine, relevancy, or share of votes, as the query says; what the threshold was applied to."""
     region: Array
-    """() int32 region that anchored the query; -1 = none (nothing retrieved, or a query without anchor)."""
+    """() int32 region that anchored the query; -1 if no region was retrieved, or for a query without anchor."""
     score: Array
     """() float: similarity of the text to that region; for queries without anchor the best similarity."""
     quantile: Array | None = None

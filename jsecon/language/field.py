@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import os
 import sys
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from jsecon.files import (
     pack_tree,
     parse_json,
     read_arrays,
-    read_zip,
     unpack_tree,
     write_arrays,
 )
@@ -40,8 +38,6 @@ from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
 
 FORMAT = "jsecon-field"
 VERSION = 2
-_ZIP_VERSION = 1
-"""of field.npz, a zip archive of NumPy's arrays"""
 _RECORDS = {
     cls.__name__: cls
     for cls in (LanguageField, Gaussians, Votes, Regions, Parts, Camera, Autoencoder, Rotation, Spread)
@@ -134,20 +130,15 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     if not path.is_file():
         raise InputError(path, "a folder" if path.is_dir() else "no such file", "a field file", _REMEDY)
     changed = f"It may have been changed or cut short in copying. {_REMEDY}"
-    is_zip = zipfile.is_zipfile(path)
+    if path.suffix == ".npz":
+        raise InputError(path, "it is a field of an earlier version of jsecon", "field.safetensors", _REMEDY)
     try:
-        if is_zip:  # field.npz, as it was written before field.safetensors
-            members = read_zip(path)
-            header = parse_json(members.pop("header", np.zeros(0, np.uint8)).tobytes() or b"null")
-        else:
-            header, members = read_arrays(path, memory_map_above=mapped, verify=checked)
+        header, members = read_arrays(path, memory_map_above=mapped, verify=checked)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            problem = "it is an archive of another program" if is_zip else "it is a file of jsecon, but no field"
-            raise InputError(path, problem, "a field file", _REMEDY)
-        expected = _ZIP_VERSION if is_zip else VERSION
-        if (version := header.get("version")) != expected:
+            raise InputError(path, "it is a file of jsecon, but no field", "a field file", _REMEDY)
+        if (version := header.get("version")) != VERSION:
             remedy = f"Read it with the jsecon that wrote it. {_REMEDY}"
-            raise InputError(path, f"version {version}", f"version {expected}", remedy)
+            raise InputError(path, f"version {version}", f"version {VERSION}", remedy)
         field = unpack_tree(_known(header["field"]), members, _RECORDS.__getitem__)
         whole = isinstance(field, LanguageField)
         problem = _disagreement(field) or _oddity(field, checked) if whole else "no field at its root"
