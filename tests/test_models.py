@@ -36,11 +36,11 @@ def test_what_a_folder_is_good_for(folders, model, words):
     told = {use.model: use for use in findings.uses}
     assert {name for name, use in told.items() if use.usable} == {model}
     for word in words:
-        assert word in told[model].told
+        assert word in told[model].summary
     for name, use in told.items():
         if name != model:
-            assert "expected" in use.told
-            assert "huggingface.co" in use.told or "github.com" in use.told
+            assert "expected" in use.summary
+            assert "huggingface.co" in use.summary or "github.com" in use.summary
     assert unusable(findings) == []
 
 
@@ -68,7 +68,7 @@ def test_damage_and_emptiness_end_in_exit_code_2(tmp_path, capsys):
     assert cli.main(["models", "check", str(folder)]) == 2
     told = capsys.readouterr()
     assert "cannot be opened: ONNX Runtime" in told.out
-    assert "nothing that can be used" in told.err
+    assert "no model that can be used" in told.err
     (tmp_path / "empty").mkdir()
     assert cli.main(["models", "check", str(tmp_path / "empty")]) == 2
     assert "0 graphs" in capsys.readouterr().out

@@ -188,8 +188,8 @@ def test_numbers_that_are_no_scale_and_bias_are_refused(tmp_path, content):
 
 def _told(folder) -> str:
     use = next(use for use in inspect_models(folder).uses if use.model == "CLIP")
-    assert use.usable, use.told
-    return use.told
+    assert use.usable, use.summary
+    return use.summary
 
 
 # The probability in place of the contrast's threshold

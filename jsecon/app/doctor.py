@@ -153,7 +153,7 @@ def _models(folder: Path | None) -> list[Check]:
     from jsecon.pipeline.models import inspect_models
 
     found = [inspect_models(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
-    usable = {use.model: use.told for findings in reversed(found) for use in findings.uses if use.usable}
+    usable = {use.model: use.summary for findings in reversed(found) for use in findings.uses if use.usable}
     missing = "none in {}: jsecon models check says what is missing"
     return [
         Check(use.model, "ok", usable[use.model])

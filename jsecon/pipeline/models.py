@@ -1,4 +1,4 @@
-"""What a folder of models holds: every graph's signature, and what jsecon can use it for."""
+"""Inspects a folder of models: the signature of every graph, and what jsecon can use the folder for."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -14,29 +14,39 @@ from jsecon.networks.session import Graph, describe
 
 @dataclasses.dataclass(frozen=True)
 class Use:
-    """One thing that a folder could be used for."""
+    """A kind of model that a folder may hold.
+
+    Attributes:
+      model: CLIP, SAM, SAM 2 or SAM 3.
+      usable: Whether the folder holds one.
+      summary: How to use it, or what is wrong with the folder.
+    """
 
     model: str
-    """CLIP, SAM, SAM 2, SAM 3."""
     usable: bool
-    told: str
-    """how to use it, or what was found instead of what."""
+    summary: str
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelReport:
-    """What lies in a folder."""
+    """Content of a folder.
+
+    Attributes:
+      folder: The folder.
+      graphs: Inputs and outputs of each .onnx file by its path within the folder, or why it cannot be opened.
+      uses: What the folder can be used for.
+    """
 
     folder: Path
     graphs: dict[str, str]
-    """path of each .onnx file within the folder -> its inputs and outputs, or why it cannot be opened."""
     uses: tuple[Use, ...]
 
 
 def inspect_models(folder: str | Path) -> ModelReport:
-    """Opens every graph of a folder, and puts each kind of model in it to the test.
+    """Opens every graph of a folder, and tries the folder as each kind of model.
 
-    Raises InputError where there is no such folder.
+    Raises:
+      InputError: There is no such folder.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -46,23 +56,23 @@ def inspect_models(folder: str | Path) -> ModelReport:
 
 
 def report_lines(findings: ModelReport) -> Iterable[str]:
-    """The findings as lines of text."""
+    """Formats a report as lines of text."""
     yield f"{findings.folder}: {len(findings.graphs)} graphs"
     for path, signature in findings.graphs.items():
         yield f"  {path}"
         yield from (f"    {line}" for line in signature.splitlines())
     for use in findings.uses:
         yield f"{use.model}: {'usable' if use.usable else 'not usable'}"
-        yield f"  {use.told}"
+        yield f"  {use.summary}"
 
 
 def unusable(findings: ModelReport) -> list[InputError]:
-    """That the folder can be used for nothing, where that is so."""
+    """Returns an error if no model of the folder can be used, else an empty list."""
     if any(use.usable for use in findings.uses):
         return []
     expected = f"{' or '.join(use.model for use in findings.uses)} as ONNX graphs"
     remedy = "See above for what is missing and where such exports are published."
-    return [InputError(findings.folder, "nothing that can be used", expected, remedy)]
+    return [InputError(findings.folder, "no model that can be used", expected, remedy)]
 
 
 def _signature(path: Path) -> str:
@@ -84,21 +94,21 @@ def _clip(folder: Path) -> str:
     embedder = ClipEmbedder(folder)
     embedder.check()
     size, files = embedder.size, embedder.files
-    told = f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}"
+    summary = f"images of {size}x{size} px and texts to {embedder.dim} numbers; layout {files.layout}"
     embedder.close()
-    told = f"{told}, tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
+    summary = f"{summary}, tokenizer {files.tokenizer.relative_to(folder)}: jsecon run --embedder {folder}"
     if files.rules is None:
-        return told
+        return summary
     length, pad, clean = files.rules
-    return f"{told}\n  texts of {length} ids, filled by {pad!r}, cleaned by {clean!r}; {_sigmoid(embedder)}"
+    return f"{summary}\n  texts of {length} tokens, padded with {pad!r}, cleaned by {clean!r}; {_sigmoid(embedder)}"
 
 
 def _sigmoid(embedder: ClipEmbedder) -> str:
-    """What tells how likely a text is there: the scale and bias, or what takes their place."""
-    found, where = embedder.logits, embedder.files.logits
-    if found is None or where is None:
+    """How the probability of a text follows from its cosine, or what to do without it."""
+    logits, where = embedder.logits, embedder.files.logits
+    if logits is None or where is None:
         return f"no scale and bias, so that a text is refused by its contrast. {LOGITS_REMEDY}"
-    return f"how likely a text is there: sigmoid({found.scale:.4f} cosine {found.bias:+.4f}), from {where.name}"
+    return f"how likely a text is there: sigmoid({logits.scale:.4f} cosine {logits.bias:+.4f}), from {where.name}"
 
 
 def _sam(folder: Path) -> str:

@@ -1,6 +1,6 @@
-"""What looks at the frames: OpenCV and colours without any weights, or SAM, SAM 2 and CLIP from model folders.
+"""Opens what looks at the frames: OpenCV and colours without weights, or SAM, SAM 2 and CLIP from model folders.
 
-Networks are opened when first needed and closed when their stage is done: their memory would stay otherwise.
+Networks are opened when first needed and closed when their stage is done, to free their memory.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,21 @@ from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Networks
 from jsecon.vision.stores import StoredSegmenter
 
-_NAME = "given-"
+_EXTERNAL = "given-"
+"""prefix of the names of external spaces, as fields hold them"""
 
 
 class ExternalSpace:
-    """Embedder (jsecon.vision.protocols) of a space of `dim` numbers that no model here knows: it has no texts and no
-    canonical phrases, and embeds nothing. Its regions can be asked for by a pixel."""
+    """Embedder (jsecon.vision.protocols) of embeddings from files, whose model is missing.
+
+    It embeds neither texts nor regions; its regions can be queried by a pixel.
+
+    Args:
+      dim: Length of an embedding.
+    """
 
     def __init__(self, dim: int):
-        self.dim, self.name = dim, f"{_NAME}{dim}"
+        self.dim, self.name = dim, f"{_EXTERNAL}{dim}"
         self.canonical = self.reference = np.zeros((0, dim), np.float32)
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> NoReturn:
@@ -37,21 +43,26 @@ class ExternalSpace:
 
 
 def external_dim(name: str | None) -> int | None:
-    """How many numbers an embedding has in the given space of this name; None for every other space."""
-    return int(name.removeprefix(_NAME)) if name is not None and name.startswith(_NAME) else None
+    """Returns the length of an embedding in the external space of this name, or None for any other space."""
+    return int(name.removeprefix(_EXTERNAL)) if name is not None and name.startswith(_EXTERNAL) else None
 
 
 def missing_model(dim: int) -> InputError:
-    """That the model of a given space is needed."""
+    """Returns the error that the model of an external space is needed."""
     remedy = "Give its folder: --embedder DIR. Without it, ask by a pixel (--at)."
-    found = f"regions whose embeddings came from files, {dim} numbers each"
-    return InputError("field", found, "the CLIP model that made them", remedy)
+    problem = f"regions whose embeddings came from files, {dim} numbers each"
+    return InputError("field", problem, "the CLIP model that made them", remedy)
 
 
 def open_networks(options: Options, store: Path) -> Networks:
-    """SAM, SAM 2 and CLIP where the options name their folders; what they find is kept under `store`.
+    """Opens SAM, SAM 2 and CLIP if the options name their folders.
 
-    Raises InputError where a folder holds no such model.
+    Args:
+      options: Options of the run.
+      store: Folder that caches proposals and embeddings.
+
+    Raises:
+      InputError: A folder holds no such model.
     """
     segmenter = tracker = None
     if options.segmenter is not None:
@@ -64,14 +75,14 @@ def open_networks(options: Options, store: Path) -> Networks:
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(options.tracker)
-    given = None
+    external = None
     if options.features is not None:
         from jsecon.data.langsplat import embedding_size
 
-        given = ExternalSpace(embedding_size(options.features))
+        external = ExternalSpace(embedding_size(options.features))
         if options.embedder is None:
-            return Networks(given, segmenter, tracker)
-    name = None if given is None else given.name
+            return Networks(external, segmenter, tracker)
+    name = None if external is None else external.name
     return Networks(open_embedder(name, folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
 
 
@@ -82,11 +93,16 @@ def open_embedder(
     templates: Sequence[str] = ("{}",),
     store: Path | None = None,
 ) -> Embedder:
-    """The embedder whose space is called `name` (None: any): CLIP where its folder is given, else colours. In a given
-    space (`ExternalSpace`) only CLIP knows texts, and any will do whose embeddings have as many numbers.
+    """Opens an embedder: CLIP if its folder is named, else colours.
 
-    `templates` are phrases for CLIP to put texts into. Raises InputError where the folder holds no CLIP model, or the
-    embedder found is of another space.
+    Args:
+      name: Name of the space, or None for any. In an external space any CLIP with embeddings of that length is taken.
+      folder: Folder of a CLIP model.
+      templates: Phrases for texts of CLIP.
+      store: Folder that caches embeddings.
+
+    Raises:
+      InputError: The folder holds no CLIP model, or the embedder is of another space.
     """
     dim = external_dim(name)
     if dim is not None and folder is None:
@@ -95,24 +111,24 @@ def open_embedder(
         from jsecon.networks.clip import ClipEmbedder
 
         # pyright compares a cached_property with a protocol's attribute without reading it.
-        found: Embedder = ClipEmbedder(folder, templates=templates, store=store)  # pyright: ignore[reportAssignmentType]
+        embedder: Embedder = ClipEmbedder(folder, templates=templates, store=store)  # pyright: ignore[reportAssignmentType]
         remedy = "Give the folder of the model that the field was made with: --embedder DIR."
     else:
         from jsecon.vision.colours import ColourEmbedder
 
-        found = ColourEmbedder()
+        embedder = ColourEmbedder()
         remedy = "Run the capture again with this version."
         if name is not None and name.startswith("clip-"):
             remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
         elif tuple(templates) != ("{}",):
             there = "a field whose texts are colours"
             raise InputError("--template", there, "one made with CLIP", "Leave out --template.")
-    if dim is not None and found.dim != dim:
-        there, wanted = f"a model whose embeddings have {found.dim} numbers", f"{dim}, as those from files have"
-        raise InputError("--embedder", there, wanted, "Give the CLIP model that made the files.")
-    if dim is None and name not in (None, found.name):
-        raise InputError("field", f"regions embedded by {name!r}", f"{found.name!r}", remedy)
-    return found
+    if dim is not None and embedder.dim != dim:
+        problem, expected = f"a model whose embeddings have {embedder.dim} numbers", f"{dim}, as those from files have"
+        raise InputError("--embedder", problem, expected, "Give the CLIP model that made the files.")
+    if dim is None and name not in (None, embedder.name):
+        raise InputError("field", f"regions embedded by {name!r}", f"{embedder.name!r}", remedy)
+    return embedder
 
 
 def field_embedder(field: LanguageField, folder: Path | None = None, *, templates: Sequence[str] = ("{}",)) -> Embedder:
