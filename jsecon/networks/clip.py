@@ -3,7 +3,7 @@
 A model folder has one of three layouts:
     immich            visual/model.onnx, textual/model.onnx, visual/preprocess_cfg.json, textual/tokenizer.json
     transformers.js   onnx/vision_model.onnx, onnx/text_model.onnx, preprocessor_config.json, tokenizer.json
-    flat              two .onnx files, told apart by their inputs, with those JSON files beside them
+    flat              two .onnx files, which differ in their inputs, with those JSON files beside them
 MobileCLIP has CLIP's vocabulary. SigLIP and SigLIP 2 are recognised by config.json (`tokenizer.read_text_rules`).
 
 A region is embedded as LangSplat does it: masked, cropped to its box, padded to a black square. A text is embedded as

@@ -365,7 +365,7 @@ class Sam2Tracker:
           prompts: (B, H, W) bool masks of B objects in that frame; an empty one is not followed.
 
         Returns:
-          (T, H, W) int16 index of the object, -1 for none. A pixel of several objects goes to the highest logit.
+          (T, H, W) int16 index of the object, or -1. A pixel of several objects goes to the highest logit.
 
         Raises:
           ValueError: The shapes disagree, or there is no such frame.

@@ -1,4 +1,4 @@
-"""Turns texts into token ids with a model's own tokenizer.json, through Hugging Face's `tokenizers`.
+"""Turns texts into token ids with a model's tokenizer.json, through Hugging Face's `tokenizers`.
 
 CLIP's files differ in normaliser, padding and special tokens, so a text is cleaned and split into words here as
 open_clip does it. The files of SigLIP and SigLIP 2 are used as they are. They state neither the length of a text nor
@@ -202,7 +202,9 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
     if isinstance(text, dict) and "hf_tokenizer_name" in text:
         options = text.get("tokenizer_kwargs") or {}
         if not isinstance(options, dict) or set(options) - {"clean"}:
-            raise InputError(path, f"tokenizer_kwargs {options}", '{"clean": ...} or none', "Take another model.")
+            raise InputError(
+                path, f"tokenizer_kwargs {options}", '{"clean": ...} or an empty one', "Take another model."
+            )
         length = text.get("context_length", OPEN_CLIP_LENGTH)
         clean = options.get("clean", "whitespace")
         pad = _read_padding(tokenizer)[0]

@@ -1,6 +1,6 @@
 """Checks of a dry run: it refuses the inputs that a run would refuse.
 
-Each check is one that a stage makes itself before its long work. None reads more than headers and a few files.
+Each check is one that a stage makes before its long work. It reads no more than headers and a few files.
 """
 
 import contextlib
@@ -23,11 +23,11 @@ from jsecon.pipeline.scene_files import read_scene
 from jsecon.types import ImageFile
 
 
-def check_inputs(work: RunContext, running: Collection[str], results: Mapping[str, Path]) -> None:
+def check_inputs(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> None:
     """Checks the inputs of a run.
 
     Args:
-      work: The run.
+      context: The run.
       running: Names of the stages that would run. Inputs of the other stages are not checked.
       results: Cache file of each stage by its name; files of stages that would run need not exist.
 
@@ -36,8 +36,8 @@ def check_inputs(work: RunContext, running: Collection[str], results: Mapping[st
         few frames are left to fit to, a file of Gaussians cannot be read, or masks, proposals or features do not belong
         to the frames.
     """
-    options = work.options
-    require_place(work.out)
+    options = context.options
+    require_place(context.out)
     if "poses" in running:
         require_pycolmap(options.capture)
         if is_video(options.capture) and min(video_size(options.capture)) < 1:
@@ -46,7 +46,7 @@ def check_inputs(work: RunContext, running: Collection[str], results: Mapping[st
     if is_bare_scene(options.capture):
         read_scene(options.capture)
         return
-    extent = _extent(work, running, results)
+    extent = _extent(context, running, results)
     train = np.flatnonzero(~holdout_mask(extent.frames, options.holdout))
     require_training(len(train) if extent.frames > 1 else extent.frames, extent.frames)
     if options.gaussians is not None and "gaussians" in running:
@@ -72,9 +72,9 @@ def require_place(folder: Path) -> None:
         raise InputError(folder, f"{parent} cannot be written", "a folder that can be written", remedy)
 
 
-def _extent(work: RunContext, running: Collection[str], results: Mapping[str, Path]) -> CaptureExtent:
+def _extent(context: RunContext, running: Collection[str], results: Mapping[str, Path]) -> CaptureExtent:
     """Returns number, size and names of the frames that a run would load. A video's frames have no names yet."""
-    options = work.options
+    options = context.options
     size_options = {name: getattr(options, name) for name in ("downscale", "long_side", "frames")}
     if "load" not in running:
         with contextlib.suppress(cache.CorruptCacheError):  # a run would compute it again
@@ -84,7 +84,7 @@ def _extent(work: RunContext, running: Collection[str], results: Mapping[str, Pa
     if "poses" not in results:
         return capture_extent(options.capture, **size_options)
     if "poses" not in running:
-        return capture_extent(work.out / "poses", **size_options)
+        return capture_extent(context.out / "poses", **size_options)
     if is_video(options.capture):
         size = downscaled_size(video_size(options.capture), options.downscale, options.long_side)
         return CaptureExtent(options.frames or DEFAULT_VIDEO_FRAMES, size)

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def default_hint(default: str) -> str:
-    """Returns the default of an option for its help text, or nothing for a flag or an option without a default."""
+    """Returns the default of an option for its help text, or an empty text for a flag or an option without a default."""
     return "" if default in ("", "None", "False") else f"(default: {default})"
 
 
@@ -104,7 +104,7 @@ class MaskOptions:
       masks: Folder of instance masks: an integer PNG or .npy per frame under the frame's name (0 is background), in
         subfolders like the images' if those have some; or <object>/<frame>.png in black and white; or LangSplat's
         _s.npy. Without it, jsecon finds the objects in the frames.
-      proposals: Folder of masks of single frames, to be brought together over the frames: <frame>.json of SAM's own
+      proposals: Folder of masks of single frames, to be brought together over the frames: <frame>.json of SAM's
         generator, a COCO file of all frames, LangSplat's _s.npy, PNGs or .npy, named like the masks of --masks.
       granularity: Without --masks, how large the objects are that jsecon finds by itself. Fine separates parts of
         things. Coarse joins the colours of a thing, and separates things by the depth that the Gaussians render.
@@ -177,7 +177,7 @@ class Options(FieldOptions, ModelOptions, MaskOptions, BareOptions, SceneOptions
 
     @property
     def associated_by(self) -> Literal["consensus", "tracking"]:
-        """How masks are associated over the frames: by tracking if a tracker is given, else by `association`."""
+        """How masks are associated over the frames: by tracking with a tracker, else by `association`."""
         return self.association if self.tracker is None else "tracking"
 
 
@@ -236,7 +236,7 @@ def require_inputs(options: Options) -> None:
 
 
 def require_own_folder(options: Options, out: Path) -> None:
-    """Checks that the output folder is not one of the input folders, nor a folder of the capture's own files.
+    """Checks that the output folder is not one of the input folders, nor a folder of the capture's files.
 
     Args:
       options: Options of the run.
@@ -252,7 +252,7 @@ def require_own_folder(options: Options, out: Path) -> None:
         for folder in folders:
             if folder.is_dir() and folder.resolve() == out.resolve():
                 problem = f"it is the input folder ({name}) and the output folder at once"
-                remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
+                remedy = f"Write to a new folder, for example {out / 'field'}, or one elsewhere."
                 raise InputError(out, problem, "", remedy)
 
 

@@ -37,7 +37,7 @@ class Results:
     gaussians: Gaussians
     """N Gaussians, read or fitted"""
     masklets: np.ndarray
-    """(T, H, W) int16 labels of the training frames, -1 for none"""
+    """(T, H, W) int16 labels of the training frames, -1 for no region"""
     regions: Regions
     """R regions of the training frames"""
     parts: Parts | None = None
@@ -90,7 +90,7 @@ class RunContext:
       options: Options of the run.
       networks: Models of the run.
       out: Output folder. It does not count as input if it lies inside of an input folder.
-      load: Replaces the loader of captures, for data with a layout of its own.
+      load: Replaces the loader of captures, for data with an unusual layout.
     """
 
     options: Options

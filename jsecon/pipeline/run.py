@@ -1,6 +1,6 @@
 """A run: from a capture to a language field, stage by stage, each stored as it is finished.
 
-    poses (if there are none) -> load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field
+    poses (if they are missing) -> load -> gaussians -> masklets -> regions -> codes -> votes -> distil -> field
 
 and with --parts, after regions, the parts of the scene. Last, the held-out frames are measured.
 
@@ -145,7 +145,7 @@ def plan_run(context: RunContext, stage_list: list[Stage], folder: Path) -> Plan
 
 
 def _owns_output(stage: Stage, stage_list: list[Stage], paths: dict[str, Path]) -> bool:
-    """Whether a stage's output folder is still its own, or no later stage will read it."""
+    """Whether a stage's output folder still belongs to it, or no later stage will read it."""
     if stage.output_dir is None:
         return True
     file = stage.output_dir / KEY_FILE
@@ -253,7 +253,7 @@ def run(
       options: Options of the run.
       out: Output folder.
       listener: Receives plan, progress and notes.
-      load: Replaces the loader of captures, for data with a layout of its own. It may read no files but those beneath
+      load: Replaces the loader of captures, for data with an unusual layout. It may read no files but those beneath
         `options.capture`.
       cache_folder: Folder of the cache; by default OUT/cache.
       coordinator: Calls the other processes of the run (`run_worker`), if there are any.

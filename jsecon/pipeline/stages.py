@@ -93,7 +93,7 @@ def capture_stages(context: RunContext) -> list[Stage]:
     posed = dataclasses.replace(context, options=options)
     plan = load(posed)
     # The stage computes from the posed capture, whatever the context of the run says.
-    compute = lambda given: plan.compute(given._replace(context=posed))
+    compute = lambda stage_input: plan.compute(stage_input._replace(context=posed))
     return [stage, dataclasses.replace(plan, compute=compute, after=("poses",), files=None)]
 
 
@@ -454,7 +454,7 @@ def associate_masks(
       checkpoint: A tracker resumes behind its last frame.
 
     Returns:
-      (T, H, W) int16 labels of the training frames, -1 for none.
+      (T, H, W) int16 labels of the training frames, -1 for no region.
     """
     options, train = context.options, training_frames(capture)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
