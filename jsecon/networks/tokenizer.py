@@ -203,7 +203,7 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
         options = text.get("tokenizer_kwargs") or {}
         if not isinstance(options, dict) or set(options) - {"clean"}:
             raise InputError(
-                path, f"tokenizer_kwargs {options}", '{"clean": ...} or an empty one', "Take another model."
+                path, f"tokenizer_kwargs {options}", '{"clean": ...} or {}', "Take another model."
             )
         length = text.get("context_length", OPEN_CLIP_LENGTH)
         clean = options.get("clean", "whitespace")

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def default_hint(default: str) -> str:
-    """Returns the default of an option for its help text, or an empty text for a flag or an option without a default."""
+    """Returns the default of an option for its help text; empty for a flag or an option without a default."""
     return "" if default in ("", "None", "False") else f"(default: {default})"
 
 
@@ -252,7 +252,7 @@ def require_own_folder(options: Options, out: Path) -> None:
         for folder in folders:
             if folder.is_dir() and folder.resolve() == out.resolve():
                 problem = f"it is the input folder ({name}) and the output folder at once"
-                remedy = f"Write to a new folder, for example {out / 'field'}, or one elsewhere."
+                remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
                 raise InputError(out, problem, "", remedy)
 
 
