@@ -202,9 +202,7 @@ def read_text_rules(folder: Path, tokenizer: Path) -> TextRules | None:
     if isinstance(text, dict) and "hf_tokenizer_name" in text:
         options = text.get("tokenizer_kwargs") or {}
         if not isinstance(options, dict) or set(options) - {"clean"}:
-            raise InputError(
-                path, f"tokenizer_kwargs {options}", '{"clean": ...} or {}', "Take another model."
-            )
+            raise InputError(path, f"tokenizer_kwargs {options}", '{"clean": ...} or {}', "Take another model.")
         length = text.get("context_length", OPEN_CLIP_LENGTH)
         clean = options.get("clean", "whitespace")
         pad = _read_padding(tokenizer)[0]
