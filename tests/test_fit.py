@@ -182,9 +182,7 @@ def test_a_growing_fit_gains_gaussians_where_the_picture_is_wrong_and_resumes_to
     counts = [int(in_use(state.gaussians).sum()) for state in states]
     assert counts == sorted(counts)
     assert 50 <= gaussians.count <= 60
-    kept, _ = fit_gaussians(capture, start=few, **given | {"schedule": WHOLE})
-    assert kept.count == 20
-    assert evaluate_psnr(gaussians, capture) > evaluate_psnr(kept, capture)
+    assert evaluate_psnr(gaussians, capture) > evaluate_psnr(few, capture) + 2
     again, _ = fit_gaussians(capture, state=jax.tree.map(np.asarray, states[3]), **given)
     assert same(again, gaussians)
 

@@ -69,7 +69,7 @@ def test_sigmoid_and_its_derivative_over_the_float_range():
     np.testing.assert_allclose(slope, half / (1 + half) ** 2, rtol=2e-6, atol=1e-37)
 
 
-@pytest.mark.parametrize("count", [16385, 32769, 40000, 100000])
+@pytest.mark.parametrize("count", [40000, *(pytest.param(n, marks=pytest.mark.long) for n in (16385, 32769, 100000))])
 def test_at_the_sizes_where_jax_39103_strikes(count):
     rng = np.random.default_rng(count)
     x, y = rng.normal(size=(count, 3)).astype(np.float32), rng.normal(size=(2, 3)).astype(np.float32)

@@ -102,6 +102,7 @@ def test_the_interval_is_of_pairs():
     assert 0.015 < low < mean < high < 0.025  # though the texts differ by 0.3
 
 
+@pytest.mark.long
 def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F811
     rows = rows_of(points=False)
     few = ("VALA: contrast, lenient silhouette, sharp", "ours, tracks: contrast, silhouette")
