@@ -1,22 +1,22 @@
-"""How XLA compiles the tests' programs: fast, and as in a user's process in files marked `as_shipped`.
+"""How XLA compiles the tests' programs: fast by default, as in a user's process in files marked `as_shipped`.
 
-Most of a test run's time is XLA's. What these options leave out is the speed of the programs, and nothing of what they
-compute beyond rounding. It matters to few tests: those whose claim is about the code that is shipped.
+XLA takes most of a test run's time. The fast options give slower programs with the same results up to rounding. Only
+tests of the machine code that users run need the options of a user's process.
 """
 
 import functools
 import importlib.metadata
 
 _KNOWN = tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < (0, 12)
-"""whether XLA still knows its old emitters: an unknown flag ends the process"""
+"""whether XLA knows the flag of its old emitters; an unknown flag ends the process"""
 EMITTERS = {"xla_cpu_use_fusion_emitters": False} if _KNOWN else {}
 FAST = {
     **EMITTERS,
     "xla_backend_optimization_level": 0,
     "xla_cpu_parallel_codegen_split_count": 1,
 }
-"""for most programs: a fifth of the CPU time that XLA takes as shipped. In XLA_FLAGS, so that the processes which tests
-start find on disk what is compiled already."""
+"""options of most programs: a fifth of XLA's CPU time with its defaults. They stand in XLA_FLAGS, so that subprocesses
+share the compiled programs on disk."""
 SHIPPED = {
     **{name: True for name in EMITTERS},
     "xla_backend_optimization_level": 3,
@@ -24,8 +24,8 @@ SHIPPED = {
 }
 """XLA's own defaults"""
 LOOPS = {"xla_backend_optimization_level": 1}
-"""for programs that are run hundreds of times: three times faster than FAST, for twice the compilation. Not in files
-marked `few_steps`"""
+"""options of programs that run hundreds of times: three times faster than FAST, for twice the compilation time. Files
+marked `few_steps` do without them."""
 RUN_OFTEN = frozenset({"jit_step", "jit__step", "jit__epochs", "jit__descend", "jit__run"})
 """their names: the training loops"""
 
@@ -37,7 +37,7 @@ _state = {"shipped": False, "loops": True}
 
 @functools.cache
 def install() -> None:
-    """From now on jax compiles each program of this process by what is chosen below."""
+    """Makes jax compile each further program of this process with the options of `choose`."""
     import jax._src.compiler as compiler
 
     compile_or_read = compiler.compile_or_get_cached
@@ -53,8 +53,10 @@ def install() -> None:
 
 
 def choose(*, shipped: bool, loops: bool = True) -> None:
-    """Programs compiled from now on are those of a process without our flags, or fast ones, `loops` among them as
-    LOOPS says. What was compiled otherwise is forgotten; on disk, jax's own keys tell them apart."""
+    """Sets the options of further programs: XLA's defaults if `shipped`, else FAST, with LOOPS for training loops.
+
+    A change of `shipped` clears the compiled programs. On disk, jax's keys tell both kinds apart.
+    """
     import jax
 
     _state["loops"] = loops

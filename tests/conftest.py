@@ -1,7 +1,7 @@
-"""What every test shares: type checks at run time, a float64 switch, a small scene, and where the real captures lie.
+"""Shared fixtures and hooks: type checks at run time, a float64 switch, a small scene, a finished run.
 
-Two host devices, the flags of `compiling` and the import hook must be settled before jax makes its first array and
-before jsecon is imported.
+Two host devices, the flags of `compiling` and the import hook are set before jax makes its first array and before
+jsecon is imported.
 """
 
 import atexit
@@ -18,8 +18,7 @@ import compiling
 os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 {compiling.ENVIRONMENT}")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-# Programs that one test compiled are there for all others of the run: those of the other workers, of subprocesses, and
-# those that compile the same again. xdist's workers inherit the folder.
+# All workers and subprocesses of a run share one folder of compiled programs. xdist's workers inherit it.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jsecon-tests-")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
@@ -48,7 +47,7 @@ install_import_hook(
 
 compiling.install()
 
-# The same examples in every CI run: what a submission is judged by must not be drawn by lot.
+# CI draws the same examples in every run.
 settings.register_profile("ci", derandomize=True, deadline=None)
 if os.environ.get("CI"):
     settings.load_profile("ci")
@@ -58,7 +57,7 @@ import numpy as np  # noqa: E402
 from jsecon.process import clear_programs, compilation_counts  # noqa: E402
 from jsecon.types import Camera, Gaussians  # noqa: E402
 
-# Tracing makes many objects and few cycles: looking for those ten times less often saves a tenth of a test's time.
+# Tracing makes many objects and few cycles: ten times fewer collections save a tenth of a test's time.
 gc.freeze()
 gc.set_threshold(20_000, 20, 20)
 
@@ -69,12 +68,12 @@ LONGEST = (
     "scene_stages", "processes", "capacity", "distill",
 )
 # fmt: on
-"""files, without test_, that start first; those that wait for the shared run come after its own file"""
+"""files, without test_, that start first; files that use `room_run` come after test_pipeline, which makes it"""
 
 
 def pytest_collection_modifyitems(items):
-    """Files as shipped come first, so that a worker changes its options once; then the longest: one of them at the end
-    would leave the other workers without work."""
+    """Sorts files: first those compiled as shipped, so that a worker changes its options once; then the longest, which
+    would keep one worker busy alone at the end."""
     place = {name: n for n, name in enumerate(LONGEST)}
     items.sort(
         key=lambda item: (
@@ -86,8 +85,8 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item, nextitem):
-    """Programs are compiled as the file's mark says, those of the fixtures too; after the file they are forgotten
-    before they use up the process's memory maps."""
+    """Compiles the programs of a test and of its fixtures as the file's mark says; after a file, clears the programs if
+    they hold many of the process's memory maps."""
     marked = {name: item.get_closest_marker(name) is not None for name in ("as_shipped", "few_steps")}
     compiling.choose(shipped=marked["as_shipped"], loops=not marked["few_steps"])
     done = yield
@@ -102,7 +101,7 @@ def pytest_sessionstart(session):
 
 
 def pytest_sessionfinish(session):
-    """What a worker of xdist built is added up in the process that prints it."""
+    """Passes a worker's number of compiled programs to the process that prints the sum."""
     session.config.programs.update(compilation_counts())
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["programs"] = dict(session.config.programs)
@@ -120,7 +119,7 @@ def pytest_terminal_summary(terminalreporter, config):
 
 @pytest.fixture
 def x64():
-    """float64 for the time of one test: gradients against central differences need it."""
+    """Enables float64 for one test, for gradients against central differences."""
     with jax.enable_x64(True):
         yield
 
@@ -167,7 +166,7 @@ def camera(cameras) -> Camera:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of real captures beside the checkout; a test that asks for it is skipped where there is none."""
+    """Folder of real captures beside the checkout; without it the test is skipped."""
     folder = HOME.parent / "shared"
     if not (folder / "captures").is_dir():
         pytest.skip("no real captures beside the checkout")
@@ -176,7 +175,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory):
-    """A context for what all workers of a run share: one makes it, the others wait and find it there."""
+    """A context manager for a folder that all workers share: one worker fills it while the others wait."""
 
     @contextlib.contextmanager
     def alone(name):
@@ -190,7 +189,7 @@ def made_once(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def room(made_once) -> Path:
-    """The demo room on disk, as small as it can be and still have objects to find: 8 views of 160x120, 2 held out."""
+    """A small demo room on disk: 8 views of 160x120, 2 held out."""
     from experiments.datasets.plain_room import make_room
     from jsecon.demo import write_room
 
@@ -203,7 +202,7 @@ def room(made_once) -> Path:
 
 @pytest.fixture(scope="session")
 def room_run(room, made_once, tmp_path_factory):
-    """A finished run on that room with its true masks given, and a folder as it was written, this worker's own."""
+    """(result, folder) of a finished run on the room with its true masks; the folder is this worker's copy."""
     from jsecon.pipeline import run as pipeline
 
     options = pipeline.Options(room, masks=room / "masks", holdout=4, steps=150)
