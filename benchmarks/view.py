@@ -96,7 +96,7 @@ def asked(page: Page, viewer: Viewer, text: str) -> dict[str, float]:
     quiet(page)
     page.js("seen.upload = seen.enter = 0, seen.first = null")
     told: dict[str, float] = {}
-    paint, then = viewer.layers.paint, viewer.then
+    paint, then = viewer.scene.paint, viewer.then
 
     def timed_paint(*given) -> None:
         paint(*given)
@@ -106,12 +106,12 @@ def asked(page: Page, viewer: Viewer, text: str) -> dict[str, float]:
         told.setdefault("heard", 1000 * time.time())
         then(*given, **more)
 
-    viewer.layers.paint, viewer.then = timed_paint, timed_then
+    viewer.scene.paint, viewer.then = timed_paint, timed_then
     cpu = time.process_time()
     page.type(FIND, text)
     until(lambda: "sent" in told, "the answer is sent", 60)
     cpu = 1000 * (time.process_time() - cpu)
-    viewer.layers.paint, viewer.then = paint, then
+    viewer.scene.paint, viewer.then = paint, then
     try:
         page.until("seen.upload", UPLOAD_SECONDS)
     except TimeoutError:

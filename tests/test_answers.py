@@ -8,7 +8,7 @@ from small_field import REGIONS, make_field
 from test_gltf import read_glb
 
 from jsecon.app import cli
-from jsecon.app.viewer.static_page import NOWHERE, main_regions
+from jsecon.app.outputs import main_regions
 from jsecon.data.gaussians.files import load_gaussians
 from jsecon.language.field import save_field
 
@@ -43,7 +43,7 @@ def test_a_field_is_exported_in_every_format(saved, tmp_path, capsys):
     codes = np.concatenate([found[name] for name in found if name.startswith("_CODE")], axis=1)
     np.testing.assert_array_equal(codes, field.codes)
     regions = main_regions(field)
-    np.testing.assert_array_equal(found["_REGION"][:, 0], np.where(regions == NOWHERE, -1, regions))
+    np.testing.assert_array_equal(found["_REGION"][:, 0], regions)
     assert set(range(REGIONS)) <= set(found["_REGION"][:, 0].astype(int))
 
 

@@ -63,8 +63,8 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     assert isinstance(mapped.parts.part, np.memmap)
     for threshold in (None, 2.0):
         how["threshold"] = threshold
-        answers, _ = ask.answer_each(ask.queries_of(field, ColourEmbedder(), **how))
-        blocks, _ = ask.answer_in_blocks(mapped, ColourEmbedder(), **how)
+        answers, _ = ask.ask_each(field, ColourEmbedder(), **how)
+        blocks, _ = ask.ask_each(mapped, ColourEmbedder(), **how)
         for memory, own in zip(answers, blocks, strict=True):
             np.testing.assert_array_equal(own.rows[own.mask], np.flatnonzero(memory.mask))
             np.testing.assert_array_equal(own.selection.similarity[own.mask], memory.selection.similarity[memory.mask])
@@ -76,7 +76,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
 
 @pytest.mark.parametrize(
     "more",
-    [("--by", "silhouette"), ("--by", "one_step"), ("--even",), ("--box", "#1", 2, 2, 9, 9), ("--phrases", "sam3")],
+    [("--by", "silhouette"), ("--box", "#1", 2, 2, 9, 9), ("--phrases", "sam3")],
 )
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run

@@ -8,8 +8,8 @@ import pytest
 from small_field import make_field
 
 from jsecon.app.ask import ask_text
-from jsecon.app.viewer.candidates import Pictures, candidates, region_along
-from jsecon.app.viewer.static_page import main_regions
+from jsecon.app.outputs import main_regions
+from jsecon.app.viewer.candidates import RegionPictures, candidates, region_along
 from jsecon.errors import InputError
 from jsecon.query.pixel import region_at
 from jsecon.vision.colours import BASIC, ColourEmbedder
@@ -63,7 +63,7 @@ def test_a_field_without_regions_has_no_candidates(field):
 
 
 def test_a_region_is_pictured_where_its_gaussians_are(field):
-    pictures = Pictures(field)
+    pictures = RegionPictures(field)
     photo = pictures.renderer.photo(1)
     for region in range(5):
         part = pictures.region(region, 1)
@@ -88,7 +88,7 @@ def test_a_ray_meets_the_region_of_its_pixel(field, frame):
     agree = []
     for x, y in ((24, 20), (18, 14), (30, 26), (20, 28), (28, 12), (24, 30)):
         ray = turn.T @ [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1]
-        found = region_along(field, np.asarray(camera.centres), ray, focal=float(camera.fx), seen=seen)
+        found = region_along(field, np.asarray(camera.centres), ray, focal=float(camera.fx), visible=seen)
         agree.append(found == region_at(field, frame, x, y))
     assert sum(agree) >= 5, agree  # the frame's own Jacobian differs off its axis
 
@@ -97,9 +97,9 @@ def test_a_ray_passes_what_is_hidden(field):
     camera = jax.tree.map(np.asarray, field.cameras)[0]
     ahead, centre = camera.world_to_camera[2, :3], np.asarray(camera.centres)
     everything = np.ones(64, bool)
-    first = region_along(field, centre, ahead, focal=45.0, seen=everything)
+    first = region_along(field, centre, ahead, focal=45.0, visible=everything)
     assert first >= 0
-    behind = region_along(field, centre, ahead, focal=45.0, seen=main_regions(field) != first)
+    behind = region_along(field, centre, ahead, focal=45.0, visible=main_regions(field) != first)
     assert behind != first
-    assert region_along(field, centre, ahead, focal=45.0, seen=~everything) == -1
-    assert region_along(field, centre, -ahead, focal=45.0, seen=everything) == -1
+    assert region_along(field, centre, ahead, focal=45.0, visible=~everything) == -1
+    assert region_along(field, centre, -ahead, focal=45.0, visible=everything) == -1

@@ -39,7 +39,7 @@ def test_it_tells_what_is_here_and_what_is_not(tmp_path, capsys, monkeypatch):
 
 
 def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "LEAST_MEMORY", 1 << 60)
+    monkeypatch.setattr(doctor, "MIN_MEMORY", 1 << 60)
 
     def wrong():
         raise RuntimeError("cosines are off")
@@ -48,22 +48,22 @@ def test_what_every_run_needs_and_is_wrong_is_exit_code_2(capsys, monkeypatch):
     assert cli.main(["doctor", "--json"]) == 2
     told = json.loads(capsys.readouterr().out)
     assert {check["name"]: check["status"] for check in told["checks"]}["backend"] == "wrong"
-    assert [error["name"] for error in told["refused"]] == ["backend", "memory"]
-    assert told["refused"][0]["remedy"] == backend.REMEDY
+    assert [error["where"] for error in told["errors"]] == ["backend", "memory"]
+    assert told["errors"][0]["remedy"] == backend.REMEDY
     with pytest.raises(InputError, match="no such folder"):
         doctor.run_checks(Path("nowhere"))
 
 
 def test_a_package_that_cannot_be_imported(monkeypatch):
     monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "no_such_module"))
-    check = doctor._packages()
+    check = doctor.check_packages()
     assert check.status == "missing"
-    assert "no_such_module (No module named" in check.told
-    assert [error.where for error in doctor.wrong([check])] == ["packages"]
+    assert "no_such_module (No module named" in check.message
+    assert [error.where for error in doctor.failures([check])] == ["packages"]
     monkeypatch.setattr(doctor, "PACKAGES", ("cv2",))
-    assert doctor._packages().status == "ok"
+    assert doctor.check_packages().status == "ok"
     monkeypatch.delattr("cv2.ximgproc.createSuperpixelSLIC")
-    assert "without ximgproc" in doctor._packages().told
+    assert "without ximgproc" in doctor.check_packages().message
 
 
 def test_it_knows_the_packages_and_extras_of_the_project():
@@ -77,14 +77,14 @@ def test_limits_of_a_cgroup_are_told(monkeypatch):
     files = {"memory.max": ["1073741824"], "memory.current": ["1000"], "cpu.max": ["50000", "100000"]}
     for module in (doctor, process):
         monkeypatch.setattr(module, "read_cgroup", lambda new, old: files.get(new, []))
-    memory, cores = doctor._memory(), doctor._cores()
-    assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.told) == ("wrong", True)
-    assert "the time of only 0.5 (cgroup)" in cores.told
+    memory, cores = doctor.check_memory(), doctor.check_cores()
+    assert (memory.status, "limit 1.0 GiB (cgroup)" in memory.message) == ("wrong", True)
+    assert "the time of 0.5 (cgroup)" in cores.message
 
 
 def test_a_disk_without_room_for_programs_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "not" / "yet"))
-    assert doctor._programs().status == "ok"
-    monkeypatch.setattr(doctor, "LEAST_FOR_PROGRAMS", 1 << 60)
-    check = doctor._programs()
-    assert (check.status, "compiled in every run" in check.told) == ("missing", True)
+    assert doctor.check_programs().status == "ok"
+    monkeypatch.setattr(doctor, "MIN_CACHE_DISK", 1 << 60)
+    check = doctor.check_programs()
+    assert (check.status, "compiled in every run" in check.message) == ("missing", True)

@@ -35,7 +35,7 @@ def test_a_dry_run_lists_every_stage_and_writes_nothing(room, tmp_path, capsys):
 def test_bad_options_are_refused_as_in_a_run(room, tmp_path, capsys):
     line = ["run", str(room), "--out", str(tmp_path / "out"), "--steps", "0", "--dry-run", "--json"]
     assert cli.main(line) == 2
-    assert json.loads(capsys.readouterr().out)["error"]["name"] == "--steps"
+    assert json.loads(capsys.readouterr().out)["error"]["where"] == "--steps"
 
 
 @pytest.mark.parametrize("given", [{}, {"downscale": 2.0}, {"long_side": 50, "frames": 3}])

@@ -11,7 +11,7 @@ from jsecon.app.cli import finish
 from jsecon.app.verbs import Output
 from jsecon.errors import InputError, describe_error
 
-PARTS = {"name": "mug.png", "found": "text", "expected": "a picture", "remedy": "Draw one."}
+PARTS = {"where": "mug.png", "problem": "text", "expected": "a picture", "remedy": "Draw one."}
 ERROR = PARTS | {"message": "mug.png: text, expected a picture. Draw one."}
 
 
@@ -27,12 +27,12 @@ def test_figures_and_paths_are_one_object(capsys):
 
 
 def test_what_was_refused_is_told_beside_what_was_not(capsys):
-    assert finish(Output(json=True), {"answers": [1], "refused": _errors()}) == 2
+    assert finish(Output(json=True), {"answers": [1], "errors": _errors()}) == 2
     out, err = capsys.readouterr()
     told = json.loads(out)
-    assert told["error"] == told["refused"][1] == ERROR
-    assert (told["refused"][0]["name"], told["answers"], err) == ("cup.png", [1], "")
-    assert finish(Output(), {"refused": _errors()}) == 2
+    assert told["error"] == told["errors"][1] == ERROR
+    assert (told["errors"][0]["where"], told["answers"], err) == ("cup.png", [1], "")
+    assert finish(Output(), {"errors": _errors()}) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert [line.split(":")[1] for line in err.splitlines()] == [" cup.png", " mug.png"]
@@ -85,10 +85,10 @@ def test_a_stop_and_a_bug_are_error_objects_with_their_own_codes(tmp_path, monke
             == "interrupted. Run the same command again to resume."
         )
     assert fails(within(None)) == 2
-    assert json.loads(capsys.readouterr().out)["error"]["found"] == "half of it"
+    assert json.loads(capsys.readouterr().out)["error"]["problem"] == "half of it"
     with pytest.raises(ZeroDivisionError):
         fails(ZeroDivisionError("a bug"))
-    assert json.loads(capsys.readouterr().out)["error"]["found"] == "internal error: a bug"
+    assert json.loads(capsys.readouterr().out)["error"]["problem"] == "internal error: a bug"
 
 
 @pytest.mark.parametrize(

@@ -92,10 +92,10 @@ def one_region(scene, cameras, means, *, unseen=()):
 
 
 @pytest.mark.parametrize("options", [(), ("--threshold", 0)])
-def test_even_never_selects_what_no_view_saw(scene, cameras, tmp_path, options):
+def test_what_no_view_saw_is_never_selected(scene, cameras, tmp_path, options):
     means = 0.05 * np.random.default_rng(0).normal(size=(64, 3))
     save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means, unseen=[3, 17, 40]))
-    told = ask(tmp_path / "field.safetensors", tmp_path / "out", "--even", "--keep-outliers", *options)
+    told = ask(tmp_path / "field.safetensors", tmp_path / "out", "--by", "silhouette", "--keep-outliers", *options)
     chosen = jsecon.load_gaussians(tmp_path / "out" / told["ply"]).means
     away = np.linalg.norm(chosen[:, None] - means[None, [3, 17, 40]], axis=-1)
     assert len(chosen) == 61
@@ -109,15 +109,15 @@ def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, ca
     save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means))
     told = ask(tmp_path / "field.safetensors", tmp_path / "out")
     assert told["count"] == 58
-    assert told["outliers_dropped"] == 6
+    assert told["outliers"]["dropped"] == 6
     assert told["outliers"] == {
-        "dropped": 6, "of_selected": 64, "clusters_kept": 2, "clusters_dropped": 0, "keep_with": "--keep-outliers",
+        "dropped": 6, "selected": 64, "clusters_kept": 2, "clusters_dropped": 0,
     }  # fmt: skip
     printed = capsys.readouterr().out
     assert "6 of 64" in printed
     assert "--keep-outliers" in printed
     kept = ask(tmp_path / "field.safetensors", tmp_path / "kept", "--keep-outliers")
-    assert (kept["count"], kept["outliers_dropped"]) == (64, 0)
+    assert (kept["count"], kept["outliers"]["dropped"]) == (64, 0)
     assert "--keep-outliers" not in capsys.readouterr().out
 
 

@@ -9,7 +9,7 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 import viser
 from small_field import make_field
 
-from jsecon.app.viewer.scene import LARGEST, Layers
+from jsecon.app.viewer.scene import MAX_STD, FieldScene
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def colours(layers, count=64):
 @pytest.mark.parametrize("size", [1e-4, 1, 300])
 def test_the_window_holds_the_field_at_any_size(field, server, size):
     logs = np.asarray(field.gaussians.log_scales) + np.float32(np.log(size))
-    layers = Layers(server, with_gaussians(field, means=np.asarray(field.gaussians.means) * size, log_scales=logs))
+    layers = FieldScene(server, with_gaussians(field, means=np.asarray(field.gaussians.means) * size, log_scales=logs))
     seen = np.zeros(64, int)
     for rows, handle in layers._groups:
         seen[rows] += 1
@@ -54,24 +54,24 @@ def test_the_window_holds_the_field_at_any_size(field, server, size):
 def test_huge_and_tiny_gaussians_stay_within_what_viser_holds(field, server):
     logs = np.array(field.gaussians.log_scales)
     logs[0], logs[1] = 20, -40
-    layers = Layers(server, with_gaussians(field, log_scales=logs))
+    layers = FieldScene(server, with_gaussians(field, log_scales=logs))
     for _, handle in layers._groups:
         assert np.isfinite(handle.covariances).all()
-        assert np.abs(handle.covariances).max() <= 1.001 * LARGEST**2
+        assert np.abs(handle.covariances).max() <= 1.001 * MAX_STD**2
     assert layers.scale * np.exp(np.median(logs)) == pytest.approx(1, rel=1e-3)
 
 
 def test_gaussians_that_are_not_finite_are_left_out(field, server):
     means = np.array(field.gaussians.means)
     means[3] = np.nan
-    layers = Layers(server, with_gaussians(field, means=means))
-    assert layers.scale == pytest.approx(Layers(server, field).scale, rel=0.1)
+    layers = FieldScene(server, with_gaussians(field, means=means))
+    assert layers.scale == pytest.approx(FieldScene(server, field).scale, rel=0.1)
     assert all(np.isfinite(handle.centers).all() for _, handle in layers._groups)
     np.testing.assert_array_equal(np.flatnonzero(colours(layers)[:, 3] == 0), [3])
 
 
 def test_only_the_groups_that_change_are_sent(field, server, monkeypatch):
-    layers = Layers(server, field)
+    layers = FieldScene(server, field)
     base, all_seen = layers.photo, np.ones(64, bool)
     sent = []
     layers.paint(base, all_seen)
@@ -89,7 +89,7 @@ def test_only_the_groups_that_change_are_sent(field, server, monkeypatch):
 
 
 def test_frames_stand_where_they_were_taken(field, server):
-    layers = Layers(server, field)
+    layers = FieldScene(server, field)
     centres = np.asarray(field.cameras.centres) * layers.scale
     assert list(layers.frustums) == [0, 1, 2, 3]
     for t, frustum in layers.frustums.items():

@@ -69,7 +69,7 @@ def test_texts_have_names_of_their_own_also_without_case(field):
 def test_a_text_and_a_pixel_of_one_name_do_not_share_files(field):
     at = "at frame_1 24 20"
     pixel, region = ask_pixel(field, 1, 24, 20), ask_region(field, 1)
-    assert pixel.question == at
+    assert pixel.query == at
     assert file_stem(pixel) != file_stem(answer(field, at))
     assert file_stem(region) != file_stem(answer(field, "region 1"))
     assert file_stem(pixel) == file_stem(ask_pixel(field, "frame_1", 24, 20)) != file_stem(ask_pixel(field, 1, 24, 21))
@@ -157,7 +157,7 @@ def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):
             heard.extend(texts)
             return super().embed_text(texts)
 
-    for by in ("votes", "one_step"):
+    for by in ("votes", "code"):
         heard: list[str] = []
         embedder = Heard()
         heard.clear()
@@ -166,15 +166,12 @@ def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):
         assert set(heard) == {word}
 
 
-def test_a_pixel_and_an_outline_are_refused_by_what_compares_texts(field, word, tmp_path, capsys):
+def test_an_outline_is_not_selected_by_codes(field, tmp_path, capsys):
     save_field(tmp_path / "field.safetensors", field)
-    for by in ("one_step", "canonical"):
-        with pytest.raises(InputError, match=f"by {by}"):
-            ask_pixel(field, 1, 24, 20, by=by)
-    for more in (("--at", "#1", 24, 20, "--by", "canonical"), ("--box", "#1", 0, 0, 40, 30, "--by", "code")):
-        assert run("query", tmp_path / "field.safetensors", *more, "--out", tmp_path / "out") == 2
-        assert "by" in capsys.readouterr().err
-        assert not list((tmp_path / "out").glob("*.json"))
+    box = "--box", "#1", 0, 0, 40, 30
+    assert run("query", tmp_path / "field.safetensors", *box, "--by", "code", "--out", tmp_path / "out") == 2
+    assert "--by" in capsys.readouterr().err
+    assert not list((tmp_path / "out").glob("*.json"))
 
 
 def test_one_centroid_in_the_world_of_a_map_projection(field, tmp_path):

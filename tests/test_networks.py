@@ -212,7 +212,7 @@ def test_texts_need_the_model_of_embeddings_from_files(seen, models, tmp_path, c
     assert "came from files, 3 numbers each" in capsys.readouterr().err
     with pytest.raises(InputError, match="--embedder DIR"):
         ExternalSpace(3).embed_text(["red"])
-    assert cli.main([*ask, "--embedder", str(models[1]), "--by", "canonical"]) == 0  # the phrases, too, are the model's
+    assert cli.main([*ask, "--embedder", str(models[1]), "--quantile", "0"]) == 0
     assert 0 < json.loads((tmp_path / "answers" / "red.json").read_text())["score"] < 1
     with pytest.raises(InputError, match="5, as those from files have"):
         networks.open_embedder("given-5", folder=models[1])

@@ -67,6 +67,6 @@ def test_a_text_that_is_not_utf8_is_refused_in_one_sentence(saved, tmp_path, cap
     assert main(asked) == 2
     line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("jsecon: "))
     assert line.isascii()
-    for by in ("votes", "one_step"):
+    for by in ("votes", "code"):
         with pytest.raises(InputError, match="not UTF-8"):
             ask_text(field, ColourEmbedder(), text, by=by)

@@ -8,7 +8,7 @@ from small_field import make_field
 
 from jsecon.app.ask import ask_region, ask_text
 from jsecon.app.viewer.candidates import Candidate
-from jsecon.app.viewer.panel import sheet, told
+from jsecon.app.viewer.panel import candidate_grid, messages
 from jsecon.app.viewer.view_state import ViewState
 from jsecon.errors import InputError
 from jsecon.vision.colours import ColourEmbedder
@@ -23,26 +23,26 @@ def field(scene, cameras):
 
 def test_an_answer_is_told_with_how_many_and_how_sure(field):
     answer = ask_region(field, 1)
-    text = told(field, ViewState((1,)), [answer])
-    assert f"<b>region 1</b>: {answer.mask.sum()} Gaussians, sure to" in text
-    assert 50 <= int(re.search(r"sure to (\d+) %", text).group(1)) <= 100
+    text = messages(field, ViewState((1,)), [answer])
+    assert f"<b>region 1</b>: {answer.mask.sum()} Gaussians, confidence" in text
+    assert 50 <= int(re.search(r"confidence (\d+) %", text).group(1)) <= 100
     assert "score" not in text  # of what was pointed at: it is no similarity
 
 
 def test_what_has_no_answer_is_told_and_why(field):
     nothing = ask_region(field, 99)
-    assert "nothing here answers it: the best score is 0.00, and 0.12" in told(field, ViewState(("x",)), [nothing])
-    none_left = ask_region(field, 1, similarity_threshold=1.1)
-    assert "no Gaussian reaches the threshold 0.50" in told(field, ViewState((1,)), [none_left])
+    assert "no match: the best score is 0.00, and 0.12" in messages(field, ViewState(("x",)), [nothing])
+    none_left = ask_region(field, 1, threshold=1.1)
+    assert "no Gaussian reaches the threshold 0.50" in messages(field, ViewState((1,)), [none_left])
     with pytest.raises(InputError) as error:
         ask_text(field, EMBEDDER, "<b>a thing")
-    text = told(field, ViewState(("<b>a thing",)), [error.value])
+    text = messages(field, ViewState(("<b>a thing",)), [error.value])
     assert "no colour word" in text
     assert "<b>&lt;b&gt;a thing</b>" in text
 
 
 def test_several_answers_have_swatches_of_their_own(field):
-    text = told(field, ViewState((0, 1)), [ask_region(field, 0), ask_region(field, 1)])
+    text = messages(field, ViewState((0, 1)), [ask_region(field, 0), ask_region(field, 1)])
     first, second = re.findall(r"background:(#\w{6})", text)
     assert first != second
 
@@ -50,8 +50,8 @@ def test_several_answers_have_swatches_of_their_own(field):
 def test_the_candidate_that_was_taken_is_marked(field):
     answer, picture = ask_region(field, 1), np.full((20, 40, 3), (200, 30, 30), np.uint8)
     found = [(0, Candidate(1, 0.5, 0), picture), (0, Candidate(3, 0.25, 0), picture)]
-    text = sheet(ViewState(("red",)), [answer], found)
-    assert re.findall(r"(\d): (\d\.\d+)(, taken)?", text) == [("1", "0.50", ", taken"), ("2", "0.25", "")]
+    text = candidate_grid([answer], found)
+    assert re.findall(r"(\d): (\d\.\d+)(, selected)?", text) == [("1", "0.50", ", selected"), ("2", "0.25", "")]
     assert text.count("data:image/jpeg;base64,") == 2
     assert text.count("solid transparent") == 1
-    assert 'style="display:grid' in sheet(ViewState(), [], [])
+    assert 'style="display:grid' in candidate_grid([], [])

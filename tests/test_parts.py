@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from small_field import field_of, make_field, unit_rows
 
-from jsecon.app.ask import answer_in_blocks, ask_text
+from jsecon.app.ask import ask_each, ask_text
+from jsecon.language import field as field_file
+from jsecon.language.field import load_field, save_field
 from jsecon.query.anchored import query_anchored
 from jsecon.query.parts import HELD, THING, answering_parts, part_nearness, parts_instead, query_parts
 from jsecon.types import Parts, Regions, Votes
@@ -205,21 +207,24 @@ def test_a_higher_threshold_takes_fewer_and_a_probability_decides_where_there_is
     assert parts_instead(field, text, 0.0, logits=unlikely) is None
 
 
-def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blocks(unheld):
+def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blocks(unheld, tmp_path, monkeypatch):
     field, directions, thing = unheld
     embedder = Embedder({"fifth": directions[4], "first": directions[0]})
     answer = ask_text(field, embedder, "fifth")
     np.testing.assert_array_equal(answer.mask, thing == 4)
-    assert "parts" in answer.left_out["regions"]
+    assert "parts" in answer.skipped["regions"]
     np.testing.assert_array_equal(ask_text(field, embedder, "fifth", by="silhouette").selection.region, -1)
     plain = ask_text(field, embedder, "first")
     np.testing.assert_array_equal(plain.mask, thing == 0)
-    assert "regions" not in plain.left_out
+    assert "regions" not in plain.skipped
     alone = ask_text(dataclasses.replace(field, parts=None), embedder, "fifth")  # the region that it went to, whole
     np.testing.assert_array_equal(alone.mask, thing >= 3)
-    (found, first), refused = answer_in_blocks(field, embedder, texts=["fifth", "first"])
+    save_field(tmp_path / "field.safetensors", field)
+    monkeypatch.setattr(field_file, "MAPPED", 0)
+    mapped = load_field(tmp_path / "field.safetensors", mapped=True)
+    (found, first), refused = ask_each(mapped, embedder, texts=["fifth", "first"])
     assert not refused
     np.testing.assert_array_equal(np.sort(found.rows[found.mask]), np.flatnonzero(thing == 4))
-    assert found.left_out == answer.left_out
+    assert found.skipped == answer.skipped
     assert float(found.selection.score) == float(answer.selection.score)
     np.testing.assert_array_equal(np.sort(first.rows[first.mask]), np.flatnonzero(thing == 0))

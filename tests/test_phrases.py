@@ -12,7 +12,7 @@ from clip_files import COLOURS
 from sam3_files import write_sam3
 
 from jsecon.app import cli
-from jsecon.app.phrases import capture_of, frames_of, lifted
+from jsecon.app.phrases import find_capture, lift_phrase, load_frames
 from jsecon.data.gaussians.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -69,7 +69,7 @@ def test_a_frame_without_masks_has_its_say(room_run):
     large = np.zeros((2, 2 * height, 2 * width), bool)
     large[0, 60:150, 80:200] = large[1, 90:200, 100:240] = True
     seen = PhraseMasks(large, np.float32([0.9, 0.8])), PhraseMasks(large[:0], np.float32([]))
-    answer = lifted(field, "mug", dict(zip((1, 2), seen)), threshold=0.5, outliers=False)
+    answer = lift_phrase(field, "mug", dict(zip((1, 2), seen)), threshold=0.5, outliers=False)
     union = large.any(0)[::2, ::2]  # the masks of a frame are one outline, at the field's size
     expected = lift(field, np.stack([union, np.zeros_like(union)]), [1, 2])
     np.testing.assert_array_equal(answer.mask, expected.mask)
@@ -79,33 +79,33 @@ def test_a_frame_without_masks_has_its_say(room_run):
 
 def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room, tmp_path):
     field = load_field(room_run[1] / "field.safetensors")
-    assert capture_of(field, room_run[1]) == Path(room)
-    frames = frames_of(field, room, 3)
+    assert find_capture(field, room_run[1]) == Path(room)
+    frames = load_frames(field, room, 3)
     assert list(frames) == [0, 4, 7]
     np.testing.assert_array_equal(frames[4], room_run[0].capture.frames[4])
     (tmp_path / "poses").mkdir()
-    assert capture_of(field, tmp_path) == tmp_path / "poses"
+    assert find_capture(field, tmp_path) == tmp_path / "poses"
     another = dataclasses.replace(field, names=(*field.names[:7], "another"))
     with pytest.raises(InputError, match=f"8 frames, {field.names[0]} .*expected one called another"):
-        frames_of(another, room, 3)
+        load_frames(another, room, 3)
     wide = dataclasses.replace(field, cameras=dataclasses.replace(field.cameras, width=200))
     with pytest.raises(InputError, match="frames of 160x120, expected 200x120, or the same shape"):
-        frames_of(wide, room, 3)
+        load_frames(wide, room, 3)
     moved = dataclasses.replace(field, provenance="{}")
     with pytest.raises(InputError, match="--images DIR"):
-        capture_of(moved, room_run[1])
+        find_capture(moved, room_run[1])
     with pytest.raises(InputError, match="--looks"):
-        frames_of(field, room, 0)
+        load_frames(field, room, 0)
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--phrases", "MODEL"], "nothing to find"),
-        (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: no text"),
+        (["--phrases", "MODEL"], "there is no query"),
+        (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: there is no text"),
         (["red", "--phrases", "MODEL", "--all", "--by", "code"], "--by --all"),
-        (["red", "--images", "x"], "--images: no --phrases"),
-        (["red", "--looks", "3"], "--looks: no --phrases"),
+        (["red", "--images", "x"], "--images: it needs --phrases"),
+        (["red", "--looks", "3"], "--looks: it needs --phrases"),
         (["red", "--phrases", "nowhere"], "no such folder, expected SAM 3's graphs"),
         (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: nothing there"),
     ],

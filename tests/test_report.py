@@ -186,7 +186,7 @@ def test_a_region_is_cut_out_of_each_frame_and_missing_where_it_is_not_seen():
     labels = np.full((3, 60, 80), -1)
     labels[0, 10:20, 10:30] = labels[2, 30:50, 40:80] = 4
     frames[labels == 4] = (0, 200, 0)
-    strip = pictures.followed(frames, labels, 4, side=48)
+    strip = pictures.masklet_strip(frames, labels, 4, side=48)
     assert strip.shape == (48, 3 * 48 + 2 * 3, 3)
     tiles = [strip[:, k * 51 : k * 51 + 48] for k in range(3)]
     assert (tiles[1] == 40).all()
@@ -202,5 +202,5 @@ def test_a_selection_is_brighter_than_what_it_leaves_and_the_truth_is_outlined()
     frame = np.full((24, 32, 3), 100, np.uint8)
     image = pictures.selection_overlay(frame, mask, truth)
     assert image[9, 9, 0] > image[2, 2, 0]
-    assert (image.reshape(-1, 3) == pictures.TRUE).all(1).any()
-    assert not (pictures.selection_overlay(frame, mask).reshape(-1, 3) == pictures.TRUE).all(1).any()
+    assert (image.reshape(-1, 3) == pictures.TRUTH).all(1).any()
+    assert not (pictures.selection_overlay(frame, mask).reshape(-1, 3) == pictures.TRUTH).all(1).any()

@@ -14,12 +14,13 @@ import pytest
 
 pytest.importorskip("fastapi", reason="the extra serve is not installed")
 from small_field import make_field
+from starlette.exceptions import HTTPException
 from starlette.testclient import TestClient
 
 from jsecon.app.server.api import application
-from jsecon.app.server.guard import Busy, Guard, Limits, Workers
-from jsecon.app.server.scenes import Question, Scene, open_scenes
-from jsecon.app.server.serve import ready
+from jsecon.app.server.guard import Limits, Workers
+from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
+from jsecon.app.server.serve import prepare
 from jsecon.errors import InputError
 from jsecon.language.field import save_field
 from jsecon.process import cores
@@ -44,7 +45,7 @@ def client(scenes):
 def test_a_text_and_a_pixel_are_answered(client, scenes):
     told = client.post("/query", json={"text": "red"}).json()
     assert told["field"] == "desk"
-    assert told["count"] == int(scenes["desk"].answer(Question("red")).mask.sum())
+    assert told["count"] == int(scenes["desk"].answer(SceneQuery("red")).mask.sum())
     pixel = client.post("/query", json={"at": ["frame_1", 24, 20], "field": "shelf"}).json()
     assert pixel["field"] == "shelf"
     assert pixel["count"] > 0
@@ -58,17 +59,17 @@ def test_what_is_known_is_told_while_all_threads_are_taken_and_no_thread_is_adde
     held, limits = threading.Event(), Limits(waiting=cores() + 3, seconds=0.05)
     desk, asked = scenes["desk"], []
 
-    def slow(question):
-        asked.append(question.text)
+    def slow(query):
+        asked.append(query.text)
         assert held.wait(60)
-        return {"question": question.text}
+        return {"query": query.text}
 
     with TestClient(application({"desk": desk}, limits=limits), HERE) as client:
         ask = lambda text: client.post("/query", json={"text": text})
         first = ask("red")
         while first.status_code == 503:  # it was computed for longer than 0.05 s
             first = ask("red")
-        monkeypatch.setattr(desk, "_record", slow)
+        monkeypatch.setattr(desk, "record", slow)
         before = threading.active_count()
         answers = [ask(f"thing {k}") for k in range(20)]
         assert {answer.status_code for answer in answers} == {503}
@@ -82,29 +83,28 @@ def test_what_is_known_is_told_while_all_threads_are_taken_and_no_thread_is_adde
         answer = ask("green")
         while answer.status_code == 503:
             answer = ask("green")
-        assert answer.json() == {"question": "green"}
+        assert answer.json() == {"query": "green"}
         assert not any(text.startswith("more") for text in asked)
-    desk._records.clear()
+    desk.records.clear()
 
 
 def test_places_are_bounded_and_given_back():
-    """One thread: a running question keeps its place when its client gives up, and one that waits leaves."""
+    """One thread: a running query keeps its place when its client gives up, and one that waits leaves."""
 
     async def soak():
-        workers, held = Workers(1, 2), threading.Event()
+        blocked = threading.Event()
+        workers = Workers(1, 2)
         for _ in range(30):
-            with pytest.raises(TimeoutError):
-                await workers.compute(held.wait, 0.002)
-        assert workers.taken == 1
+            with pytest.raises(HTTPException, match=r"within 0\.002 s"):
+                await workers.compute(blocked.wait, 0.002)
         waits = asyncio.ensure_future(workers.compute(lambda: "late", 20))
         await asyncio.sleep(0.01)
-        with pytest.raises(Busy):
+        with pytest.raises(HTTPException, match="Too many queries"):
             await workers.compute(lambda: 1, 1)
-        held.set()
+        blocked.set()
         assert await waits == "late"
         assert await workers.compute(lambda: 3, 20) == 3
         workers.close()
-        assert workers.taken == 0
 
     asyncio.run(soak())
 
@@ -157,7 +157,9 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
     assert len(regions) == 5
     assert regions[0]["frame"].startswith("frame_")
     words = next(
-        w for w in ("red", "green", "blue", "white", "black", "brown") if scenes["desk"].answer(Question(w)).mask.any()
+        w
+        for w in ("red", "green", "blue", "white", "black", "brown")
+        if scenes["desk"].answer(SceneQuery(w)).mask.any()
     )
     ply = client.get("/selection.ply", params={"text": words})
     assert ply.content.startswith(b"ply\n")
@@ -187,7 +189,7 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
         (422, b'{"at": ["#99999999999999999999", 1, 2]}'),
         (422, b'{"at": ["#\xc2\xb2", 1, 2]}'),
         (422, b'{"at": [0, 1' + b"0" * 200 + b", 2]}"),
-        (422, b'{"at": [0, 1, 2], "by": "canonical"}'),
+        (422, b'{"at": [0, 1, 2], "by": "one_step"}'),
         (422, b'{"at": [0, 1, 2], "all": true}'),
         (422, b'{"text": "caf\\udce9 red"}'),
         (422, b'{"text": null}'),
@@ -243,22 +245,22 @@ def test_a_token_is_asked_for_where_one_is_set(scenes, tmp_path):
     assert guarded.get("/healthz", headers={"Authorization": "Bearer wrong"}).status_code == 401
     assert guarded.get("/healthz", headers={"Authorization": "Bearer secret"}).status_code == 200
     with pytest.raises(InputError, match="a token that clients must have"):
-        ready([tmp_path / "none.safetensors"], host="0.0.0.0", port=0, token="", embedder=None)
+        prepare([tmp_path / "none.safetensors"], host="0.0.0.0", port=0, token="", embedder=None)
 
 
 def test_its_address_is_told_and_a_port_in_use_is_refused(scenes, tmp_path):
     field = dataclasses.replace(scenes["desk"].field, embedder=ColourEmbedder().name)
     save_field(tmp_path / "field.safetensors", field)
     given = {"host": "127.0.0.1", "token": "", "embedder": None}
-    told, _ = ready([tmp_path / "field.safetensors"], port=0, **given)
+    told, _ = prepare([tmp_path / "field.safetensors"], port=0, **given)
     port = int(told["address"].removeprefix("http://127.0.0.1:"))
     assert port > 0
     assert [scene["name"] for scene in told["fields"]] == [tmp_path.name]
     if has_ipv6():
-        six, _run = ready([tmp_path / "field.safetensors"], port=0, **given | {"host": "::1"})
+        six, _run = prepare([tmp_path / "field.safetensors"], port=0, **given | {"host": "::1"})
         assert six["address"].startswith("http://[::1]:")
     with pytest.raises(InputError, match="in use"):
-        ready([tmp_path / "field.safetensors"], port=port, **given)
+        prepare([tmp_path / "field.safetensors"], port=port, **given)
 
 
 def has_ipv6() -> bool:
@@ -269,23 +271,17 @@ def has_ipv6() -> bool:
     return True
 
 
-def sent(receive, limits=LIMITS, app=None):
-    """(status, body) that the guard lets through or not."""
+def sent(scenes, receive, limits=LIMITS):
+    """Status of the answer to a request whose body comes from `receive`."""
     told = []
-
-    async def reached(scope, receive, send):
-        message = await receive()
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-        await send({"type": "http.response.body", "body": message["body"]})
+    headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
+    scope = {"type": "http", "method": "POST", "path": "/query", "query_string": b"", "headers": headers}
 
     async def send(message):
         told.append(message)
 
-    async def run():
-        await Guard(app or reached, "", limits)({"type": "http", "headers": [(b"host", b"localhost")]}, receive, send)
-
-    asyncio.run(run())
-    return told[0]["status"], told[1]["body"]
+    asyncio.run(application(scenes, limits=limits)(scope, receive, send))
+    return told[0]["status"]
 
 
 def test_a_slow_sender_and_one_that_goes_away(scenes):
@@ -293,23 +289,20 @@ def test_a_slow_sender_and_one_that_goes_away(scenes):
         await asyncio.sleep(0.1)
         return {"type": "http.request", "body": b"x", "more_body": True}
 
-    assert sent(slow)[0] == 408
-
     async def gone():
         return {"type": "http.disconnect"}
-
-    assert sent(gone)[0] == 400
 
     async def endless():
         return {"type": "http.request", "body": b"x" * 900, "more_body": True}
 
-    assert sent(endless)[0] == 413
+    async def complete():
+        return {"type": "http.request", "body": b'{"text": "red"}'}
 
-    async def whole():
-        return {"type": "http.request", "body": b"abc"}
-
-    assert sent(whole) == (200, b"abc")
-    assert sent(whole, Limits(requests=0))[0] == 503
+    assert sent(scenes, slow) == 408
+    assert sent(scenes, gone) == 400
+    assert sent(scenes, endless) == 413
+    assert sent(scenes, complete) == 200
+    assert sent(scenes, complete, Limits(requests=0)) == 503
 
 
 def test_clients_at_once_get_the_same_answers(client):

@@ -259,16 +259,14 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
     embedder = Told(texts, Logits(20.0, -18.0))
     mug = ask_text(field, embedder, "mug")
     assert int(mug.selection.region) == 0
-    np.testing.assert_allclose(mug.there, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
+    np.testing.assert_allclose(mug.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
     both = ask_text(field, embedder, "mug or cup")
-    np.testing.assert_allclose(both.there, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
+    np.testing.assert_allclose(both.presence, 1 / (1 + np.exp(-2.0)), rtol=1e-4)
     ghost = ask_text(field, embedder, "ghost")
     assert int(ghost.selection.region) == -1
-    assert 0 <= ghost.there < PRESENCE_THRESHOLD
-    for by in ("one_step", "canonical"):
-        assert ask_text(field, embedder, "mug", by=by).there is None  # no region is retrieved
+    assert 0 <= ghost.presence < PRESENCE_THRESHOLD
     silent = ask_text(field, Told(texts, None), "mug")
-    assert silent.there is None
+    assert silent.presence is None
 
     save_field(tmp_path / "field.safetensors", dataclasses.replace(field, embedder="told"))
     told = {}
@@ -277,10 +275,10 @@ def test_the_answer_says_how_likely_the_text_is_there(field, tmp_path, monkeypat
         out = tmp_path / name
         assert cli.main(["query", str(tmp_path / "field.safetensors"), "mug", "ghost", "--out", str(out)]) == 0
         told[name] = [json.loads((out / f"{text}.json").read_text()) for text in ("mug", "ghost")]
-    assert set(told["with"][0]["probability"]) == {"there", "mean", "tenth"}
-    assert list(told["with"][1]["probability"]) == ["there"]
-    assert set(told["without"][0]["probability"]) == {"mean", "tenth"}
-    assert "there" not in (told["without"][1]["probability"] or {})
+    assert set(told["with"][0]["probability"]) == {"presence", "mean", "percentile_10"}
+    assert list(told["with"][1]["probability"]) == ["presence"]
+    assert set(told["without"][0]["probability"]) == {"mean", "percentile_10"}
+    assert "presence" not in (told["without"][1]["probability"] or {})
 
 
 def test_an_unreadable_vocabulary_is_named(tmp_path):

@@ -28,9 +28,9 @@ def test_an_answer_without_a_region_says_so_and_one_without_gaussians_differs(sc
     write_answers(field, [none, empty], tmp_path, told, views=1)
     first, second, pictures = told.lines
     assert first.startswith("'unicorn': 0 of 64 Gaussians")
-    assert first.endswith("region None, nothing selected: no region answers it")
-    assert second.endswith("region 1, nothing selected")
+    assert first.endswith("no region matches it, no Gaussian is selected")
+    assert second.endswith("region 1, no Gaussian is selected")
     assert pictures.endswith("answers.html")
-    assert "no region answers it" in (tmp_path / "answers.html").read_text()
+    assert "no region matches it" in (tmp_path / "answers.html").read_text()
     written = [json.loads(file.read_text()) for file in sorted(tmp_path.rglob("*.json"))]
     assert sorted((w["query"], w["region"]) for w in written) == [("faint", 1), ("unicorn", None)]

@@ -43,7 +43,7 @@ def free_port() -> int:
 def viewer(scene, cameras):
     field, _ = make_field(scene, cameras, dim=ColourEmbedder().dim)
     field = dataclasses.replace(field, votes=with_overlap(field.votes), embedder=ColourEmbedder.name)
-    port, state = free_port(), view_state.asked(ViewState(), START)
+    port, state = free_port(), view_state.with_texts(ViewState(), START)
     viewer = open_viewer(field, ColourEmbedder(), host="127.0.0.1", port=port, name="<desk>", state=state)
     yield viewer
     viewer.stop()
@@ -53,7 +53,7 @@ def viewer(scene, cameras):
 @pytest.fixture(autouse=True)
 def as_begun(viewer):
     """Each test begins with a viewer that was asked nothing."""
-    settled(viewer, lambda: viewer.then(lambda _: ViewState(), whole=True))
+    settled(viewer, lambda: viewer.then(lambda _: ViewState(), update_controls=True))
 
 
 def settled(viewer: Viewer, act) -> ViewState:
@@ -67,7 +67,7 @@ def settled(viewer: Viewer, act) -> ViewState:
 
 def word_of(viewer: Viewer) -> str:
     """A colour that selects a part of the scene."""
-    masks = {word: viewer.answer(view_state.Ask(word)).mask.sum() for word in BASIC}
+    masks = {word: viewer.answer(view_state.ViewQuery(word)).mask.sum() for word in BASIC}
     return next(word for word, count in masks.items() if 3 < count < 30)
 
 
@@ -75,50 +75,50 @@ def colours(viewer: Viewer) -> np.ndarray:
     """(N, 4) RGBA as the window has them."""
     count = viewer.field.gaussians.count
     told = np.zeros((count, 4), np.uint8)
-    for rows, handle in viewer.layers._groups:
+    for rows, handle in viewer.scene._groups:
         told[rows] = np.ascontiguousarray(handle.buffer[:, 7]).view(np.uint8).reshape(-1, 4)
     return told
 
 
 def test_a_text_lights_up(viewer):
     base, word = colours(viewer), word_of(viewer)
-    before = [handle.buffer.copy() for _, handle in viewer.layers._groups]
-    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, word)))
-    mask = viewer.answer(view_state.Ask(word)).mask
+    before = [handle.buffer.copy() for _, handle in viewer.scene._groups]
+    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, word)))
+    mask = viewer.answer(view_state.ViewQuery(word)).mask
     lit = colours(viewer)
     assert (lit[~mask, :3].astype(int) <= base[~mask, :3]).all()
     np.testing.assert_array_equal(lit[:, 3], base[:, 3])
-    tint = 0.45 * base[mask, :3] + 0.55 * view_state.tints(1)[0]
+    tint = 0.45 * base[mask, :3] + 0.55 * view_state.answer_colours(1)[0]
     np.testing.assert_allclose(lit[mask, :3], tint, atol=1)
-    for (_, handle), was in zip(viewer.layers._groups, before, strict=True):
+    for (_, handle), was in zip(viewer.scene._groups, before, strict=True):
         np.testing.assert_array_equal(handle.buffer[:, :7], was[:, :7])
 
 
 def test_show_only_hide_and_undo(viewer):
     word, opacity = word_of(viewer), colours(viewer)[:, 3]
-    mask = viewer.answer(view_state.Ask(word)).mask
-    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, word)))
-    settled(viewer, lambda: viewer.then(view_state.shown_only))
+    mask = viewer.answer(view_state.ViewQuery(word)).mask
+    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, word)))
+    settled(viewer, lambda: viewer.then(view_state.isolate))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, opacity, 0))
     settled(viewer, viewer.undo)
     np.testing.assert_array_equal(colours(viewer)[:, 3], opacity)
-    settled(viewer, lambda: viewer.then(view_state.hidden))
+    settled(viewer, lambda: viewer.then(view_state.hide))
     np.testing.assert_array_equal(colours(viewer)[:, 3], np.where(mask, 0, opacity))
-    assert settled(viewer, lambda: viewer.then(view_state.all_shown)) == ViewState()
+    assert settled(viewer, lambda: viewer.then(view_state.show_all)) == ViewState()
 
 
-@pytest.mark.parametrize("paint", view_state.PAINTS)
+@pytest.mark.parametrize("paint", view_state.COLOURINGS)
 def test_every_paint(viewer, paint):
-    settled(viewer, lambda: viewer.then(lambda s: view_state.moved(s, paint=paint)))
+    settled(viewer, lambda: viewer.then(lambda s: view_state.with_controls(s, colouring=paint)))
     told = colours(viewer)
     kinds = len(np.unique(told[:, :3], axis=0))
     assert kinds == 1 if paint == "score" else kinds > 2
-    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, word_of(viewer))))
+    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, word_of(viewer))))
     assert (colours(viewer)[:, :3] != told[:, :3]).any()
 
 
 def test_part_or_whole_changes_what_a_region_takes(viewer):
-    part, whole = (viewer.answer(view_state.Ask(2, whole=w)).mask for w in (0.0, 1.0))
+    part, whole = (viewer.answer(view_state.ViewQuery(2, part_vs_whole=w)).mask for w in (0.0, 1.0))
     overlap = np.asarray(viewer.field.votes.overlap)[2]
     assert (np.delete(overlap, 2) >= 0.1).any(), "a field whose regions overlap"
     assert whole.sum() > part.sum() > 0
@@ -126,34 +126,34 @@ def test_part_or_whole_changes_what_a_region_takes(viewer):
 
 
 def test_odd_texts_and_links_are_told_and_change_nothing(viewer):
-    state = settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, "the meaning of life; black or ''")))
-    assert len(state.things) == 2
-    told = viewer.panel._told.content
+    state = settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, "the meaning of life; black or ''")))
+    assert len(state.queries) == 2
+    told = viewer.panel._messages.content
     assert "no colour word" in told
     assert "a part without words" in told
     before = colours(viewer)
-    settled(viewer, lambda: viewer.restore('{"things": [-1]}'))
+    settled(viewer, lambda: viewer.restore('{"queries": [-1]}'))
     assert viewer.panel._notice.visible
     assert "Copy the whole line" in viewer.panel._notice.content
     assert viewer.history.state == state
     np.testing.assert_array_equal(colours(viewer), before)
-    settled(viewer, lambda: viewer.then(lambda s: view_state.asked(s, "<script>alert(1)</script> red")))
-    assert "<script>" not in viewer.panel._told.content
-    settled(viewer, lambda: viewer.then(lambda s: view_state.clicked(s, 4000)))
-    assert "nothing here answers it" in viewer.panel._told.content
+    settled(viewer, lambda: viewer.then(lambda s: view_state.with_texts(s, "<script>alert(1)</script> red")))
+    assert "<script>" not in viewer.panel._messages.content
+    settled(viewer, lambda: viewer.then(lambda s: view_state.toggle_region(s, 4000)))
+    assert "no match" in viewer.panel._messages.content
 
 
 def test_an_error_inside_is_told_and_the_viewer_goes_on(viewer, capsys):
     settled(viewer, lambda: viewer.then(lambda s: 1 / 0))
-    assert "the terminal has it" in viewer.panel._notice.content
+    assert "The terminal shows its trace" in viewer.panel._notice.content
     assert "ZeroDivisionError" in capsys.readouterr().err
-    assert settled(viewer, lambda: viewer.then(lambda s: view_state.clicked(s, 1))).things == (1,)
+    assert settled(viewer, lambda: viewer.then(lambda s: view_state.toggle_region(s, 1))).queries == (1,)
 
 
 def test_files_of_the_answers(viewer, tmp_path):
-    answer = viewer.answer(view_state.Ask(1))
+    answer = viewer.answer(view_state.ViewQuery(1))
     assert isinstance(answer, Answer)
-    with zipfile.ZipFile(io.BytesIO(viewer.packed([answer]))) as archive:
+    with zipfile.ZipFile(io.BytesIO(viewer.zipped([answer]))) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path)
     assert {"region-1.json", "region-1.ply"} <= set(names)
@@ -233,9 +233,9 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         assert len(np.unique(first.reshape(-1, 3) // 16, axis=0)) > 8, "the canvas is blank"
 
         page.type(input_of("find"), word)
-        until(lambda: viewer.history.state.things == (word,), "the text arrives")
+        until(lambda: viewer.history.state.queries == (word,), "the text arrives")
         after_change(page, first)
-        count = int(viewer.answer(view_state.Ask(word)).mask.sum())
+        count = int(viewer.answer(view_state.ViewQuery(word)).mask.sum())
         page.until(f"document.body.innerText.includes('{word}: {count} Gaussians')")
         page.until("document.querySelectorAll('figure img').length >= 3")
 
@@ -245,13 +245,13 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
 
         width, height = page.js(f"(() => {{ const c = {CANVAS}; return [c.clientWidth, c.clientHeight]; }})()")
         x, y = round(0.4 * width), round(0.55 * height)
-        focal = height / 2 / np.tan(viewer.layers.fov(0) / 2)
+        focal = height / 2 / np.tan(viewer.scene.fov(0) / 2)
         lens = (np.float32(v) for v in (focal, focal, width / 2, height / 2))
         seen_from = Camera(viewer.field.cameras.world_to_camera[0], *lens, width=width, height=height)
         region = int(region_shares_seen(viewer.field, seen_from, x, y).argmax())
         left, top = page.js(f"(() => {{ const r = {CANVAS}.getBoundingClientRect(); return [r.x, r.y]; }})()")
         page.click(left + x, top + y)
-        until(lambda: viewer.history.state.things == (region,), f"region {region} is clicked")
+        until(lambda: viewer.history.state.queries == (region,), f"region {region} is clicked")
 
         other = next(
             (u, v)
@@ -261,9 +261,9 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
             and region_shares_seen(viewer.field, seen_from, u, v).max() > 0.3
         )
         page.click(left + other[0], top + other[1], shift=True)
-        until(lambda: len(viewer.history.state.things) == 2, "a second region beside it")
+        until(lambda: len(viewer.history.state.queries) == 2, "a second region beside it")
         page.click(left + other[0], top + other[1], shift=True)
-        until(lambda: viewer.history.state.things == (region,), "and away again")
+        until(lambda: viewer.history.state.queries == (region,), "and away again")
 
         page.press("export")
         packed = until(lambda: list((tmp_path / "downloads").glob("*.zip")), "the files arrive")[0]
@@ -275,24 +275,24 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         until(lambda: viewer.history.state.hidden, "the region is hidden")
         after_change(page, clicked)
         page.type(input_of("link"), link)
-        until(lambda: viewer.history.state.things == (region,) and not viewer.history.state.hidden, "the link is back")
+        until(lambda: viewer.history.state.queries == (region,) and not viewer.history.state.hidden, "the link is back")
         until(lambda: (np.abs(scene_of(page) - clicked).max(-1) > 12).mean() < 0.005, "and looks the same")
 
         page.press("undo")
         until(lambda: viewer.history.state.hidden, "one step back")
         client = next(iter(viewer.server.get_clients().values()))
-        viewer.frame(client, 2)
-        centre = viewer.layers._centres[2]
+        viewer.go_to_frame(client, 2)
+        centre = viewer.scene._centers[2]
         until(lambda: np.allclose(client.camera.position, centre, atol=1e-3), "at the frame")
         page.until("document.querySelectorAll('img').length > 0")
-        viewer.layers.show_frames(True)
+        viewer.scene.show_frames(True)
         time.sleep(1)
-        near = viewer.layers._centres[0] + 0.04 * viewer.layers.scale * viewer.layers._turns[0].as_matrix()[:, 2]
-        place = viewer.layers._turns[2].inv().apply(near - centre)
-        focal = height / 2 / np.tan(viewer.layers.fov(2) / 2)
-        things = viewer.history.state.things
+        near = viewer.scene._centers[0] + 0.04 * viewer.scene.scale * viewer.scene._rotations[0].as_matrix()[:, 2]
+        place = viewer.scene._rotations[2].inv().apply(near - centre)
+        focal = height / 2 / np.tan(viewer.scene.fov(2) / 2)
+        things = viewer.history.state.queries
         page.click(left + width / 2 + focal * place[0] / place[2], top + height / 2 + focal * place[1] / place[2])
         until(lambda: viewer.panel._frame.value == "frame_0", "the camera of another frame is clicked")
-        assert viewer.history.state.things == things
+        assert viewer.history.state.queries == things
         outside = [url for url in page.asked if not url.startswith((address, "data:", "blob:", "ws://127.0.0.1"))]
         assert not outside

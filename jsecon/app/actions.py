@@ -1,14 +1,14 @@
 """The work of each verb of the command line.
 
-A verb's function returns its files and figures, which --json prints (ending.py), and under "then" what it does after
-that is printed.
+A verb's function returns the files that it wrote and its figures, which --json prints, and the errors of what it could
+not do besides under "errors". Under "then" it returns what to do after that is printed.
 """
 
 import dataclasses
-import re
 import sys
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, VerbResult, View
 from jsecon.errors import InputError
@@ -17,6 +17,10 @@ from jsecon.pipeline.progress import Console
 from jsecon.process import worker_info
 
 _RUN_FILES = ("field.safetensors", "report.html", "metrics.json")
+_OLD_FIELD = (
+    "an earlier version made this field, without the unrelated words that texts are compared with. Fixed thresholds "
+    "decide which texts are answered. Make it again with `jsecon run`."
+)
 
 
 def _demo(verb: Demo, console: Console) -> VerbResult:
@@ -55,8 +59,8 @@ def _fit(verb: Fit, console: Console) -> VerbResult:
         from jsecon.app.run_report import write_scene
         from jsecon.data.gaussians.files import require_writable_format
         from jsecon.pipeline import run as pipeline
-    require_writable_format(verb.out)
 
+    require_writable_format(verb.out)
     folder = verb.out.with_suffix("")
     if verb.dry_run:
         return pipeline.dry_run(verb.options, folder, scene_only=True, listener=console)
@@ -64,19 +68,7 @@ def _fit(verb: Fit, console: Console) -> VerbResult:
 
 
 def _query(verb: Query, console: Console) -> VerbResult:
-    if not (verb.texts or verb.at or verb.mask or verb.box):
-        remedy = 'For example: jsecon query field.safetensors "red mug" --out answers'
-        raise InputError("query", "nothing to find", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
-    pixels = [(frame, *_whole("--at", x, y)) for frame, x, y in verb.at]
-    boxes = [(frame, *_whole("--box", *ends)) for frame, *ends in verb.box]
-    for pairs in verb.mask:
-        if len(pairs) % 2:
-            remedy = "For example: --mask frame_00012 mug.png"
-            raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", remedy)
-    if not 0 <= verb.quantile <= 1:
-        remedy = f"{Query.quantile:g} is the default; 0 refuses no text."
-        raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
-    _check_phrases(verb)
+    _check_query(verb)
     require_writable(verb.out)
     with console.progress("field"):
         from jsecon.app import ask
@@ -88,34 +80,37 @@ def _query(verb: Query, console: Console) -> VerbResult:
     if is_bare_scene(verb.field):
         verb = dataclasses.replace(verb, field=_field_of_scene(verb, console))
     with console.progress("field"):
-        if large := ask.larger_than_memory(verb.field):
-            outlined = bool(verb.mask or boxes or verb.phrases)
-            ask.require_blocks(verb.field, by=verb.by, even=verb.even, outlined=outlined)
+        large = ask.larger_than_memory(verb.field)
+        if large:
+            ask.require_blocks(verb.field, by=verb.by, outlined=bool(verb.mask or verb.box or verb.phrases))
             check_field(verb.field)
         field = load_field(verb.field, mapped=large)
         texts = verb.texts if verb.phrases is None else []
         embedder = _embedder(field, verb, console) if texts else None
-    by_phrase, unread = ([], []) if verb.phrases is None else _phrases(field, verb, console)
-    options: dict[str, Any] = {"texts": texts, "pixels": pixels, "several": verb.all, "by": verb.by}
-    options |= {"threshold": verb.threshold, "quantile": verb.quantile, "outliers": not verb.keep_outliers}
+    answers, errors = ([], []) if verb.phrases is None else _ask_phrases(field, verb, console)
     with console.progress("answers"):
-        if large:
-            answers, refused = ask.answer_in_blocks(field, embedder, **options)
-        else:
-            options |= {"masks": verb.mask, "boxes": boxes, "even": verb.even}
-            answers, refused = ask.answer_each(ask.queries_of(field, embedder, **options))
-    answers, refused = by_phrase + answers, unread + refused
+        outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
+        options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
+        outlines = [lambda pairs=pairs: ask.ask_masks(field, pairs, **outline) for pairs in verb.mask]
+        outlines += [lambda box=box: ask.ask_box(field, *box, **outline) for box in verb.box]
+        for more, refused in (
+            ask.ask_each(field, embedder, texts=texts, pixels=verb.at, **options),
+            ask.collect(outlines),
+        ):
+            answers += more
+            errors += refused
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
-    return result | {"refused": refused}
+    return result | {"errors": errors}
 
 
 def _field_of_scene(verb: Query, console: Console) -> Path:
-    """Returns the field of a scene without photographs, made in OUT/field if it is not there yet."""
+    """Returns the field of a scene without photographs, which is made in OUT/field unless it is there."""
     from jsecon.pipeline import run as pipeline
     from jsecon.pipeline.options import Options
 
-    options, folder = Options(verb.field, embedder=verb.embedder), verb.out / "field"
+    options = Options(verb.field, embedder=verb.embedder)
+    folder = verb.out / "field"
     with console.progress("plan"):
         path = pipeline.current_field(options, folder)
     if path is None:
@@ -125,27 +120,43 @@ def _field_of_scene(verb: Query, console: Console) -> Path:
     return path
 
 
-def _check_phrases(verb: Query) -> None:
-    """Raises InputError if --phrases is combined with options that it does not use, or --images or --looks lack it."""
+def _check_query(verb: Query) -> None:
+    """Raises InputError for options of a query that are out of range, or that cannot be combined."""
+    if not (verb.texts or verb.at or verb.mask or verb.box):
+        remedy = 'For example: jsecon query field.safetensors "red mug" --out answers'
+        raise InputError("query", "there is no query", "a TEXT, --at FRAME X Y, --mask or --box", remedy)
+    for pairs in verb.mask:
+        if len(pairs) % 2:
+            remedy = "For example: --mask frame_00012 mug.png"
+            raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", remedy)
+    if not 0 <= verb.quantile <= 1:
+        remedy = f"{Query.quantile:g} is the default; 0 refuses no text."
+        raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
+    if (verb.mask or verb.box) and verb.by != "votes":
+        problem = "--mask and --box select by the outline alone"
+        raise InputError("--by", problem, remedy="Leave --by out, or ask by a text.")
     if verb.phrases is None:
         for name, used in (("--images", verb.images is not None), ("--looks", verb.looks != Query.looks)):
             if used:
-                problem = "no --phrases is given, which it belongs to"
-                raise InputError(name, problem, remedy="Give --phrases DIR, a SAM 3 model folder.")
+                raise InputError(name, "it needs --phrases", remedy="Give --phrases DIR, a SAM 3 model folder.")
         return
     if not verb.texts:
         remedy = 'For example: jsecon query field.safetensors "red mug" --phrases sam3 --out answers'
-        raise InputError("--phrases", "no text is given, which is the phrase", remedy=remedy)
-    unused = {"by": verb.by != "votes", "all": verb.all, "even": verb.even}
-    unused["quantile"] = verb.quantile != Query.quantile
-    unused |= {"template": bool(verb.template), "embedder": verb.embedder is not None}
+        raise InputError("--phrases", "there is no text, which is the phrase", remedy=remedy)
+    unused = {
+        "--by": verb.by != "votes",
+        "--all": verb.all,
+        "--quantile": verb.quantile != Query.quantile,
+        "--template": bool(verb.template),
+        "--embedder": verb.embedder is not None,
+    }
     if any(unused.values()):
-        flags = " ".join(f"--{name}" for name, used in unused.items() if used)
-        problem = f"{flags} cannot be combined with it: SAM 3 reads the texts and finds all of a kind"
+        flags = " ".join(flag for flag, used in unused.items() if used)
+        problem = f"{flags} cannot be combined with it, since SAM 3 reads the texts and finds all objects of a kind"
         raise InputError("--phrases", problem, remedy=f"Leave out {flags}.")
 
 
-def _phrases(field: Any, verb: Query, console: Console) -> tuple[list[Any], list[InputError]]:
+def _ask_phrases(field: Any, verb: Query, console: Console) -> tuple[list[Any], list[InputError]]:
     """Returns the answers of SAM 3 to the texts, and the errors of texts that it cannot read."""
     with console.progress("phrases") as progress:
         from jsecon.app import phrases
@@ -153,13 +164,14 @@ def _phrases(field: Any, verb: Query, console: Console) -> tuple[list[Any], list
 
         assert verb.phrases is not None
         sam3 = Sam3(verb.phrases)
-        frames = phrases.frames_of(field, verb.images or phrases.capture_of(field, verb.field.parent), verb.looks)
+        capture = verb.images or phrases.find_capture(field, verb.field.parent)
+        frames = phrases.load_frames(field, capture, verb.looks)
         options = {"threshold": verb.threshold, "outliers": not verb.keep_outliers, "progress": progress}
-        answers, refused = phrases.ask_phrases(field, sam3, verb.texts, frames, **options)
+        answers, errors = phrases.ask_phrases(field, sam3, verb.texts, frames, **options)
     for answer in answers:
         seen = sum(map(bool, (answer.frames or {}).values()))
-        console.say(f"{answer.question!r}: seen in {seen} of {len(frames)} frames")
-    return answers, refused
+        console.say(f"{answer.query!r}: seen in {seen} of {len(frames)} frames")
+    return answers, errors
 
 
 def _export(verb: Export, console: Console) -> VerbResult:
@@ -178,27 +190,52 @@ def _export(verb: Export, console: Console) -> VerbResult:
 
 
 def _view(verb: View, console: Console) -> VerbResult:
-    if verb.export is None:
-        from jsecon.app.viewer.window import view
+    if verb.export is not None:
+        return _export_page(verb, console)
+    from jsecon.app.access import bracketed, token_for
+    from jsecon.app.viewer.view_state import ViewState, from_link, with_texts
+    from jsecon.app.viewer.window import open_viewer
+    from jsecon.language.field import load_field
+    from jsecon.pipeline.networks import ExternalSpace, external_dim
 
-        return view(verb, lambda field, verb: _embedder(field, verb, console), console.say)
+    token = token_for(verb.host, verb.token)
+    state = from_link(verb.link) if verb.link else ViewState()
+    if verb.texts:
+        state = with_texts(state, "; ".join(verb.texts))
+    field = load_field(verb.field)
+    name = verb.field.resolve().parent.name
+    dim = None
+    if not verb.texts and verb.embedder is None:
+        dim = external_dim(field.embedder)  # without its model a field can be clicked, but not searched by texts
+    embedder = _embedder(field, verb, console) if dim is None else ExternalSpace(dim)
+    access = {"host": verb.host, "port": verb.port, "token": token, "hosts": verb.allow_host}
+    viewer = open_viewer(field, embedder, name=name, state=state, **access)
+    console.say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
+    query = f"/?{urlencode({'token': token})}" if token else ""
+    console.say(f"http://{bracketed(verb.host)}:{viewer.server.get_port()}{query}")
+    viewer.run()
+    return {}
+
+
+def _export_page(verb: View, console: Console) -> VerbResult:
+    """Writes the page of `jsecon view --export`."""
+    assert verb.export is not None
     if verb.export.suffix != ".html":
         raise InputError("--export", f"{verb.export} does not end in .html", remedy="For example: --export page.html")
     require_writable(verb.export.parent)
     with console.progress("page"):
-        from jsecon.app import ask
+        from jsecon.app.ask import ask_each
         from jsecon.app.viewer.static_page import write_page
         from jsecon.language.field import load_field
 
         field = load_field(verb.field)
         embedder = _embedder(field, verb, console) if verb.texts else None
-        answers, refused = ask.answer_each(ask.queries_of(field, embedder, texts=verb.texts))
+        answers, errors = ask_each(field, embedder, texts=verb.texts)
         size = write_page(field, answers, verb.export, title=verb.field.resolve().parent.name)
-    console.say(
-        f"{(count := field.gaussians.count)} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {verb.export}"
-    )
-    lit = [answer.question for answer in answers]
-    return {"written": {"page": verb.export}, "refused": refused, "gaussians": count, "answers": lit, "bytes": size}
+    count = field.gaussians.count
+    console.say(f"{count} Gaussians, {len(answers)} answers, {size / 2**20:.1f} MiB  {verb.export}")
+    texts = [answer.query for answer in answers]
+    return {"written": {"page": verb.export}, "gaussians": count, "answers": texts, "bytes": size, "errors": errors}
 
 
 def _eval(verb: Eval, console: Console) -> VerbResult:
@@ -208,17 +245,18 @@ def _eval(verb: Eval, console: Console) -> VerbResult:
         from jsecon.app.evaluation import write_evaluation
         from jsecon.language.field import load_field
 
-        embedder = _embedder(field := load_field(verb.field), verb, console)
+        field = load_field(verb.field)
+        embedder = _embedder(field, verb, console)
     return write_evaluation(field, embedder, verb.labels, out, console)
 
 
 def _serve(verb: Serve, console: Console) -> VerbResult:
     with console.progress("start"):
-        from jsecon.app.server.serve import ready
+        from jsecon.app.server.serve import prepare
 
     access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
-        result, serve = ready(verb.fields, embedder=verb.embedder, **access)
+        result, serve = prepare(verb.fields, embedder=verb.embedder, **access)
     for scene in result["fields"]:
         console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
         if scene["unrelated_words"] is None:
@@ -231,43 +269,28 @@ def _models(verb: Models, console: Console) -> VerbResult:
     with console.progress("graphs"):
         from jsecon.pipeline.models import inspect_models, report_lines, unusable
 
-        findings = inspect_models(verb.folder)
-    for line in report_lines(findings):
+        report = inspect_models(verb.folder)
+    for line in report_lines(report):
         console.say(line)
-    return dataclasses.asdict(findings) | {"refused": unusable(findings)}
+    return dataclasses.asdict(report) | {"errors": unusable(report)}
 
 
 def _doctor(verb: Doctor, console: Console) -> VerbResult:
-    with console.progress("looking"):
-        from jsecon.app.doctor import run_checks, wrong
+    with console.progress("checks"):
+        from jsecon.app.doctor import failures, run_checks
 
         checks = run_checks(verb.models)
-    console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.told}" for check in checks))
-    return {"checks": checks, "refused": wrong(checks)}
-
-
-_OLD_FIELD = (
-    "an earlier version made this field, without the unrelated words that texts are compared with. Fixed thresholds "
-    "decide which texts are answered. Make it again with `jsecon run`."
-)
+    console.say("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
+    return {"checks": checks, "errors": failures(checks)}
 
 
 def _embedder(field: Any, verb: FieldVerb, console: Console) -> Any:
+    """Opens the embedder of a field, and warns of a field of an earlier version."""
     from jsecon.pipeline import networks
 
     if field.reference is None:
         console.note(_OLD_FIELD)
     return networks.field_embedder(field, verb.embedder, templates=verb.template or ("{}",))
-
-
-_EXAMPLES = {"--at": "For example: --at frame_00012 310 145", "--box": "For example: --box frame_00012 280 120 340 190"}
-
-
-def _whole(option: str, *texts: str) -> list[int]:
-    for text in texts:
-        if not re.fullmatch("[0-9]{1,9}", text):
-            raise InputError(option, repr(text), "whole numbers of pixels", _EXAMPLES[option])
-    return [int(text) for text in texts]
 
 
 VERBS: dict[str, tuple[Any, type]] = {
@@ -282,3 +305,4 @@ VERBS: dict[str, tuple[Any, type]] = {
     "models": (_models, Models),
     "doctor": (_doctor, Doctor),
 }
+"""Name of a verb -> the function that does its work, and the class of its options."""

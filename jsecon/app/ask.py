@@ -1,11 +1,9 @@
-"""One question put to a field: a text, a pixel, or what somebody outlined. Its answer becomes files in app/outputs.
+"""Queries of a field: a text, a pixel, a region, or an outline. app/outputs writes the answers to files.
 
-Read on the way from a text to its .ply, without the ground; behind each file lies more of its own room, behind
-splat/transform and query/render the engine, behind silhouettes query/silhouette:
+A text passes these modules on the way to its .ply; splat/ renders for them.
 
-    ask     app/ask, language/field, vision/colours, query/several, query/anchored, query/match
-    clean   language/membership, query/outliers
-    write   app/outputs, query/masks, splat/transform, data/gaussian_files
+    ask     app/ask, language/field, vision/colours, query/match, query/select, language/membership, query/outliers
+    write   app/outputs, splat/transform, data/gaussian_files
 """
 
 import dataclasses
@@ -18,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 
 from jsecon.data.images import read_pixels
 from jsecon.data.masks import resize_nearest
@@ -27,70 +25,86 @@ from jsecon.language.field import subset_field
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.process import MEMORY, memory_budget
-from jsecon.query.anchored import RegionMatch, found_of, found_region, query_region, select_gaussians
-from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.query.anchored import RegionMatch, found_of, found_region, select_gaussians
 from jsecon.query.blocks import SparseSelection, select_in_blocks
-from jsecon.query.match import PIECE_THRESHOLD, QUANTILE, Refusal, best_presence
+from jsecon.query.match import PIECE_THRESHOLD, QUANTILE, best_presence
 from jsecon.query.outliers import split_outliers
 from jsecon.query.outline import box_mask, lift
 from jsecon.query.parts import InParts, parts_instead, query_parts
 from jsecon.query.pixel import region_at
 from jsecon.query.several import found_of_several, parts_of_question
 from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
-from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
-from jsecon.types import Array, LanguageField, Selection
+from jsecon.types import LanguageField, Selection
 
-BY_VOTES = ("votes", *SILHOUETTE_WEIGHTS)
-"""anchored, membership by a Gaussian's votes; of SILHOUETTE_WEIGHTS then one by one by the outline that they make"""
-BY_CODES = ("one_step", "canonical")
-"""every Gaussian's code against the text, without regions"""
-METHODS = (*BY_VOTES, "code", *BY_CODES)
-"""code: anchored, membership by a Gaussian's code"""
-ONE_STEP_THRESHOLD = 0.8
-"""on the cosine of a Gaussian's code and the text's"""
-CANONICAL_THRESHOLD = 0.5
-"""on the relevancy: closer to the text than to every canonical phrase"""
+T = TypeVar("T")
+METHODS = ("votes", "silhouette", "code")
+"""how a region selects Gaussians: by their votes, by these and the outline in the views, or by their codes"""
+PARTS_ANSWER = {"regions": "no region holds the object, so the parts that match the text were selected"}
+"""why a text is answered by parts"""
+POINTED = {"text encoder": "the region under the pixel is the query"}
+"""why a pixel needs no text encoder"""
+MIN_BLOCK_ROWS = 1 << 12
+"""rows of an answer to a mapped field are padded to powers of two from here on, so that few sizes are compiled"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """What a question selected."""
+    """What a query selected.
 
-    question: str
+    Attributes:
+      query: The text, or the name of the pixel, region or outline.
+      by: One of METHODS, "outline" or "phrase".
+      selection: The Gaussians as the query selects them.
+      mask: (N,) bool, the selection without outliers.
+      skipped: Part of the work -> why it was not needed.
+      presence: Probability that the text is true of the best region; None for embedders without `Logits`.
+      frames: Of a phrase, name of a frame -> score of each of its masks, best first.
+      rows: (M,) int64 ids of the Gaussians that selection and mask have rows for; None if these are all.
+      key: What tells the query from any other in the names of its files; None for a text, which does so itself.
+      clusters: Number of clusters that DBSCAN kept and dropped, (0, 0) if it was not needed.
+    """
+
+    query: str
     by: str
-    """one of METHODS, or "outline", or "phrase"."""
     selection: Selection
-    """as the query gave it."""
     mask: np.ndarray
-    """(N,) bool: the selection without outliers."""
-    left_out: dict[str, str]
-    """part -> why it was not needed."""
-    there: float | None = None
-    """probability that the text is true of the region that answers it, or of the likeliest where none does; None of
-    embedders without one (`Logits`)."""
+    skipped: dict[str, str]
+    presence: float | None = None
     frames: Mapping[str, list[float]] | None = None
-    """of a phrase: frame -> the score of each mask found there, best first; None of other questions."""
     rows: np.ndarray | None = None
-    """(M,) int64 the Gaussians that selection and mask have a row for, where those are not all N of the field."""
     key: str | None = None
-    """what tells the question from every other in the names of its files; None: `question` alone does, a text."""
     clusters: tuple[int, int] = (0, 0)
-    """clusters that DBSCAN kept and dropped; (0, 0) where it was not needed or found none."""
 
     @property
     def quantile(self) -> float | None:
-        """Share of unrelated words that are less similar to the scene than the text is; None where it is not known."""
+        """Share of unrelated words that are less similar to the scene than the text; None if it is unknown."""
         share = self.selection.quantile
         return None if share is None or np.isnan(share) else round(float(share), 4)
 
     @property
     def dropped(self) -> int:
-        """Gaussians dropped as outliers."""
+        """Number of Gaussians that were dropped as outliers."""
         return int(np.asarray(self.selection.mask).sum() - self.mask.sum())
 
 
+class _Match(NamedTuple):
+    """The regions that match a query, before Gaussians are selected."""
+
+    name: str
+    regions: RegionMatch
+    skipped: dict[str, str]
+    key: str | None = None
+    keep: str = "supported"
+    """clusters to keep of the selection (`split_outliers`)"""
+    presence: float | None = None
+    parts: InParts | None = None
+    """answer in place of the regions"""
+    texts: Any = None
+    """embeddings of several texts or matches, by which a field with parts trims the selection"""
+
+
 def quantile_message(quantile: float) -> str:
-    """What a quantile among unrelated words means, in whole percent, rounded down."""
+    """Describes a quantile among unrelated words in whole percent, rounded down."""
     return f"more similar than {int(100 * quantile + 1e-6)} % of unrelated words"
 
 
@@ -103,116 +117,31 @@ def ask_text(
     threshold: float | None = None,
     outliers: bool = True,
     several: bool = False,
-    near: Int[np.ndarray, "n k"] | None = None,
     piece_threshold: float = PIECE_THRESHOLD,
     quantile: float = QUANTILE,
 ) -> Answer:
-    """The Gaussians that a text names; with `several`, of all regions that answer it (`query_several` has the rule).
-    With `near` (N, K), the `nearest` of each Gaussian, shares of votes are evened out over them before they are cut.
-    `piece_threshold`: how near to the text the pieces of a thing come, 1 for none (`regions_of_text`). `quantile`: a
-    text selects nothing unless it is more similar to the scene than this share of unrelated words (`query_anchored`).
+    """Selects the Gaussians that a text names.
 
-    A text may be composite: `"red mug" or "bowl" but not "handle"`. Of a field with parts, those answer a plain text
-    that no region does (`parts_instead`). Raises InputError where the embedder has no words for a part, and for several
-    regions or a composite text by anything but votes.
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      text: The text. It may be composite: `"red mug" or "bowl" but not "handle"`.
+      by: One of METHODS.
+      threshold: Threshold of the method; None is its default.
+      outliers: Whether to drop outliers.
+      several: Whether to select all regions that match instead of the best one.
+      piece_threshold: How near to the text other pieces of the object must be; 1 adds no piece.
+      quantile: Share of unrelated words that must be less similar to the scene than the text, else it has no match.
+
+    Returns:
+      The answer. If a field has parts, they answer a plain text that no region matches.
+
+    Raises:
+      InputError: The embedder has no words for the text, or several regions are selected by codes.
     """
-    require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
-    wanted, unwanted = parts_of_question(text)
-    if by in BY_CODES and not several and len(wanted + unwanted) == 1:
-        return answer_of(field, text, by, _compared(field, embedder, wanted[0], by, threshold), outliers, {})
-    given: dict[str, Any] = {"piece_threshold": piece_threshold, "quantile": quantile}
-    asked = sought(field, embedder, text, by=by, several=several, **given)
-    if (found := unheld(asked, by, threshold)) is not None:
-        selection, asked, left = found.selection, asked._replace(there=found.there), UNHELD
-    else:
-        selection, left = select_gaussians(field, asked.found, threshold, by="code" if by == "code" else "votes"), {}
-        if several and field.parts is not None:
-            selection = query_parts(asked.field, selection, asked.wanted)
-    selection = _shaped(field, selection, by, threshold, near)
-    answer = answer_of(field, text, by, selection, outliers, left, keep=asked.keep)
-    return dataclasses.replace(answer, there=asked.there)
-
-
-class Sought(NamedTuple):
-    """What a text asks of a field's regions."""
-
-    field: LanguageField
-    """with canonical phrases."""
-    wanted: Float[Array, "q e"]
-    """embeddings of what is wanted."""
-    found: RegionMatch
-    keep: str
-    """of the selection's clusters: "largest", or "all" where there may be several things."""
-    there: float | None
-    """as in `Answer`."""
-    refused_by: Refusal
-
-
-UNHELD = {"regions": "none holds what the text names: the parts that answer it were taken"}
-
-
-def unheld(asked: Sought, by: str, threshold: float | None) -> InParts | None:
-    """`parts_instead` for a plain text by votes; None of other questions, and where the field has no parts."""
-    if asked.field.parts is None or asked.keep != "largest" or by not in BY_VOTES:
-        return None
-    how: dict[str, Any] = {"similarity_threshold": threshold, "logits": asked.refused_by.logits}
-    how["quantile"] = asked.refused_by.quantile
-    region = found_of(asked.field, asked.wanted[0], quantile=0.0, retrieval="contrast")  # as parts are measured
-    return parts_instead(asked.field, asked.wanted[0], region.score, **how)
-
-
-def sought(
-    field: LanguageField,
-    embedder: Any,
-    text: str,
-    *,
-    by: str = "votes",
-    several: bool = False,
-    piece_threshold: float = PIECE_THRESHOLD,
-    quantile: float = QUANTILE,
-) -> Sought:
-    """The regions that a text names; options and errors as for `ask_text`."""
-    field = with_phrases(field, embedder)
-    wanted, unwanted = parts_of_question(text)
-    # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
-    logits = getattr(embedder, "logits", None)
-    how: dict[str, Any] = {"piece_threshold": piece_threshold, "logits": logits, "quantile": quantile}
-    keep = "largest"
-    if several or unwanted or len(wanted) > 1:
-        if by not in BY_VOTES:
-            found = f"by {by} it has no answer of several regions"
-            raise InputError(f"query {text!r}", found, remedy="Ask by votes or a silhouette, or for one thing.")
-        embedded, keep = jax.device_put(embedder.embed_text(wanted + unwanted)), "all"
-        texts = embedded[: len(wanted)]
-        found = found_of_several(field, texts, embedded[len(wanted) :], several=several, **how)
-    else:
-        texts = jax.device_put(embedder.embed_text(wanted))
-        found = found_of(field, texts[0], **how)
-    there = best_presence(field.regions, texts, found.region, logits)
-    return Sought(field, texts, found, keep, there, Refusal(None, quantile, logits))
-
-
-def _compared(field: LanguageField, embedder: Any, text: str, by: str, threshold: float | None) -> Selection:
-    """The Gaussians whose codes are like the text's."""
-    from jsecon.language.codes import encode
-
-    code = encode(field.autoencoder, jax.device_put(embedder.embed_text([text])[0]))
-    if by == "one_step":
-        return query_one_step(field.codes, code, ONE_STEP_THRESHOLD if threshold is None else threshold)
-    canonical = encode(field.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical))
-    return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD if threshold is None else threshold)
-
-
-def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
-    """The field with canonical phrases and unrelated words: those of who reads the text, where its embeddings came from
-    files without; and such words in the templates that texts are put into, where those are the reader's own."""
-    reference = None if field.reference is None else getattr(embedder, "reference", None)
-    plain = getattr(embedder, "templates", ("{}",)) == ("{}",)
-    if len(field.canonical) and (plain or reference is None):
-        return field
-    own: dict[str, Any] = {} if len(field.canonical) else {"canonical": np.asarray(embedder.canonical, np.float32)}
-    own |= {} if reference is None else {"reference": np.asarray(reference, np.float16)}
-    return dataclasses.replace(field, **own)
+    options = {"several": several, "piece_threshold": piece_threshold, "quantile": quantile}
+    match = _match_text(field, embedder, text, by=by, threshold=threshold, **options)
+    return _select(field, match, by, threshold, outliers)
 
 
 def ask_pixel(
@@ -224,41 +153,53 @@ def ask_pixel(
     by: str = "votes",
     threshold: float | None = None,
     outliers: bool = True,
-    near: Int[np.ndarray, "n k"] | None = None,
 ) -> Answer:
-    """The Gaussians of what lies under pixel (column x, row y) of a frame (its index or name); no text is embedded.
-    `near` as for `ask_text`.
+    """Selects the Gaussians of what lies under a pixel.
 
-    Raises InputError for a frame or pixel that the field does not have, where no region lies there, and for a method
-    that compares a text.
+    Args:
+      field: The field.
+      frame: Index or name of a frame (`frame_index`).
+      x: Column.
+      y: Row.
+      by: One of METHODS.
+      threshold: Threshold of the method; None is its default.
+      outliers: Whether to drop outliers.
+
+    Returns:
+      The answer.
+
+    Raises:
+      InputError: The field has no such frame or pixel, or no region lies there.
     """
-    name, region = region_under(field, frame, x, y)
-    if by in BY_CODES:
-        remedy = "Ask for it by votes, code or a silhouette."
-        raise InputError(f"query {name!r}", f"by {by} a text is compared, and a pixel has none", remedy=remedy)
-    selection = query_region(field, region, by="code" if by == "code" else "votes", similarity_threshold=threshold)
-    selection = _shaped(field, selection, by, threshold, near)
-    return answer_of(field, name, by, selection, outliers, POINTED, key=name)
+    return _select(field, _match_pixel(field, frame, x, y), by, threshold, outliers)
 
 
-POINTED = {"text encoder": "the region under the pixel is the anchor"}
+def ask_region(
+    field: LanguageField,
+    region: int,
+    *,
+    several: bool = False,
+    threshold: float | None = None,
+    piece_threshold: float | None = None,
+) -> Answer:
+    """Selects the Gaussians of a region by votes.
 
+    Args:
+      field: The field.
+      region: Its id. A region that the field does not have selects no Gaussians.
+      several: Whether to select all regions that are alike.
+      threshold: Threshold on the share of votes; None is its default.
+      piece_threshold: How near to the region other pieces of the object must be; None adds no piece.
 
-def region_under(field: LanguageField, frame: int | str, x: int, y: int) -> tuple[str, int]:
-    """What the question at a pixel is called, and the region there. Raises InputError as `ask_pixel` does."""
-    index = frame_index(field, frame)
-    region, name = region_at(field, index, x, y), field.names[index]
-    if region < 0:
-        remedy = "Choose another pixel or frame: report.html of the run shows the regions."
-        raise InputError(f"frame {name}", f"no region lies under column {x}, row {y}", remedy=remedy)
-    return f"at {name} {x} {y}", region
-
-
-def ask_region(field: LanguageField, region: int, *, several: bool = False, **shape: Any) -> Answer:
-    """The Gaussians of a region, with `several` of all that are alike; `shape` as for `query_region`."""
-    selection = query_region(field, region, alike_threshold=ALIKE_THRESHOLD if several else None, **shape)
-    left, name = {"text encoder": "the region is the anchor"}, f"region {region}"
-    return answer_of(field, name, "votes", selection, True, left, keep="all" if several else "largest", key=name)
+    Returns:
+      The answer.
+    """
+    alike = ALIKE_THRESHOLD if several else None
+    regions = found_region(field, region, alike_threshold=alike, piece_threshold=piece_threshold)
+    name = f"region {region}"
+    skipped = {"text encoder": "the region is the query"}
+    match = _Match(name, regions, skipped, key=name, keep="all" if several else "supported")
+    return _select(field, match, "votes", threshold, True)
 
 
 def ask_outline(
@@ -270,247 +211,344 @@ def ask_outline(
     outliers: bool = True,
     key: str | None = None,
 ) -> Answer:
-    """The Gaussians of one thing, outlined in one frame or several: frame -> mask (H, W), or what `box_mask` made.
+    """Selects the Gaussians of an object that is outlined in frames.
 
-    Raises InputError as `jsecon.query.outline.lift` does.
+    Args:
+      field: The field.
+      name: Name of the answer.
+      outlines: Index or name of a frame -> mask (H, W), or what `box_mask` makes.
+      threshold: Share of a Gaussian that must lie inside; None is 0.5.
+      outliers: Whether to drop outliers.
+      key: Key of the answer; None is its name.
+
+    Returns:
+      The answer.
+
+    Raises:
+      InputError: The field has no such frame, or no Gaussian can be told to lie inside.
     """
     frames = [frame_index(field, frame) for frame in outlines]
-    least = SHARE_THRESHOLD if threshold is None else threshold
-    selection = lift(field, np.stack([np.asarray(m).astype(int) for m in outlines.values()]), frames, threshold=least)
-    left = {"text encoder": "the outline says what is meant"}
-    return answer_of(field, name, "outline", selection, outliers, left, key=name if key is None else key)
-
-
-def _shaped(
-    field: LanguageField, selection: Selection, by: str, threshold: float | None, near: np.ndarray | None
-) -> Selection:
-    """As it is, or by a silhouette what fits the shares best in the views; with `near` shares are evened out first,
-    where a view sees the Gaussian."""
-    least = SHARE_THRESHOLD if threshold is None else threshold
-    if near is not None and by in BY_VOTES:
-        share = smooth_over_neighbours(jnp.asarray(selection.similarity), jnp.asarray(near))
-        seen = jnp.asarray(field.votes.views) > 0
-        share = jnp.where(seen, share, 0.0)
-        inside = seen & (share >= least) & jnp.any(selection.mask)
-        selection = dataclasses.replace(selection, mask=inside, similarity=share)
-    if by not in SILHOUETTE_WEIGHTS:
-        return selection
-    given = field.gaussians, field.cameras, selection.similarity
-    mask = fit_silhouette(*given, threshold=least, weights=SILHOUETTE_WEIGHTS[by]) & (
-        jnp.asarray(field.votes.views) > 0
+    masks = np.stack([np.asarray(mask).astype(int) for mask in outlines.values()])
+    selection = lift(field, masks, frames, threshold=SHARE_THRESHOLD if threshold is None else threshold)
+    answer = Answer(
+        name, "outline", selection, np.asarray(selection.mask), {"text encoder": "the outline is the query"}
     )
-    return dataclasses.replace(selection, mask=mask & jnp.any(selection.mask))
+    return drop_outliers(field, dataclasses.replace(answer, key=name if key is None else key), outliers)
+
+
+def _match_text(
+    field: LanguageField,
+    embedder: Any,
+    text: str,
+    *,
+    by: str,
+    threshold: float | None,
+    several: bool,
+    quantile: float,
+    piece_threshold: float = PIECE_THRESHOLD,
+) -> _Match:
+    """Finds the regions that match a text, or the parts that answer in place of them."""
+    require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
+    field = with_phrases(field, embedder)
+    included, excluded = parts_of_question(text)
+    # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
+    logits = getattr(embedder, "logits", None)
+    rules: dict[str, Any] = {"piece_threshold": piece_threshold, "logits": logits, "quantile": quantile}
+    if several or excluded or len(included) > 1:
+        if by == "code":
+            problem = "codes cannot select several regions"
+            raise InputError(f"query {text!r}", problem, remedy="Ask by votes or silhouette, or for one thing.")
+        embedded = jax.device_put(embedder.embed_text(included + excluded))
+        texts = embedded[: len(included)]
+        regions = found_of_several(field, texts, embedded[len(included) :], several=several, **rules)
+        presence = best_presence(field.regions, texts, regions.region, logits)
+        trim = texts if several and field.parts is not None else None
+        return _Match(text, regions, {}, keep="all", presence=presence, texts=trim)
+    texts = jax.device_put(embedder.embed_text(included))
+    regions = found_of(field, texts[0], **rules)
+    presence = best_presence(field.regions, texts, regions.region, logits)
+    if field.parts is not None and by != "code":
+        unrefused = found_of(field, texts[0], quantile=0.0, retrieval="contrast")  # as parts are measured
+        rules = {"similarity_threshold": threshold, "logits": logits, "quantile": quantile}
+        parts = parts_instead(field, texts[0], unrefused.score, **rules)
+        if parts is not None:
+            return _Match(text, regions, PARTS_ANSWER, presence=parts.there, parts=parts)
+    return _Match(text, regions, {}, presence=presence)
+
+
+def _match_pixel(field: LanguageField, frame: int | str, x: int, y: int) -> _Match:
+    """Finds the region under a pixel."""
+    index = frame_index(field, frame)
+    region = region_at(field, index, x, y)
+    if region < 0:
+        remedy = "Choose another pixel or frame: report.html of the run shows the regions."
+        raise InputError(f"frame {field.names[index]}", f"no region lies under column {x}, row {y}", remedy=remedy)
+    name = f"at {field.names[index]} {x} {y}"
+    return _Match(name, found_region(field, region), POINTED, key=name)
+
+
+def _select(field: LanguageField, match: _Match, by: str, threshold: float | None, outliers: bool) -> Answer:
+    """Selects the Gaussians of matching regions."""
+    require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
+    if match.parts is not None:
+        selection = match.parts.selection
+    else:
+        selection = select_gaussians(field, match.regions, threshold, by="code" if by == "code" else "votes")
+    return _finish(field, match, selection, by, threshold, outliers)
+
+
+def _finish(
+    field: LanguageField, match: _Match, selection: Selection, by: str, threshold: float | None, outliers: bool
+) -> Answer:
+    """Trims a selection by parts, silhouette and outliers."""
+    if match.texts is not None:
+        selection = query_parts(field, selection, match.texts)
+    if by == "silhouette":
+        scene = field.gaussians, field.cameras, selection.similarity
+        least = SHARE_THRESHOLD if threshold is None else threshold
+        mask = fit_silhouette(*scene, threshold=least, weights=SILHOUETTE_WEIGHTS["silhouette"])
+        mask &= (jnp.asarray(field.votes.views) > 0) & jnp.any(selection.mask)
+        selection = dataclasses.replace(selection, mask=mask)
+    answer = Answer(match.name, by, selection, np.asarray(selection.mask), match.skipped, match.presence, key=match.key)
+    return drop_outliers(field, answer, outliers, keep=match.keep)
+
+
+def drop_outliers(field: LanguageField, answer: Answer, enabled: bool = True, *, keep: str = "supported") -> Answer:
+    """Drops the Gaussians of an answer that stand apart from the rest.
+
+    Args:
+      field: The field, with a row for each row of the answer.
+      answer: The answer.
+      enabled: False keeps all.
+      keep: Clusters to keep (`split_outliers`): "supported" are those that the masks of the views support as much as
+        the largest, since a mask may show one object in several pieces.
+
+    Returns:
+      The answer with its mask, its clusters, and in `skipped` why DBSCAN was not needed.
+    """
+    if not enabled:
+        skipped = answer.skipped | {"DBSCAN": "outliers are kept"}
+        return dataclasses.replace(answer, mask=np.asarray(answer.selection.mask), skipped=skipped)
+    weight = np.clip(np.asarray(answer.selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
+    result = split_outliers(field.gaussians.means, np.asarray(answer.selection.mask), keep=keep, weight=weight)
+    skipped = answer.skipped | ({"DBSCAN": result.skipped} if result.skipped else {})
+    clusters = (result.clusters_kept, result.clusters_dropped)
+    return dataclasses.replace(answer, mask=result.mask, skipped=skipped, clusters=clusters)
+
+
+def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
+    """Adds to a field what texts are compared with, if its own does not serve.
+
+    Args:
+      field: The field.
+      embedder: The embedder of the texts.
+
+    Returns:
+      The field with canonical phrases, and with unrelated words in the embedder's templates if it has any.
+    """
+    reference = None if field.reference is None else getattr(embedder, "reference", None)
+    has_templates = getattr(embedder, "templates", ("{}",)) != ("{}",)
+    if len(field.canonical) and (reference is None or not has_templates):
+        return field
+    canonical = field.canonical if len(field.canonical) else np.asarray(embedder.canonical, np.float32)
+    reference = field.reference if reference is None else np.asarray(reference, np.float16)
+    return dataclasses.replace(field, canonical=canonical, reference=reference)
 
 
 def frame_index(field: LanguageField, frame: int | str) -> int:
-    """A frame's index: from its name, from the end of a name that no other name has, or from its place, an integer or
-    "#10". Raises InputError for one that the field does not have."""
+    """Finds a frame.
+
+    Args:
+      field: The field.
+      frame: Its name, the end of a name that no other name has, or its index, an integer or "#10".
+
+    Returns:
+      Its index.
+
+    Raises:
+      InputError: The field has no such frame, or several.
+    """
     if isinstance(frame, str):
         for name in (frame, Path(frame).stem):
             if name in field.names:
                 return field.names.index(name)
-        ends = [t for t, name in enumerate(field.names) if frame and name.endswith(frame)]
-        if len(ends) == 1:
-            return ends[0]
-        if len(ends) > 1:
-            found = f"the names of {len(ends)} frames end so, such as that of {field.names[ends[0]]}"
-            raise InputError(f"frame {frame}", found, remedy="Give more of the name.")
+        matches = [t for t, name in enumerate(field.names) if frame and name.endswith(frame)]
+        if len(matches) == 1:
+            return matches[0]
+        if len(matches) > 1:
+            problem = f"{len(matches)} frames have names that end so, such as {field.names[matches[0]]}"
+            raise InputError(f"frame {frame}", problem, remedy="Give more of the name.")
     digits = re.fullmatch(r"#([0-9]{1,9})", frame) if isinstance(frame, str) else None
-    place = int(digits[1]) if digits else frame if isinstance(frame, int) and not isinstance(frame, bool) else -1
-    if 0 <= place < len(field.names):
-        return place
+    index = int(digits[1]) if digits else frame if isinstance(frame, int) and not isinstance(frame, bool) else -1
+    if 0 <= index < len(field.names):
+        return index
     last = len(field.names) - 1
     known = f"a name ({field.names[0]} ... {field.names[-1]}), the end of one, or a place, #0 to #{last}"
     raise InputError(f"frame {frame}", "no such frame in the field", known, "report.html of the run shows the frames.")
 
 
-def answer_of(
-    field: LanguageField,
-    question: str,
-    by: str,
-    selection: Selection,
-    outliers: bool,
-    left: dict[str, str],
-    keep: str = "largest",
-    key: str | None = None,
-) -> Answer:
-    """A selection as the answer to a question, without outliers; `left`: what was not needed, and why; `key` as in
-    `Answer`.
+def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
+    """Reads a mask at the size of the field's frames.
 
-    With keep="largest", clusters that the views' masks support as much as MIN_CLUSTER_SUPPORT of the largest stay too:
-    a mask may show one thing in several pieces.
+    Args:
+      file: An image. Black is outside.
+      field: The field.
+
+    Returns:
+      (H, W) bool.
+
+    Raises:
+      InputError: The file is not an image, or has another shape.
     """
-    if not outliers:
-        left = left | {"DBSCAN": "not asked for"}
-        return Answer(question, by, selection, np.asarray(selection.mask), left, key=key)
-    seen = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
-    keep = "supported" if keep == "largest" else keep
-    found = split_outliers(field.gaussians.means, np.asarray(selection.mask), keep=keep, weight=seen)
-    left = left | ({"DBSCAN": found.skipped} if found.skipped else {})
-    clusters = found.clusters_kept, found.clusters_dropped
-    return Answer(question, by, selection, found.mask, left, clusters=clusters, key=key)
+    image = read_pixels(Path(file))
+    width, height = field.cameras.width, field.cameras.height
+    mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
+    if abs(mask.shape[1] * height - mask.shape[0] * width) > max(width, height) + max(mask.shape):
+        problem = f"the mask is {mask.shape[1]}x{mask.shape[0]}"
+        expected = f"{width}x{height}, or the same shape at another size"
+        raise InputError(file, problem, expected, "Outline the frame as the run used it.")
+    return resize_nearest(mask, width, height) > 0
 
 
-_T = TypeVar("_T")
-_LEAST = 1 << 12
-"""rows of an answer in blocks, some of them empty: programs are compiled for powers of two from there on"""
+def ask_masks(field: LanguageField, pairs: Sequence[str], **options: Any) -> Answer:
+    """Selects the Gaussians of an object that mask files outline.
+
+    Args:
+      field: The field.
+      pairs: Frame, file, frame, file ...
+      **options: Options of `ask_outline`.
+
+    Returns:
+      The answer, named after the first file.
+
+    Raises:
+      InputError: As of `ask_outline` and `read_mask`, or a frame has two masks.
+    """
+    frames, files = pairs[::2], pairs[1::2]
+    names = [field.names[frame_index(field, frame)] for frame in frames]
+    if len(set(names)) < len(names):
+        raise InputError("--mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
+    outlines = {name: read_mask(Path(file), field) for name, file in zip(names, files)}
+    key = "\0".join(("mask", *(part for pair in zip(names, files) for part in pair)))
+    return ask_outline(field, Path(files[0]).stem, outlines, key=key, **options)
 
 
-def queries_of(
+def ask_box(field: LanguageField, frame: str, *ends: int, **options: Any) -> Answer:
+    """Selects the Gaussians of the object in a box of a frame.
+
+    Args:
+      field: The field.
+      frame: Name of the frame.
+      *ends: Left, upper, right and lower end, px.
+      **options: Options of `ask_outline`.
+
+    Returns:
+      The answer.
+
+    Raises:
+      InputError: As of `ask_outline`.
+    """
+    name = f"box {field.names[frame_index(field, frame)]} {' '.join(map(str, ends))}"
+    return ask_outline(field, name, {frame: box_mask(field, *ends)}, **options)
+
+
+def ask_each(
     field: LanguageField,
     embedder: Any,
     *,
     texts: Sequence[str] = (),
-    pixels: Sequence[tuple[Any, ...]] = (),
-    masks: Sequence[Sequence[str]] = (),
-    boxes: Sequence[tuple[Any, ...]] = (),
-    several: bool = False,
-    even: bool = False,
+    pixels: Sequence[tuple[str, int, int]] = (),
     by: str = "votes",
     threshold: float | None = None,
-    quantile: float = QUANTILE,
     outliers: bool = True,
-) -> list[Callable[[], Answer]]:
-    """What the command line asks of a field, each to be called: texts, pixels (frame, column, row), outlines (frame,
-    file, frame, file, ... of one thing), boxes (frame, left, upper, right, lower end)."""
-    shape: dict[str, Any] = {"threshold": threshold, "outliers": outliers}
-    how = shape | {"by": by, "near": nearest_neighbours(field.gaussians.means) if even else None}
-    found: list[Callable[[], Answer]] = []
-    text_how = how | {"several": several, "quantile": quantile}
-    found += [functools.partial(ask_text, field, embedder, text, **text_how) for text in texts]
-    found += [functools.partial(ask_pixel, field, *pixel, **how) for pixel in pixels]
+    several: bool = False,
+    quantile: float = QUANTILE,
+) -> tuple[list[Answer], list[InputError]]:
+    """Answers texts and pixels. An error of one does not stop the others.
 
-    def require_outline(name: str) -> None:
-        if by != "votes" or even:
-            found = "the outline alone decides, so --by and --even have no meaning"
-            raise InputError(f"query {name!r}", found, remedy="Leave them out, or ask by a text.")
+    Args:
+      field: The field. One from `load_field(mapped=True)` is read once, in blocks.
+      embedder: Its embedder.
+      texts: Texts (`ask_text`).
+      pixels: Frame, column and row of each pixel (`ask_pixel`).
+      by: One of METHODS; "votes" or "code" for a mapped field.
+      threshold: Threshold of the method; None is its default.
+      outliers: Whether to drop outliers.
+      several: As for `ask_text`.
+      quantile: As for `ask_text`.
 
-    def outlined(pairs: Sequence[str]) -> Answer:
-        files = dict(zip(pairs[::2], map(Path, pairs[1::2])))
-        outlines = {frame: read_mask(file, field) for frame, file in files.items()}
-        names = [field.names[frame_index(field, frame)] for frame in pairs[::2]]
-        if len(set(names)) < len(names):
-            raise InputError("--mask", "a frame is given twice", remedy="Give one mask of a thing in each frame.")
-        require_outline(Path(pairs[1]).stem)
-        key = "\0".join(("mask", *(part for pair in zip(names, pairs[1::2]) for part in pair)))
-        return ask_outline(field, Path(pairs[1]).stem, outlines, key=key, **shape)
+    Returns:
+      The answers, and the errors of the other queries. Answers of a mapped field hold the rows of what they select.
+    """
+    options: dict[str, Any] = {"by": by, "threshold": threshold, "several": several, "quantile": quantile}
+    queries: list[Callable[[], _Match]] = [
+        *(functools.partial(_match_text, field, embedder, text, **options) for text in texts),
+        *(functools.partial(_match_pixel, field, *pixel) for pixel in pixels),
+    ]
+    matches, errors = collect(queries)
+    if not isinstance(field.votes.regions, np.memmap):
+        return [_select(field, match, by, threshold, outliers) for match in matches], errors
+    selections = select_in_blocks(field, [match.regions for match in matches], threshold, by=by)
+    canonical = with_phrases(field, embedder).canonical if texts else field.canonical
+    field = dataclasses.replace(field, canonical=canonical)
+    pairs = zip(matches, selections)
+    return [_select_rows(field, match, selection, by, outliers) for match, selection in pairs], errors
 
-    def boxed(frame: str, *ends: int) -> Answer:
-        name = f"box {field.names[frame_index(field, frame)]} {' '.join(map(str, ends))}"
-        require_outline(name)
-        return ask_outline(field, name, {frame: box_mask(field, *ends)}, **shape)
 
-    found += [functools.partial(outlined, pairs) for pairs in masks]
-    return found + [functools.partial(boxed, *box) for box in boxes]
-
-
-def answer_each(questions: Sequence[Callable[[], _T]]) -> tuple[list[_T], list[InputError]]:
-    """The answers, and why the other questions have none: one that cannot be understood does not stop the rest."""
-    answers, refused = [], []
-    for ask in questions:
+def collect(queries: Sequence[Callable[[], T]]) -> tuple[list[T], list[InputError]]:
+    """Calls functions, and returns their results and the InputErrors of those that fail."""
+    results: list[T] = []
+    errors: list[InputError] = []
+    for query in queries:
         try:
-            answers.append(ask())
+            results.append(query())
         except InputError as error:
-            refused.append(error)
-    return answers, refused
+            errors.append(error)
+    return results, errors
 
 
-def read_mask(file: Path, field: LanguageField) -> Bool[np.ndarray, "h w"]:
-    """(H, W) bool of an image file, at the size of the field's frames: what is not black. Raises InputError where it is
-    no image, or one of another shape."""
-    image, size = read_pixels(Path(file)), (field.cameras.width, field.cameras.height)
-    mask = np.asarray(image[..., :3].any(-1) if image.ndim == 3 else image > 0, np.uint8)
-    if abs(mask.shape[1] * size[1] - mask.shape[0] * size[0]) > max(size) + max(mask.shape):
-        found, wanted = (
-            f"the mask is {mask.shape[1]}x{mask.shape[0]}",
-            f"{size[0]}x{size[1]}, or the same shape at another size",
-        )
-        raise InputError(file, found, wanted, "Outline the frame as the run used it.")
-    return resize_nearest(mask, *size) > 0
+def _select_rows(field: LanguageField, match: _Match, sparse: SparseSelection, by: str, outliers: bool) -> Answer:
+    """Makes the answer of a mapped field from the rows that a match selects."""
+    quantile = match.regions.quantile
+    if match.parts is not None:
+        selection = jax.tree.map(np.asarray, match.parts.selection)
+        rows = np.flatnonzero(selection.mask)
+        sparse = SparseSelection(rows, selection.similarity[rows], -1, float(selection.score))
+        quantile = selection.quantile
+    count = len(sparse.gaussians)
+    size = min(max(1 << max(count - 1, 0).bit_length(), MIN_BLOCK_ROWS), field.gaussians.count)
+    rows = np.zeros(size, np.int64)
+    similarity = np.zeros(size, np.float32)
+    rows[:count] = sparse.gaussians
+    similarity[:count] = sparse.similarity
+    best = np.asarray(sparse.region, np.int32), np.asarray(sparse.score, np.float32)
+    selection = Selection(np.arange(size) < count, similarity, *best, np.asarray(quantile))
+    answer = _finish(subset_field(field, rows), match, selection, by, None, outliers)
+    return dataclasses.replace(answer, rows=rows)
 
 
 def larger_than_memory(file: Path) -> bool:
-    """Whether the columns of a field file are more than memory should hold of them (`memory_budget`). Raises InputError
-    for a budget that is no number."""
+    """Returns whether a field file is larger than what may stay in memory (`memory_budget`)."""
     return file.is_file() and file.stat().st_size > memory_budget()
 
 
-def require_blocks(file: Path, *, by: str, even: bool, outlined: bool) -> None:
-    """Raises InputError where a field larger than memory is asked what needs all of it at once."""
-    needs = {f"--by {by}": by not in ("votes", "code"), "--even": even, "--mask, --box or --phrases": outlined}
-    for option, given in needs.items():
-        if given:
-            size, most = file.stat().st_size / 2**30, memory_budget() / 2**30
-            found = (
-                f"the field has {size:.3g} GiB, memory has room for {most:.3g}, and {option} needs all of it at once"
-            )
+def require_blocks(file: Path, *, by: str, outlined: bool) -> None:
+    """Checks that queries of a field larger than memory can be answered in blocks.
+
+    Args:
+      file: Path of the field.
+      by: How Gaussians are selected.
+      outlined: Whether a query is an outline or a phrase.
+
+    Raises:
+      InputError: They need the whole field in memory.
+    """
+    options = {f"--by {by}": by not in ("votes", "code"), "--mask, --box or --phrases": outlined}
+    for option, used in options.items():
+        if used:
+            size, budget = file.stat().st_size / 2**30, memory_budget() / 2**30
+            problem = f"the field has {size:.3g} GiB, memory has room for {budget:.3g}, and {option} needs all of it"
             remedy = (
                 f"Ask by a text or --at, by votes or code, or read it into memory: {MEMORY}={1.1 * size:.2g} (GiB)."
             )
-            raise InputError(file, found, remedy=remedy)
-
-
-class _Asked(NamedTuple):
-    """A question that has found its regions."""
-
-    name: str
-    by: str
-    found: RegionMatch
-    text: Sought | None = None
-
-
-def answer_in_blocks(
-    field: LanguageField,
-    embedder: Any,
-    *,
-    texts: Sequence[str] = (),
-    pixels: Sequence[tuple[Any, ...]] = (),
-    several: bool = False,
-    by: str = "votes",
-    threshold: float | None = None,
-    quantile: float = QUANTILE,
-    outliers: bool = True,
-) -> tuple[list[Answer], list[InputError]]:
-    """What `answer_each` of `queries_of` would return of a mapped field, by votes or code, in one pass over its
-    columns. The answers hold what is selected, and no number for any other Gaussian (`Answer.rows`)."""
-
-    def of_text(text: str) -> _Asked:
-        asked = sought(field, embedder, text, by=by, several=several, quantile=quantile)
-        return _Asked(text, by, asked.found, asked)
-
-    def at_pixel(*pixel: Any) -> _Asked:
-        name, region = region_under(field, *pixel)
-        return _Asked(name, by, found_region(field, region))
-
-    asking = [functools.partial(of_text, text) for text in texts]
-    asked, refused = answer_each(asking + [functools.partial(at_pixel, *pixel) for pixel in pixels])
-    chosen = select_in_blocks(field, [each.found for each in asked], threshold, by=by)
-    instead = [None if each.text is None else unheld(each.text, by, threshold) for each in asked]
-    return [_answered(field, *each, several, outliers) for each in zip(asked, chosen, instead)], refused
-
-
-def _answered(
-    field: LanguageField, asked: _Asked, chosen: SparseSelection, instead: InParts | None, several: bool, outliers: bool
-) -> Answer:
-    if instead is not None:
-        whole = jax.tree.map(np.asarray, instead.selection)
-        rows = np.flatnonzero(whole.mask)
-        chosen = SparseSelection(rows, whole.similarity[rows], -1, float(whole.score))
-    count = len(chosen.gaussians)
-    size = min(max(1 << max(count - 1, 0).bit_length(), _LEAST), field.gaussians.count)  # few sizes to compile for
-    rows, similarity = np.zeros(size, np.int64), np.zeros(size, np.float32)
-    rows[:count], similarity[:count] = chosen.gaussians, chosen.similarity
-    own, mask = subset_field(field, rows), np.arange(size) < count
-    told = asked.found.quantile if instead is None else instead.selection.quantile
-    best = np.asarray(chosen.region, np.int32), np.asarray(chosen.score, np.float32)
-    selection = Selection(mask, similarity, *best, np.asarray(told))
-    if asked.text is None:
-        answer = answer_of(own, asked.name, asked.by, selection, outliers, POINTED, key=asked.name)
-        return dataclasses.replace(answer, rows=rows)
-    if several and own.parts is not None:
-        selection = query_parts(
-            dataclasses.replace(own, canonical=asked.text.field.canonical), selection, asked.text.wanted
-        )
-    there, left = (asked.text.there, {}) if instead is None else (instead.there, UNHELD)
-    answer = answer_of(own, asked.name, asked.by, selection, outliers, left, keep=asked.text.keep)
-    return dataclasses.replace(answer, rows=rows, there=there)
+            raise InputError(file, problem, remedy=remedy)

@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             result = {"error": InputError("", "interrupted", remedy=remedy)}
             return finish(output, result, 130)
         if isinstance(error, InputError):
-            return finish(output, {"refused": [error]})
+            return finish(output, {"errors": [error]})
         # a bug, whose trace the interpreter prints
         remedy = "Report it with the trace on standard error."
         finish(output, {"error": InputError("jsecon", f"internal error: {describe_error(error)}", remedy=remedy)})
@@ -173,24 +173,24 @@ def finish(output: Output, result: VerbResult, code: int = 0) -> int:
     Returns:
       The exit code: 2 if the result has errors.
     """
-    refused = result.get("refused", ())
-    for error in refused:
+    errors = result.get("errors", ())
+    for error in errors:
         if output.debug:
             traceback.print_exception(error)
         if not output.json:
             print(f"jsecon: {error}", file=sys.stderr)
     if output.json:
-        fields = {name: value for name, value in result.items() if name != "refused" or len(refused) > 1}
-        if refused:
-            fields["error"] = refused[-1]
-        print(json.dumps(fields, default=_plain), flush=True)
-    return 2 if refused else code
+        fields = {name: value for name, value in result.items() if name != "errors" or len(errors) > 1}
+        if errors:
+            fields["error"] = errors[-1]
+        print(json.dumps(fields, default=_to_json), flush=True)
+    return 2 if errors else code
 
 
-def _plain(value: Any) -> Any:
-    """Returns what JSON takes of an error, a record, or a path."""
+def _to_json(value: Any) -> Any:
+    """Returns an error, a record or a path as JSON takes it."""
     if isinstance(value, InputError):
-        parts = {"name": value.where, "found": value.problem, "expected": value.expected, "remedy": value.remedy}
+        parts = {name: getattr(value, name) for name in ("where", "problem", "expected", "remedy")}
         return {"message": str(value)} | parts
     return vars(value) if dataclasses.is_dataclass(value) else str(value)
 

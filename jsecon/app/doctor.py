@@ -1,4 +1,4 @@
-"""`jsecon doctor`: what of this machine a run needs, and whether it is there."""
+"""`jsecon doctor`: checks what runs need of this machine."""
 
 import dataclasses
 import importlib
@@ -13,10 +13,12 @@ from typing import Literal
 from jsecon.errors import InputError, describe_error
 from jsecon.process import available_memory, cores, read_cgroup
 
-LEAST_MEMORY, LEAST_DISK = 2 << 30, 200 << 20
+MIN_MEMORY = 2 << 30
 """bytes that `jsecon demo` takes, rounded up"""
-LEAST_FOR_PROGRAMS = 32 << 20
-"""bytes of its compiled programs, rounded up"""
+MIN_DISK = 200 << 20
+"""bytes that `jsecon demo` writes, rounded up"""
+MIN_CACHE_DISK = 32 << 20
+"""bytes of the compiled programs of `jsecon demo`, rounded up"""
 PACKAGES = (
     "numpy",
     "filelock",
@@ -37,6 +39,7 @@ PACKAGES = (
     "shtab",
     "lazy_loader",
 )
+"""modules of the packages that jsecon requires; jax has a check of its own"""
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
     "formats": (("gsply", "pillow_heif"), ".sog, .spz of version 4, HEIC photographs"),
@@ -46,34 +49,51 @@ EXTRAS = {
     "words": (("ai_edge_litert",), "the experiment on real words"),
     "export": (("torch", "open_clip", "segment_anything", "sam2", "onnx"), "SAM, SAM 2 and CLIP from checkpoints"),
 }
-"""extra -> the modules that it installs, what it gives"""
+"""extra -> the modules that it installs, and what it is for"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """One line."""
+    """Result of one check.
+
+    Attributes:
+      name: What is checked.
+      status: Whether it is fine.
+      message: What the check measured.
+      remedy: What to do about it, if every run depends on it.
+    """
 
     name: str
     status: Literal["ok", "missing", "wrong"]
-    told: str
+    message: str
     remedy: str = ""
-    """what mends it, where every run needs it."""
 
 
 def run_checks(models: Path | None = None) -> list[Check]:
-    """All lines; `models`: a folder to look for models in. Raises InputError where there is no such folder."""
-    checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), _packages()]
-    checks += [*_backend(), _cores(), _memory(), _disk(), _programs(), *_models(models), *map(_extra, EXTRAS)]
-    return [*checks, Check("browser", "ok", "none is needed: pages open in any, Chromium is for the tests")]
+    """Runs all checks.
+
+    Args:
+      models: Folder with .onnx files, or of such folders; None examines no models.
+
+    Returns:
+      The results.
+
+    Raises:
+      InputError: There is no such folder.
+    """
+    checks = [Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}"), check_packages()]
+    checks += [*_check_jax(), check_cores(), check_memory(), _check_disk(), check_programs()]
+    return [*checks, *_check_models(models), *map(_check_extra, EXTRAS)]
 
 
-def wrong(checks: Iterable[Check]) -> list[InputError]:
-    """What every run needs and is not there."""
-    broken = [check for check in checks if check.remedy and check.status != "ok"]
-    return [InputError(check.name, check.told, remedy=check.remedy) for check in broken]
+def failures(checks: Iterable[Check]) -> list[InputError]:
+    """Returns an error for each check that failed and that every run depends on."""
+    failed = [check for check in checks if check.remedy and check.status != "ok"]
+    return [InputError(check.name, check.message, remedy=check.remedy) for check in failed]
 
 
-def _packages() -> Check:
+def check_packages() -> Check:
+    """Imports the packages that jsecon requires."""
     broken = {}
     for name in PACKAGES:
         try:
@@ -83,12 +103,12 @@ def _packages() -> Check:
         except Exception as error:  # a broken wheel raises anything
             broken[name] = f"{name} ({error})"
     if not broken:
-        return Check("packages", "ok", f"{len(PACKAGES)} that jsecon is built on can be imported")
+        return Check("packages", "ok", f"all {len(PACKAGES)} required packages can be imported")
     return Check("packages", "missing", ", ".join(broken.values()), 'Run: pip install --force-reinstall "jsecon"')
 
 
-def _backend() -> list[Check]:
-    """The devices of jax, and whether it computes right numbers."""
+def _check_jax() -> list[Check]:
+    """Checks the devices of jax, and whether it computes right numbers on them."""
     try:
         import jax
 
@@ -97,78 +117,84 @@ def _backend() -> list[Check]:
         kinds = [device.platform for device in jax.devices()]
         devices = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     except Exception as error:  # whatever a driver or a wheel raises
-        told = str(error) or describe_error(error)
-        return [Check("jax", "wrong", told, 'Run: pip install --force-reinstall "jax>=0.10.2,<0.13"')]
-    found = [Check("jax", "ok", f"{jax.__version__}, devices: {devices}")]
+        remedy = 'Run: pip install --force-reinstall "jax>=0.10.2,<0.13"'
+        return [Check("jax", "wrong", str(error) or describe_error(error), remedy)]
+    jax_check = Check("jax", "ok", f"{jax.__version__}, devices: {devices}")
     try:
         report = check_backend()
     except RuntimeError as error:
-        return [*found, Check("backend", "wrong", str(error), REMEDY)]
-    told = f"cosines right to {report.cosine_error:.0e}"
+        return [jax_check, Check("backend", "wrong", str(error), REMEDY)]
+    message = f"cosines are right to {report.cosine_error:.0e}"
     if report.has_jax_39103:
-        told += "; jax issue 39103 is present, in a form that jsecon avoids and your own code may not"
-    return [*found, Check("backend", "ok", told)]
+        message += "; this jax has issue 39103, which jsecon avoids but your code may meet"
+    return [jax_check, Check("backend", "ok", message)]
 
 
-def _cores() -> Check:
+def check_cores() -> Check:
+    """Counts the cores that may be used, and the time limit of the cgroup."""
     quota = read_cgroup("cpu.max", "cpu/cpu.cfs_quota_us")
     period = (quota[1:] or read_cgroup("", "cpu/cpu.cfs_period_us") or ["100000"])[0]
-    told = f"{cores()} of {os.cpu_count()} may be used"
+    message = f"{cores()} of {os.cpu_count()} may be used"
     if quota and quota[0].isdecimal() and int(quota[0]) < cores() * int(period):
-        told += f", but the time of only {int(quota[0]) / int(period):.3g} (cgroup)"
-    return Check("cores", "ok", told)
+        message += f", limited to the time of {int(quota[0]) / int(period):.3g} (cgroup)"
+    return Check("cores", "ok", message)
 
 
-def _memory() -> Check:
+def check_memory() -> Check:
+    """Measures the free memory."""
     free, limit = available_memory()
     if free is None:
-        return Check("memory", "ok", "this system does not tell how much is free")
-    told = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
-    enough = free >= LEAST_MEMORY
-    told += "" if enough else f"; jsecon demo takes {_size(LEAST_MEMORY)}"
-    return Check("memory", "ok" if enough else "wrong", told, "End other programs, or raise the limit.")
+        return Check("memory", "ok", "this system does not report the free memory")
+    message = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
+    if free < MIN_MEMORY:
+        message += f"; jsecon demo takes {_size(MIN_MEMORY)}"
+    return Check("memory", "ok" if free >= MIN_MEMORY else "wrong", message, "End other programs, or raise the limit.")
 
 
-def _disk() -> Check:
-    free, writable = shutil.disk_usage(".").free, os.access(".", os.W_OK)
-    told = f"{_size(free)} free in {Path.cwd()}{'' if writable else ', which cannot be written: give --out'}"
-    return Check("disk", "ok" if writable and free >= LEAST_DISK else "wrong", told)
+def _check_disk() -> Check:
+    """Measures the free space of the current folder."""
+    free = shutil.disk_usage(".").free
+    writable = os.access(".", os.W_OK)
+    message = f"{_size(free)} free in {Path.cwd()}{'' if writable else ', which cannot be written: use --out'}"
+    return Check("disk", "ok" if writable and free >= MIN_DISK else "wrong", message)
 
 
-def _programs() -> Check:
+def check_programs() -> Check:
+    """Examines the folder of compiled programs."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is None:
-        return Check("programs", "missing", "no folder that can be written: every run compiles anew (set HOME)")
+        return Check("programs", "missing", "no folder can be written, so that every run compiles anew (set HOME)")
     files = [file for file in Path(folder).rglob("*") if file.is_file()]
-    told = f"{len(files)} compiled, {_size(sum(f.stat().st_size for f in files))} in {folder}"
-    made = next(place for place in (Path(folder), *Path(folder).parents) if place.is_dir())
-    if (free := shutil.disk_usage(made).free) < LEAST_FOR_PROGRAMS:
-        return Check("programs", "missing", f"{told}, {_size(free)} free: what more there is is compiled in every run")
-    return Check("programs", "ok", told)
+    message = f"{len(files)} compiled, {_size(sum(f.stat().st_size for f in files))} in {folder}"
+    existing = next(parent for parent in (Path(folder), *Path(folder).parents) if parent.is_dir())
+    free = shutil.disk_usage(existing).free
+    if free < MIN_CACHE_DISK:
+        return Check("programs", "missing", f"{message}, {_size(free)} free: every run compiles further ones")
+    return Check("programs", "ok", message)
 
 
-def _models(folder: Path | None) -> list[Check]:
+def _check_models(folder: Path | None) -> list[Check]:
+    """Examines a folder of models and the folders in it."""
     if folder is None:
-        return [Check("models", "missing", "no folder given (--models DIR): without CLIP, texts name colours")]
+        return [Check("models", "missing", "no folder to examine (--models DIR); without CLIP, texts name colours")]
     from jsecon.pipeline.models import inspect_models
 
-    found = [inspect_models(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
-    usable = {use.model: use.summary for findings in reversed(found) for use in findings.uses if use.usable}
-    missing = "none in {}: jsecon models check says what is missing"
-    return [
-        Check(use.model, "ok", usable[use.model])
-        if use.model in usable
-        else Check(use.model, "missing", missing.format(folder))
-        for use in found[0].uses
-    ]
+    reports = [inspect_models(place) for place in (folder, *sorted(p for p in folder.glob("*") if p.is_dir()))]
+    usable = {use.model: use.summary for report in reversed(reports) for use in report.uses if use.usable}
+    missing = f"no usable model in {folder}; jsecon models check says what is missing"
+    models = [use.model for use in reports[0].uses]
+    return [Check(m, "ok", usable[m]) if m in usable else Check(m, "missing", missing) for m in models]
 
 
-def _extra(name: str) -> Check:
-    modules, gives = EXTRAS[name]
+def _check_extra(name: str) -> Check:
+    """Checks whether the modules of an extra are installed."""
+    modules, purpose = EXTRAS[name]
     absent = [module for module in modules if importlib.util.find_spec(module) is None]
-    told = f'{gives}: pip install "jsecon[{name}]" ({", ".join(absent)})' if absent else gives
-    return Check(name, "missing" if absent else "ok", told)
+    if not absent:
+        return Check(name, "ok", purpose)
+    return Check(name, "missing", f'{purpose}: pip install "jsecon[{name}]" ({", ".join(absent)})')
 
 
 def _size(count: int) -> str:
+    """Returns a number of bytes in GiB or MiB."""
     return f"{count / 2**30:.1f} GiB" if count >= 1 << 30 else f"{count / 2**20:.0f} MiB"

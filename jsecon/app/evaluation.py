@@ -1,28 +1,41 @@
-"""How well a field answers texts, against labels."""
+"""How well a field answers texts: each kind of query against labels, by the point-level rendered protocol."""
 
 import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from jsecon.app import ask
+import jax
+import jax.numpy as jnp
+
+from jsecon.app.ask import ask_text, with_phrases
 from jsecon.data.labels import LabelledFrame, load_lerf_labels
 from jsecon.errors import InputError
 from jsecon.evaluate.lerf import Row, evaluate_point_level_rendered
 from jsecon.files import write_text
+from jsecon.language.codes import encode
 from jsecon.pipeline.progress import Listener
+from jsecon.query.baselines import query_canonical, query_one_step
+from jsecon.query.several import parts_of_question
 from jsecon.types import LanguageField, Selection
+
+Evaluation: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
+"""kind of query -> its pairs, and their summary"""
 
 KINDS: dict[str, dict[str, Any]] = {
     "anchored": {"by": "votes"},
     "silhouette": {"by": "silhouette"},
     "all": {"several": True},
     "anchored_code": {"by": "code"},
-    "one_step": {"by": "one_step"},
-    "canonical": {"by": "canonical"},
 }
-"""kind of query in metrics.json -> how jsecon.app.ask asks"""
+"""kind of query -> options of `ask_text`"""
+BASELINES = ("one_step", "canonical")
+"""kinds of queries that compare the code of each Gaussian with a text"""
+ONE_STEP_THRESHOLD = 0.8
+"""on the cosine of a Gaussian's code and the text's"""
+CANONICAL_THRESHOLD = 0.5
+"""on the relevancy: nearer to the text than to every canonical phrase"""
 
 
 def evaluate(
@@ -30,39 +43,86 @@ def evaluate(
     embedder: Any,
     labels: Sequence[LabelledFrame],
     listener: Listener,
-    kinds: Sequence[str] = tuple(KINDS),
-) -> dict[str, tuple[list[Row], dict[str, Any]]]:
-    """Rows and summary of each kind of query under the point-level rendered protocol."""
+    kinds: Sequence[str] = (*KINDS, *BASELINES),
+) -> Evaluation:
+    """Measures kinds of queries.
+
+    Args:
+      field: The field.
+      embedder: Its embedder. A text that it has no words for counts as 0.
+      labels: Masks of named objects in frames of the field.
+      listener: Receives the progress.
+      kinds: Names in `KINDS` and `BASELINES`.
+
+    Returns:
+      Pairs and summary of each kind.
+    """
     cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
-    found = {}
+    results = {}
     for kind in kinds:
 
-        def select(text: str, how: dict[str, Any] = KINDS[kind]) -> Selection | None:
+        def select(text: str, kind: str = kind) -> Selection | None:
             try:
-                asked = ask.ask_text(field, embedder, text, **how)
-            except InputError:  # no words for it: no answer, which counts as 0
+                if kind in BASELINES:
+                    return select_by_code(field, embedder, text, kind)
+                answer = ask_text(field, embedder, text, **KINDS[kind])
+            except InputError:  # no words for it
                 return None
-            return dataclasses.replace(asked.selection, mask=asked.mask)
+            return dataclasses.replace(answer.selection, mask=answer.mask)
 
         with listener.progress(f"evaluate {kind}") as progress:
-            found[kind] = evaluate_point_level_rendered(field.gaussians, cameras, labels, select, progress=progress)
-    return found
+            results[kind] = evaluate_point_level_rendered(field.gaussians, cameras, labels, select, progress=progress)
+    return results
+
+
+def select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) -> Selection:
+    """Selects the Gaussians whose codes are similar to that of a text, without regions.
+
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      text: The text.
+      kind: "one_step" for the cosine, "canonical" for the relevancy against the canonical phrases.
+
+    Returns:
+      The selection.
+
+    Raises:
+      InputError: The embedder has no words for the text.
+    """
+    texts, _ = parts_of_question(text)
+    code = encode(field.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
+    if kind == "one_step":
+        return query_one_step(field.codes, code, ONE_STEP_THRESHOLD)
+    canonical = encode(field.autoencoder, jnp.asarray(with_phrases(field, embedder).canonical))
+    return query_canonical(field.codes, code, canonical, CANONICAL_THRESHOLD)
 
 
 def write_evaluation(
     field: LanguageField, embedder: Any, folder: Path, out: Path, listener: Listener
 ) -> dict[str, Any]:
-    """Prints the table and writes OUT/evaluation.json, with every pair; returns the table's figures."""
-    found = evaluate(field, embedder, load_lerf_labels(folder), listener)
-    print_table(found, listener)
-    told = {kind: summary | {"rows": [pair(row) for row in rows]} for kind, (rows, summary) in found.items()}
-    write_text(out / "evaluation.json", json.dumps(told, indent=2) + "\n")
+    """Measures a field, prints the table, and writes OUT/evaluation.json with every pair.
+
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      folder: Folder of LERF's label files.
+      out: Output folder.
+      listener: Receives the table.
+
+    Returns:
+      The summary of each kind of query, and the path of the file under "written".
+    """
+    results = evaluate(field, embedder, load_lerf_labels(folder), listener)
+    print_table(results, listener)
+    pairs = {kind: summary | {"rows": [_pair(row) for row in rows]} for kind, (rows, summary) in results.items()}
+    write_text(out / "evaluation.json", json.dumps(pairs, indent=2) + "\n")
     listener.say(f"all pairs  {out / 'evaluation.json'}")
-    return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in found.items()}
+    return {"written": {"pairs": out / "evaluation.json"}} | {kind: summary for kind, (_, summary) in results.items()}
 
 
-def pair(row: Row) -> dict[str, Any]:
-    """A row without its mask, as plain values."""
+def _pair(row: Row) -> dict[str, Any]:
+    """Returns a row without its mask as plain values."""
     return {
         "frame": row.frame,
         "query": row.query,
@@ -74,11 +134,13 @@ def pair(row: Row) -> dict[str, Any]:
     }
 
 
-def print_table(found: dict[str, tuple[list[Row], dict[str, Any]]], listener: Listener) -> None:
-    """mIoU, mAcc@0.25 and localisation of each kind, with the protocol they were measured under."""
-    told = next(iter(found.values()))[1]
-    listener.say(f"{told['protocol']}\n{told['pairs']} pairs of {told['queries']} queries in {told['frames']} frames")
+def print_table(results: Evaluation, listener: Listener) -> None:
+    """Prints the protocol, and mIoU, mAcc@0.25 and localisation accuracy of each kind of query."""
+    _, first = next(iter(results.values()))
+    listener.say(
+        f"{first['protocol']}\n{first['pairs']} pairs of {first['queries']} queries in {first['frames']} frames"
+    )
     listener.say(f"  {'query':<14} {'mIoU':>6} {'mAcc@0.25':>10} {'Loc. acc.':>10} {'missing':>8}")
-    for kind, (_, told) in found.items():
-        shares = f"{told['miou']:>6.3f} {told['macc']:>10.3f} {told['loc_acc']:>10.3f}"
-        listener.say(f"  {kind:<14} {shares} {told['missing']:>8}")
+    for kind, (_, summary) in results.items():
+        shares = f"{summary['miou']:>6.3f} {summary['macc']:>10.3f} {summary['loc_acc']:>10.3f}"
+        listener.say(f"  {kind:<14} {shares} {summary['missing']:>8}")

@@ -1,5 +1,7 @@
-"""What a notebook shows of a field, an answer and a capture, a picture and a line; and `show`, for who draws with
-matplotlib. jsecon.types calls it through the table of contents, when a notebook asks."""
+"""Fields, answers and captures in a notebook: a picture and a line of each, and `show`, which draws with matplotlib.
+
+jsecon.types calls `to_html` and `to_png` through the table of contents when a notebook asks.
+"""
 
 import html
 from typing import Any
@@ -17,81 +19,50 @@ from jsecon.fit.resize import resize_frame, scale_cameras
 from jsecon.pipeline import networks
 from jsecon.types import Capture, LanguageField, Selection
 
-LONG_SIDE, SHOWN = 240, 4
-"""px of each picture; frames of a capture"""
+LONG_SIDE = 240
+"""longer side of a picture, px"""
+CAPTURE_FRAMES = 4
+"""number of frames in the picture of a capture"""
+HISTOGRAM_HEIGHT = 80
+"""height of the histogram of a selection, px"""
 
 
-def to_html(thing: Any) -> str:
-    """A LanguageField, a Selection or a Capture as a picture and a line, HTML."""
-    image, words = _shown(thing)
+def to_html(value: Any) -> str:
+    """Returns a LanguageField, a Selection or a Capture as a picture and a line of HTML."""
+    image, words = _picture(value)
     return f'<div><img alt="" src="{report.data_uri(image)}"><br>{html.escape(words)}</div>'
 
 
-def to_png(thing: Any) -> bytes:
-    """The picture alone, as a PNG file."""
-    return cv2.imencode(".png", cv2.cvtColor(_shown(thing)[0], cv2.COLOR_RGB2BGR))[1].tobytes()
+def to_png(value: Any) -> bytes:
+    """Returns the picture of a LanguageField, a Selection or a Capture as a PNG file."""
+    return cv2.imencode(".png", cv2.cvtColor(_picture(value)[0], cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
-def _shown(thing: LanguageField | Selection | Capture) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
-    if isinstance(thing, LanguageField):
-        return _of_field(thing)
-    return _of_capture(thing) if isinstance(thing, Capture) else _of_selection(thing)
+def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 3, **options: Any) -> Any:
+    """Draws the frames that show best what a text selects, rendered without and with the selection, by matplotlib.
 
+    Args:
+      field: The field.
+      text: The text.
+      embedder: Embedder of the field; None opens it.
+      views: Number of frames.
+      **options: Options of `jsecon.app.ask.ask_text`.
 
-def _of_field(field: LanguageField) -> tuple[np.ndarray, str]:
-    """The first view, in the scene's colours and in those of the codes."""
-    cameras = jax.tree.map(np.asarray, field.cameras)
-    renderer = pictures.Renderer(field.gaussians, scale_cameras(cameras, _scale(cameras.width, cameras.height)))
-    image = np.concatenate([renderer.photo(0), renderer.colours(0, pictures.code_colours(field))], axis=1)
-    words = f"LanguageField of {field.gaussians.count:,} Gaussians, {field.regions.count} regions and "
-    return image, f"{words}{len(field.names)} frames, texts by {field.embedder or 'no embedder'}"
+    Returns:
+      Axes (2, views) of the figure.
 
-
-def _of_capture(capture: Capture) -> tuple[np.ndarray, str]:
-    """SHOWN of its frames."""
-    cameras = capture.cameras
-    small = scale_cameras(cameras, _scale(cameras.width, cameras.height))
-    picked = np.unique(np.linspace(0, len(capture.names) - 1, SHOWN).round().astype(int))
-    image = np.concatenate([resize_frame(np.asarray(capture.frames[t]), small) for t in picked], axis=1)
-    words = f"Capture of {len(capture.names)} frames of {cameras.width}x{cameras.height}, "
-    words += f"{int(np.asarray(capture.held_out).sum())} held out, {len(capture.points):,} sparse points"
-    return image, words + ("" if capture.depths is None else ", with depth")
-
-
-def _of_selection(selection: Selection) -> tuple[np.ndarray, str]:
-    """How many Gaussians have which similarity, on a logarithmic scale; those selected in their colour."""
-    mask, similarity = np.asarray(selection.mask), np.nan_to_num(np.asarray(selection.similarity, np.float64))
-    low, high = min(similarity.min(initial=0.0), 0.0), max(similarity.max(initial=0.0), 1e-6)
-    image = np.full((80, LONG_SIDE, 3), 255, np.uint8)
-    for kind, colour in ((np.ones_like(mask), (190, 190, 190)), (mask, pictures.SELECTED)):
-        counts = np.histogram(similarity[kind], LONG_SIDE // 4, (low, high))[0]
-        heights = np.rint(76 * np.log1p(counts) / np.log1p(max(len(mask), 1))).astype(int)
-        for n, height in enumerate(heights.tolist()):
-            image[80 - height :, 4 * n : 4 * n + 3] = colour
-    words = f"Selection of {int(mask.sum()):,} of {len(mask):,} Gaussians, score {float(selection.score):.3f}, "
-    return image, words + f"region {int(selection.region)}; similarity from {low:.2g} to {high:.2g}"
-
-
-def _scale(width: int, height: int) -> float:
-    return min(LONG_SIDE / max(width, height), 1.0)
-
-
-def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 3, **how: Any) -> Any:
-    """The `views` frames that show best what a text selects, rendered, and with the selection: a figure of matplotlib,
-    whose axes (2, views) are returned.
-
-    `embedder`: the field's own, opened where it is not given; `how` as for `jsecon.app.ask.ask_text`. Raises
-    InputError where matplotlib is missing, and where the embedder has no words for the text.
+    Raises:
+      InputError: matplotlib is missing, or the embedder has no words for the text.
     """
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
         remedy = "Run: pip install 'jsecon[figures]'"
         raise InputError("jsecon.show", "the package matplotlib is missing", remedy=remedy) from error
-    answer = ask_text(field, embedder or networks.field_embedder(field), text, **how)
+    answer = ask_text(field, embedder or networks.field_embedder(field), text, **options)
     masks = answer_masks(field, answer, views) or {0: np.zeros((field.cameras.height, field.cameras.width), bool)}
     renderer = pictures.Renderer(field.gaussians, field.cameras)
-    size = 3.2 * len(masks), 4.8
+    size = (3.2 * len(masks), 4.8)
     figure, axes = plt.subplots(2, len(masks), squeeze=False, figsize=size, layout="constrained")
     for column, (t, mask) in zip(axes.T, masks.items()):
         photo = renderer.photo(t)
@@ -102,3 +73,51 @@ def show(field: LanguageField, text: str, *, embedder: Any = None, views: int = 
     score = float(answer.selection.score)
     figure.suptitle(f"{text}: {int(answer.mask.sum()):,} Gaussians, score {score:.2f}")
     return axes
+
+
+def _picture(value: LanguageField | Selection | Capture) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
+    """Returns the picture and the line of a value."""
+    if isinstance(value, LanguageField):
+        return _field_picture(value)
+    return _capture_picture(value) if isinstance(value, Capture) else _selection_picture(value)
+
+
+def _field_picture(field: LanguageField) -> tuple[np.ndarray, str]:
+    """Renders the first view in the scene's colours and in those of the codes."""
+    cameras = jax.tree.map(np.asarray, field.cameras)
+    renderer = pictures.Renderer(field.gaussians, scale_cameras(cameras, _scale(cameras.width, cameras.height)))
+    image = np.concatenate([renderer.photo(0), renderer.colours(0, pictures.code_colours(field))], axis=1)
+    words = f"LanguageField of {field.gaussians.count:,} Gaussians, {field.regions.count} regions and "
+    return image, f"{words}{len(field.names)} frames, texts by {field.embedder or 'no embedder'}"
+
+
+def _capture_picture(capture: Capture) -> tuple[np.ndarray, str]:
+    """Puts some of the frames side by side."""
+    cameras = capture.cameras
+    small = scale_cameras(cameras, _scale(cameras.width, cameras.height))
+    frames = np.unique(np.linspace(0, len(capture.names) - 1, CAPTURE_FRAMES).round().astype(int))
+    image = np.concatenate([resize_frame(np.asarray(capture.frames[t]), small) for t in frames], axis=1)
+    words = f"Capture of {len(capture.names)} frames of {cameras.width}x{cameras.height}, "
+    words += f"{int(np.asarray(capture.held_out).sum())} held out, {len(capture.points):,} sparse points"
+    return image, words + ("" if capture.depths is None else ", with depth")
+
+
+def _selection_picture(selection: Selection) -> tuple[np.ndarray, str]:
+    """Draws a logarithmic histogram of the similarities; the selected Gaussians have their colour."""
+    mask = np.asarray(selection.mask)
+    similarity = np.nan_to_num(np.asarray(selection.similarity, np.float64))
+    low = min(similarity.min(initial=0.0), 0.0)
+    high = max(similarity.max(initial=0.0), 1e-6)
+    image = np.full((HISTOGRAM_HEIGHT, LONG_SIDE, 3), 255, np.uint8)
+    for rows, colour in ((np.ones_like(mask), (190, 190, 190)), (mask, pictures.SELECTED)):
+        counts = np.histogram(similarity[rows], LONG_SIDE // 4, (low, high))[0]
+        heights = (HISTOGRAM_HEIGHT - 4) * np.log1p(counts) / np.log1p(max(len(mask), 1))
+        for n, height in enumerate(np.rint(heights).astype(int).tolist()):
+            image[HISTOGRAM_HEIGHT - height :, 4 * n : 4 * n + 3] = colour
+    words = f"Selection of {int(mask.sum()):,} of {len(mask):,} Gaussians, score {float(selection.score):.3f}, "
+    return image, words + f"region {int(selection.region)}; similarity from {low:.2g} to {high:.2g}"
+
+
+def _scale(width: int, height: int) -> float:
+    """Returns the scale at which a frame fits a picture."""
+    return min(LONG_SIDE / max(width, height), 1.0)

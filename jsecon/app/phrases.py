@@ -1,17 +1,16 @@
-"""A phrase put to SAM 3 in some frames of a field's capture: what most of them find of it, as Gaussians.
+"""Texts put to SAM 3 as phrases in some frames of a field's capture, and lifted to Gaussians.
 
-A frame in which nothing is found speaks too: what it sees is outside. So a thing that one frame alone takes for it is
-not selected.
+A frame without a mask of the phrase counts too: what it sees is outside. So an object that SAM 3 takes for the phrase
+in one frame alone is not selected.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from jsecon.app.ask import Answer, answer_of
+from jsecon.app.ask import Answer, drop_outliers
 from jsecon.data.frames import Progress, evenly_spaced
 from jsecon.errors import InputError
 from jsecon.language.membership import SHARE_THRESHOLD
@@ -25,31 +24,57 @@ Frames = Mapping[int, np.ndarray]
 """index of a field's frame -> (H, W, 3) uint8 RGB, at any size of the frame's shape"""
 
 
-def frames_of(field: LanguageField, capture: Path, count: int) -> dict[int, np.ndarray]:
-    """`count` of the field's frames, evenly spaced, read again from the capture that it was made from: as large as SAM
-    3 takes them, where their files are. Raises InputError where it is another capture, or cannot be read."""
+def load_frames(field: LanguageField, capture: Path, count: int) -> dict[int, np.ndarray]:
+    """Reads frames of a field again from its capture, evenly spaced, at the size that SAM 3 takes.
+
+    Args:
+      field: The field.
+      capture: The capture that it was made from.
+      count: Number of frames.
+
+    Returns:
+      Index of a frame -> its image.
+
+    Raises:
+      InputError: It is another capture, or cannot be read, or `count` is not positive.
+    """
     from jsecon.data.capture import load_capture
 
     if count < 1:
         raise InputError("--looks", str(count), "at least 1", "8 is the default.")
-    chosen = [int(t) for t in evenly_spaced(len(field.names), count)]
-    names = [field.names[t] for t in chosen]
-    found = load_capture(capture, long_side=IMAGE_SIDE, holdout=None, only=names)
-    (height, width), own = found.frames.shape[1:3], (field.cameras.width, field.cameras.height)
-    if abs(width * own[1] - height * own[0]) > max(own) + max(width, height):
-        told, wanted = f"frames of {width}x{height}", f"{own[0]}x{own[1]}, or the same shape at another size"
-        raise InputError(capture, told, wanted, "Give the capture that the field was made from.")
-    return {t: np.asarray(found.frames[found.names.index(name)]) for t, name in zip(chosen, names)}
+    indices = [int(t) for t in evenly_spaced(len(field.names), count)]
+    names = [field.names[t] for t in indices]
+    loaded = load_capture(capture, long_side=IMAGE_SIDE, holdout=None, only=names)
+    height, width = loaded.frames.shape[1:3]
+    field_width, field_height = field.cameras.width, field.cameras.height
+    if abs(width * field_height - height * field_width) > max(field_width, field_height) + max(width, height):
+        problem = f"frames of {width}x{height}"
+        expected = f"{field_width}x{field_height}, or the same shape at another size"
+        raise InputError(capture, problem, expected, "Give the capture that the field was made from.")
+    return {t: np.asarray(loaded.frames[loaded.names.index(name)]) for t, name in zip(indices, names)}
 
 
-def capture_of(field: LanguageField, beside: Path) -> Path:
-    """The capture that a field in the folder `beside` was made from: the poses that its run found, else the folder that
-    the run was given. Raises InputError where neither is there."""
-    if (poses := beside / "poses").exists():
+def find_capture(field: LanguageField, folder: Path) -> Path:
+    """Finds the capture that a field was made from: the poses that its run estimated, else the run's input.
+
+    Args:
+      field: The field.
+      folder: Its folder.
+
+    Returns:
+      Path of the capture.
+
+    Raises:
+      InputError: Neither exists.
+    """
+    poses = folder / "poses"
+    if poses.exists():
         return poses
-    if (capture := locate_sources(field, beside).capture) is not None:
-        return capture
-    raise InputError("--phrases", "the capture that the field was made from is not found", remedy="Give --images DIR.")
+    capture = locate_sources(field, folder).capture
+    if capture is None:
+        problem = "the capture that the field was made from is missing"
+        raise InputError("--phrases", problem, remedy="Give --images DIR.")
+    return capture
 
 
 def ask_phrases(
@@ -62,38 +87,66 @@ def ask_phrases(
     outliers: bool = True,
     progress: Progress = None,
 ) -> tuple[list[Answer], list[InputError]]:
-    """An answer to each phrase, of all the things that it names, and why other phrases have none. Each frame is encoded
-    once for all of them. Raises InputError where the model cannot be used."""
-    read, refused = {}, []
+    """Selects all objects that phrases name. Each frame is encoded once for all phrases.
+
+    Args:
+      field: The field.
+      sam3: The model. It is closed afterwards.
+      phrases: The phrases.
+      frames: Frames to search.
+      threshold: Share of a Gaussian that must lie inside the masks; None is 0.5.
+      outliers: Whether to drop outliers.
+      progress: Called with the number of finished frames, and of all.
+
+    Returns:
+      The answers, and the errors of phrases that the model cannot read.
+
+    Raises:
+      InputError: The model cannot be used.
+    """
+    tokens = {}
+    errors = []
     for phrase in phrases:
         try:
-            read[phrase] = sam3.read(phrase)
+            tokens[phrase] = sam3.read(phrase)
         except InputError as error:
-            refused.append(error)
-    found: dict[str, dict[int, PhraseMasks]] = {phrase: {} for phrase in read}
-    for n, (t, frame) in enumerate(frames.items() if read else ()):
+            errors.append(error)
+    masks: dict[str, dict[int, PhraseMasks]] = {phrase: {} for phrase in tokens}
+    for n, (t, frame) in enumerate(frames.items() if tokens else ()):
         encoded = sam3.encode(frame)
-        for phrase, words in read.items():
-            found[phrase][t] = sam3.masks(encoded, words)
+        for phrase, words in tokens.items():
+            masks[phrase][t] = sam3.masks(encoded, words)
         if progress is not None:
             progress(n + 1, len(frames))
     sam3.close()
-    how = {"threshold": SHARE_THRESHOLD if threshold is None else threshold, "outliers": outliers}
-    return [lifted(field, phrase, masks, **how) for phrase, masks in found.items()], refused
+    threshold = SHARE_THRESHOLD if threshold is None else threshold
+    answers = [lift_phrase(field, phrase, m, threshold=threshold, outliers=outliers) for phrase, m in masks.items()]
+    return answers, errors
 
 
-def lifted(
-    field: LanguageField, phrase: str, found: Mapping[int, PhraseMasks], *, threshold: float, outliers: bool
+def lift_phrase(
+    field: LanguageField, phrase: str, masks: Mapping[int, PhraseMasks], *, threshold: float, outliers: bool
 ) -> Answer:
-    """The Gaussians that lie in the masks of a phrase in most of the frames that see them (`jsecon.lift`)."""
-    size, names = (field.cameras.width, field.cameras.height), field.names
-    scores = {names[t]: [round(float(score), 4) for score in own.scores] for t, own in found.items()}
-    masks = [np.asarray(own.masks.any(0), np.float32) for own in found.values()]
-    stack = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) >= 0.5 for mask in masks])
-    left = {"text encoder": "SAM 3 reads the phrase"}
+    """Selects the Gaussians that lie in the masks of a phrase in most of the frames that see them (`jsecon.lift`).
+
+    Args:
+      field: The field.
+      phrase: The phrase.
+      masks: Index of a frame -> the masks of the phrase in it, of which there may be none.
+      threshold: Share of a Gaussian that must lie inside.
+      outliers: Whether to drop outliers.
+
+    Returns:
+      The answer.
+    """
+    size = field.cameras.width, field.cameras.height
+    scores = {field.names[t]: [round(float(score), 4) for score in m.scores] for t, m in masks.items()}
+    unions = [np.asarray(m.masks.any(0), np.float32) for m in masks.values()]
+    stack = np.stack([cv2.resize(union, size, interpolation=cv2.INTER_AREA) >= 0.5 for union in unions])
+    skipped = {"text encoder": "SAM 3 reads the phrase"}
     if not stack.any():
-        none = np.zeros(field.gaussians.count, bool)
-        return Answer(phrase, "phrase", query_region(field, -1), none, left, frames=scores)
-    selection = lift(field, stack, list(found), threshold=threshold)
-    answer = answer_of(field, phrase, "phrase", selection, outliers, left, keep="all")
-    return dataclasses.replace(answer, frames=scores)
+        selection = query_region(field, -1)
+        return Answer(phrase, "phrase", selection, np.asarray(selection.mask), skipped, frames=scores)
+    selection = lift(field, stack, list(masks), threshold=threshold)
+    answer = Answer(phrase, "phrase", selection, np.asarray(selection.mask), skipped, frames=scores)
+    return drop_outliers(field, answer, outliers, keep="all")

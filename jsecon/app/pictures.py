@@ -1,4 +1,4 @@
-"""Pictures of what a run found: regions in colours that stay the same in every view, codes as colours, selections."""
+"""Pictures of a run: regions in colours that stay the same in every view, codes as colours, selections."""
 
 import colorsys
 import functools
@@ -15,17 +15,19 @@ from jsecon.splat.render import render, render_rgb
 from jsecon.types import Array, Camera, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
-"""RGB of a selection: no natural object's colour"""
-TRUE = (255, 255, 255)
+"""RGB of a selection, which no natural object has"""
+TRUTH = (255, 255, 255)
 """RGB of the ground truth's outline, over a black line"""
-_FONT = cv2.FONT_HERSHEY_SIMPLEX, 0.36
 UNKNOWN = 0.25
-"""grey of Gaussians without a code"""
+"""grey of Gaussians without a code, 0 to 1"""
+GOLDEN_ANGLE = 0.61803398875
+"""difference of neighbouring hues, in turns"""
+_FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.36)
 
 
 def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
-    """RGB of regions 0 .. count-1: hues a golden angle apart, three lightnesses in turn; kept as count grows."""
-    hues = (0.11 + 0.61803398875 * np.arange(count)) % 1.0
+    """Returns the RGB of regions 0 .. count-1: hues a golden angle apart, three lightnesses in turn."""
+    hues = (0.11 + GOLDEN_ANGLE * np.arange(count)) % 1.0
     colours = [colorsys.hls_to_rgb(h, (0.62, 0.42, 0.72)[i % 3], 0.85) for i, h in enumerate(hues)]
     return (np.asarray(colours, np.float64).reshape(count, 3) * 255).astype(np.uint8)
 
@@ -33,50 +35,57 @@ def palette(count: int) -> UInt8[np.ndarray, "n 3"]:
 def label_overlay(
     frame: UInt8[np.ndarray, "h w 3"], labels: Int[np.ndarray, "h w"], *, opacity: float = 0.72
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The frame in grey with each region in its colour and a dark line between regions; unlabelled pixels stay grey."""
+    """Returns the frame in grey with each region in its colour and a dark line between regions. -1 stays grey."""
     grey = np.repeat(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2).astype(np.float32)
-    known = labels >= 0
     colours = palette(int(labels.max(initial=0)) + 1)[np.maximum(labels, 0)]
-    image = np.where(known[..., None], (1 - opacity) * grey + opacity * colours, 0.55 * grey)
-    image[_borders(labels)] *= 0.35
+    image = np.where((labels >= 0)[..., None], (1 - opacity) * grey + opacity * colours, 0.55 * grey)
+    border = np.zeros(labels.shape, bool)
+    border[1:] |= labels[1:] != labels[:-1]
+    border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
+    image[border] *= 0.35
     return image.astype(np.uint8)
-
-
-def _borders(labels: np.ndarray) -> np.ndarray:
-    edge = np.zeros(labels.shape, bool)
-    edge[1:] |= labels[1:] != labels[:-1]
-    edge[:, 1:] |= labels[:, 1:] != labels[:, :-1]
-    return edge
 
 
 def selection_overlay(
     frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], truth: Bool[np.ndarray, "h w"] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The frame, darkened outside of the selection's mask and tinted inside, with the ground truth's outline on top."""
+    """Returns the frame, dark outside of the selection's mask and tinted inside, with the ground truth's outline."""
     image = frame.astype(np.float32)
     image = np.where(mask[..., None], 0.55 * image + 0.45 * np.array(SELECTED, np.float32), 0.5 * image)
     image = _outlined(image.astype(np.uint8), mask, SELECTED, 1)
     if truth is not None:
-        image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, TRUE, 1)
+        image = _outlined(_outlined(image, truth, (0, 0, 0), 3), truth, TRUTH, 1)
     return image
 
 
 def answers_overlay(
     frame: UInt8[np.ndarray, "h w 3"], masks: Mapping[str, Bool[np.ndarray, "h w"]]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The frame in dark grey, in its colours where masks are, their texts above or beneath them: of the masks, the
-    largest first, those that leave each other and the texts room."""
+    """Shows the answers to several texts in one frame.
+
+    Args:
+      frame: The frame.
+      masks: Text -> mask of its answer.
+
+    Returns:
+      The frame in dark grey, and in its colours inside the masks, with each text above or beneath its mask. Of masks
+      that overlap, or whose texts would, the largest is shown.
+    """
     image = np.repeat(0.35 * frame.mean(-1, keepdims=True), 3, axis=-1).astype(np.uint8)
-    taken, places = np.zeros(frame.shape[:2], bool), {}
+    occupied = np.zeros(frame.shape[:2], bool)
+    places: dict[str, tuple[int, int]] = {}
     for text in sorted((text for text, mask in masks.items() if mask.any()), key=lambda text: -masks[text].sum()):
         rows, columns = np.nonzero(masks[text])
-        (wide, high), _ = cv2.getTextSize(text, *_FONT, 1)
-        left = int(np.clip(columns.mean() - wide / 2, 1, max(image.shape[1] - wide - 1, 1)))
-        for base in (max(int(rows.min()) - 4, high + 1), min(int(rows.max()) + high + 5, len(image) - 3)):
-            own = masks[text].copy()
-            own[base - high - 1 : base + 4, left : left + wide] = True
-            if text not in places and not (taken & own).any():
-                places[text], taken = (left, base), taken | own
+        (width, height), _ = cv2.getTextSize(text, *_FONT, 1)
+        left = int(np.clip(columns.mean() - width / 2, 1, max(image.shape[1] - width - 1, 1)))
+        above = max(int(rows.min()) - 4, height + 1)
+        beneath = min(int(rows.max()) + height + 5, len(image) - 3)
+        for base in (above, beneath):
+            area = masks[text].copy()
+            area[base - height - 1 : base + 4, left : left + width] = True
+            if text not in places and not (occupied & area).any():
+                places[text] = (left, base)
+                occupied |= area
     for text in places:
         image[masks[text]] = frame[masks[text]]
     for text, at in places.items():
@@ -85,25 +94,36 @@ def answers_overlay(
     return image
 
 
-def followed(
+def masklet_strip(
     frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"], region: int, *, side: int = 96
 ) -> UInt8[np.ndarray, "{side} w2 3"]:
-    """One region through T frames: each cut out around it and outlined, dark where it is not seen."""
+    """Shows one region through frames.
+
+    Args:
+      frames: T frames.
+      labels: Region ids of their pixels, -1 where there is none.
+      region: Id of the region.
+      side: Side of a tile, px.
+
+    Returns:
+      T tiles side by side: the region cut out and outlined; dark if a frame does not show it.
+    """
     tiles = []
-    for frame, own in zip(frames, labels == region):
-        rows, columns = np.nonzero(own)
+    for frame, mask in zip(frames, labels == region):
+        rows, columns = np.nonzero(mask)
         tile = np.full((side, side, 3), 40, np.uint8)
         if len(rows):
             (top, low), (left, right) = ((int(a.min()), int(a.max()) + 1) for a in (rows, columns))
             scale = side / (1.3 * max(low - top, right - left) + 8)
             shift = [side / 2 - scale * (left + right) / 2, side / 2 - scale * (top + low) / 2]
             matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
-            tile = cv2.warpAffine(_outlined(frame, own, SELECTED, 1), matrix, (side, side), borderValue=(40, 40, 40))
+            tile = cv2.warpAffine(_outlined(frame, mask, SELECTED, 1), matrix, (side, side), borderValue=(40, 40, 40))
         tiles += [tile, np.full((side, 3, 3), 128, np.uint8)]
     return np.concatenate(tiles[:-1], axis=1)
 
 
 def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thickness: int) -> np.ndarray:
+    """Draws the outline of a mask into an image."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     image = np.ascontiguousarray(image)
     cv2.drawContours(image, contours, -1, colour, thickness)
@@ -111,36 +131,54 @@ def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thic
 
 
 def code_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
-    """(N, 3) RGB in [0, 1]: the codes' first three principal components, stretched over the regions; grey = unknown."""
+    """Returns the codes of the Gaussians as colours.
+
+    Args:
+      field: The field.
+
+    Returns:
+      (N, 3) RGB in [0, 1]: the first three principal components of the codes, stretched over the regions. A Gaussian
+      without a code is grey.
+    """
     table = np.asarray(field.region_codes, np.float64)
     codes = np.asarray(field.codes, np.float64)
     known = np.abs(codes).max(axis=1, initial=0.0) > 0
     used = table[np.abs(table).max(axis=1, initial=0.0) > 0]
     if len(used) == 0:
         return np.full((len(codes), 3), UNKNOWN)
-    middle = used.mean(0)
-    axes = np.linalg.svd(used - middle, full_matrices=False)[2][:3]
+    mean = used.mean(0)
+    axes = np.linalg.svd(used - mean, full_matrices=False)[2][:3]
     axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(1)])[:, None]
-    points, shown = (used - middle) @ axes.T, (codes - middle) @ axes.T
+    points = (used - mean) @ axes.T
     low, high = points.min(0), points.max(0)
     rgb = np.full((len(codes), 3), 0.5)
-    rgb[:, : len(axes)] = np.clip((shown - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
+    rgb[:, : len(axes)] = np.clip(((codes - mean) @ axes.T - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
     rgb[~known] = UNKNOWN
     return rgb
 
 
-def strip(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, gap: int = 6) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Pictures of one height side by side on white, each over its caption."""
-    foot, columns = 26, []
+def side_by_side(panels: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, gap: int = 6) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Returns pictures of one height side by side on white, each over its caption."""
+    caption_height = 26
+    columns = []
     for caption, image in panels.items():
-        under = np.full((foot, image.shape[1], 3), 255, np.uint8)
+        under = np.full((caption_height, image.shape[1], 3), 255, np.uint8)
         under = cv2.putText(under, caption, (2, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
-        columns += [np.concatenate([image, under]), np.full((len(image) + foot, gap, 3), 255, np.uint8)]
+        columns += [np.concatenate([image, under]), np.full((len(image) + caption_height, gap, 3), 255, np.uint8)]
     return np.concatenate(columns[:-1], axis=1)
 
 
 class Renderer:
-    """Pictures of one scene from its views; `in_blocks`, of one larger than memory, in its own colours alone."""
+    """Renders one scene in its views.
+
+    Args:
+      gaussians: The scene.
+      cameras: Its T views.
+      in_blocks: Renders a scene that is larger than memory, in its own colours only.
+
+    Attributes:
+      photo: Renders a view in the scene's colours, (H, W, 3) uint8. It keeps the pictures.
+    """
 
     def __init__(self, gaussians: Gaussians, cameras: Camera, *, in_blocks: bool = False):
         self._gaussians = gaussians if in_blocks else jax.device_put(gaussians)
@@ -149,15 +187,16 @@ class Renderer:
         self.photo = functools.cache(self._photo)
 
     def _photo(self, view: int) -> UInt8[np.ndarray, "h w 3"]:
-        """The scene in its own colours."""
+        """Renders a view in the scene's colours."""
         if self._bounds is not None:
             return _to_bytes(render_in_blocks(self._gaussians, self._cameras[view], bounds=self._bounds))
         return _to_bytes(render_rgb(self._gaussians, self._cameras[view]).features)
 
     def colours(self, view: int, rgb: Float[Array, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """The scene with one colour per Gaussian."""
+        """Renders a view with one colour (in [0, 1]) for each Gaussian."""
         return _to_bytes(render(self._gaussians, self._cameras[view], np.asarray(rgb, np.float32)).features)
 
 
 def _to_bytes(image: Array) -> np.ndarray:
+    """Returns an image in [0, 1] as uint8."""
     return (np.clip(np.asarray(image), 0.0, 1.0) * 255 + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What is written at the end of a verb: metrics.json, and a page of pictures to look at."""
+"""What is written at the end of a run: metrics.json, and report.html with pictures of its stages."""
 
 import dataclasses
 import json
@@ -16,40 +16,62 @@ from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 from jsecon.types import Capture, Gaussians, Quality
 
-FRAMES_SHOWN, FOLLOWED, LARGE = 6, 10, 0.15
-"""rows of frames; masklets followed, the largest of those that fill less than a part of a frame; frames of each"""
+FRAMES = 6
+"""number of frames that are shown with masklets and codes"""
+MASKLETS = 10
+"""number of masklets that are shown through as many frames"""
+LARGE = 0.15
+"""share of a frame; a masklet that fills more in some frame is not shown by itself"""
 
 
 def write_run(run: Run, out: Path, listener: Listener) -> dict[str, Any]:
-    """OUT/metrics.json and OUT/report.html of a run without ground truth; says the figures. Returns the metrics."""
+    """Writes OUT/metrics.json and OUT/report.html of a run, and prints its figures.
+
+    Args:
+      run: The run.
+      out: Output folder.
+      listener: Receives the figures.
+
+    Returns:
+      The metrics.
+    """
     metrics = run_metrics(run)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    warnings = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
     with listener.progress("report"):
-        told = [note.removeprefix(WARNING) for note in run.notes if note.startswith(WARNING)]
-        warnings = [report.section("Warning", note) for note in told]
-        parts = [*warnings, report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
+        parts = [report.section("Warning", note) for note in warnings]
+        parts += [report.tiles(_tiles(metrics)), *scene_parts(run), *work_parts(run)]
         title = f"Language field of {run.options.capture.resolve().name}"
         write_text(out / "report.html", report.page(title, "Made by jsecon from posed frames.", parts))
     print_quality(run.held_out, listener)
-    for note in told:
+    for note in warnings:
         listener.say(f"{WARNING}{note}")
     listener.say(
         f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, codes of {metrics['code_size']} numbers, "
         f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
         f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
     )
-    file = out / "field.safetensors"
-    listener.say(
-        f"field   {file}\nreport  {out / 'report.html'}\nask it  jsecon query {file} "
-        f'"dark green bottle" --out {out / "answers"}'
-    )
+    field = out / "field.safetensors"
+    listener.say(f"field   {field}\nreport  {out / 'report.html'}")
+    listener.say(f'next    jsecon query {field} "dark green bottle" --out {out / "answers"}')
     return metrics
 
 
 def write_scene(
     gaussians: Gaussians, capture: Capture, held_out: Quality, out: Path, listener: Listener
 ) -> dict[str, Any]:
-    """The file of a fitted scene, in the world of the capture's files; says the figures, and returns them."""
+    """Writes the file of a fitted scene in the world of the capture's files, and prints its figures.
+
+    Args:
+      gaussians: The scene.
+      capture: The capture that it was fitted to.
+      held_out: Its quality in held-out frames.
+      out: The .ply, .spz or .glb to write.
+      listener: Receives the figures.
+
+    Returns:
+      The path of the file under "written", and the figures.
+    """
     save_gaussians(out, gaussians, similarity=capture.to_source)
     print_quality(held_out, listener)
     listener.say(f"{gaussians.count} Gaussians  {out}")
@@ -57,16 +79,16 @@ def write_scene(
 
 
 def quality_metrics(held_out: Quality) -> dict[str, float | None]:
-    """Mean PSNR (dB) and SSIM of the frames held out; None where there are none."""
-    some, (psnr, ssim) = len(held_out.frames), (held_out.psnr, held_out.ssim)
+    """Returns mean PSNR (dB) and SSIM of the held-out frames, None if there are no such frames."""
+    some = len(held_out.frames) > 0
     return {
-        "held_out_psnr": round(float(np.mean(psnr)), 3) if some else None,
-        "held_out_ssim": round(float(np.mean(ssim)), 4) if some else None,
+        "held_out_psnr": round(float(np.mean(held_out.psnr)), 3) if some else None,
+        "held_out_ssim": round(float(np.mean(held_out.ssim)), 4) if some else None,
     }
 
 
 def print_quality(held_out: Quality, listener: Listener) -> None:
-    """How well the scene shows the frames held out; nothing where there are none."""
+    """Prints mean PSNR and SSIM if there are held-out frames."""
     count = len(held_out.frames)
     if count:
         psnr, ssim = float(np.mean(held_out.psnr)), float(np.mean(held_out.ssim))
@@ -74,7 +96,7 @@ def print_quality(held_out: Quality, listener: Listener) -> None:
 
 
 def run_metrics(run: Run) -> dict[str, Any]:
-    """The figures of a run, for metrics.json."""
+    """Returns the figures of a run for metrics.json."""
     return {
         "gaussians": run.field.gaussians.count,
         "regions": run.field.regions.count,
@@ -83,7 +105,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
         "size": [run.capture.cameras.width, run.capture.cameras.height],
         **quality_metrics(run.held_out),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
-        "left_out": run.skipped,
+        "skipped": run.skipped,
         "notes": list(run.notes),
         "programs_compiled": run.programs,
         "peak_memory_mib": round(peak_memory_mib(), 1),
@@ -91,83 +113,89 @@ def run_metrics(run: Run) -> dict[str, Any]:
 
 
 def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
+    """Returns the headline figures of the report."""
     psnr = metrics["held_out_psnr"]
     return {
         "Gaussians": f"{metrics['gaussians']:,}",
         "regions": str(metrics["regions"]),
-        "numbers a code": str(metrics["code_size"]),
-        "held-out PSNR": "none held out" if psnr is None else f"{psnr:.2f} dB",
-        "in all": f"{sum(metrics['seconds'].values()):.0f} s",
+        "numbers in a code": str(metrics["code_size"]),
+        "held-out PSNR": "no held-out frames" if psnr is None else f"{psnr:.2f} dB",
+        "total": f"{sum(metrics['seconds'].values()):.0f} s",
         "peak memory": f"{metrics['peak_memory_mib']:,.0f} MiB",
     }
 
 
 def scene_parts(run: Run) -> list[str]:
-    """Frames, masklets, codes and the rendered scene, row by row."""
+    """Returns the parts of a page that show frames, masklets, codes and the rendered scene."""
     train = np.flatnonzero(~np.asarray(run.capture.held_out))
-    shown = train[np.unique(np.linspace(0, len(train) - 1, FRAMES_SHOWN).round().astype(int))]
-    renderer, colours = pictures.Renderer(run.field.gaussians, run.field.cameras), pictures.code_colours(run.field)
-    place = {int(t): n for n, t in enumerate(train)}
+    renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
+    colours = pictures.code_colours(run.field)
     cells = []
-    for t in (int(t) for t in shown):
+    for row in _evenly(len(train), FRAMES):
+        t = int(train[row])
         frame = np.asarray(run.capture.frames[t])
         cells += [
             report.figure(frame, run.capture.names[t]),
-            report.figure(pictures.label_overlay(frame, run.labels[place[t]]), "masklets", sharp=True),
+            report.figure(pictures.label_overlay(frame, run.labels[row]), "masklets", sharp=True),
             report.figure(renderer.colours(t, colours), "codes"),
-            report.figure(renderer.photo(t), "the Gaussians' own colours"),
+            report.figure(renderer.photo(t), "rendered"),
         ]
-    words = "One colour is one region in every view. Codes are shown by their first three principal components, as the "
-    words += "Gaussians render them; grey is unknown."
-    parts = [report.section("Frames, masklets, codes", words, report.grid(cells, 4)), _followed(run, train)]
+    words = (
+        "A region has one colour in all views. The colours of the codes are their first three principal components, "
+        "rendered by the Gaussians; a grey Gaussian has no code."
+    )
+    parts = [report.section("Frames, masklets, codes", words, report.grid(cells, 4)), _masklet_part(run, train)]
     if len(run.psnr):
-        out = np.flatnonzero(run.capture.held_out)
-        order = out[np.unique(np.linspace(0, len(out) - 1, 4).round().astype(int))]
-        values, cells = dict(zip(out.tolist(), run.psnr.tolist())), []
-        for t in order.tolist():
+        held_out = np.flatnonzero(run.capture.held_out)
+        psnr = dict(zip(held_out.tolist(), run.psnr.tolist()))
+        cells = []
+        for t in held_out[_evenly(len(held_out), 4)].tolist():
             cells.append(report.figure(np.asarray(run.capture.frames[t]), run.capture.names[t]))
-            cells.append(report.figure(renderer.photo(t), "rendered", strong=f"{values[t]:.2f} dB"))
-        words = "Never seen by any step; photograph and rendering."
+            cells.append(report.figure(renderer.photo(t), "rendered", strong=f"{psnr[t]:.2f} dB"))
+        words = "Photographs that no step has seen, and their renderings."
         parts.append(report.section("Held-out frames", words, report.grid(cells, 4)))
     return parts
 
 
-def _followed(run: Run, train: np.ndarray) -> str:
-    """Masklets through the frames, a row each."""
-    views = np.unique(np.linspace(0, len(train) - 1, FOLLOWED).round().astype(int))
-    frames, labels = np.asarray(run.capture.frames)[train[views]], run.labels[views]
-    sizes = np.stack([np.bincount(own[own >= 0], minlength=run.field.regions.count) for own in labels])
+def _masklet_part(run: Run, train: np.ndarray) -> str:
+    """Returns the part of a page that shows the largest masklets of single things through the frames."""
+    views = _evenly(len(train), MASKLETS)
+    frames = np.asarray(run.capture.frames)[train[views]]
+    labels = run.labels[views]
+    sizes = np.stack([np.bincount(view[view >= 0], minlength=run.field.regions.count) for view in labels])
     small = np.flatnonzero(sizes.max(0) < LARGE * labels[0].size)
-    largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:FOLLOWED]
+    largest = small[np.argsort(-sizes.sum(0)[small], kind="stable")][:MASKLETS]
     rows = []
     for region in largest[sizes.sum(0)[largest] > 0].tolist():
-        seen = int((np.asarray(run.field.regions.pixels)[region] > 0).sum())
-        strip = pictures.followed(frames, labels, region)
-        rows.append(report.wide(strip, f"in {seen} of {len(run.labels)} frames", strong=f"region {region}"))
-    words = "The same region, cut out of frames that follow each other around the scene; dark where it is not seen."
+        count = int((np.asarray(run.field.regions.pixels)[region] > 0).sum())
+        tiles = pictures.masklet_strip(frames, labels, region)
+        rows.append(report.wide(tiles, f"in {count} of {len(run.labels)} frames", strong=f"region {region}"))
+    words = "Each row is one region, cut out of frames around the scene. A dark tile is a frame that does not show it."
     return report.section("Masklets through the frames", words, *rows)
 
 
+def _evenly(count: int, most: int) -> np.ndarray:
+    """Returns at most `most` indices below `count`, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, most).round().astype(int))
+
+
 def work_parts(run: Run) -> list[str]:
-    """Seconds, stages, notes and where it all came from."""
+    """Returns the parts of a page that show seconds, stages, notes and settings."""
     notes = report.table(["notes"], [[note] for note in run.notes], numbers_from=9) if run.notes else ""
-    given = [(f.name, getattr(run.options, f.name), f.default) for f in dataclasses.fields(run.options)]
-    tables = [
-        report.table([head, "value"], [row[:2] for row in given if (row[1] == row[2]) == usual], numbers_from=9)
-        for head, usual in (("changed", False), ("setting", True))
-    ]
-    kept = report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
-    folded = (
-        report.folded("the others, as they are by default", tables[1]),
-        report.folded("as the field keeps it", kept),
+    options = [(f.name, getattr(run.options, f.name), f.default) for f in dataclasses.fields(run.options)]
+    changed, default = (
+        report.table([head, "value"], [row[:2] for row in options if (row[1] == row[2]) == is_default], numbers_from=9)
+        for head, is_default in (("changed", False), ("setting", True))
     )
-    measured = "Wall time, also of what happened in an earlier run; and the programs that jax built for it now, in "
-    measured += "brackets those that it read from disk."
-    counts = run.compilations
-    built = {name: f"{count['all']} ({count['from_disk']})" if count["all"] else "" for name, count in counts.items()}
-    ran = "What ran, and what was left out because this scene does not need it."
+    provenance = report.preformatted(json.dumps(json.loads(run.field.provenance), indent=2))
+    folded = report.folded("settings at their defaults", default), report.folded("provenance of the field", provenance)
+    measured = (
+        "Wall time of each stage, also of those that an earlier run computed, and the number of programs that jax "
+        "compiled for it in this run (in brackets: read from disk)."
+    )
+    programs = {name: f"{n['all']} ({n['from_disk']})" if n["all"] else "" for name, n in run.compilations.items()}
     return [
-        report.section("Seconds of each stage", measured, report.bars(run.seconds, built)),
-        report.section("Stages", ran, report.steps(run.steps), notes),
-        report.section("Settings", "", tables[0], *folded),
+        report.section("Seconds of each stage", measured, report.bars(run.seconds, programs)),
+        report.section("Stages", "What ran, and what this scene does not need.", report.steps(run.steps), notes),
+        report.section("Settings", "", changed, *folded),
     ]

@@ -24,11 +24,11 @@ from jsecon.pipeline.options import (
 T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
 """an option that may be given several times"""
-By = Literal["votes", "silhouette", "strict_silhouette", "lenient_silhouette", "code", "one_step", "canonical"]
+By = Literal["votes", "silhouette", "code"]
 
 VerbResult: TypeAlias = dict[str, Any]
-"""files and figures of a verb: plain values, paths and records; under "refused" the InputErrors of what it could not do
-besides"""
+"""Files and figures of a verb: plain values, paths and records; under "errors" the InputErrors of what it could not do
+besides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Output:
     """Options of every verb.
 
     Attributes:
-      json: Prints one JSON object on standard output at the end, with {"error": ...} of message, name, found, expected
-        and remedy if the verb fails. Everything else goes to standard error.
+      json: Prints one JSON object on standard output at the end, with {"error": ...} of message, where, problem,
+        expected and remedy if the verb fails. Everything else goes to standard error.
       debug: Prints the whole trace of an error.
     """
 
@@ -168,18 +168,14 @@ class Query(FieldVerb):
       mask: Selects what a mask outlines in a frame, or a thing that masks outline in several frames. Black is outside.
       box: Selects the regions that are seen by more than half in a box of a frame.
       out: Output folder.
-      by: How Gaussians are selected. With votes and code, the text selects a region, and the region the Gaussians with
-        its votes or with its code. With silhouette, each Gaussian of the votes is then kept or dropped by what the
-        outline of all gains in the views, either strict (where it is opaque) or lenient (where it is there at all).
-        With one_step and canonical, each Gaussian's code is compared with the text.
-      threshold: Threshold of the measure of --by. By default it is 0.5 for votes, silhouettes and canonical, 0.9 for
-        code, and 0.8 for one_step, which is too high for CLIP.
-      quantile: A text selects nothing unless it is more similar to the scene than this share of unrelated words. Of
-        texts that name nothing in the scene, about 1 - quantile are answered. With 0 every text is answered.
+      by: How a matching region selects Gaussians: by its votes, or by its code. With silhouette, each Gaussian of the
+        votes is then kept or dropped by what the outline of all gains in the views.
+      threshold: Smallest similarity of a selected Gaussian. By default it is 0.5 for votes and silhouette, and 0.9 for
+        code.
+      quantile: Share of unrelated words that must be less similar to the scene than a text, else the text has no match.
+        About 1 - quantile of the texts of absent objects are answered. With 0 every text is answered.
       all: Selects every region that answers a text, such as all the chairs, and not only the best one: those whose
         similarity has come 0.75 of the way from the middle region's to the best one's (by votes or a silhouette).
-      even: Smooths the votes over the ten neighbours of each Gaussian before the threshold. Rims become sharper if the
-        masks are noisy.
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. Without it, DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
       phrases: Folder of a SAM 3 model (.onnx). Each text is put to it as a phrase in some frames of the capture, and
@@ -192,9 +188,9 @@ class Query(FieldVerb):
     """
 
     texts: Positional[list[str]]
-    at: Annotated[Repeated[tuple[str, str, str]], arg(metavar="FRAME X Y")] = dataclasses.field(default_factory=list)
+    at: Annotated[Repeated[tuple[str, int, int]], arg(metavar="FRAME X Y")] = dataclasses.field(default_factory=list)
     mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
-    box: Annotated[Repeated[tuple[str, str, str, str, str]], arg(metavar="FRAME X0 Y0 X1 Y1")] = dataclasses.field(
+    box: Annotated[Repeated[tuple[str, int, int, int, int]], arg(metavar="FRAME X0 Y0 X1 Y1")] = dataclasses.field(
         default_factory=list
     )
     out: Option[Path]
@@ -202,7 +198,6 @@ class Query(FieldVerb):
     threshold: Option[float | None] = None
     quantile: Option[float] = 0.82
     all: Option[bool] = False
-    even: Option[bool] = False
     keep_outliers: Option[bool] = False
     phrases: Option[Path | None] = None
     images: Option[Path | None] = None

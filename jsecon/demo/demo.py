@@ -72,7 +72,7 @@ def run_demo(
     with listener.progress("report"):
         texts = sorted({name for frame in labels for name in frame.objects})
         questions = ask.queries_of(run.field, embedder, texts=texts)
-        answers = {answer.question: answer for answer in ask.answer_each(questions)[0]}
+        answers = {answer.query: answer for answer in ask.answer_each(questions)[0]}
         queries = {
             text: write_answer(run.field, answer, out / "queries", answer_masks(run.field, answer, views=2))
             for text, answer in answers.items()
@@ -83,13 +83,13 @@ def run_demo(
         write_film(run.field, [answer for answer in answers.values() if answer.mask.any()], out / "demo.webp")
         film = report.film((out / "demo.webp").read_bytes(), "Rendered from the field: each text lights up its match.")
         write_text(out / "report.html", _page(run, results, queries, labels, metrics, film, seed))
-    single = sum(query["left_out"].get("DBSCAN") == "the selection is one component" for query in queries.values())
-    metrics["left_out"]["DBSCAN"] = f"{single} of {len(queries)} selections are one component"
+    single = sum(query["skipped"].get("DBSCAN") == "the selection is one component" for query in queries.values())
+    metrics["skipped"]["DBSCAN"] = f"{single} of {len(queries)} selections are one component"
     metrics["peak_memory_mib"] = round(peak_memory_mib(), 1)
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     evaluation.print_table(results, listener)
     listener.say(
-        f"held-out PSNR {metrics['held_out_psnr']:.2f} dB, {metrics['seconds_in_all']:.0f} s of work, "
+        f"held-out PSNR {metrics['held_out_psnr']:.2f} dB, {metrics['total_seconds']:.0f} s of work, "
         f"peak memory {metrics['peak_memory_mib']:.0f} MiB"
     )
     field = out / "field.safetensors"
@@ -124,8 +124,8 @@ def _metrics(results: Results, run: Run, true_run: Run) -> dict[str, Any]:
         "regions": run.field.regions.count,
         "gaussians": run.field.gaussians.count,
         "seconds": {name: round(value, 2) for name, value in seconds.items()},
-        "seconds_in_all": round(sum(seconds.values()), 1),
-        "left_out": {f"{name} (true masks)": why for name, why in true_run.skipped.items()} | run.skipped,
+        "total_seconds": round(sum(seconds.values()), 1),
+        "skipped": {f"{name} (true masks)": why for name, why in true_run.skipped.items()} | run.skipped,
         "peak_memory_mib": 0.0,
     }
 
@@ -143,7 +143,7 @@ def _write_panels(file: Path, run: Run, frame: int, masks: Mapping[str, np.ndarr
         "answers to texts": pictures.answers_overlay(frames[frame], masks),
     }
     with atomic_write(file) as temporary:
-        image = cv2.cvtColor(pictures.strip(panels), cv2.COLOR_RGB2BGR)
+        image = cv2.cvtColor(pictures.side_by_side(panels), cv2.COLOR_RGB2BGR)
         temporary.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
 
 
@@ -166,7 +166,7 @@ def _page(
             "mIoU, true masks given": f"{metrics['true_masks']['miou']:.3f}",
             "mIoU, one-step query": f"{metrics['one_step']['miou']:.3f}",
             "held-out PSNR": f"{metrics['held_out_psnr']:.2f} dB",
-            "of work": f"{metrics['seconds_in_all']:.0f} s",
+            "of work": f"{metrics['total_seconds']:.0f} s",
         }
     )
     names = {

@@ -19,8 +19,8 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 
 import jsecon
 from jsecon.app.ask import frame_index
-from jsecon.app.server.guard import LIMITS, Busy, Guard, Limits, Workers
-from jsecon.app.server.scenes import Question, Scene
+from jsecon.app.server.guard import LIMITS, Guard, Limits, Workers
+from jsecon.app.server.scenes import Scene, SceneQuery
 from jsecon.app.verbs import By
 from jsecon.errors import InputError
 from jsecon.process import cores
@@ -125,27 +125,23 @@ def application(
             return await workers.compute(work, limits.seconds)
         except InputError as error:
             raise _wrong(field, _in_words_of_the_api(str(error))) from error
-        except TimeoutError as error:
-            raise HTTPException(503, f"No answer within {limits.seconds:g} s. Try again.") from error
-        except Busy as error:
-            raise HTTPException(503, "Too many queries wait for an answer. Try again.") from error
 
     @app.post("/query", summary="Count, score and place of the answer to a text or a pixel")
-    async def query(asked: AnyQuery) -> Response:
-        if (asked.text is None) == (asked.at is None):
-            raise _wrong("text", 'missing, and "at" too.' if asked.at is None else 'give it, or "at", and not both.')
-        if asked.at is not None and asked.all:
+    async def query(request: AnyQuery) -> Response:
+        if (request.text is None) == (request.at is None):
+            raise _wrong("text", 'missing, and "at" too.' if request.at is None else 'give it, or "at", and not both.')
+        if request.at is not None and request.all:
             raise _wrong("all", 'it needs a text, and "at" has none.')
-        scene = scene_of(asked.field)
-        question = Question(asked.text or "", asked.at, asked.by, asked.threshold, asked.all)
-        record = scene.known(question)
+        scene = scene_of(request.field)
+        scene_query = SceneQuery(request.text or "", request.at, request.by, request.threshold, request.all)
+        record = scene.records.get(scene_query)
         if record is None:
-            record = await computed(lambda: scene.record(question), "text" if asked.at is None else "at")
+            record = await computed(lambda: scene.record(scene_query), "text" if request.at is None else "at")
         return AsciiResponse(record)
 
     @app.get("/regions", summary="Pixels and views of each region")
-    async def regions(asked: Annotated[Fields, Query()]) -> Response:
-        scene = scene_of(asked.field)
+    async def regions(request: Annotated[Fields, Query()]) -> Response:
+        scene = scene_of(request.field)
         rows = [
             {
                 "region": region,
@@ -158,31 +154,31 @@ def application(
         return AsciiResponse({"field": scene.name, "regions": rows})
 
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's own world")
-    async def selection(asked: Annotated[TextQuery, Query()]) -> Response:
-        scene = scene_of(asked.field)
+    async def selection(request: Annotated[TextQuery, Query()]) -> Response:
+        scene = scene_of(request.field)
 
         def work() -> bytes:
-            answer = scene.answer(Question(asked.text, by=asked.by))
+            answer = scene.answer(SceneQuery(request.text, by=request.by))
             if not answer.mask.any():
-                raise InputError(f"query {answer.question!r}", "it selects nothing", remedy="Ask with other words.")
+                raise InputError(f"query {answer.query!r}", "no Gaussian is selected", remedy="Ask with other words.")
             return scene.ply(answer)
 
         return Response(await computed(work, "text"), media_type="application/octet-stream")
 
     @app.get("/mask.png", summary="The selection alone in a frame, alpha above 0.7")
-    async def mask(asked: Annotated[MaskQuery, Query()]) -> Response:
-        scene = scene_of(asked.field)
+    async def mask(request: Annotated[MaskQuery, Query()]) -> Response:
+        scene = scene_of(request.field)
         try:
-            frame = None if asked.frame is None else frame_index(scene.field, asked.frame)
+            frame = None if request.frame is None else frame_index(scene.field, request.frame)
         except InputError as error:
             raise _wrong("frame", str(error)) from error
-        question = Question(asked.text, by=asked.by)
-        name, image = await computed(lambda: scene.mask(scene.answer(question), frame), "text")
+        scene_query = SceneQuery(request.text, by=request.by)
+        name, image = await computed(lambda: scene.mask(scene.answer(scene_query), frame), "text")
         return Response(image, media_type="image/png", headers={"x-frame": re.sub("[^ -~]", "?", name)})
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
-        return AsciiResponse({"status": "ok", "fields": [scene.described() for scene in scenes.values()]})
+        return AsciiResponse({"status": "ok", "fields": [scene.description() for scene in scenes.values()]})
 
     @app.get("/", include_in_schema=False)
     async def page() -> Response:
@@ -201,7 +197,7 @@ def application(
     @app.exception_handler(AnyHTTPException)
     async def refused(request: Request, error: Exception) -> Response:
         assert isinstance(error, AnyHTTPException)
-        return AsciiResponse({"error": error.detail}, error.status_code)
+        return AsciiResponse({"error": error.detail}, error.status_code, error.headers)
 
     @app.exception_handler(500)
     async def failed(request: Request, error: Exception) -> Response:

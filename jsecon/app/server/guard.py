@@ -4,11 +4,11 @@ import asyncio
 import dataclasses
 import threading
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from starlette.datastructures import Headers
-from starlette.requests import ClientDisconnect, Request
+from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 
 from jsecon.app.access import is_allowed_host, token_matches
@@ -36,51 +36,39 @@ class Limits:
 LIMITS = Limits()
 
 
-class Busy(Exception):
-    """The maximum number of queries waits already."""
-
-
 class Workers:
     """Threads that compute answers.
 
-    A query keeps its place until its thread has finished it, also after its client was told that it took too long.
-
     Args:
       threads: Maximum number of threads.
-      most: Maximum number of queries in the threads or waiting for one.
+      places: Maximum number of queries in the threads or waiting for one.
     """
 
-    def __init__(self, threads: int, most: int):
-        self.most = most
-        self.taken = 0
+    def __init__(self, threads: int, places: int):
+        self._places = threading.Semaphore(places)
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="jsecon-answer")
-        self._lock = threading.Lock()
 
     async def compute(self, work: Callable[[], Any], seconds: float) -> Any:
-        """Runs a function in a thread.
+        """Runs a function in a thread. It keeps its place until it ends, also after its client got an error.
 
         Args:
-          work: The function.
-          seconds: Time limit, s. Work that has not begun by then never does.
+          work: The function. If it has not begun within the time limit, it never does.
+          seconds: Time limit, s.
 
         Returns:
           What `work` returns; its exceptions are raised here.
 
         Raises:
-          Busy: All places are taken.
-          TimeoutError: The time limit has passed.
+          HTTPException: 503, since all places are taken or the time limit has passed.
         """
-        with self._lock:
-            if self.taken >= self.most:
-                raise Busy
-            self.taken += 1
+        if not self._places.acquire(blocking=False):
+            raise HTTPException(503, "Too many queries wait for an answer. Try again.")
         future = self._pool.submit(work)
-        future.add_done_callback(self._leave)
-        return await asyncio.wait_for(asyncio.wrap_future(future), seconds)
-
-    def _leave(self, future: Future) -> None:
-        with self._lock:
-            self.taken -= 1
+        future.add_done_callback(lambda _: self._places.release())
+        try:
+            return await asyncio.wait_for(asyncio.wrap_future(future), seconds)
+        except TimeoutError as error:
+            raise HTTPException(503, f"No answer within {seconds:g} s. Try again.") from error
 
     def close(self) -> None:
         """Ends the threads. Work that has begun is finished, work that waits is dropped."""
@@ -108,62 +96,58 @@ class Guard:
         self.active = 0
 
     async def __call__(self, scope: dict, receive: Callable, send: Callable) -> None:
-        """Answers a request that is refused, and passes the others on with their whole body."""
+        """Answers a request that is refused, and passes the others on."""
         if scope["type"] == "lifespan":
             return await self.app(scope, receive, send)
         if scope["type"] != "http":
             return await send({"type": "websocket.close", "code": 1008})
-        if self.active >= self.limits.requests:
-            return await _refusal(503, "Too many requests at once. Try again.")(scope, receive, send)
+        refusal = self._refusal(Headers(scope=scope), scope["method"])
+        if refusal is not None:
+            status, message = refusal
+            response = JSONResponse({"error": message}, status, headers={"connection": "close"})
+            return await response(scope, receive, send)
         self.active += 1
         try:
-            response = self._refused(Headers(scope=scope), scope.get("method", "GET"))
-            if response is None:
-                body, response = await self._body(Request(scope, receive))
-            if response is not None:
-                return await response(scope, receive, send)
-            await self.app(scope, _replay(body, receive), send)
+            await self.app(scope, self._limited(receive), send)
         finally:
             self.active -= 1
 
-    def _refused(self, headers: Headers, method: str) -> JSONResponse | None:
-        """Returns the refusal that follows from the headers, or None."""
+    def _refusal(self, headers: Headers, method: str) -> tuple[int, str] | None:
+        """Returns the status and the message of a request that is refused, or None."""
+        if self.active >= self.limits.requests:
+            return 503, "Too many requests at once. Try again."
         if self.token:
             if not token_matches(headers.get("authorization", "").encode("latin-1"), f"Bearer {self.token}"):
-                return _refusal(401, "A token is required. Send the header Authorization: Bearer TOKEN.")
+                return 401, "A token is required. Send the header Authorization: Bearer TOKEN."
         elif not is_allowed_host(headers.get("host", ""), self.hosts):
-            words = "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME."
-            return _refusal(403, words)
+            return 403, "The Host header does not name this server. Allow it with jsecon serve --allow-host NAME."
         kind = headers.get("content-type", "").partition(";")[0].strip().lower()
         if method == "POST" and kind != "application/json":
-            return _refusal(415, "The body must be JSON. Send the header Content-Type: application/json.")
+            return 415, "The body must be JSON. Send the header Content-Type: application/json."
         return None
 
-    async def _body(self, request: Request) -> tuple[bytes, JSONResponse | None]:
-        """Reads the body. Returns it, or a refusal."""
-        body = bytearray()
-        try:
-            async with asyncio.timeout(self.limits.seconds_to_send):
-                async for part in request.stream():
-                    body += part
-                    if len(body) > self.limits.body:
-                        return b"", _refusal(413, f"The body has more than {self.limits.body} bytes.")
-        except ClientDisconnect:
-            return b"", _refusal(400, "The sender closed the connection.")
-        except TimeoutError:
-            return b"", _refusal(408, f"The body did not arrive within {self.limits.seconds_to_send:g} s.")
-        return bytes(body), None
+    def _limited(self, receive: Callable) -> Callable:
+        """Returns a `receive` that raises HTTPException for a body that is too large or arrives too slowly."""
+        size = 0
+        deadline = asyncio.get_running_loop().time() + self.limits.seconds_to_send
+        complete = False
+
+        async def limited() -> Any:
+            nonlocal size, complete
+            try:
+                async with asyncio.timeout_at(None if complete else deadline):
+                    message = await receive()
+            except TimeoutError as error:
+                raise _closing(408, f"The body did not arrive within {self.limits.seconds_to_send:g} s.") from error
+            size += len(message.get("body", b""))
+            if size > self.limits.body:
+                raise _closing(413, f"The body has more than {self.limits.body} bytes.")
+            complete = not message.get("more_body", False)
+            return message
+
+        return limited
 
 
-def _refusal(status: int, message: str) -> JSONResponse:
-    return JSONResponse({"error": message}, status, headers={"connection": "close"})
-
-
-def _replay(body: bytes, receive: Callable) -> Callable:
-    """Returns a `receive` with the whole body first, and then the messages of the server."""
-    waiting = [{"type": "http.request", "body": body, "more_body": False}]
-
-    async def replay() -> Any:
-        return waiting.pop() if waiting else await receive()
-
-    return replay
+def _closing(status: int, message: str) -> HTTPException:
+    """Makes an error after which the server closes the connection, since the rest of the body is not read."""
+    return HTTPException(status, message, {"connection": "close"})

@@ -13,7 +13,7 @@ import numpy as np
 
 from jsecon.app.ask import Answer, ask_pixel, ask_text
 from jsecon.app.locate import locate_answer
-from jsecon.app.outputs import best_frames, selected
+from jsecon.app.outputs import best_frames, selected_gaussians
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -21,11 +21,13 @@ from jsecon.pipeline.networks import field_embedder
 from jsecon.query.render import selection_mask
 from jsecon.types import LanguageField
 
-KEPT = 64
+MAX_ANSWERS = 64
 """number of answers that are kept, of five bytes a Gaussian each"""
+MAX_RECORDS = 4096
+"""number of records that are kept, of some kilobytes each"""
 
 
-class Question(NamedTuple):
+class SceneQuery(NamedTuple):
     """A query.
 
     Attributes:
@@ -33,7 +35,7 @@ class Question(NamedTuple):
       pixel: Frame (name or index), column and row, or None.
       by: One of `METHODS`.
       threshold: Threshold of the method; None is its default.
-      several: Whether to select all regions that answer the text.
+      several: Whether to select all regions that match the text.
     """
 
     text: str
@@ -50,47 +52,43 @@ class Scene:
       name: Its name.
       field: The field.
       embedder: The embedder of its regions.
+
+    Attributes:
+      answer: Answers a query. It keeps the last answers.
+      records: Records of the queries that were answered, as plain values.
     """
 
     def __init__(self, name: str, field: LanguageField, embedder: Any):
         self.name = name
         self.field = field
         self.embedder = embedder
-        self.answer = functools.lru_cache(KEPT)(self._answer)
-        self._records: dict[Question, dict[str, Any]] = {}
+        self.answer = functools.lru_cache(MAX_ANSWERS)(self._answer)
+        self.records: dict[SceneQuery, dict[str, Any]] = {}
         self._gaussians = jax.device_put(field.gaussians)
         self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
 
-    def _answer(self, question: Question) -> Answer:
-        """Answers a query; `answer` keeps the last ones."""
-        options: dict[str, Any] = {"by": question.by, "threshold": question.threshold}
-        if question.pixel is not None:
-            return ask_pixel(self.field, *question.pixel, **options)
-        return ask_text(self.field, self.embedder, question.text, several=question.several, **options)
+    def _answer(self, query: SceneQuery) -> Answer:
+        """Answers a query that is not among the last ones."""
+        options: dict[str, Any] = {"by": query.by, "threshold": query.threshold}
+        if query.pixel is not None:
+            return ask_pixel(self.field, *query.pixel, **options)
+        return ask_text(self.field, self.embedder, query.text, several=query.several, **options)
 
-    def record(self, question: Question) -> dict[str, Any]:
-        """Returns what and where the answer to a query is, as plain values. It is kept for longer than the answer."""
-        record = self._record(question)
-        if len(self._records) >= KEPT * KEPT:
-            self._records.clear()
-        self._records[question] = record
-        return record
-
-    def known(self, question: Question) -> dict[str, Any] | None:
-        """Returns the record of a query that was answered before, or None."""
-        return self._records.get(question)
-
-    def _record(self, question: Question) -> dict[str, Any]:
-        answer = self.answer(question)
+    def record(self, query: SceneQuery) -> dict[str, Any]:
+        """Answers a query by plain values: what is selected and where it is. They are kept in `records`."""
+        answer = self.answer(query)
         region = int(answer.selection.region)
-        return {
-            "question": answer.question,
+        if len(self.records) >= MAX_RECORDS:
+            self.records.clear()
+        self.records[query] = {
+            "query": answer.query,
             "field": self.name,
             "count": int(answer.mask.sum()),
             "region": region if region >= 0 else None,
             "score": round(float(answer.selection.score), 6),
             "place": locate_answer(self.field, answer).as_dict() if answer.mask.any() else None,
         }
+        return self.records[query]
 
     def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
         """Renders an answer alone in a frame.
@@ -110,10 +108,10 @@ class Scene:
         """Returns the selected Gaussians as a .ply in the capture's own world."""
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "selection.ply"
-            save_ply(file, selected(self.field.gaussians, answer.mask), similarity=self.field.to_source)
+            save_ply(file, selected_gaussians(self.field.gaussians, answer.mask), similarity=self.field.to_source)
             return file.read_bytes()
 
-    def described(self) -> dict[str, Any]:
+    def description(self) -> dict[str, Any]:
         """Returns name, sizes and frames of the field as plain values."""
         return {
             "name": self.name,
@@ -146,5 +144,5 @@ def open_scenes(files: list[Path], embedder: Path | None) -> dict[str, Scene]:
         field = load_field(file)
         scenes[name] = Scene(name, field, field_embedder(field, embedder))
         with contextlib.suppress(InputError):  # an embedder that has no word for it
-            scenes[name].mask(scenes[name].answer(Question("red")), 0)
+            scenes[name].mask(scenes[name].answer(SceneQuery("red")), 0)
     return scenes

@@ -22,7 +22,7 @@ from jsecon.errors import InputError
 REMEDY = 'pip install "jsecon[serve]"'
 
 
-def ready(
+def prepare(
     files: list[Path],
     *,
     host: str,
@@ -53,13 +53,13 @@ def ready(
 
         from jsecon.app.server.api import application
     except ImportError as error:
-        found = f"the package {error.name} is missing"
-        raise InputError("jsecon serve", found, remedy=f"Run: {REMEDY}") from error
+        problem = f"the package {error.name} is missing"
+        raise InputError("jsecon serve", problem, remedy=f"Run: {REMEDY}") from error
     token = token_for(host, token)
     listening = listen(host, port)
     scenes = open_scenes(files, embedder)
     app = application(scenes, token=token, hosts=(host, *hosts))
     config = uvicorn.Config(app, log_level="warning", timeout_keep_alive=5, ws="none", server_header=False)
     address = f"http://{bracketed(host)}:{listening.getsockname()[1]}"
-    described = {"address": address, "fields": [scene.described() for scene in scenes.values()]}
-    return described, lambda: uvicorn.Server(config).run(sockets=[listening])
+    description = {"address": address, "fields": [scene.description() for scene in scenes.values()]}
+    return description, lambda: uvicorn.Server(config).run(sockets=[listening])

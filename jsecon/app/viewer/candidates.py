@@ -1,5 +1,4 @@
-"""What else an answer might be: the regions nearest to what was asked, each with a picture; and the region that a ray
-meets."""
+"""Other regions that an answer might be, each with a picture; and the region that a ray meets."""
 
 import dataclasses
 from typing import Any
@@ -10,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jsecon.app.ask import with_phrases
+from jsecon.app.outputs import main_regions
 from jsecon.app.pictures import Renderer
-from jsecon.app.viewer.static_page import main_regions
 from jsecon.query.match import RETRIEVALS, answers, evidence, scene_residuals, words_of
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
@@ -19,84 +18,112 @@ from jsecon.query.several import ROUNDING, parts_of_question
 from jsecon.query.similarity import similarities
 from jsecon.types import Camera, LanguageField
 
-SIDE = 1025
-"""px of the view that looks along a ray, which meets the middle of its middle pixel"""
+RAY_VIEW_SIDE = 1025
+"""side of the view that looks along a ray, px; the ray meets the centre of its middle pixel"""
 MARGIN = 0.3
-"""around a region in its picture, in parts of its size"""
+"""margin around a region in its picture, as a share of its size"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A region that an answer might be."""
+    """A region that an answer might be.
+
+    Attributes:
+      region: Its id.
+      score: Its similarity with the query.
+      frame: Index of the frame that shows most of it.
+    """
 
     region: int
     score: float
-    """similarity with what was asked."""
     frame: int
-    """that shows most of it."""
 
 
-def candidates(field: LanguageField, embedder: Any, thing: str | int, count: int = 6) -> list[Candidate]:
-    """The `count` regions nearest to a text or a region, the nearest first, as queries weigh them (`evidence`).
+def candidates(field: LanguageField, embedder: Any, query: str | int, count: int = 6) -> list[Candidate]:
+    """Finds the regions that are most similar to a text or a region, as queries weigh them (`evidence`).
 
-    For a text the nearest wanted part of `parts_of_question` counts, and a region as near to an unwanted one is left
-    out; for a region what sets both apart from the scene, itself left out. Raises InputError for a text that the
-    embedder doesn't understand.
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      query: A text, of whose alternatives the most similar one counts; regions that match a text behind "but not"
+        better are left out. Or the id of a region, which is compared by what sets regions apart from the scene.
+      count: Maximum number of candidates.
+
+    Returns:
+      The candidates, best first.
+
+    Raises:
+      InputError: The embedder has no words for the text.
     """
     if field.regions.count == 0:
         return []
-    table, pixels = jnp.asarray(field.regions.embeddings), jnp.asarray(field.regions.pixels)
-    if isinstance(thing, str):
+    table = jnp.asarray(field.regions.embeddings)
+    pixels = jnp.asarray(field.regions.pixels)
+    if isinstance(query, str):
         field = with_phrases(field, embedder)
         words, retrieval = words_of(field, RETRIEVALS[0])
-        wanted, unwanted = parts_of_question(thing)
-        texts = jnp.asarray(embedder.embed_text(wanted + unwanted))
-        each = [_answers(table, text, jnp.asarray(field.canonical), words, pixels, retrieval) for text in texts]
-        near, known = np.stack([found for found, _ in each]), np.array(each[0][1])
-        score = near[: len(wanted)].max(0)
-        known &= score > near[len(wanted) :].max(0, initial=-np.inf) + ROUNDING
+        included, excluded = parts_of_question(query)
+        canonical = jnp.asarray(field.canonical)
+        texts = jnp.asarray(embedder.embed_text(included + excluded))
+        matches = [_answers(table, text, canonical, words, pixels, retrieval) for text in texts]
+        scores = np.stack([score for score, _ in matches])
+        score = scores[: len(included)].max(0)
+        known = matches[0][1] & (score > scores[len(included) :].max(0, initial=-np.inf) + ROUNDING)
     else:
-        score, known = (np.array(a) for a in _likeness(table, pixels, min(thing, field.regions.count - 1)))
-        known[thing : thing + 1] = False
-    weighed = np.where(known, np.where(score > 0, score * np.asarray(_evidence(pixels)), score), -np.inf)
-    order = [r for r in np.argsort(-weighed, kind="stable")[:count] if known[r]]
+        score, known = (np.array(a) for a in _region_similarity(table, pixels, min(query, field.regions.count - 1)))
+        known[query : query + 1] = False
+    weighted = np.where(known, np.where(score > 0, score * np.asarray(_evidence(pixels)), score), -np.inf)
+    order = [r for r in np.argsort(-weighted, kind="stable")[:count] if known[r]]
     frames = np.asarray(field.regions.pixels).argmax(1)
     return [Candidate(int(r), float(score[r]), int(frames[r])) for r in order]
 
 
-_answers, _evidence = jax.jit(answers, static_argnames="retrieval"), jax.jit(evidence)
+_answers = jax.jit(answers, static_argnames="retrieval")
+_evidence = jax.jit(evidence)
 
 
 @jax.jit
-def _likeness(embeddings, pixels, region):
-    apart, known = scene_residuals(embeddings, pixels)
-    found, measured = similarities(apart, apart[region])
-    return jnp.where(measured, found, 0.0), known & measured
+def _region_similarity(embeddings, pixels, region):
+    """Returns cosines of all regions with one, by what sets them apart from the scene, and where they are known."""
+    residuals, known = scene_residuals(embeddings, pixels)
+    cosines, measured = similarities(residuals, residuals[region])
+    return jnp.where(measured, cosines, 0.0), known & measured
 
 
-class Pictures:
-    """Pictures of a field's frames and regions, as its Gaussians show them."""
+class RegionPictures:
+    """Pictures of a field's frames and regions, rendered from its Gaussians.
+
+    Args:
+      field: The field.
+
+    Attributes:
+      renderer: Renders the frames.
+      regions: (N,) main region of each Gaussian, or -1.
+    """
 
     def __init__(self, field: LanguageField):
-        self.renderer, self.regions = Renderer(field.gaussians, field.cameras), main_regions(field)
+        self.renderer = Renderer(field.gaussians, field.cameras)
+        self.regions = main_regions(field)
         self._means = np.asarray(field.gaussians.means)
         self._poses = np.asarray(field.cameras.world_to_camera)
-        self._lens = [np.asarray(a) for a in (field.cameras.fx, field.cameras.fy, field.cameras.cx, field.cameras.cy)]
+        self._intrinsics = [np.asarray(getattr(field.cameras, name)) for name in ("fx", "fy", "cx", "cy")]
 
     def region(self, region: int, frame: int) -> UInt8[np.ndarray, "h w 3"]:
-        """The part of a frame that shows a region's Gaussians; all of it where it has none there."""
+        """Returns the part of a frame that shows a region's Gaussians, or the whole frame if it shows none."""
         photo = self.renderer.photo(frame)
         height, width = photo.shape[:2]
         points = self._means[self.regions == region] @ self._poses[frame, :3, :3].T + self._poses[frame, :3, 3]
         points = points[points[:, 2] > 1e-6]
-        fx, fy, cx, cy = (a[frame] for a in self._lens)
-        u, v = fx * points[:, 0] / points[:, 2] + cx, fy * points[:, 1] / points[:, 2] + cy
+        fx, fy, cx, cy = (a[frame] for a in self._intrinsics)
+        u = fx * points[:, 0] / points[:, 2] + cx
+        v = fy * points[:, 1] / points[:, 2] + cy
         inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
         if not inside.any():
             return photo
-        (left, right), (upper, lower) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
-        half = max(right - left, lower - upper, 16) * (0.5 + MARGIN)
-        x, y = (left + right) / 2, (upper + lower) / 2
+        (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
+        half = max(right - left, bottom - top, 16) * (0.5 + MARGIN)
+        x = (left + right) / 2
+        y = (top + bottom) / 2
         rows = slice(int(max(y - half, 0)), int(min(y + half, height)) + 1)
         return photo[rows, int(max(x - half, 0)) : int(min(x + half, width)) + 1]
 
@@ -107,19 +134,30 @@ def region_along(
     direction: Float[np.ndarray, "3"],
     *,
     focal: float,
-    seen: Bool[np.ndarray, " n"],
+    visible: Bool[np.ndarray, " n"],
 ) -> int:
-    """The region that makes up most of the pixel that a ray meets, among the Gaussians `seen` (N,); -1 where none makes
-    up `MIN_SHARE`. `focal`: px of the view that the ray belongs to. World units, as the field's."""
+    """Finds the region that a ray meets.
+
+    Args:
+      field: The field.
+      origin: Origin of the ray in the field's world.
+      direction: Direction of the ray.
+      focal: Focal length of the view that the ray belongs to, px.
+      visible: Gaussians that the ray can meet.
+
+    Returns:
+      The region that makes up most of the pixel on the ray, or -1 if no region has `MIN_SHARE` of it.
+    """
     forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    aside = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    aside /= np.linalg.norm(aside)
+    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([aside, np.cross(forward, aside), forward])
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ np.asarray(origin, np.float64)
-    lens = (np.asarray(x, np.float32) for x in (focal, focal, SIDE / 2, SIDE / 2))
-    camera = Camera(pose.astype(np.float32), *lens, width=SIDE, height=SIDE)
-    logits = jnp.where(jnp.asarray(seen), field.gaussians.opacity_logits, HIDDEN_LOGIT)
+    intrinsics = (np.asarray(x, np.float32) for x in (focal, focal, RAY_VIEW_SIDE / 2, RAY_VIEW_SIDE / 2))
+    camera = Camera(pose.astype(np.float32), *intrinsics, width=RAY_VIEW_SIDE, height=RAY_VIEW_SIDE)
+    logits = jnp.where(jnp.asarray(visible), field.gaussians.opacity_logits, HIDDEN_LOGIT)
     gaussians = dataclasses.replace(field.gaussians, opacity_logits=logits)
-    shares = region_shares_seen(dataclasses.replace(field, gaussians=gaussians), camera, SIDE // 2, SIDE // 2)
+    field = dataclasses.replace(field, gaussians=gaussians)
+    shares = region_shares_seen(field, camera, RAY_VIEW_SIDE // 2, RAY_VIEW_SIDE // 2)
     return int(shares.argmax()) if shares.size and shares.max() >= MIN_SHARE else -1

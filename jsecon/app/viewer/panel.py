@@ -1,9 +1,9 @@
-"""The viewer's panel: its controls, and what it says in HTML."""
+"""The viewer's panel: its controls, and messages and candidates as HTML."""
 
 import base64
 import html
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -12,208 +12,260 @@ import numpy as np
 from jsecon.app.ask import Answer, quantile_message
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate
-from jsecon.app.viewer.view_state import PAINTS, ViewState, tints
+from jsecon.app.viewer.view_state import COLOURINGS, ViewState, answer_colours
 from jsecon.errors import InputError
 from jsecon.language.membership import probability_inside
 from jsecon.query.match import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, QUANTILE
 from jsecon.types import LanguageField
 
 THUMBNAIL = 88
-"""px"""
+"""longer side of a candidate's picture, px"""
+SAME_CLICK_SECONDS = 0.5
+"""s after a click on a frame's camera within which viser reports it for the scene too, by a ray rounded otherwise"""
+SAME_CLICK_ANGLE = 0.02
+"""largest difference of the directions of these two rays"""
 
-
-SAME_CLICK = 0.5
-"""seconds within which the scene hears of a click on a frustum"""
+Step = Callable[[ViewState], ViewState]
 
 
 class Panel:
-    """The controls, and what they tell the viewer."""
+    """The controls, and the events by which they act on the viewer.
+
+    Args:
+      viewer: The viewer.
+      server: The viser server.
+      field: The field.
+    """
 
     def __init__(self, viewer: Any, server: Any, field: LanguageField):
-        gui, self._names, self._busy = server.gui, field.names, False
+        self._viewer = viewer
+        self._names = field.names
+        self._ray = np.zeros(3)
+        self._clicked_at = 0.0
+        gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label(f"jsecon · {viewer.name}")
-        usual = ViewState()
-        with gui.add_form(None) as asking:
-            hint = "What to find, then enter. Several things between semicolons, each in a colour of its own."
+        default = ViewState()
+        with gui.add_form(None) as text_form:
+            hint = "Text to find, then press enter. Separate several texts by semicolons; each has its own colour."
             self._text = gui.add_text("find", "", hint=hint)
-        self._told = gui.add_html("")
+        self._messages = gui.add_html("")
         self._notice = gui.add_html("", visible=False)
-        self._every = gui.add_checkbox("all that fit", usual.every, hint="Every region that answers, not only the best")
-        hint = "The least share of a Gaussian that has to lie in what answers"
-        self._threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, usual.threshold, hint=hint)
-        known = field.votes.overlap is not None
-        hint = "0: the best region alone; 1: all that overlaps it and is nearer to what was asked than most"
-        hint = hint if known else "This field does not know which regions overlap"
-        self._whole = gui.add_slider("part or whole", 0.0, 1.0, 0.05, usual.whole, disabled=not known, hint=hint)
-        self._paint = gui.add_dropdown("colour", PAINTS, initial_value=usual.paint)
-        acts = gui.add_button_group("what is lit up", ("show only", "hide", "export"))
-        back = gui.add_button_group("", ("show all", "undo"))
-        with gui.add_folder("what else it might be", expand_by_default=True) as self._else:
-            self._sheet = gui.add_html("")
-            self._take = gui.add_button_group("instead", ("1",), hint="That region in place of the answer")
-        self._else.visible = False
+        hint = "Select every region that matches, not only the best one"
+        self._all_matches = gui.add_checkbox("all matches", default.all_matches, hint=hint)
+        hint = "Smallest share of a Gaussian that must lie in the matching regions"
+        self._threshold = gui.add_slider("threshold", 0.0, 1.0, 0.01, default.threshold, hint=hint)
+        has_overlap = field.votes.overlap is not None
+        hint = "0 selects the best region alone, 1 also all regions that overlap it and match better than most"
+        hint = hint if has_overlap else "This field does not record which regions overlap"
+        self._part_vs_whole = gui.add_slider(
+            "part or whole", 0.0, 1.0, 0.05, default.part_vs_whole, disabled=not has_overlap, hint=hint
+        )
+        self._colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
+        selection_buttons = gui.add_button_group("selection", ("isolate", "hide", "export"))
+        view_buttons = gui.add_button_group("", ("show all", "undo"))
+        with gui.add_folder("other candidates", expand_by_default=True) as self._candidate_folder:
+            self._candidates = gui.add_html("")
+            self._select = gui.add_button_group("select", ("1",), hint="Select that region in place of the answer")
+        self._candidate_folder.visible = False
         with gui.add_folder("frames", expand_by_default=False):
-            hint = "Goes to where the frame was taken"
+            hint = "Go to the camera of a frame"
             self._frame = gui.add_dropdown("frame", ("choose", *field.names), initial_value="choose", hint=hint)
-            cameras = gui.add_checkbox("show cameras", False, hint="Click one to go there")
+            cameras = gui.add_checkbox("show cameras", False, hint="Click a camera to go there")
             self._picture = gui.add_image(np.zeros((2, 2, 3), np.uint8), visible=False)
-        with gui.add_form(None) as restoring:
-            hint = "Copy it to keep what is seen; paste one and press enter to have it back"
+        with gui.add_form(None) as link_form:
+            hint = "Copy this line to keep the view. Paste a line and press enter to restore it."
             self._link = gui.add_text("link", "", hint=hint)
 
-        on = lambda handle: handle.on_update
-        asking.on_submit(_later(lambda e: viewer.then(lambda s: view_state.asked(s, self._text.value))))
-        restoring.on_submit(_later(lambda e: viewer.restore(self._link.value)))
-        for name in ("every", "threshold", "whole", "paint"):
-            on(getattr(self, f"_{name}"))(_later(lambda e, name=name: self._moved(viewer, name, e.target.value)))
-        steps = {"show only": view_state.shown_only, "hide": view_state.hidden, "show all": view_state.all_shown}
-        for group in (acts, back):
-
-            @group.on_click
-            async def _(event: Any) -> None:
-                act = event.target.value
-                if act in steps:
-                    viewer.then(steps[act], whole=True)
-                elif act == "undo":
-                    viewer.undo()
-                else:
-                    viewer.export(event.client)
-
-        self._take.on_click(_later(lambda e: viewer.take(int(e.target.value) - 1)))
-        on(self._frame)(_later(lambda e: self._chosen(viewer, e)))
-        on(cameras)(_later(lambda e: viewer.layers.show_frames(e.target.value)))
-        for frame, frustum in viewer.layers.frustums.items():
-            frustum.on_click(_later(lambda e, frame=frame: self._clicked(viewer, e, frame)))
+        text_form.on_submit(_in_order(lambda _: viewer.then(lambda s: view_state.with_texts(s, self._text.value))))
+        link_form.on_submit(_in_order(lambda _: viewer.restore(self._link.value)))
+        for name in ("all_matches", "threshold", "part_vs_whole", "colouring"):
+            control = getattr(self, f"_{name}")
+            control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
+        for buttons in (selection_buttons, view_buttons):
+            buttons.on_click(_in_order(self._press))
+        self._select.on_click(_in_order(lambda event: viewer.select(int(event.target.value) - 1)))
+        self._frame.on_update(_in_order(self._choose_frame))
+        cameras.on_update(_in_order(lambda event: viewer.scene.show_frames(event.target.value)))
+        for frame, frustum in viewer.scene.frustums.items():
+            frustum.on_click(_in_order(lambda event, frame=frame: self._click_frame(event, frame)))
         for modifier in (None, "shift"):
-            server.scene.on_click(modifier=modifier)(_later(lambda e: self._clicked(viewer, e, None)))
+            server.scene.on_click(modifier=modifier)(_in_order(self._click_scene))
 
         @server.on_client_connect
         async def _(client: Any) -> None:
-            client.camera.on_update(_later(viewer.seen_from))
+            client.camera.on_update(_in_order(viewer.set_camera))
 
-        self._ray, self._then = np.zeros(3), 0.0
-        """of the last click on a frustum, which the scene hears of too, by a ray that is rounded otherwise; and when"""
+    def _press(self, event: Any) -> None:
+        """Handles a button."""
+        steps: dict[str, Step] = {
+            "isolate": view_state.isolate,
+            "hide": view_state.hide,
+            "show all": view_state.show_all,
+        }
+        button = event.target.value
+        if button in steps:
+            self._viewer.then(steps[button], update_controls=True)
+        elif button == "undo":
+            self._viewer.undo()
+        else:
+            self._viewer.export(event.client)
 
-    def _moved(self, viewer: Any, name: str, value: Any) -> None:
-        if getattr(viewer.history.state, name) != value:
-            viewer.then(lambda state: view_state.moved(state, **{name: value}))
+    def _set_control(self, name: str, value: Any) -> None:
+        """Handles a control that a user moved."""
+        if getattr(self._viewer.history.state, name) != value:
+            self._viewer.then(lambda state: view_state.with_controls(state, **{name: value}))
 
-    def _chosen(self, viewer: Any, event: Any) -> None:
+    def _choose_frame(self, event: Any) -> None:
+        """Handles a frame of the list."""
         if event.client is not None and event.target.value in self._names:
-            viewer.frame(event.client, self._names.index(event.target.value))
+            self._viewer.go_to_frame(event.client, self._names.index(event.target.value))
 
-    def _clicked(self, viewer: Any, event: Any, frame: int | None) -> None:
-        if frame is not None:
-            self._ray, self._then = np.asarray(event.ray_direction), time.monotonic()
-            viewer.frame(event.client, frame)
-        elif time.monotonic() - self._then > SAME_CLICK or not np.allclose(event.ray_direction, self._ray, atol=0.02):
-            camera = event.client.camera
-            focal = camera.image_height / 2 / np.tan(camera.fov / 2)
-            viewer.click(event.ray_origin, event.ray_direction, focal, more=event.modifier == "shift")
+    def _click_frame(self, event: Any, frame: int) -> None:
+        """Handles a click on a frame's camera."""
+        self._ray = np.asarray(event.ray_direction)
+        self._clicked_at = time.monotonic()
+        self._viewer.go_to_frame(event.client, frame)
 
-    def show(self, state: ViewState) -> None:
-        """Sets the controls as a state has them."""
-        self._text.value = view_state.line_of(state)
-        self._every.value, self._paint.value = state.every, state.paint
-        self._threshold.value, self._whole.value = state.threshold, state.whole
+    def _click_scene(self, event: Any) -> None:
+        """Handles a click on the scene, unless it was one on a frame's camera."""
+        recent = time.monotonic() - self._clicked_at <= SAME_CLICK_SECONDS
+        if recent and np.allclose(event.ray_direction, self._ray, atol=SAME_CLICK_ANGLE):
+            return
+        camera = event.client.camera
+        focal = camera.image_height / 2 / np.tan(camera.fov / 2)
+        self._viewer.click(event.ray_origin, event.ray_direction, focal, add=event.modifier == "shift")
 
-    def tell(self, content: str) -> None:
-        self._told.content = content
+    def show_state(self, state: ViewState) -> None:
+        """Sets the controls to a state."""
+        self._text.value = view_state.text_line(state)
+        self._all_matches.value = state.all_matches
+        self._colouring.value = state.colouring
+        self._threshold.value = state.threshold
+        self._part_vs_whole.value = state.part_vs_whole
+
+    def show_messages(self, content: str) -> None:
+        """Shows messages about the answers, and removes the notice."""
+        self._messages.content = content
         self._notice.visible = False
 
-    def notice(self, text: str | InputError) -> None:
-        content = _error(text) if isinstance(text, InputError) else html.escape(text)
-        self._notice.content, self._notice.visible = _box(content), True
+    def show_notice(self, text: str | InputError) -> None:
+        """Shows a notice."""
+        self._notice.content = _box(_error(text) if isinstance(text, InputError) else html.escape(text))
+        self._notice.visible = True
 
-    def candidates(self, content: str, count: int) -> None:
-        self._sheet.content, self._else.visible = content, count > 0
+    def show_candidates(self, content: str, count: int) -> None:
+        """Shows candidates, with a button for each."""
+        self._candidates.content = content
+        self._candidate_folder.visible = count > 0
         if count:
-            self._take.options = tuple(str(k + 1) for k in range(count))
+            self._select.options = tuple(str(k + 1) for k in range(count))
 
-    def frame(self, frame: int, picture: np.ndarray) -> None:
+    def show_frame(self, frame: int, picture: np.ndarray) -> None:
+        """Shows a frame's picture (H, W, 3) uint8."""
         self._frame.value = self._names[frame]
-        self._picture.image, self._picture.visible = picture, True
+        self._picture.image = picture
+        self._picture.visible = True
 
-    def link(self, text: str) -> None:
-        self._link.value = text
+    def show_link(self, link: str) -> None:
+        """Shows the link of the view."""
+        self._link.value = link
 
 
-def _later(act: Any) -> Any:
-    """A callback that runs in the order of what the page tells, as viser's coroutines do."""
+def _in_order(act: Callable[[Any], Any]) -> Any:
+    """Returns a callback that runs in the order of the page's events, as viser's coroutines do."""
 
-    async def told_of(event: Any) -> None:
+    async def callback(event: Any) -> None:
         act(event)
 
-    return told_of
+    return callback
 
 
 def _error(error: InputError) -> str:
-    told, remedy = error.sentence, error.remedy
-    return f"<details><summary>{html.escape(told)}</summary>{html.escape(remedy)}</details>"
+    """Returns an error as HTML, whose remedy a click shows."""
+    return f"<details><summary>{html.escape(error.sentence)}</summary>{html.escape(error.remedy)}</details>"
 
 
 def _box(text: str) -> str:
+    """Returns a box around HTML."""
     return f'<div style="margin:0 .8em .5em;padding:.4em .6em;border-left:3px solid #fa0;font-size:.8em">{text}</div>'
 
 
 def _colour(place: int) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*tints(place + 1)[place])
+    """Returns the colour of an answer for CSS."""
+    return "#{:02x}{:02x}{:02x}".format(*answer_colours(place + 1)[place])
 
 
 def _swatch(place: int) -> str:
+    """Returns a square in the colour of an answer."""
     shape = "display:inline-block;width:.8em;height:.8em;border-radius:2px"
     return f'<span style="{shape};background:{_colour(place)}"></span>'
 
 
-def told(field: LanguageField, state: ViewState, answers: Sequence[Answer | InputError]) -> str:
-    """What there is to say about each answer: how many Gaussians, how sure, or why there is none."""
+def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | InputError]) -> str:
+    """Describes the answers as HTML: how many Gaussians with which confidence, or why there are none.
+
+    Args:
+      field: The field.
+      state: The state.
+      answers: The answer or the error of each of its queries.
+    """
     lines = []
-    for place, (thing, found) in enumerate(zip(state.things, answers, strict=True)):
-        name = thing if isinstance(thing, str) else f"region {thing}"
+    for place, (query, answer) in enumerate(zip(state.queries, answers, strict=True)):
+        name = query if isinstance(query, str) else f"region {query}"
         head = f"{_swatch(place)} <b>{html.escape(name)}</b>"
-        if isinstance(found, InputError):
-            lines.append(_box(f"{head}: {_error(found)}"))
+        if isinstance(answer, InputError):
+            lines.append(_box(f"{head}: {_error(answer)}"))
             continue
-        score, count = float(found.selection.score), int(found.mask.sum())
-        if int(found.selection.region) < 0 and not np.asarray(found.selection.mask).any():
-            if found.quantile is not None:
-                best, least = quantile_message(found.quantile), f"{100 * QUANTILE:.0f} %"
-            elif found.there is not None:
-                best, least = f"it is there with a probability of {found.there:.2g}", PRESENCE_THRESHOLD
-            else:
-                best, least = f"the best score is {score:.2f}", CONTRAST_THRESHOLD
-            why = f"nothing here answers it: {best}, and {least} is the least"
-            lines.append(_box(f"{head}: {why}. Below is what comes nearest."))
+        score = float(answer.selection.score)
+        count = int(answer.mask.sum())
+        if int(answer.selection.region) < 0 and not np.asarray(answer.selection.mask).any():
+            lines.append(_box(f"{head}: no match: {_refusal(answer)}. The nearest candidates are below."))
         elif not count:
             lines.append(_box(f"{head}: no Gaussian reaches the threshold {state.threshold:.2f}."))
         else:
-            sure = probability_inside(found.selection.similarity, field.votes, found.mask).mean()
-            kind = f"score {score:.2f}, " if isinstance(thing, str) else ""
-            lines.append(f'<div style="margin:0 .8em .4em;font-size:.85em">{head}: {count} Gaussians, {kind}')
-            lines[-1] += (
-                "by its parts, as no region holds it" if "regions" in found.left_out else f"sure to {100 * sure:.0f} %"
-            )
-            lines[-1] += "</div>"
+            parts = [f"{count} Gaussians"]
+            if isinstance(query, str):
+                parts.append(f"score {score:.2f}")
+            if "regions" in answer.skipped:
+                parts.append("parts in place of a region")
+            else:
+                inside = probability_inside(answer.selection.similarity, field.votes, answer.mask).mean()
+                parts.append(f"confidence {100 * inside:.0f} %")
+            lines.append(f'<div style="margin:0 .8em .4em;font-size:.85em">{head}: {", ".join(parts)}</div>')
     return "".join(lines)
 
 
-def sheet(
-    state: ViewState, answers: Sequence[Answer | InputError], found: Sequence[tuple[int, Candidate, np.ndarray]]
+def _refusal(answer: Answer) -> str:
+    """Returns the measure by which a query has no match, and its threshold."""
+    if answer.quantile is not None:
+        return f"{quantile_message(answer.quantile)}, and {100 * QUANTILE:.0f} % are required"
+    if answer.presence is not None:
+        return f"the probability that it is there is {answer.presence:.2g}, and {PRESENCE_THRESHOLD} is required"
+    return f"the best score is {float(answer.selection.score):.2f}, and {CONTRAST_THRESHOLD} is required"
+
+
+def candidate_grid(
+    answers: Sequence[Answer | InputError], pictured: Sequence[tuple[int, Candidate, np.ndarray]]
 ) -> str:
-    """The candidates with their pictures and scores, as HTML; the region that was taken has a frame of its colour."""
+    """Lays out candidates as HTML. A region that is selected has a frame in the colour of its answer.
+
+    Args:
+      answers: The answers.
+      pictured: Index of an answer, one of its candidates, and that candidate's picture.
+    """
     cells = []
-    for number, (place, candidate, picture) in enumerate(found):
-        side = THUMBNAIL / max(picture.shape[:2])
-        small = cv2.resize(picture, None, fx=side, fy=side, interpolation=cv2.INTER_AREA)
-        packed = base64.b64encode(cv2.imencode(".jpg", small[..., ::-1])[1].tobytes()).decode()
+    for number, (place, candidate, picture) in enumerate(pictured):
+        scale = THUMBNAIL / max(picture.shape[:2])
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        data = base64.b64encode(cv2.imencode(".jpg", small[..., ::-1])[1].tobytes()).decode()
         answer = answers[place]
-        taken = not isinstance(answer, InputError) and int(answer.selection.region) == candidate.region
-        edge = _colour(place) if taken else "transparent"
+        selected = not isinstance(answer, InputError) and int(answer.selection.region) == candidate.region
+        edge = _colour(place) if selected else "transparent"
         cells.append(
-            f'<figure style="margin:0;text-align:center;font-size:.75em"><img src="data:image/jpeg;base64,{packed}" '
+            f'<figure style="margin:0;text-align:center;font-size:.75em"><img src="data:image/jpeg;base64,{data}" '
             f'style="border:3px solid {edge};border-radius:4px;max-width:100%"><figcaption>{_swatch(place)} '
-            f"{number + 1}: {candidate.score:.2f}{', taken' if taken else ''}</figcaption></figure>"
+            f"{number + 1}: {candidate.score:.2f}{', selected' if selected else ''}</figcaption></figure>"
         )
     grid = "display:grid;grid-template-columns:repeat(3,1fr);gap:.4em;margin:.4em .6em;align-items:end"
     return f'<div style="{grid}">{"".join(cells)}</div>'

@@ -1,7 +1,7 @@
-"""A field as one HTML page that opens by double click: its Gaussians, regions and the answers to given texts.
+"""A field as one HTML page without server or outside resource: its Gaussians, regions and the answers to texts.
 
-No server and no outside resource. A Gaussian takes 19 bytes, before base64: places in 16 bits along each side of the
-scene's box, turns in 8, sizes and colours in 8 (the colour of spherical harmonics of degree 0), its region in 16.
+A Gaussian takes 19 bytes before base64: its centre in 16 bits along each side of the scene's box, quaternion, sizes and
+colour (spherical harmonics of degree 0) in 8 bits a number, its region in 16.
 """
 
 import base64
@@ -13,108 +13,112 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jsecon.app.ask import Answer
+from jsecon.app.outputs import main_regions
 from jsecon.files import write_text
-from jsecon.language.membership import SHARE_THRESHOLD, vote_blocks, vote_shares
 from jsecon.numerics import sigmoid
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians, LanguageField
 
-NOWHERE = 65535
-"""the region of a Gaussian that has none"""
-FAR = 0.002
-"""part of the Gaussians at each end of an axis that the box of places leaves out: they would take its digits"""
-LARGEST = 0.25
-"""of a Gaussian drawn, in the box's diagonal"""
-FAINT = 4
-"""opacity, of 255, below which a Gaussian is left out"""
+NO_REGION = 65535
+"""code of a Gaussian without a region"""
+BOX_TAIL = 0.002
+"""share of the Gaussians at each end of an axis that the box leaves out, since its 16 bits would be spent on strays"""
+MAX_SIZE = 0.25
+"""largest standard deviation of a Gaussian that is drawn, as a share of the box's diagonal"""
+MIN_OPACITY = 4
+"""smallest opacity of a Gaussian that is drawn, of 255"""
 
 
 def write_page(field: LanguageField, answers: Sequence[Answer], file: Path, *, title: str) -> int:
-    """Writes the page of a field with the answers to texts; returns its bytes."""
+    """Writes the page of a field.
+
+    Args:
+      field: The field.
+      answers: Answers to texts.
+      file: The .html to write.
+      title: Title of the page.
+
+    Returns:
+      Its size in bytes.
+    """
     text = page(field, answers, title=title)
     write_text(file, text)
     return len(text.encode())
 
 
 def page(field: LanguageField, answers: Sequence[Answer], *, title: str) -> str:
-    """The page."""
+    """Returns the page of a field; arguments as for `write_page`."""
     gaussians = field.gaussians
-    means, opacity = np.asarray(gaussians.means, np.float64), np.asarray(sigmoid(np.asarray(gaussians.opacity_logits)))
-    low, high = np.quantile(means[np.isfinite(means).all(1)], (FAR, 1 - FAR), axis=0)
+    means = np.asarray(gaussians.means, np.float64)
+    finite = np.isfinite(means).all(1)
+    opacity = np.asarray(sigmoid(np.asarray(gaussians.opacity_logits)))
+    low, high = np.quantile(means[finite], (BOX_TAIL, 1 - BOX_TAIL), axis=0)
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
-    sizes = np.asarray(gaussians.log_scales, np.float64)
-    kept = np.isfinite(means).all(1) & ((means >= low) & (means <= high)).all(1) & (opacity * 255 >= FAINT)
-    kept &= sizes.max(1) < np.log(LARGEST * np.linalg.norm(high - low))
-    told = {
-        "count": int(kept.sum()),
+    drawn = finite & ((means >= low) & (means <= high)).all(1) & (opacity * 255 >= MIN_OPACITY)
+    largest = MAX_SIZE * np.linalg.norm(high - low)
+    drawn &= np.asarray(gaussians.log_scales, np.float64).max(1) < np.log(largest)
+    splats, size_range = _pack(gaussians, main_regions(field), opacity, drawn, low, high)
+    scene = {
+        "count": int(drawn.sum()),
         "regions": field.regions.count,
         "low": low.tolist(),
         "span": (high - low).tolist(),
-        "texts": [_told(answer, kept) for answer in answers],
-        **_camera(field, means[kept]),
+        "texts": [_pack_answer(answer, drawn) for answer in answers],
+        **_camera(field, means[drawn]),
+        **size_range,
     }
-    splats, ends = _packed(gaussians, main_regions(field), opacity, kept, low, high)
-    template = resources.files("jsecon.app").joinpath("splat_page.html").read_text(encoding="utf-8")
-    written = json.dumps(told | ends).replace("</", "<\\/")
-    filled = template.replace("__TITLE__", html.escape(title)).replace("__TOLD__", written)
+    template = resources.files("jsecon.app.viewer").joinpath("static_page.html").read_text(encoding="utf-8")
+    filled = template.replace("__TITLE__", html.escape(title))
+    filled = filled.replace("__SCENE__", json.dumps(scene).replace("</", "<\\/"))
     return filled.replace("__SPLATS__", base64.b64encode(splats).decode())
 
 
-def main_regions(field: LanguageField) -> Int[np.ndarray, " n"]:
-    """The region that has most of each Gaussian, and at least half; NOWHERE where none has. Read in blocks."""
-    parts = [np.zeros(0, np.int32)]
-    for votes in vote_blocks(field.votes):
-        share, found = np.nan_to_num(np.asarray(vote_shares(votes))), np.asarray(votes.regions)
-        best = share.argmax(1)
-        rows = np.arange(len(best))
-        parts.append(np.where(share[rows, best] >= SHARE_THRESHOLD, found[rows, best], NOWHERE))
-    return np.concatenate(parts)
-
-
-def _told(answer: Answer, kept: Bool[np.ndarray, " n"]) -> dict[str, Any]:
-    bits = np.packbits(np.asarray(answer.mask)[kept], bitorder="little")
+def _pack_answer(answer: Answer, drawn: Bool[np.ndarray, " n"]) -> dict[str, Any]:
+    """Returns an answer as the page reads it."""
+    bits = np.packbits(np.asarray(answer.mask)[drawn], bitorder="little")
     mask = base64.b64encode(bits.tobytes()).decode()
-    return {"text": answer.question, "score": float(answer.selection.score), "mask": mask}
+    return {"text": answer.query, "score": float(answer.selection.score), "mask": mask}
 
 
 def _camera(field: LanguageField, means: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Where the page begins: at the first frame, looking at what lies in its middle; up is the mean of all frames'."""
+    """Returns the first view: the first frame, with the mean up direction of all, turning about what it looks at."""
     poses = np.asarray(field.cameras.world_to_camera, np.float64)
-    eye, forward = -poses[0, :3, :3].T @ poses[0, :3, 3], poses[0, 2, :3]
+    eye = -poses[0, :3, :3].T @ poses[0, :3, 3]
+    forward = poses[0, 2, :3]
     depth = (means - eye) @ forward
-    aside = np.linalg.norm(means - eye - depth[:, None] * forward, axis=1)
-    ahead = depth[(depth > 0) & (aside < 0.2 * np.maximum(depth, 1e-9))]
-    away = float(np.median(ahead)) if len(ahead) else float(np.linalg.norm(np.ptp(means, axis=0)))
+    off_axis = np.linalg.norm(means - eye - depth[:, None] * forward, axis=1)
+    ahead = depth[(depth > 0) & (off_axis < 0.2 * np.maximum(depth, 1e-9))]
+    distance = float(np.median(ahead)) if len(ahead) else float(np.linalg.norm(np.ptp(means, axis=0)))
     return {
         "eye": eye.tolist(),
-        "target": (eye + away * forward).tolist(),
+        "target": (eye + distance * forward).tolist(),
         "up": (-poses[:, 1, :3].mean(0)).tolist(),
         "focal": float(np.asarray(field.cameras.fx)[0]),
         "size": [field.cameras.width, field.cameras.height],
     }
 
 
-def _packed(
-    gaussians: Gaussians, regions: np.ndarray, opacity: np.ndarray, kept: np.ndarray, low: np.ndarray, high: np.ndarray
+def _pack(
+    gaussians: Gaussians, regions: np.ndarray, opacity: np.ndarray, drawn: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[bytes, dict[str, float]]:
-    """The columns that the page reads, and the ends of the logarithms of sizes."""
-    means = (np.asarray(gaussians.means, np.float64)[kept] - low) / np.maximum(high - low, 1e-12)
-    sizes = np.asarray(gaussians.log_scales, np.float64)[kept]
-    there = sizes[np.isfinite(sizes)]  # a flat Gaussian, of size 0, is packed as the least of them
-    least, most = (float(np.quantile(there, q)) for q in (0.001, 1.0)) if len(there) else (0.0, 1.0)
-    span = max(most - least, 1e-6)
-    turns = np.asarray(gaussians.quaternions, np.float64)[kept]
-    turns = turns / np.maximum(np.linalg.norm(turns, axis=1, keepdims=True), 1e-12)
-    colours = 0.5 + C0 * np.asarray(gaussians.sh, np.float64)[kept, 0]
+    """Returns the columns of the drawn Gaussians as the page reads them, and the range of their logarithmic sizes."""
+    places = (np.asarray(gaussians.means, np.float64)[drawn] - low) / np.maximum(high - low, 1e-12)
+    sizes = np.asarray(gaussians.log_scales, np.float64)[drawn]
+    finite = sizes[np.isfinite(sizes)]  # a flat Gaussian, of size 0, gets the smallest code
+    size_low, size_high = (float(np.quantile(finite, q)) for q in (0.001, 1.0)) if len(finite) else (0.0, 1.0)
+    size_span = max(size_high - size_low, 1e-6)
+    quaternions = np.asarray(gaussians.quaternions, np.float64)[drawn]
+    quaternions = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
+    colours = 0.5 + C0 * np.asarray(gaussians.sh, np.float64)[drawn, 0]
     columns = (
-        np.rint(65535 * np.clip(means, 0, 1)).astype("<u2"),
-        regions[kept].astype("<u2"),
-        np.rint(127 * turns).astype(np.int8),
-        np.rint(255 * np.clip((sizes - least) / span, 0, 1)).astype(np.uint8),
+        np.rint(65535 * np.clip(places, 0, 1)).astype("<u2"),
+        np.where(regions < 0, NO_REGION, regions)[drawn].astype("<u2"),
+        np.rint(127 * quaternions).astype(np.int8),
+        np.rint(255 * np.clip((sizes - size_low) / size_span, 0, 1)).astype(np.uint8),
         np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8),
-        np.rint(255 * opacity[kept]).astype(np.uint8),
+        np.rint(255 * opacity[drawn]).astype(np.uint8),
     )
-    return b"".join(column.tobytes() for column in columns), {"size_low": least, "size_span": span}
+    return b"".join(column.tobytes() for column in columns), {"size_low": size_low, "size_span": size_span}

@@ -1,6 +1,6 @@
-"""What a viewer shows of a field, as a value: a state, what leads from one to the next, and the colours that follow.
+"""The state of the viewer as a value: steps from one state to the next, links, and the colours of a state.
 
-No window and no field: app/viewer has both.
+The module knows neither a window nor a field.
 """
 
 import colorsys
@@ -16,215 +16,284 @@ from jsecon.errors import InputError, describe_error
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.query.match import PIECE_THRESHOLD
 
-Paint: TypeAlias = Literal["photo", "code", "region", "score"]
-PAINTS: tuple[Paint, ...] = get_args(Paint)
-"""what the Gaussians' colours say: the photographs, the codes, the regions, how far each belongs to the answers"""
-DIM, GREY = 0.4, 0.6
-"""of what no answer lights up: how bright it stays, and how much of its colour goes"""
+Colouring: TypeAlias = Literal["photo", "code", "region", "score"]
+COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
+"""what the colours of the Gaussians show: the photographs, codes, regions, or how far each belongs to the answers"""
+DIM = 0.4
+"""brightness of Gaussians outside of all answers, as a share of their own"""
+GREY = 0.6
+"""share of their colour that these lose"""
 TINT = 0.55
-"""of an answer's own colour in what it lights up"""
-MOST = 40
-"""things asked for at once, and texts' length in a link times a hundred"""
+"""share of the answer's colour in the Gaussians of an answer"""
+GOLDEN_ANGLE = 0.61803398875
+"""difference of neighbouring hues, in turns"""
+MAX_QUERIES = 40
+"""number of queries that are highlighted at once"""
+MAX_TEXT = 4000
+"""letters of a text in a link"""
+MAX_UNDO = 100
+"""number of states that undo goes back"""
 
 
 @dataclasses.dataclass(frozen=True)
-class Ask:
-    """One thing that is asked for, and how."""
+class ViewQuery:
+    """One text or region, and the options that select its Gaussians.
 
-    thing: str | int
-    """a text, or a region."""
+    Attributes:
+      query: A text, or the id of a region.
+      threshold: Smallest share of a selected Gaussian.
+      part_vs_whole: 0 selects the best region alone, 1 all regions that overlap it and are nearer to the query than
+        most.
+      all_matches: Whether to select all regions that match instead of the best one.
+    """
+
+    query: str | int
     threshold: float = SHARE_THRESHOLD
-    """least share of a Gaussian."""
-    whole: float = 1 - PIECE_THRESHOLD
-    """0: a part alone, the best region; 1: all that overlaps it and is nearer to what was asked than most."""
-    every: bool = False
-    """all regions that answer, not only the best."""
+    part_vs_whole: float = 1 - PIECE_THRESHOLD
+    all_matches: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewState:
-    """What is seen. Two equal states look the same."""
+    """What the viewer shows. Two equal states look the same.
 
-    things: tuple[str | int, ...] = ()
-    """what is lit up, in the order of its colours: texts, and regions that were clicked."""
-    threshold: float = Ask.threshold
-    whole: float = Ask.whole
-    every: bool = False
-    paint: Paint = "photo"
-    only: tuple[Ask, ...] = ()
-    """if any, all else is gone."""
-    hidden: tuple[Ask, ...] = ()
-    """what is gone."""
+    Attributes:
+      queries: Texts and clicked regions that are highlighted, in the order of their colours.
+      threshold: As in `ViewQuery`.
+      part_vs_whole: As in `ViewQuery`.
+      all_matches: As in `ViewQuery`.
+      colouring: What the colours of the Gaussians show.
+      isolated: If any, only their Gaussians are visible.
+      hidden: Queries whose Gaussians are invisible.
+      camera: In a link, position, point looked at and up direction, nine numbers in the field's world; else empty.
+    """
+
+    queries: tuple[str | int, ...] = ()
+    threshold: float = ViewQuery.threshold
+    part_vs_whole: float = ViewQuery.part_vs_whole
+    all_matches: bool = False
+    colouring: Colouring = "photo"
+    isolated: tuple[ViewQuery, ...] = ()
+    hidden: tuple[ViewQuery, ...] = ()
     camera: tuple[float, ...] = ()
-    """in a link: position, the point looked at, upwards, nine numbers in the field's world; empty: as it is."""
 
     @property
-    def asks(self) -> tuple[Ask, ...]:
-        """What is lit up, with how it is asked."""
-        return tuple(Ask(thing, self.threshold, self.whole, self.every) for thing in self.things)
+    def view_queries(self) -> tuple[ViewQuery, ...]:
+        """The highlighted queries with their options."""
+        return tuple(ViewQuery(q, self.threshold, self.part_vs_whole, self.all_matches) for q in self.queries)
 
 
-def asked(state: ViewState, line: str) -> ViewState:
-    """Lights up what the texts of a line name, between semicolons, each once; nothing for none."""
-    said = dict.fromkeys(text.strip() for text in line.split(";") if text.strip())
-    return dataclasses.replace(state, things=tuple(said)[:MOST])
+def with_texts(state: ViewState, line: str) -> ViewState:
+    """Highlights the texts of a line, which semicolons separate, each once."""
+    texts = dict.fromkeys(text.strip() for text in line.split(";") if text.strip())
+    return dataclasses.replace(state, queries=tuple(texts)[:MAX_QUERIES])
 
 
-def line_of(state: ViewState) -> str:
-    """The line that asks for the texts of a state."""
-    return "; ".join(thing for thing in state.things if isinstance(thing, str))
+def text_line(state: ViewState) -> str:
+    """Returns the line of the highlighted texts."""
+    return "; ".join(query for query in state.queries if isinstance(query, str))
 
 
-def clicked(state: ViewState, region: int, *, more: bool = False) -> ViewState:
-    """Lights up a region alone, or with `more` beside what is lit up; a second time takes it away."""
-    rest = tuple(thing for thing in state.things if thing != region) if more else ()
-    taken_away = region in state.things if more else state.things == (region,)
-    return dataclasses.replace(state, things=rest if taken_away else (*rest, region)[-MOST:])
+def toggle_region(state: ViewState, region: int, *, add: bool = False) -> ViewState:
+    """Highlights a region, alone or with `add` beside the other queries. A second time removes it."""
+    others = tuple(query for query in state.queries if query != region) if add else ()
+    remove = region in state.queries if add else state.queries == (region,)
+    return dataclasses.replace(state, queries=others if remove else (*others, region)[-MAX_QUERIES:])
 
 
-def instead(state: ViewState, place: int, region: int) -> ViewState:
-    """A region in place of the thing that is lit up in the colour `place`."""
-    things = dict.fromkeys((*state.things[:place], region, *state.things[place + 1 :]))
-    return dataclasses.replace(state, things=tuple(things))
+def replace_match(state: ViewState, place: int, region: int) -> ViewState:
+    """Highlights a region in place of the query number `place`."""
+    queries = dict.fromkeys((*state.queries[:place], region, *state.queries[place + 1 :]))
+    return dataclasses.replace(state, queries=tuple(queries))
 
 
-def moved(state: ViewState, **controls: Any) -> ViewState:
-    """The state with threshold and whole (0 to 1), every or paint as given."""
-    for name in ("threshold", "whole"):
+def with_controls(state: ViewState, **controls: Any) -> ViewState:
+    """Sets threshold, part_vs_whole (both clipped to 0 .. 1), all_matches, colouring or camera."""
+    for name in ("threshold", "part_vs_whole"):
         if name in controls:
             controls[name] = round(min(max(float(controls[name]), 0.0), 1.0), 3)
     return dataclasses.replace(state, **controls)
 
 
-def shown_only(state: ViewState) -> ViewState:
-    """What is lit up and nothing else; as it is where nothing is lit up."""
-    return dataclasses.replace(state, only=state.asks) if state.things else state
+def isolate(state: ViewState) -> ViewState:
+    """Shows only what is highlighted, if anything is."""
+    return dataclasses.replace(state, isolated=state.view_queries) if state.queries else state
 
 
-def hidden(state: ViewState) -> ViewState:
-    """Without what is lit up."""
-    gone = dict.fromkeys((*state.hidden, *state.asks))
-    return dataclasses.replace(state, things=(), hidden=tuple(gone)[-MOST:])
+def hide(state: ViewState) -> ViewState:
+    """Hides what is highlighted."""
+    hidden = dict.fromkeys((*state.hidden, *state.view_queries))
+    return dataclasses.replace(state, queries=(), hidden=tuple(hidden)[-MAX_QUERIES:])
 
 
-def all_shown(state: ViewState) -> ViewState:
-    """Nothing is gone any more."""
-    return dataclasses.replace(state, only=(), hidden=())
+def show_all(state: ViewState) -> ViewState:
+    """Shows all Gaussians again."""
+    return dataclasses.replace(state, isolated=(), hidden=())
 
 
 @dataclasses.dataclass(frozen=True)
 class History:
-    """A state and those before it, to go back to."""
+    """A state and those before it.
+
+    Attributes:
+      state: The present state.
+      past: Earlier states, the last one last.
+    """
 
     state: ViewState = dataclasses.field(default_factory=ViewState)
     past: tuple[ViewState, ...] = ()
 
-    LENGTH = 100
-
     def then(self, state: ViewState) -> "History":
-        """The next state. One that looks the same adds nothing, and a control that moves on takes the place of where
-        it was, so that going back leads to before it was touched."""
+        """Returns the history with a next state. All moves of one slider in a row count as one step."""
         if state == self.state:
             return self
-        changed = _differing(self.state, state)
-        sliding = changed in ({"threshold"}, {"whole"}) and self.past and _differing(self.past[-1], state) == changed
-        return History(state, self.past if sliding else (*self.past, self.state)[-self.LENGTH :])
+        changed = _differences(self.state, state)
+        is_slider = changed in ({"threshold"}, {"part_vs_whole"})
+        if is_slider and self.past and _differences(self.past[-1], state) == changed:
+            return History(state, self.past)
+        return History(state, (*self.past, self.state)[-MAX_UNDO:])
 
     def back(self) -> "History":
-        """The state before; the first where there is none."""
+        """Returns the history before the last step. The first state stays."""
         return History(self.past[-1], self.past[:-1]) if self.past else self
 
 
-def _differing(one: ViewState, other: ViewState) -> set[str]:
+def _differences(one: ViewState, other: ViewState) -> set[str]:
+    """Returns the names of the fields that differ."""
     names = [field.name for field in dataclasses.fields(ViewState)]
     return {name for name in names if getattr(one, name) != getattr(other, name)}
 
 
-def link_of(state: ViewState) -> str:
-    """The state as one line of JSON, what is as usual left out."""
-    usual = ViewState()
-    changed = {n: v for n, v in dataclasses.asdict(state).items() if v != getattr(usual, n)}
-    return json.dumps(changed, ensure_ascii=False, separators=(",", ":"))
+def to_link(state: ViewState) -> str:
+    """Returns the state as one line of JSON, without fields at their defaults."""
+    default = ViewState()
+    fields = {name: value for name, value in dataclasses.asdict(state).items() if value != getattr(default, name)}
+    return json.dumps(fields, ensure_ascii=False, separators=(",", ":"))
 
 
-def state_of(link: str) -> ViewState:
-    """The state that `link_of` wrote. Raises InputError for anything else."""
+def from_link(link: str) -> ViewState:
+    """Reads the state that `to_link` wrote.
+
+    Args:
+      link: The line of JSON.
+
+    Returns:
+      The state.
+
+    Raises:
+      InputError: The line is not one of a viewer.
+    """
     try:
-        if not isinstance(told := json.loads(link), dict):
-            raise ValueError("no JSON object")
-        told |= {name: tuple(value) for name, value in told.items() if isinstance(value, list)}
-        told |= {name: tuple(_ask(**ask) for ask in told[name]) for name in ("only", "hidden") if name in told}
-        state = ViewState(**told)
-        _require_kinds(state)
+        fields = json.loads(link)
+        if not isinstance(fields, dict):
+            raise ValueError("it is not a JSON object")
+        fields = {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
+        for name in ("isolated", "hidden"):
+            if name in fields:
+                fields[name] = tuple(_checked_query(**query) for query in fields[name])
+        state = ViewState(**fields)
+        _check_fields(state)
     except (ValueError, TypeError, RecursionError) as error:
-        found = f"{link[:60]!r} is not a line that a viewer gave ({describe_error(error)})"
-        raise InputError("link", found, remedy="Copy the whole line.") from error
+        problem = f"{link[:60]!r} is not a line of the viewer ({describe_error(error)})"
+        raise InputError("link", problem, remedy="Copy the whole line.") from error
     return state
 
 
-def _ask(**given: Any) -> Ask:
-    ask = Ask(**given)
-    _require_kinds(ViewState((ask.thing,), ask.threshold, ask.whole, ask.every))
-    return ask
+def _checked_query(**fields: Any) -> ViewQuery:
+    """Returns the query of a link, or raises ValueError."""
+    query = ViewQuery(**fields)
+    _check_fields(ViewState((query.query,), query.threshold, query.part_vs_whole, query.all_matches))
+    return query
 
 
-def _require_kinds(state: ViewState) -> None:
-    """Raises ValueError where a value is none that a viewer gives."""
-    whole = lambda value: isinstance(value, int) and not isinstance(value, bool)
-    number = lambda value: isinstance(value, float) or whole(value)
-    text = lambda value: isinstance(value, str) and len(value.strip()) > 0 and len(value) <= 100 * MOST
-    thing = lambda value: text(value) or (whole(value) and value >= 0)
-    fits = {
-        "things": isinstance(state.things, tuple) and all(map(thing, state.things)),
-        "as many as can be shown": max(len(state.things), len(state.only), len(state.hidden)) <= MOST,
-        "threshold": number(state.threshold) and 0 <= state.threshold <= 1,
-        "whole": number(state.whole) and 0 <= state.whole <= 1,
-        "every": isinstance(state.every, bool),
-        "paint": state.paint in PAINTS,
-        "camera": len(state.camera) in (0, 9) and all(number(x) and abs(x) < 1e9 for x in state.camera),
+def _check_fields(state: ViewState) -> None:
+    """Raises ValueError if a field has a value that the viewer cannot produce."""
+
+    def is_int(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool)
+
+    def is_number(value: Any) -> bool:
+        return isinstance(value, float) or is_int(value)
+
+    def is_query(value: Any) -> bool:
+        return 0 < len(value.strip()) <= MAX_TEXT if isinstance(value, str) else is_int(value) and value >= 0
+
+    valid = {
+        "queries": isinstance(state.queries, tuple) and all(map(is_query, state.queries)),
+        "number of queries": max(len(state.queries), len(state.isolated), len(state.hidden)) <= MAX_QUERIES,
+        "threshold": is_number(state.threshold) and 0 <= state.threshold <= 1,
+        "part_vs_whole": is_number(state.part_vs_whole) and 0 <= state.part_vs_whole <= 1,
+        "all_matches": isinstance(state.all_matches, bool),
+        "colouring": state.colouring in COLOURINGS,
+        "camera": len(state.camera) in (0, 9) and all(is_number(x) and abs(x) < 1e9 for x in state.camera),
     }
-    if wrong := [name for name, fit in fits.items() if not fit]:
-        raise ValueError(f"not as it should be: {', '.join(wrong)}")
+    if invalid := [name for name, fits in valid.items() if not fits]:
+        raise ValueError(f"invalid {', '.join(invalid)}")
 
 
-def tints(count: int) -> UInt8[np.ndarray, "k 3"]:
-    """RGB of answers 0 .. count-1: strong hues, a golden angle apart; kept as count grows."""
-    hues = (0.91 + 0.61803398875 * np.arange(count)) % 1.0
+def answer_colours(count: int) -> UInt8[np.ndarray, "k 3"]:
+    """Returns the RGB of answers 0 .. count-1: strong hues, a golden angle apart."""
+    hues = (0.91 + GOLDEN_ANGLE * np.arange(count)) % 1.0
     return (255 * np.array([colorsys.hls_to_rgb(h, 0.6, 1.0) for h in hues]).reshape(count, 3)).astype(np.uint8)
 
 
-def shown(
-    count: int, only: Sequence[Bool[np.ndarray, " n"]], hidden: Sequence[Bool[np.ndarray, " n"]]
+def visible_gaussians(
+    count: int, isolated: Sequence[Bool[np.ndarray, " n"]], hidden: Sequence[Bool[np.ndarray, " n"]]
 ) -> Bool[np.ndarray, " n"]:
-    """(N,) which of `count` Gaussians are seen: those in any of `only`, if there are any, and in none of `hidden`."""
-    seen = np.any(only, axis=0) if len(only) else np.ones(count, bool)
-    return seen & ~np.any(hidden, axis=0) if len(hidden) else seen
+    """Finds the visible Gaussians.
+
+    Args:
+      count: Number of Gaussians N.
+      isolated: Masks; if there are any, Gaussians outside of all are invisible.
+      hidden: Masks of invisible Gaussians.
+
+    Returns:
+      (N,) mask.
+    """
+    visible = np.any(isolated, axis=0) if len(isolated) else np.ones(count, bool)
+    return visible & ~np.any(hidden, axis=0) if len(hidden) else visible
 
 
-def lit(
+def highlight(
     base: UInt8[np.ndarray, "n 3"],
     masks: Sequence[Bool[np.ndarray, " n"]],
     similarities: Sequence[Float[np.ndarray, " n"]],
 ) -> UInt8[np.ndarray, "n 3"]:
-    """(N, 3) RGB: `base` where there is no answer; else each answer's Gaussians in its colour, one that several light
-    up in that of the answer that it is most similar to, and the rest dim and grey."""
+    """Tints the Gaussians of each answer in its colour, and dims the others.
+
+    Args:
+      base: RGB of the Gaussians.
+      masks: Mask of each answer. Without answers the colours stay.
+      similarities: Similarity of each Gaussian with each answer. A Gaussian of several answers has the colour of the
+        most similar one.
+
+    Returns:
+      (N, 3) RGB.
+    """
     if not masks:
         return base
-    result = (DIM * (1 - GREY) * base + DIM * GREY * base.mean(1, keepdims=True, dtype=np.float32)).astype(np.uint8)
-    nearest = np.full(len(base), -np.inf, np.float32)
-    for mask, similarity, tint in zip(masks, similarities, tints(len(masks)), strict=True):
-        rows = np.flatnonzero(mask & (np.nan_to_num(similarity) > nearest))
-        nearest[rows] = similarity[rows]
-        result[rows] = ((1 - TINT) * base[rows] + TINT * tint).astype(np.uint8)
-    return result
+    colours = (DIM * (1 - GREY) * base + DIM * GREY * base.mean(1, keepdims=True, dtype=np.float32)).astype(np.uint8)
+    best = np.full(len(base), -np.inf, np.float32)
+    for mask, similarity, tint in zip(masks, similarities, answer_colours(len(masks)), strict=True):
+        rows = np.flatnonzero(mask & (np.nan_to_num(similarity) > best))
+        best[rows] = similarity[rows]
+        colours[rows] = ((1 - TINT) * base[rows] + TINT * tint).astype(np.uint8)
+    return colours
 
 
-def scored(similarities: Sequence[Float[np.ndarray, " n"]], count: int) -> UInt8[np.ndarray, "n 3"]:
-    """(N, 3) RGB of how far each Gaussian belongs to any answer: dark blue 0, red 0.5, pale yellow 1; grey without an
-    answer."""
+def score_colours(similarities: Sequence[Float[np.ndarray, " n"]], count: int) -> UInt8[np.ndarray, "n 3"]:
+    """Colours the Gaussians by how far they belong to the answers.
+
+    Args:
+      similarities: Similarity of each Gaussian with each answer, 0 to 1.
+      count: Number of Gaussians N.
+
+    Returns:
+      (N, 3) RGB of the largest similarity: dark blue 0, red 0.5, pale yellow 1; grey without answers.
+    """
     if not similarities:
         return np.full((count, 3), 110, np.uint8)
-    most = np.nan_to_num(np.max(similarities, axis=0))
+    largest = np.nan_to_num(np.max(similarities, axis=0))
     stops = np.array([[18, 20, 60], [90, 24, 120], [205, 50, 70], [250, 150, 40], [252, 250, 190]], np.float32)
     table = np.stack([np.interp(np.linspace(0, 1, 256), np.linspace(0, 1, 5), c) for c in stops.T], 1)
-    return table.astype(np.uint8)[(255 * np.clip(most, 0, 1)).astype(np.uint8)]
+    return table.astype(np.uint8)[(255 * np.clip(largest, 0, 1)).astype(np.uint8)]

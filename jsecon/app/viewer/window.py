@@ -1,7 +1,7 @@
-"""A field in a browser, asked as one types (extra `viewer`): viser's window around the states of app/viewing.
+"""`jsecon view`: a field in a browser, queried as one types (extra `viewer`).
 
-One thread owns the state. What the page tells becomes a step in a queue; when the queue is empty the last state is
-drawn, so that a slider that moves faster than answers come skips what lies between.
+One thread owns the state. Each event of the page becomes a step in a queue. The last state is drawn when the queue is
+empty, so that a slider that moves faster than answers come skips what lies between.
 """
 
 import contextlib
@@ -15,163 +15,188 @@ import zipfile
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
 
 import numpy as np
 
-from jsecon.app.access import bracketed, listen, token_for
+from jsecon.app.access import listen, token_for
 from jsecon.app.ask import Answer, ask_region, ask_text
 from jsecon.app.outputs import answer_masks, file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.access import guarded_pages
-from jsecon.app.viewer.candidates import Candidate, Pictures, candidates, region_along
-from jsecon.app.viewer.panel import Panel, sheet, told
-from jsecon.app.viewer.scene import Layers
-from jsecon.app.viewer.static_page import NOWHERE
-from jsecon.app.viewer.view_state import Ask, History, ViewState
+from jsecon.app.viewer.candidates import Candidate, RegionPictures, candidates, region_along
+from jsecon.app.viewer.panel import Panel, candidate_grid, messages
+from jsecon.app.viewer.scene import FieldScene
+from jsecon.app.viewer.view_state import History, ViewQuery, ViewState
 from jsecon.errors import InputError
-from jsecon.language.field import load_field
-from jsecon.pipeline.networks import ExternalSpace, external_dim
 from jsecon.types import LanguageField
 
-REMEDY = 'pip install "jsecon[viewer]"'
-KEPT = 32
-"""answers, of five bytes a Gaussian each"""
-IDLE = 0.6
-"""seconds without a step after which the link follows the camera"""
-VIEWS = 3
-"""masks in an export"""
+REMEDY = 'Run: pip install "jsecon[viewer]". Or write a page with --export.'
+MAX_ANSWERS = 32
+"""number of answers that are kept, of five bytes a Gaussian each"""
+IDLE_SECONDS = 0.6
+"""s without a step after which the link follows the camera"""
+EXPORTED_MASKS = 3
+"""number of masks of an answer in an export"""
 
 
 class Viewer:
-    """A field, its window, and the thread that draws."""
+    """A field, its window, and the thread that draws.
+
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      server: The viser server.
+      name: Name of the field.
+
+    Attributes:
+      history: The present state, and those before it.
+      drawn: The state that the window shows.
+      scene: The field in the window.
+      panel: The controls.
+      answer: Answers a `ViewQuery`, by an Answer or an InputError. It keeps the last answers.
+    """
 
     def __init__(self, field: LanguageField, embedder: Any, server: Any, *, name: str):
-        self.field, self.embedder, self.server, self.name = field, embedder, server, name
+        self.field = field
+        self.embedder = embedder
+        self.server = server
+        self.name = name
         self.history = History()
         self.drawn: ViewState | None = None
-        """the state that the window shows"""
-        self.layers = Layers(server, field)
+        self.scene = FieldScene(server, field)
         self.panel = Panel(self, server, field)
-        self.answer = functools.lru_cache(KEPT)(self._answer)
-        self.base = functools.cache(self._base)
+        self.answer = functools.lru_cache(MAX_ANSWERS)(self._answer)
+        self._base_colours = functools.cache(self._compute_base_colours)
         self._steps: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._camera, self._candidates = (), []
+        self._camera: tuple[float, ...] = ()
+        self._candidates: list[tuple[int, Candidate]] = []
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     @functools.cached_property
-    def pictures(self) -> Pictures:
-        return Pictures(self.field)
+    def pictures(self) -> RegionPictures:
+        """Pictures of the frames and regions."""
+        return RegionPictures(self.field)
 
     def start(self, state: ViewState) -> None:
-        """Draws a first state, and from then on what the page asks for; all that a question needs is compiled."""
-        self._go(state, whole=True)
+        """Draws a first state, compiles what queries need, and starts the thread."""
+        self._set_state(state, update_controls=True)
         self._paint(self.history.state)
-        warm = view_state.asked(ViewState(), "red")
-        answers = [self.answer(ask) for ask in warm.asks]
-        told(self.field, warm, answers)
-        self._sure(warm, answers)
-
-        def act() -> None:
-            self.pictures.renderer.photo(0)
-            self._tell(self.history.state)
-
-        self.do(act)
+        example = view_state.with_texts(ViewState(), "red")
+        answers = [self.answer(query) for query in example.view_queries]
+        messages(self.field, example, answers)
+        self._find_candidates(example, answers)
+        self.do(lambda: self.pictures.renderer.photo(0))
+        self.do(lambda: self._describe(self.history.state))
         self._thread.start()
 
+    def run(self) -> None:
+        """Keeps the viewer running until it is interrupted."""
+        try:
+            self.server.sleep_forever()
+        finally:
+            self.stop()  # a thread inside XLA at the interpreter's end aborts it
+
     def stop(self) -> None:
+        """Ends the thread."""
         self._steps.put(None)
         self._thread.join()
 
-    def then(self, step: Callable[[ViewState], ViewState], *, whole: bool = False) -> None:
-        """Later, in turn: the state that follows; `whole`, where controls and camera are to follow it too."""
-        self._steps.put(lambda: self._go(step(self.history.state), whole=whole))
+    def then(self, step: Callable[[ViewState], ViewState], *, update_controls: bool = False) -> None:
+        """Queues a step from the state to the next. `update_controls` also sets the controls and the camera."""
+        self._steps.put(lambda: self._set_state(step(self.history.state), update_controls=update_controls))
 
-    def do(self, act: Callable[[], None]) -> None:
-        """Later, in turn: an act that leaves the state as it is."""
+    def do(self, act: Callable[[], Any]) -> None:
+        """Queues an act that does not change the state."""
         self._steps.put(act)
 
     def undo(self) -> None:
-        self._steps.put(self._undo)
+        """Queues the step back to the state before."""
 
-    def _undo(self) -> None:
-        self.history = self.history.back()
-        self.panel.show(self.history.state)
+        def back() -> None:
+            self.history = self.history.back()
+            self.panel.show_state(self.history.state)
+
+        self.do(back)
 
     def restore(self, link: str) -> None:
-        """The state of a link."""
-        self.then(lambda state: view_state.state_of(link), whole=True)
+        """Queues the state of a link."""
+        self.then(lambda _: view_state.from_link(link), update_controls=True)
 
-    def seen_from(self, camera: Any) -> None:
-        """Where a client looks from, in the field's world."""
-        numbers = np.concatenate([camera.position, camera.look_at]) / self.layers.scale
+    def set_camera(self, camera: Any) -> None:
+        """Records where a client looks from, for the link."""
+        numbers = np.concatenate([camera.position, camera.look_at]) / self.scene.scale
         self._camera = tuple(np.round(np.concatenate([numbers, camera.up_direction]), 5).tolist())
 
-    def click(self, origin: Sequence[float], direction: Sequence[float], focal: float, *, more: bool) -> None:
-        """Lights up what a ray of the window meets."""
-        start = np.asarray(origin) / self.layers.scale
+    def click(self, origin: Sequence[float], direction: Sequence[float], focal: float, *, add: bool) -> None:
+        """Queues highlighting the region that a ray of the window meets."""
+        start = np.asarray(origin) / self.scene.scale
 
         def step(state: ViewState) -> ViewState:
-            seen = self._shown(state)
-            region = region_along(self.field, start, np.asarray(direction), focal=focal, seen=seen)
+            visible = self._visible(state)
+            region = region_along(self.field, start, np.asarray(direction), focal=focal, visible=visible)
             if region < 0:
-                self.panel.notice("No region is known there: it is background, or no frame shows it.")
+                self.panel.show_notice("No region is known there: it is background, or no frame shows it.")
                 return state
-            return view_state.clicked(state, region, more=more)
+            return view_state.toggle_region(state, region, add=add)
 
-        self.then(step, whole=True)
+        self.then(step, update_controls=True)
 
-    def take(self, number: int) -> None:
-        """One of the candidates instead of the thing that it is a candidate for."""
+    def select(self, number: int) -> None:
+        """Queues highlighting a candidate in place of its query."""
 
         def step(state: ViewState) -> ViewState:
             place, candidate = self._candidates[number]
-            return view_state.instead(state, place, candidate.region)
+            return view_state.replace_match(state, place, candidate.region)
 
-        self.then(step, whole=True)
+        self.then(step, update_controls=True)
 
-    def frame(self, client: Any, frame: int) -> None:
-        """Goes to where a frame was taken, and shows the frame with its regions."""
+    def go_to_frame(self, client: Any, frame: int) -> None:
+        """Queues a flight to a frame, and its picture with its regions."""
 
         def act() -> None:
             if client is not None:
-                self.layers.fly(client, frame)
+                self.scene.fly(client, frame)
             photo = self.pictures.renderer.photo(frame)
-            painted = self.pictures.renderer.colours(frame, self.base("region") / np.float32(255))
-            self.panel.frame(frame, np.concatenate([photo, (photo * 0.35 + painted * 0.65).astype(np.uint8)]))
+            regions = self.pictures.renderer.colours(frame, self._base_colours("region") / np.float32(255))
+            self.panel.show_frame(frame, np.concatenate([photo, (photo * 0.35 + regions * 0.65).astype(np.uint8)]))
 
         self.do(act)
 
     def export(self, client: Any) -> None:
-        """Sends the answers that are lit up as a .zip: .ply, .json and masks of each."""
+        """Queues sending the highlighted answers as a .zip: .ply, .json and masks of each."""
 
         def act() -> None:
-            found = [a for a in map(self.answer, self.history.state.asks) if isinstance(a, Answer) and a.mask.any()]
-            if not found:
-                self.panel.notice("Nothing is lit up, so there is nothing to export.")
+            answers = [self.answer(query) for query in self.history.state.view_queries]
+            answers = [answer for answer in answers if isinstance(answer, Answer) and answer.mask.any()]
+            if not answers:
+                self.panel.show_notice("No Gaussian is selected, so there is no file to export.")
             else:
-                client.send_file_download(f"{file_stem(found[0])}.zip", self.packed(found), save_immediately=True)
+                client.send_file_download(f"{file_stem(answers[0])}.zip", self.zipped(answers), save_immediately=True)
 
         self.do(act)
 
-    def packed(self, answers: Sequence[Answer]) -> bytes:
-        """A .zip of the answers' files."""
+    def zipped(self, answers: Sequence[Answer]) -> bytes:
+        """Returns a .zip of the files of answers."""
         packed = io.BytesIO()
-        how = {"compression": zipfile.ZIP_DEFLATED, "strict_timestamps": False}  # a clock may stand before 1980
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **how) as archive:
+        options: dict[str, Any] = {
+            "compression": zipfile.ZIP_DEFLATED,
+            "strict_timestamps": False,
+        }  # clocks before 1980
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(packed, "w", **options) as archive:
             for answer in answers:
-                write_answer(self.field, answer, Path(folder), answer_masks(self.field, answer, VIEWS))
+                write_answer(self.field, answer, Path(folder), answer_masks(self.field, answer, EXPORTED_MASKS))
             for file in sorted(Path(folder).iterdir()):
                 archive.write(file, file.name)
         return packed.getvalue()
 
     def _work(self) -> None:
+        """Takes the steps in turn, and draws the last state when no step waits."""
         while True:
             try:
-                step = self._steps.get(timeout=IDLE)
+                step = self._steps.get(timeout=IDLE_SECONDS)
             except queue.Empty:
-                self._link()
+                self._update_link()
                 continue
             if step is None:
                 return
@@ -179,82 +204,87 @@ class Viewer:
                 step()
                 if self._steps.empty() and self.history.state != self.drawn:
                     self._paint(self.history.state)
-                    self._tell(self.history.state)
+                    self._describe(self.history.state)
             except InputError as error:
-                self.panel.notice(error)
+                self.panel.show_notice(error)
             except Exception:
-                self.panel.notice("An error inside; the terminal has it.")
+                self.panel.show_notice("Internal error. The terminal shows its trace.")
                 traceback.print_exc()
 
-    def _go(self, state: ViewState, *, whole: bool) -> None:
-        self.history = self.history.then(view_state.moved(state, camera=()))
-        if whole:
-            self.panel.show(state)
+    def _set_state(self, state: ViewState, *, update_controls: bool) -> None:
+        """Makes a state the present one."""
+        self.history = self.history.then(view_state.with_controls(state, camera=()))
+        if update_controls:
+            self.panel.show_state(state)
         if state.camera:
-            self.layers.look(state.camera)
+            self.scene.look(state.camera)
 
-    def _link(self) -> None:
-        self.panel.link(view_state.link_of(view_state.moved(self.history.state, camera=self._camera)))
+    def _update_link(self) -> None:
+        """Shows the link of the state and the camera."""
+        self.panel.show_link(view_state.to_link(view_state.with_controls(self.history.state, camera=self._camera)))
 
-    def _answer(self, ask: Ask) -> Answer | InputError:
-        how: dict[str, Any] = {"several": ask.every, "piece_threshold": 1 - ask.whole}
+    def _answer(self, query: ViewQuery) -> Answer | InputError:
+        """Answers a query that is not among the last ones."""
+        options: dict[str, Any] = {"several": query.all_matches, "piece_threshold": 1 - query.part_vs_whole}
         try:
-            if isinstance(ask.thing, str):
-                return ask_text(self.field, self.embedder, ask.thing, threshold=ask.threshold, **how)
-            return ask_region(self.field, ask.thing, similarity_threshold=ask.threshold, **how)
+            if isinstance(query.query, str):
+                return ask_text(self.field, self.embedder, query.query, threshold=query.threshold, **options)
+            return ask_region(self.field, query.query, threshold=query.threshold, **options)
         except InputError as error:
             return error
 
-    def _found(self, ask: Ask) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) mask and (N,) similarity of an answer; nothing where there is none."""
-        found = self.answer(ask)
-        if isinstance(found, InputError):
+    def _selection(self, query: ViewQuery) -> tuple[np.ndarray, np.ndarray]:
+        """Returns mask (N,) and similarity (N,) of an answer; zeros for an error."""
+        answer = self.answer(query)
+        if isinstance(answer, InputError):
             return np.zeros(self.field.gaussians.count, bool), np.zeros(self.field.gaussians.count, np.float32)
-        return found.mask, np.asarray(found.selection.similarity)
+        return answer.mask, np.asarray(answer.selection.similarity)
 
-    def _shown(self, state: ViewState) -> np.ndarray:
-        only, hidden = ([self._found(ask)[0] for ask in asks] for asks in (state.only, state.hidden))
-        return view_state.shown(self.field.gaussians.count, only, hidden)
+    def _visible(self, state: ViewState) -> np.ndarray:
+        """Returns the visible Gaussians of a state (N,)."""
+        isolated, hidden = ([self._selection(q)[0] for q in queries] for queries in (state.isolated, state.hidden))
+        return view_state.visible_gaussians(self.field.gaussians.count, isolated, hidden)
 
-    def _base(self, paint: str) -> np.ndarray:
-        """(N, 3) RGB of the Gaussians without an answer."""
-        if paint == "code":
+    def _compute_base_colours(self, colouring: str) -> np.ndarray:
+        """Returns the RGB (N, 3) of the Gaussians without an answer."""
+        if colouring == "code":
             return (255 * code_colours(self.field)).astype(np.uint8)
-        if paint == "region":
-            regions = self.pictures.regions
+        if colouring == "region":
             table = np.concatenate([palette(self.field.regions.count), np.full((1, 3), 255 * UNKNOWN, np.uint8)])
-            return table[np.where(regions == NOWHERE, -1, regions)]
-        return self.layers.photo
+            return table[self.pictures.regions]
+        return self.scene.photo
 
     def _paint(self, state: ViewState) -> None:
-        """The state in colours."""
-        found = [self._found(ask) for ask in state.asks]
-        masks, similarities = [mask for mask, _ in found], [similarity for _, similarity in found]
-        if state.paint == "score":
-            colours = view_state.scored(similarities, self.field.gaussians.count)
+        """Colours the Gaussians of the window."""
+        selections = [self._selection(query) for query in state.view_queries]
+        masks = [mask for mask, _ in selections]
+        similarities = [similarity for _, similarity in selections]
+        if state.colouring == "score":
+            colours = view_state.score_colours(similarities, self.field.gaussians.count)
         else:
-            colours = view_state.lit(self.base(state.paint), masks if any(m.any() for m in masks) else [], similarities)
-        self.layers.paint(colours, self._shown(state))
+            base = self._base_colours(state.colouring)
+            colours = view_state.highlight(base, masks if any(m.any() for m in masks) else [], similarities)
+        self.scene.paint(colours, self._visible(state))
         self.drawn = state
 
-    def _tell(self, state: ViewState) -> None:
-        """What there is to say about a state; pictures as long as nothing else is asked."""
-        answers = [self.answer(ask) for ask in state.asks]
-        self.panel.tell(told(self.field, state, answers))
-        self._link()
-        self._candidates = self._sure(state, answers)
+    def _describe(self, state: ViewState) -> None:
+        """Shows messages and candidates of a state. It stops at the pictures if another step waits."""
+        answers = [self.answer(query) for query in state.view_queries]
+        self.panel.show_messages(messages(self.field, state, answers))
+        self._update_link()
+        self._candidates = self._find_candidates(state, answers)
         pictured = []
         for place, candidate in self._candidates:
             if not self._steps.empty():
                 return
             pictured.append((place, candidate, self.pictures.region(candidate.region, candidate.frame)))
-        self.panel.candidates(sheet(state, answers, pictured), len(pictured))
+        self.panel.show_candidates(candidate_grid(answers, pictured), len(pictured))
 
-    def _sure(self, state: ViewState, answers: Sequence[Answer | InputError]) -> list[tuple[int, Candidate]]:
-        """What else the answers might be: (place, candidate)."""
-        each = 6 if len(answers) == 1 else 3
-        asked = [(k, thing) for k, thing in enumerate(state.things) if not isinstance(answers[k], InputError)][:4]
-        return [(k, found) for k, thing in asked for found in candidates(self.field, self.embedder, thing, each)]
+    def _find_candidates(self, state: ViewState, answers: Sequence[Answer | InputError]) -> list[tuple[int, Candidate]]:
+        """Returns the index of a query with each of its candidates, for up to four queries."""
+        count = 6 if len(answers) == 1 else 3
+        queries = [(k, q) for k, q in enumerate(state.queries) if not isinstance(answers[k], InputError)][:4]
+        return [(k, found) for k, query in queries for found in candidates(self.field, self.embedder, query, count)]
 
 
 def open_viewer(
@@ -268,43 +298,33 @@ def open_viewer(
     token: str = "",
     hosts: Collection[str] = (),
 ) -> Viewer:
-    """A viewer that listens, and shows its page to who has the token, or on loopback without one asks for it by a name
-    of this machine (one of `hosts` too).
+    """Opens a viewer.
 
-    Raises InputError where the extra is missing, the address can't be had, or others can reach it without a token.
+    Args:
+      field: The field.
+      embedder: Its embedder.
+      host: Address to listen on.
+      port: Port to listen on; 0 takes a free one.
+      name: Name of the field.
+      state: First state.
+      token: Token that the page's address must carry; "" is that of the environment, if any.
+      hosts: Names of this machine besides those of loopback and `host`.
+
+    Returns:
+      The viewer, which listens. Without a token its page is shown to requests that name this machine.
+
+    Raises:
+      InputError: The extra is missing, the address cannot be listened on, or others can reach it without a token.
     """
     try:
         import viser
     except ImportError as error:
-        raise InputError(
-            "jsecon view", "the package viser is missing", remedy=f"Run: {REMEDY}. Or write a page with --export."
-        ) from error
+        raise InputError("jsecon view", "the package viser is missing", remedy=REMEDY) from error
     listen(host, port).close()  # viser would go on to the next port
     token = token_for(host, token)
-    quiet = contextlib.redirect_stdout(io.StringIO())  # its banner comes before anything can be asked
-    with quiet, guarded_pages(token, (host, *hosts)):
+    no_banner = contextlib.redirect_stdout(io.StringIO())  # it would come before the viewer can answer
+    with no_banner, guarded_pages(token, (host, *hosts)):
         server = viser.ViserServer(host.strip("[]"), port, label=f"jsecon · {name}", verbose=False)
     viewer = Viewer(field, embedder, server, name=name)
     viewer.start(state)
     return viewer
-
-
-def view(asked: Any, embedder_of: Callable[..., Any], say: Callable[[str], object]) -> dict[str, Any]:
-    """Shows a field as `jsecon view` asks until it is stopped; raises as `open_viewer` does."""
-    token = token_for(asked.host, asked.token)
-    state = view_state.state_of(asked.link) if asked.link else ViewState()
-    state = view_state.asked(state, "; ".join(asked.texts)) if asked.texts else state
-    field, name, dim = load_field(asked.field), asked.field.resolve().parent.name, None
-    if not asked.texts and asked.embedder is None:
-        dim = external_dim(field.embedder)  # of a space whose model isn't here: it can be clicked, and not asked
-    embedder = embedder_of(field, asked) if dim is None else ExternalSpace(dim)
-    place = {"host": asked.host, "port": asked.port, "token": token, "hosts": asked.allow_host}
-    viewer = open_viewer(field, embedder, name=name, state=state, **place)
-    say(f"{name}: {field.gaussians.count} Gaussians, {field.regions.count} regions")
-    carried = f"/?{urlencode({'token': token})}" if token else ""
-    say(f"http://{bracketed(asked.host)}:{viewer.server.get_port()}{carried}")
-    try:
-        viewer.server.sleep_forever()
-    finally:
-        viewer.stop()  # a thread inside XLA at the interpreter's end aborts it
-    return {}
