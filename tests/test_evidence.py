@@ -95,7 +95,7 @@ def one_region(scene, cameras, means, *, unseen=()):
 def test_what_no_view_saw_is_never_selected(scene, cameras, tmp_path, options):
     means = 0.05 * np.random.default_rng(0).normal(size=(64, 3))
     save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means, unseen=[3, 17, 40]))
-    told = ask(tmp_path / "field.safetensors", tmp_path / "out", "--by", "silhouette", "--keep-outliers", *options)
+    told = ask(tmp_path / "field.safetensors", tmp_path / "out", "--keep-outliers", *options)
     chosen = jsecon.load_gaussians(tmp_path / "out" / told["ply"]).means
     away = np.linalg.norm(chosen[:, None] - means[None, [3, 17, 40]], axis=-1)
     assert len(chosen) == 61

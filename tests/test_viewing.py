@@ -80,7 +80,7 @@ def test_only_and_hidden_keep_how_they_were_asked():
     only = isolate(with_controls(MUG, threshold=0.7))
     assert only.isolated == (ViewQuery("red mug", 0.7),)
     assert only.queries == MUG.queries
-    assert with_controls(only, threshold=0.2).only == (ViewQuery("red mug", 0.7),)
+    assert with_controls(only, threshold=0.2).isolated == (ViewQuery("red mug", 0.7),)
     assert isolate(with_texts(only, "")) == with_texts(only, "")
     gone = hide(MUG)
     assert gone.queries == ()

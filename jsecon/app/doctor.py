@@ -38,6 +38,7 @@ PACKAGES = (
     "tyro",
     "shtab",
     "lazy_loader",
+    "huggingface_hub",
 )
 """modules of the packages that jsecon requires; jax has a check of its own"""
 EXTRAS = {
