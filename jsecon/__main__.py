@@ -60,7 +60,7 @@ def main() -> int:
     prepare_process()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a letter that the terminal lacks ends nothing
+            stream.reconfigure(errors="backslashreplace")  # for letters that the terminal lacks
     outputs = Output(sys.stdout), Output(sys.stderr)
     sys.stdout, sys.stderr = outputs  # pyright: ignore[reportAttributeAccessIssue]
     stop_by_signals()
@@ -69,7 +69,7 @@ def main() -> int:
         from jsecon.app.cli import main as run
 
         code = run(sys.argv[1:])
-    except KeyboardInterrupt:  # amid the imports: nothing has begun
+    except KeyboardInterrupt:  # during the imports
         print("\njsecon: interrupted.", file=sys.stderr)
         code = STOPPED
     except Exception:

@@ -46,7 +46,7 @@ def test_the_oriented_box_is_that_of_the_brick(answer):
     assert len(place.points) == 64
     told = place.as_dict()
     assert told["points"] == 64
-    assert told["frame"] == "the capture's own world"
+    assert told["frame"] == "the capture's world"
     assert told["extent"] == pytest.approx(list(place.extent), abs=1e-5)
 
 

@@ -225,7 +225,7 @@ def ask_outline(
       The answer.
 
     Raises:
-      InputError: The field has no such frame, or no Gaussian can be told to lie inside.
+      InputError: The field has no such frame, or the masks outline no Gaussian.
     """
     frames = [frame_index(field, frame) for frame in outlines]
     masks = np.stack([np.asarray(mask).astype(int) for mask in outlines.values()])
@@ -337,7 +337,7 @@ def drop_outliers(field: LanguageField, answer: Answer, enabled: bool = True, *,
 
 
 def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
-    """Adds to a field what texts are compared with, if its own does not serve.
+    """Adds to a field what texts are compared with, unless it has that already.
 
     Args:
       field: The field.

@@ -47,7 +47,7 @@ examples
   jsecon run my_capture --out my_field --dry-run        what would run, and why
   jsecon doctor                                         whether this machine has what runs need
 
-A stopped run resumes when the same command is given again. jsecon --version prints the version."""
+Repeat the command of a stopped run to resume it. jsecon --version prints the version."""
 
 MARKERS = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
 

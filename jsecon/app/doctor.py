@@ -40,7 +40,7 @@ PACKAGES = (
     "lazy_loader",
     "huggingface_hub",
 )
-"""modules of the packages that jsecon requires; jax has a check of its own"""
+"""modules of the packages that jsecon requires; jax has another check"""
 EXTRAS = {
     "sfm": (("pycolmap",), "poses of photographs and videos"),
     "formats": (("gsply", "pillow_heif"), ".sog, .spz of version 4, HEIC photographs"),

@@ -1,4 +1,4 @@
-"""Where an answer is, for a robot: centre, boxes and points, in metres of the capture's own world."""
+"""Where an answer is, for a robot: centre, boxes and points, in metres of the capture's world."""
 
 import dataclasses
 import math
@@ -21,7 +21,7 @@ BOX_TAIL = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """One thing in the capture's own world, in its unit (metres if the capture has metres)."""
+    """One thing in the capture's world, in its unit (metres if the capture has metres)."""
 
     name: str
     centroid: np.ndarray
@@ -43,7 +43,7 @@ class Place:
     """similarity of the best region with the text."""
     probability: float
     """mean probability that a Gaussian belongs to the answer (`probability_inside`)."""
-    frame: str = "the capture's own world"
+    frame: str = "the capture's world"
 
     def as_dict(self) -> dict[str, Any]:
         """Returns plain values for JSON. Of the points it holds the count."""
@@ -63,7 +63,7 @@ class Place:
 def locate(field: LanguageField, text: str, embedder: Any = None, **options: Any) -> Place:
     """Locates the thing that a text names.
 
-    In five made-up rooms it selects 59 of the 60 things that have a name of their own. Their `center` is off by 6 mm in
+    In five made-up rooms it selects 59 of the 60 things that have a unique name. Their `center` is off by 6 mm in
     the median, and the box along the world's axes has an IoU of 0.69 with the true one.
 
     Args:
@@ -127,7 +127,7 @@ def locate_answer(field: LanguageField, answer: Answer) -> Place:
 
 
 def selected_centers(field: LanguageField, mask: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m 3"]:
-    """Returns the centres of the Gaussians of a mask (N,) in the capture's own world, (M, 3) float64."""
+    """Returns the centres of the Gaussians of a mask (N,) in the capture's world, (M, 3) float64."""
     to_source = np.asarray(field.to_source, np.float64)
     return np.asarray(field.gaussians.means)[mask].astype(np.float64) @ to_source[:3, :3].T + to_source[:3, 3]
 

@@ -1,7 +1,7 @@
 """Answers as files: the selected Gaussians, a JSON record and masks of each, and a page of pictures of all.
 
-Every query has file names of its own, the same in every run: an ordinary text is its own name ("red mug" is red-mug),
-any other name ends in a hash of what it stands for (`file_stem`).
+Every query has unique file names, the same in every run: an ordinary text is its name ("red mug" is red-mug), any other
+name ends in a hash of what it stands for (`file_stem`).
 """
 
 import hashlib
@@ -92,7 +92,7 @@ def answer_masks(field: LanguageField, answer: Answer, views: int) -> dict[int, 
     """
     field = part_of(field, answer)
     gaussians, mask = jax.device_put((field.gaussians, answer.mask))
-    cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
+    cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
     frames = best_frames(field, answer, views)
     return {t: np.asarray(selection_mask(gaussians, cameras[t], mask)) for t in frames}
 
@@ -120,7 +120,7 @@ def write_answer(
       ending: Format of the Gaussians: ply, spz or glb.
 
     Returns:
-      The record of the .json. Its coordinates are in the capture's own world.
+      The record of the .json. Its coordinates are in the capture's world.
     """
     stem = file_stem(answer)
     part = part_of(field, answer)
@@ -290,7 +290,7 @@ def _frame_stem(field: LanguageField, frame: int) -> str:
 
 
 def _slug(text: str) -> str:
-    """Returns the letters and digits of a text, in lower case, with hyphens between; "query" if it has none."""
+    """Returns the letters and digits of a text, in lower case, with hyphens between; "query" without any."""
     folded = unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
     return re.sub(r"[^\w]+", "-", folded).strip("-") or "query"
 

@@ -132,7 +132,7 @@ def lift_phrase(
     Args:
       field: The field.
       phrase: The phrase.
-      masks: Index of a frame -> the masks of the phrase in it, of which there may be none.
+      masks: Index of a frame -> the masks of the phrase in it, possibly without any.
       threshold: Share of a Gaussian that must lie inside.
       outliers: Whether to drop outliers.
 

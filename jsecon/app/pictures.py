@@ -101,7 +101,7 @@ def masklet_strip(
 
     Args:
       frames: T frames.
-      labels: Region ids of their pixels, -1 where there is none.
+      labels: Region ids of their pixels, -1 outside of regions.
       region: Id of the region.
       side: Side of a tile, px.
 
@@ -174,7 +174,7 @@ class Renderer:
     Args:
       gaussians: The scene.
       cameras: Its T views.
-      in_blocks: Renders a scene that is larger than memory, in its own colours only.
+      in_blocks: Renders a scene that is larger than memory, in the colours of the scene only.
 
     Attributes:
       photo: Renders a view in the scene's colours, (H, W, 3) uint8. It keeps the pictures.
@@ -183,7 +183,7 @@ class Renderer:
     def __init__(self, gaussians: Gaussians, cameras: Camera, *, in_blocks: bool = False):
         self._gaussians = gaussians if in_blocks else jax.device_put(gaussians)
         self._bounds = block_bounds(gaussians) if in_blocks else None
-        self._cameras = jax.tree.map(np.asarray, cameras)  # whose items compile nothing
+        self._cameras = jax.tree.map(np.asarray, cameras)  # whose items need no compilation
         self.photo = functools.cache(self._photo)
 
     def _photo(self, view: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -23,7 +23,7 @@ from jsecon.pipeline.options import (
 
 T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
-"""an option that may be given several times"""
+"""option that can be repeated"""
 By = Literal["votes", "silhouette", "code"]
 
 VerbResult: TypeAlias = dict[str, Any]
@@ -57,9 +57,9 @@ class Demo(Verb):
     """Makes a room, builds its field, queries it and writes a report.
 
     The room is procedural, with named, coloured objects. It is written to disk as an ordinary COLMAP capture, and
-    `jsecon run`, `query` and `eval` then use nothing of the ground truth but frames, poses and sparse points. The demo
-    writes report.html, metrics.json, field.safetensors, a short film and a .ply for each query, in one to two minutes
-    on two cores. On a capture of your own, use `jsecon run` and `jsecon query`.
+    `jsecon run`, `query` and `eval` then use only frames, poses and sparse points of it. The demo writes report.html,
+    metrics.json, field.safetensors, a short film and a .ply for each query, in one to two minutes on two cores. For
+    other captures, use `jsecon run` and `jsecon query`.
 
     Attributes:
       seed: Seed of the room.
@@ -76,19 +76,18 @@ class Demo(Verb):
 class Run(Verb, InputOptions):
     """Builds the language field of a capture.
 
-    Its stages find poses if the capture has none, fit Gaussians or read them, find masklets or read masks, embed each
-    region, and distil codes into the Gaussians. It lists the stages first, and writes field.safetensors, report.html,
-    metrics.json and cache to the output folder.
+    Its stages estimate poses that the capture lacks, fit Gaussians or read them, find masklets or read masks, embed
+    each region, and distil codes into the Gaussians. It lists the stages first, and writes field.safetensors,
+    report.html, metrics.json and cache to the output folder.
 
     Attributes:
       out: Output folder.
       dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
       processes: Number of processes that share the masklets, the embeddings, the votes and the held-out frames. The
-        field stays the same. All of them run on this machine, each with its part of the cores, unless --coordinator
-        is given.
+        field stays the same. Without --coordinator they run on this machine and share its cores.
       coordinator: HOST:PORT where process 0 listens, an address of its own machine, for a run on several machines.
-        Every machine runs the same command with the same capture and models at the same paths, and its own name must
-        stand for an address that the others reach.
+        Every machine runs the same command with the same capture and models at the same paths, and the name of
+        process 0's machine must stand for an address that the others reach.
       process: Index of this process on several machines, 0 to N - 1. Process 0 writes the output folder.
     """
 
@@ -114,7 +113,7 @@ class Run(Verb, InputOptions):
 class Fit(Verb):
     """Fits Gaussians to a capture, and no more.
 
-    Writes a scene of 3D Gaussians in the capture's own world, with PSNR and SSIM of the held-out frames. A folder
+    Writes a scene of 3D Gaussians in the capture's world, with PSNR and SSIM of the held-out frames. A folder
     named like the file without its ending keeps what is computed: a stopped fit resumes from it, and `jsecon run`
     into that folder goes on from it too.
 
@@ -156,7 +155,7 @@ class Query(FieldVerb):
     """Selects the Gaussians of a text, of a pixel, or of an outline.
 
     For each text, pixel or outline, writes to the output folder: the selected Gaussians as a .ply (INRIA's layout, in
-    the capture's own world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks
+    the capture's world; SuperSplat opens it), a .json with count, score, region, centroid and bounding box, masks
     of the frames that show it best, and answers.html with the pictures. A field of more than half of the free memory,
     or than JSECON_MEMORY (GiB) of the environment, stays on disk and is read in blocks, with the same answers: texts
     and --at, by votes or code.
@@ -210,7 +209,7 @@ class Query(FieldVerb):
 class Export(Verb):
     """Writes the whole scene of a field for other programs.
 
-    The scene is in the capture's own world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds each
+    The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds each
     Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
 
     Attributes:
@@ -298,7 +297,7 @@ class Models(Verb):
     """Examines a folder of models.
 
     For each graph it lists inputs, outputs and what jsecon can use it for, then what is missing, and where such exports
-    are published. The exit code is 2 if jsecon can use none of them.
+    are published. The exit code is 2 if jsecon cannot use any of them.
 
     Attributes:
       action: Lists what a model folder holds.

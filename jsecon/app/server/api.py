@@ -1,6 +1,6 @@
 """The HTTP interface of the server: its paths, the models of its requests, and its error messages.
 
-FastAPI makes /openapi.json from them. Its own page of documentation loads scripts of another host and is left out; the
+FastAPI makes /openapi.json from them. Its page of documentation loads scripts of another host and is left out; the
 page at / lists the paths instead.
 """
 
@@ -131,7 +131,7 @@ def application(
         if (request.text is None) == (request.at is None):
             raise _wrong("text", 'missing, and "at" too.' if request.at is None else 'give it, or "at", and not both.')
         if request.at is not None and request.all:
-            raise _wrong("all", 'it needs a text, and "at" has none.')
+            raise _wrong("all", 'it needs a text, not "at".')
         scene = scene_of(request.field)
         scene_query = SceneQuery(request.text or "", request.at, request.by, request.threshold, request.all)
         record = scene.records.get(scene_query)
@@ -153,7 +153,7 @@ def application(
         ]
         return AsciiResponse({"field": scene.name, "regions": rows})
 
-    @app.get("/selection.ply", summary="The selected Gaussians in the capture's own world")
+    @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     async def selection(request: Annotated[TextQuery, Query()]) -> Response:
         scene = scene_of(request.field)
 

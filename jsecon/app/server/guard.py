@@ -79,7 +79,7 @@ class Guard:
     """Middleware in front of the application.
 
     With a token, requests must carry it. Without one they must name this machine in their Host header, so that a page
-    of another site cannot send requests under a name of its own (DNS rebinding).
+    of another site cannot send requests under another name (DNS rebinding).
 
     Args:
       app: The ASGI application.

@@ -65,7 +65,7 @@ class Scene:
         self.answer = functools.lru_cache(MAX_ANSWERS)(self._answer)
         self.records: dict[SceneQuery, dict[str, Any]] = {}
         self._gaussians = jax.device_put(field.gaussians)
-        self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items compile nothing
+        self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
 
     def _answer(self, query: SceneQuery) -> Answer:
         """Answers a query that is not among the last ones."""
@@ -105,7 +105,7 @@ class Scene:
         return self.field.names[frames[0]], cv2.imencode(".png", np.asarray(shown, np.uint8) * 255)[1].tobytes()
 
     def ply(self, answer: Answer) -> bytes:
-        """Returns the selected Gaussians as a .ply in the capture's own world."""
+        """Returns the selected Gaussians as a .ply in the capture's world."""
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "selection.ply"
             save_ply(file, selected_gaussians(self.field.gaussians, answer.mask), similarity=self.field.to_source)

@@ -109,7 +109,7 @@ class RegionPictures:
         self._intrinsics = [np.asarray(getattr(field.cameras, name)) for name in ("fx", "fy", "cx", "cy")]
 
     def region(self, region: int, frame: int) -> UInt8[np.ndarray, "h w 3"]:
-        """Returns the part of a frame that shows a region's Gaussians, or the whole frame if it shows none."""
+        """Returns the part of a frame that shows a region's Gaussians, or else the whole frame."""
         photo = self.renderer.photo(frame)
         height, width = photo.shape[:2]
         points = self._means[self.regions == region] @ self._poses[frame, :3, :3].T + self._poses[frame, :3, 3]

@@ -47,7 +47,7 @@ class Panel:
         gui.set_panel_label(f"jsecon · {viewer.name}")
         default = ViewState()
         with gui.add_form(None) as text_form:
-            hint = "Text to find, then press enter. Separate several texts by semicolons; each has its own colour."
+            hint = "Text to find, then press enter. Separate several texts by semicolons; each has another colour."
             self._text = gui.add_text("find", "", hint=hint)
         self._messages = gui.add_html("")
         self._notice = gui.add_html("", visible=False)
@@ -203,7 +203,7 @@ def _swatch(place: int) -> str:
 
 
 def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | InputError]) -> str:
-    """Describes the answers as HTML: how many Gaussians with which confidence, or why there are none.
+    """Describes the answers as HTML: how many Gaussians with which confidence, or why no Gaussian is selected.
 
     Args:
       field: The field.

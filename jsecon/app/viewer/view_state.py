@@ -20,7 +20,7 @@ Colouring: TypeAlias = Literal["photo", "code", "region", "score"]
 COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)
 """what the colours of the Gaussians show: the photographs, codes, regions, or how far each belongs to the answers"""
 DIM = 0.4
-"""brightness of Gaussians outside of all answers, as a share of their own"""
+"""brightness of Gaussians outside of all answers, as a share of what it was"""
 GREY = 0.6
 """share of their colour that these lose"""
 TINT = 0.55

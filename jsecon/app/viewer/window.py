@@ -284,7 +284,7 @@ class Viewer:
         """Returns the index of a query with each of its candidates, for up to four queries."""
         count = 6 if len(answers) == 1 else 3
         queries = [(k, q) for k, q in enumerate(state.queries) if not isinstance(answers[k], InputError)][:4]
-        return [(k, found) for k, query in queries for found in candidates(self.field, self.embedder, query, count)]
+        return [(k, c) for k, query in queries for c in candidates(self.field, self.embedder, query, count)]
 
 
 def open_viewer(
