@@ -164,7 +164,7 @@ class Query(FieldVerb):
       texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle".
       at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them. A
         frame is named by its name, the end of its name, or its place such as #10.
-      mask: Selects what a mask outlines in a frame, or a thing that masks outline in several frames. Black is outside.
+      mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
       box: Selects the regions that are seen by more than half in a box of a frame.
       out: Output folder.
       by: How a matching region selects Gaussians: by its votes, or by its code. With silhouette, each Gaussian of the
@@ -173,14 +173,14 @@ class Query(FieldVerb):
         code.
       quantile: Share of unrelated words that must be less similar to the scene than a text, else the text has no match.
         About 1 - quantile of the texts of absent objects are answered. With 0 every text is answered.
-      all: Selects every region that answers a text, such as all the chairs, and not only the best one: those whose
-        similarity has come 0.75 of the way from the middle region's to the best one's (by votes or a silhouette).
-      keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. Without it, DBSCAN drops them, and
+      all: Selects every region of the kind that a text names, such as all chairs, instead of the best one: those whose
+        similarity lies at least 0.75 of the way from the median region to the best one (by votes or silhouette).
+      keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
-      phrases: Folder of a SAM 3 model (.onnx). Each text is put to it as a phrase in some frames of the capture, and
-        selects what lies in its masks in most of the frames that see it, all things of the kind.
+      phrases: Folder of a SAM 3 model (.onnx), which masks the objects that each text names in some frames of the
+        capture. A text then selects what lies in the masks in most of the frames that see it.
       images: With --phrases, the capture whose frames are used. By default it is where the run had it.
-      looks: With --phrases, number of frames, evenly spaced. A frame takes long.
+      looks: With --phrases, number of frames, evenly spaced. More frames take longer.
       views: Number of masks to write for each query.
       format: Format of the selected Gaussians. The glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds
         their codes and regions too.
