@@ -71,8 +71,7 @@ def run_demo(
     metrics = _metrics(results, run, true_run)
     with listener.progress("report"):
         texts = sorted({name for frame in labels for name in frame.objects})
-        questions = ask.queries_of(run.field, embedder, texts=texts)
-        answers = {answer.query: answer for answer in ask.answer_each(questions)[0]}
+        answers = {answer.query: answer for answer in ask.ask_each(run.field, embedder, texts=texts)[0]}
         queries = {
             text: write_answer(run.field, answer, out / "queries", answer_masks(run.field, answer, views=2))
             for text, answer in answers.items()
