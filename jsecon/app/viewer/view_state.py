@@ -184,10 +184,10 @@ def from_link(link: str) -> ViewState:
       InputError: The line is not one of a viewer.
     """
     try:
-        fields = json.loads(link)
-        if not isinstance(fields, dict):
+        content = json.loads(link)
+        if not isinstance(content, dict):
             raise ValueError("it is not a JSON object")
-        fields = {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
+        fields: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in content.items()}
         for name in ("isolated", "hidden"):
             if name in fields:
                 fields[name] = tuple(_checked_query(**query) for query in fields[name])
