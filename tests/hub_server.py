@@ -9,8 +9,11 @@ import hashlib
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
+import pytest
 import uvicorn
+from huggingface_hub import constants
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
@@ -148,3 +151,19 @@ def running_hub() -> Iterator[Hub]:
     yield hub
     server.should_exit = True
     thread.join()
+
+
+def use_hub(hub: Hub, cache: Path, monkeypatch: pytest.MonkeyPatch, *, offline: bool = False) -> None:
+    """Lets huggingface_hub ask this hub and keep its cache in a folder, until `monkeypatch` is undone."""
+    for name, value in {
+        "ENDPOINT": hub.endpoint,
+        "HUGGINGFACE_CO_URL_TEMPLATE": hub.endpoint + "/{repo_id}/resolve/{revision}/{filename}",
+        "HF_HUB_CACHE": str(cache),
+        "HF_HUB_OFFLINE": offline,
+    }.items():
+        monkeypatch.setattr(constants, name, value)
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    """The files of a folder as those of a repository."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -4,7 +4,7 @@ import multiprocessing
 import os
 
 import pytest
-from hub_server import Hub, Repository, running_hub
+from hub_server import Hub, Repository, running_hub, use_hub
 
 from jsecon import InputError
 from jsecon.networks import hub
@@ -30,17 +30,9 @@ def server():
 @pytest.fixture
 def local(server: Hub, tmp_path, monkeypatch) -> Hub:
     """An empty cache in front of a hub that has SlimSAM."""
-    from huggingface_hub import constants
-
     server.repositories = {NAME: Repository(dict(SLIMSAM), licence="apache-2.0")}
     server.requests.clear()
-    for name, value in {
-        "ENDPOINT": server.endpoint,
-        "HUGGINGFACE_CO_URL_TEMPLATE": server.endpoint + "/{repo_id}/resolve/{revision}/{filename}",
-        "HF_HUB_CACHE": str(tmp_path / "cache"),
-        "HF_HUB_OFFLINE": False,
-    }.items():
-        monkeypatch.setattr(constants, name, value)
+    use_hub(server, tmp_path / "cache", monkeypatch)
     return server
 
 
@@ -65,7 +57,7 @@ def test_a_name_brings_its_files_and_no_others(local):
     assert plan.commit == local.repositories[NAME].commit
     folder = hub.fetch(plan)
     assert (folder / "onnx/vision_encoder.onnx").read_bytes() == GRAPH
-    assert hub.cached_commit(folder) == plan.commit
+    assert hub.cached_address(folder) == f"hub:{NAME}@{plan.commit}"
     assert not (folder / "README.md").exists()
 
 
@@ -78,7 +70,7 @@ def test_a_model_in_the_cache_is_used_without_a_request(local, monkeypatch):
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
         folder = hub.cached_folder(slimsam())
         assert folder is not None
-        assert hub.cached_folder(hub.HubModel("segmenter", NAME, hub.cached_commit(folder))) == folder
+        assert hub.cached_folder(hub.parse_model(hub.cached_address(folder), "segmenter")) == folder
         assert hub.cached_folder(slimsam("fp16")) is None
     assert local.requests == []
 
@@ -149,11 +141,13 @@ def test_a_branch_that_moved_keeps_the_cached_commit_until_it_is_fetched(local):
     get(slimsam())
     second = hub.cached_folder(slimsam())
     assert second != first
-    assert hub.cached_folder(hub.HubModel("segmenter", NAME, hub.cached_commit(first))) == first
+    assert hub.cached_folder(hub.parse_model(hub.cached_address(first), "segmenter")) == first
 
 
 def fetch_at_once(endpoint, cache, barrier):
-    os.environ |= {"HF_ENDPOINT": endpoint, "HF_HUB_CACHE": cache}
+    here = Hub()
+    here.endpoint = endpoint
+    use_hub(here, cache, pytest.MonkeyPatch())
     barrier.wait()
     assert get(slimsam()) == NEEDED
 
@@ -161,9 +155,7 @@ def fetch_at_once(endpoint, cache, barrier):
 def test_two_processes_fetch_at_once(local, tmp_path):
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(2)
-    both = [
-        context.Process(target=fetch_at_once, args=(local.endpoint, str(tmp_path / "cache"), barrier)) for _ in range(2)
-    ]
+    both = [context.Process(target=fetch_at_once, args=(local.endpoint, tmp_path / "cache", barrier)) for _ in range(2)]
     for process in both:
         process.start()
     for process in both:

@@ -4,11 +4,13 @@ found, and a field finds its model again or says what is missing."""
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from clip_files import COLOURS, write_clip, write_visual
+from hub_server import Repository, files_in, running_hub, use_hub
 from sam2_files import write_sam2
 from sam_files import write_sam
 from test_pipeline import Recorder
@@ -36,6 +38,18 @@ from jsecon.vision.stores import StoredSegmenter
 def models(tmp_path_factory):
     base = tmp_path_factory.mktemp("models")
     return write_sam(base / "sam"), write_clip(base / "clip", "transformers.js")
+
+
+@pytest.fixture
+def hub(models):
+    """A hub that has the recommended models: the small ones of this file in their repositories' layouts."""
+    sam = {f"onnx/{Path(path).name}" if path.endswith(".onnx") else path: x for path, x in files_in(models[0]).items()}
+    with running_hub() as running:
+        running.repositories = {
+            "onnx-community/EdgeTAM-ONNX": Repository(sam),
+            "onnx-community/siglip2-base-patch16-224-ONNX": Repository(files_in(models[1])),
+        }
+        yield running
 
 
 @pytest.fixture(scope="module")
@@ -247,3 +261,50 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     np.testing.assert_array_equal(stored(frame, 0), masks)
     finer = SamSegmenter(models[0], SamSettings(points_per_side=5, crop_layers=0))
     assert finer.name != stored.name
+
+
+def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
+    room, splat, hub, tmp_path, monkeypatch, capsys
+):
+    use_hub(hub, tmp_path / "cache", monkeypatch)
+    out = tmp_path / "out"
+    command = ["run", str(room), "--gaussians", str(splat), "--holdout", "4", "--out", str(out), "--models", "auto"]
+    command += ["--points-per-side", "10", "--level", "m"]
+    assert cli.main(command) == 2  # without a terminal nothing is fetched unasked
+    assert "jsecon models get edgetam" in (said := capsys.readouterr().err)
+    assert "jsecon models get siglip2" in said
+    assert cli.main([*command, "--yes"]) == 0
+    asked = len(hub.requests)
+    use_hub(hub, tmp_path / "cache", monkeypatch, offline=True)
+    assert cli.main(command) == 0
+    field = tmp_path / "elsewhere" / "field.safetensors"
+    field.parent.mkdir()
+    shutil.copy(out / "field.safetensors", field)
+    assert str(tmp_path).encode() + b"/cache" not in field.read_bytes()
+    query = ["query", str(field), "a red thing", "--out", str(tmp_path / "answers"), "--quantile", "0"]
+    assert cli.main(query) == 0
+    assert len(hub.requests) == asked
+    use_hub(hub, tmp_path / "empty", monkeypatch)
+    capsys.readouterr()
+    assert cli.main(query) == 2
+    commit = hub.repositories["onnx-community/siglip2-base-patch16-224-ONNX"].commit
+    assert f"siglip2-base-patch16-224-ONNX@{commit}" in capsys.readouterr().err
+    assert cli.main([*query, "--yes"]) == 0
+
+
+def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, monkeypatch, capsys):
+    use_hub(hub, tmp_path / "cache", monkeypatch)
+    assert cli.main(["models", "get", "siglip2", "--yes"]) == 0
+    capsys.readouterr()
+    assert cli.main(["models", "list", "--json"]) == 0
+    rows = {
+        row["name"]: row["cached"] for row in json.loads(capsys.readouterr().out)["models"] if row["role"] == "embedder"
+    }
+    assert rows == {"clip": [], "siglip2": ["fp32"], "mobileclip": []}
+    assert cli.main(["models", "check", "siglip2"]) == 0
+    assert "CLIP: usable" in capsys.readouterr().out
+    assert cli.main(["models", "remove", "siglip2"]) == 0
+    assert cli.main(["models", "check", "siglip2"]) == 2
+    assert "jsecon models get siglip2" in capsys.readouterr().err
+    assert cli.main(["models", "get", "clap", "--yes"]) == 2
+    assert cli.main(["models", "get"]) == 2

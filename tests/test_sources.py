@@ -36,8 +36,8 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
     own = told(field, folders=hints, embedder=CLIP)
     save_field(out / "field.safetensors", own)
     for found in (locate_sources(load_field(out / "field.safetensors")), locate_sources(own, out)):
-        assert found == (CLIP, model, tmp_path / "capture")
-    assert locate_sources(own) == (CLIP, None, None)  # of a field that no file was read of
+        assert found[:3] == (CLIP, model, tmp_path / "capture")
+    assert locate_sources(own)[:3] == (CLIP, None, None)  # of a field that no file was read of
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
 )
 def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path, hint):
     own = told(field, folders={"capture": hint, "embedder": hint}, embedder=CLIP, options={"embedder": hint})
-    assert locate_sources(own, tmp_path) == (CLIP, None, None)
+    assert locate_sources(own, tmp_path)[:3] == (CLIP, None, None)
 
 
 def test_a_model_of_another_name_is_not_opened(field, tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
+from jsecon.app.models import folders_of_models, with_models
 from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, VerbResult, View
 from jsecon.errors import InputError
 from jsecon.pipeline.options import is_bare_scene, require_writable
@@ -36,7 +37,7 @@ def _run(verb: Run, console: Console) -> VerbResult:
         from jsecon.app.run_report import write_run
         from jsecon.pipeline import processes, run as pipeline
 
-    options = verb.options
+    options = with_models(verb.options, console, yes=verb.yes)
     if verb.dry_run:
         return pipeline.dry_run(options, verb.out, listener=console)
     place = worker_info()
@@ -70,6 +71,7 @@ def _fit(verb: Fit, console: Console) -> VerbResult:
 def _query(verb: Query, console: Console) -> VerbResult:
     _check_query(verb)
     require_writable(verb.out)
+    verb = with_models(verb, console, yes=verb.yes)
     with console.progress("field"):
         from jsecon.app import ask
         from jsecon.app.outputs import write_answers
@@ -256,7 +258,8 @@ def _serve(verb: Serve, console: Console) -> VerbResult:
 
     access = {"host": verb.host, "port": verb.port, "token": verb.token, "hosts": verb.allow_host}
     with console.progress("fields"):
-        result, serve = prepare(verb.fields, embedder=verb.embedder, **access)
+        embedder = with_models(verb, console, yes=False).embedder
+        result, serve = prepare(verb.fields, embedder=embedder, **access)
     for scene in result["fields"]:
         console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
         if scene["unrelated_words"] is None:
@@ -266,13 +269,28 @@ def _serve(verb: Serve, console: Console) -> VerbResult:
 
 
 def _models(verb: Models, console: Console) -> VerbResult:
-    with console.progress("graphs"):
-        from jsecon.pipeline.models import inspect_models, report_lines, unusable
+    from jsecon.app import models
 
-        report = inspect_models(verb.folder)
-    for line in report_lines(report):
-        console.say(line)
-    return dataclasses.asdict(report) | {"errors": unusable(report)}
+    if verb.action == "list":
+        return models.list_models(console)
+    if not verb.names:
+        problem = f"models {verb.action} needs a name"
+        raise InputError("jsecon", problem, remedy="jsecon models list has the names.")
+    if verb.action == "get":
+        return models.get_models(verb.names, verb.role, verb.precision, console, yes=verb.yes)
+    if verb.action == "remove":
+        return models.remove_models(verb.names, console)
+    from jsecon.pipeline.models import inspect_models, report_lines, unusable
+
+    results, errors = [], []
+    for name in verb.names:
+        with console.progress("graphs"):
+            report = inspect_models(models.cached_model(name))
+        for line in report_lines(report):
+            console.say(line)
+        results.append(dataclasses.asdict(report))
+        errors += unusable(report)
+    return {"models": results, "errors": errors}
 
 
 def _doctor(verb: Doctor, console: Console) -> VerbResult:
@@ -290,7 +308,10 @@ def _embedder(field: Any, verb: FieldVerb, console: Console) -> Any:
 
     if field.reference is None:
         console.note(_OLD_FIELD)
-    return networks.field_embedder(field, verb.embedder, templates=verb.template or ("{}",))
+    folder = with_models(verb, console, yes=verb.yes).embedder
+    if folder is None and verb.yes and (missing := networks.missing_model_of_field(field)) is not None:
+        folders_of_models({"embedder": missing}, console, yes=True)
+    return networks.field_embedder(field, folder, templates=verb.template or ("{}",))
 
 
 VERBS: dict[str, tuple[Any, type]] = {

@@ -34,6 +34,7 @@ examples
   jsecon run my_photos --out my_field                   photographs or a video: finds their poses first (extra sfm)
   jsecon run my_capture --out my_field --gaussians point_cloud.ply
                                                         the same on a scene that is already splatted
+  jsecon query scene.ply "red mug" --out answers        a splat without photographs: plans and renders views of it
   jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
   jsecon query my_field/field.safetensors "red mug" "dark green bottle" --out answers
   jsecon query my_field/field.safetensors --at frame_00012 310 145 --out answers
@@ -41,9 +42,9 @@ examples
                                                         the whole scene for other programs, codes included
   jsecon view my_field/field.safetensors "red mug"      in a browser; --export page.html writes a page
   jsecon eval my_field/field.safetensors --labels my_capture/label --out evaluation
-  jsecon run my_capture --out my_field --segmenter sam --embedder clip
-                                                        with SAM and CLIP from model folders
-  jsecon models check clip                              what a model folder holds and lacks
+  jsecon run my_capture --out my_field --models auto
+                                                        with EdgeTAM and SigLIP 2, fetched after asking
+  jsecon models list                                    models by name, sizes, licences; get NAME fetches
   jsecon run my_capture --out my_field --dry-run        what would run, and why
   jsecon doctor                                         whether this machine has what runs need
 

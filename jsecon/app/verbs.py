@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from jsecon.networks.hub import Precision, Role
 from jsecon.pipeline.options import (
     BareOptions,
     FieldOptions,
@@ -83,6 +84,7 @@ class Run(Verb, InputOptions):
     Attributes:
       out: Output folder.
       dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
+      yes: Fetches models that are not on this machine without asking.
       processes: Number of processes that share the masklets, the embeddings, the votes and the held-out frames. The
         field stays the same. Without --coordinator they run on this machine and share its cores.
       coordinator: HOST:PORT where process 0 listens, an address of its own machine, for a run on several machines.
@@ -93,6 +95,7 @@ class Run(Verb, InputOptions):
 
     out: Option[Path]
     dry_run: Option[bool] = False
+    yes: Option[bool] = False
     processes: Option[int] = 1
     coordinator: Option[str | None] = None
     process: Option[int | None] = None
@@ -140,13 +143,16 @@ class FieldVerb(Verb):
 
     Attributes:
       field: Path of field.safetensors, written by jsecon run.
-      embedder: Folder of the CLIP model that the field was made with. By default it is where the run had it.
+      embedder: The CLIP model that the field was made with: a name, hub:owner/name, or a folder. By default it is the
+        one that the run used.
+      yes: Fetches a model that is not on this machine without asking.
       template: Phrase for the texts, such as "a photo of a {}.", with CLIP. Several phrases are averaged. By default
         the bare text is used.
     """
 
     field: Positional[Path]
     embedder: Option[Path | None] = None
+    yes: Option[bool] = False
     template: Repeated[str] = dataclasses.field(default_factory=list)
 
 
@@ -177,8 +183,8 @@ class Query(FieldVerb):
         similarity lies at least 0.75 of the way from the median region to the best one (by votes or silhouette).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
-      phrases: Folder of a SAM 3 model (.onnx), which masks the objects that each text names in some frames of the
-        capture. A text then selects what lies in the masks in most of the frames that see it.
+      phrases: SAM 3 model (the name sam3, hub:owner/name, or a folder), which masks the objects that each text names in
+        some frames of the capture. A text then selects what lies in the masks in most of the frames that see it.
       images: With --phrases, the capture whose frames are used. By default it is where the run had it.
       looks: With --phrases, number of frames, evenly spaced. More frames take longer.
       views: Number of masks to write for each query.
@@ -294,18 +300,27 @@ class Serve(Verb):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Models(Verb):
-    """Examines a folder of models.
+    """Lists, fetches, examines and removes models.
 
-    For each graph it lists inputs, outputs and what jsecon can use it for, then what is missing, and where such exports
-    are published. The exit code is 2 if jsecon cannot use any of them.
+    With list, prints the models that have a name, their sizes and licences, and which of them are on this machine. With
+    get, fetches models from huggingface.co into its cache and compares each file with its hash; HF_HOME, HF_ENDPOINT,
+    HF_TOKEN and HF_HUB_OFFLINE work as usual. With check, lists inputs and outputs of each graph, what jsecon can use
+    it for, and what is missing; the exit code is 2 if jsecon cannot use any of them. With remove, deletes models from
+    the cache.
 
     Attributes:
-      action: Lists what a model folder holds.
-      folder: Folder with .onnx files.
+      action: What to do.
+      names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders.
+      role: What the models are for. By default every role that a name has.
+      precision: Precision of the graphs. By default it is the one that jsecon uses.
+      yes: Fetches without asking.
     """
 
-    action: Positional[Literal["check"]]
-    folder: Positional[Path]
+    action: Positional[Literal["list", "get", "check", "remove"]]
+    names: Positional[list[str]] = dataclasses.field(default_factory=list)
+    role: Option[Role | None] = None
+    precision: Option[Precision | None] = None
+    yes: Option[bool] = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

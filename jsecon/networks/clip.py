@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from jsecon.errors import InputError, describe_error, require
 from jsecon.files import read_json
+from jsecon.networks.hub import Precision, graph_variants
 from jsecon.networks.session import Graph, Tensor, batches, content_digest, describe, graph_files
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextRules, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
@@ -94,8 +95,12 @@ class ClipFiles:
         return content_digest(files, extra=repr(settings if self.rules is None else (*settings, *self.rules)))
 
 
-def find_clip(folder: str | Path) -> ClipFiles:
+def find_clip(folder: str | Path, precision: Precision | None = None) -> ClipFiles:
     """Finds the files of the CLIP model in a folder.
+
+    Args:
+      folder: The folder.
+      precision: Precision of its graphs; None takes the highest that is there.
 
     Raises:
       InputError: A file is missing or cannot be read.
@@ -103,7 +108,7 @@ def find_clip(folder: str | Path) -> ClipFiles:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "no such folder", "a folder with a CLIP model", PUBLISHED)
-    layout, visual, textual = _find_graphs(folder)
+    layout, visual, textual = _find_graphs(folder, precision)
     tokenizer = next((folder / name for name in TOKENIZERS if (folder / name).is_file()), None)
     if tokenizer is None:
         raise InputError(folder, f"graphs in the layout of {layout}, no tokenizer", TOKENIZERS[1], PUBLISHED)
@@ -117,16 +122,19 @@ def find_clip(folder: str | Path) -> ClipFiles:
     return ClipFiles(visual, textual, tokenizer, *numbers, layout, rules, logits)
 
 
-def _find_graphs(folder: Path) -> tuple[str, Path, Path]:
+def _find_graphs(folder: Path, precision: Precision | None) -> tuple[str, Path, Path]:
     """Returns the layout, the graph of images and the graph of texts."""
-    for layout, names in LAYOUTS.items():
-        present = [name for name in names if (folder / name).is_file()]
-        if len(present) == 1:
-            expected = f"{' and '.join(names)}, the layout of {layout}"
-            problem = f"{present[0]} without its other half"
+    for layout, plain in LAYOUTS.items():
+        halves = []
+        for names in graph_variants(plain, precision):
+            present = [name for name in names if (folder / name).is_file()]
+            if len(present) == 2:
+                return layout, folder / names[0], folder / names[1]
+            halves += present
+        if halves:
+            expected = f"{' and '.join(plain)}, the layout of {layout}"
+            problem = f"{halves[0]} without its other half"
             raise InputError(folder, problem, expected, f"Fetch the missing file. {PUBLISHED}")
-        if present:
-            return layout, folder / names[0], folder / names[1]
     graphs = {path: Graph(path, threads=1, optimise=False) for path in sorted(folder.glob("*.onnx"))}
     visual = [path for path, graph in graphs.items() if _is_visual(graph)]
     textual = [path for path, graph in graphs.items() if _is_textual(graph)]

@@ -20,13 +20,29 @@ from typing import Any, Literal
 from jsecon.errors import InputError, describe_error
 
 Role = Literal["embedder", "segmenter", "tracker", "phrases"]
-Precision = Literal["fp32", "fp16", "int8"]
 
+Precision = Literal["fp32", "fp16", "int8"]
+"""numbers that a graph computes with"""
 SUFFIXES: Mapping[Precision, str] = {"fp32": "", "fp16": "_fp16", "int8": "_quantized"}
 """precision -> what public exports append to the name of a graph"""
 PREFIX = "hub:"
 CHUNK = 1 << 20
 """bytes that are hashed at once"""
+
+
+def graph_variants(names: Sequence[str], precision: Precision | None = None) -> Iterator[tuple[str, ...]]:
+    """Yields the names of graphs in one precision after the other.
+
+    Args:
+      names: Names of the graphs in full precision, such as onnx/vision_model.onnx.
+      precision: The only precision to yield; None yields all, full precision first.
+    """
+    for suffix in SUFFIXES.values() if precision is None else (SUFFIXES[precision],):
+        yield tuple(name.removesuffix(".onnx") + f"{suffix}.onnx" for name in names)
+
+
+class NoSuchFilesError(InputError):
+    """A repository has none of the layouts of a role."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +239,7 @@ def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:
       Their paths, sorted.
 
     Raises:
-      InputError: The repository has none of the layouts that jsecon reads.
+      NoSuchFilesError: The repository has none of the layouts that jsecon reads.
     """
     known = set(paths)
     missing = []
@@ -237,7 +253,7 @@ def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:
     fewest = min(missing, key=len)
     problem = f"no {model.role} of {model.precision} that jsecon reads: {', '.join(fewest)} missing"
     remedy = f"Choose another repository or --precision. `jsecon models list` has {model.role} models that work."
-    raise InputError(model.address, problem, "", remedy)
+    raise NoSuchFilesError(model.address, problem, "", remedy)
 
 
 def cached_folder(model: HubModel) -> Path | None:
@@ -259,7 +275,7 @@ def cached_folder(model: HubModel) -> Path | None:
             folder = snapshot_download(
                 model.repository, revision=model.revision, local_files_only=True, allow_patterns=patterns
             )
-        except LocalEntryNotFoundError:
+        except (LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
             continue
         if all((Path(folder) / name).is_file() for name in required):
             return Path(folder)
@@ -348,11 +364,13 @@ def content_hash(path: Path, like: str) -> str:
     return digest.hexdigest()
 
 
-def cached_commit(folder: Path) -> str | None:
-    """Returns the commit of a folder in the hub's cache, or None for every other folder."""
+def cached_address(folder: Path) -> str | None:
+    """Returns "hub:owner/name@commit" for a folder in the hub's cache, or None for every other folder."""
     parts = folder.absolute().parts
     inside = len(parts) > 2 and parts[-2] == "snapshots" and parts[-3].startswith("models--")
-    return parts[-1] if inside else None
+    if not inside:
+        return None
+    return f"{PREFIX}{parts[-3].removeprefix('models--').replace('--', '/')}@{parts[-1]}"
 
 
 def remove(model: HubModel) -> int:
@@ -364,11 +382,11 @@ def remove(model: HubModel) -> int:
     Returns:
       Bytes that were freed; 0 if it was not there.
     """
-    from huggingface_hub import scan_cache_dir
+    from huggingface_hub import constants, scan_cache_dir
     from huggingface_hub.errors import CacheNotFound
 
     try:
-        cache = scan_cache_dir()
+        cache = scan_cache_dir(constants.HF_HUB_CACHE)
     except CacheNotFound:
         return 0
     commits = [
@@ -406,7 +424,7 @@ def get_command(model: HubModel) -> str:
     named = [row for row in catalogue() if row.repository == model.repository and row.role == model.role]
     name = named[0].name if named and model.revision == named[0].revision else model.address
     precision = "" if model.precision == "fp32" else f" --precision {model.precision}"
-    return f"jsecon models get {name} --role {model.role}{precision}"
+    return f"jsecon models get {name} --role {model.role}{precision} --yes"
 
 
 @contextlib.contextmanager

@@ -30,6 +30,7 @@ from scipy import sparse
 
 from jsecon.errors import InputError, require
 from jsecon.networks.clip import read_preprocessing
+from jsecon.networks.hub import Precision, graph_variants
 from jsecon.networks.session import Graph, batches, content_digest, describe, graph_files
 
 MEAN_STD = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
@@ -76,19 +77,27 @@ class SamFiles:
         return content_digest([*graph_files(self.encoder), *graph_files(self.decoder)], extra=settings)
 
 
-def find_sam(folder: str | Path) -> SamFiles:
+def find_sam(folder: str | Path, precision: Precision | None = None) -> SamFiles:
     """Finds the graphs of the SAM model in a folder, or in its subfolder `onnx`.
+
+    Args:
+      folder: The folder.
+      precision: Precision of its graphs; None takes the highest that is there.
 
     Raises:
       InputError: A graph is missing, or the configuration cannot be read.
     """
     folder = Path(folder)
-    place = next((p for p in (folder, folder / "onnx") if (p / ENCODER).is_file() and (p / DECODER).is_file()), None)
-    if place is None:
+    pairs = [
+        SamFiles(place / encoder, place / decoder)
+        for encoder, decoder in graph_variants((ENCODER, DECODER), precision)
+        for place in (folder, folder / "onnx")
+    ]
+    files = next((pair for pair in pairs if pair.encoder.is_file() and pair.decoder.is_file()), None)
+    if files is None:
         graphs = [path for p in (folder, folder / "onnx") if p.is_dir() for path in sorted(p.glob("*.onnx"))]
         problem = ", ".join(str(path.relative_to(folder)) for path in graphs) or "no .onnx file"
         raise InputError(folder, problem, f"SAM's graphs {ENCODER} and {DECODER}", PUBLISHED)
-    files = SamFiles(place / ENCODER, place / DECODER)
     if not (folder / CONFIG).is_file():
         return files
     mean, std, side = read_preprocessing(folder / CONFIG, complete=True)

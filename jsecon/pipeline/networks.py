@@ -3,18 +3,23 @@
 Networks are opened when first needed and closed when their stage is done, to free their memory.
 """
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 from jsecon.errors import InputError
+from jsecon.networks.hub import HubModel, cached_folder, get_command, parse_model
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import locate_sources
+from jsecon.pipeline.sources import Sources, locate_sources
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Networks
 from jsecon.vision.stores import StoredSegmenter
+
+if TYPE_CHECKING:
+    from jsecon.networks.clip import ClipFiles
 
 _EXTERNAL = "given-"
 """prefix of the names of external spaces, as fields hold them"""
@@ -66,11 +71,12 @@ def open_networks(options: Options, store: Path) -> Networks:
     """
     segmenter = tracker = None
     if options.segmenter is not None:
-        from jsecon.networks.sam import SamSegmenter, SamSettings
+        from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 
         level, side, layers = options.level, options.points_per_side, options.crop_layers
         settings = SamSettings(level=level, points_per_side=side, crop_layers=layers)
-        segmenter = StoredSegmenter(SamSegmenter(options.segmenter, settings), store / "proposals")
+        files = find_sam(options.segmenter, options.precision)
+        segmenter = StoredSegmenter(SamSegmenter(files, settings), store / "proposals")
     if options.tracker is not None:
         from jsecon.networks.sam2 import Sam2Tracker
 
@@ -83,13 +89,18 @@ def open_networks(options: Options, store: Path) -> Networks:
         if options.embedder is None:
             return Networks(external, segmenter, tracker)
     name = None if external is None else external.name
-    return Networks(open_embedder(name, folder=options.embedder, store=store / "embeddings"), segmenter, tracker)
+    model = None
+    if options.embedder is not None:
+        from jsecon.networks.clip import find_clip
+
+        model = find_clip(options.embedder, options.precision)
+    return Networks(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
 
 
 def open_embedder(
     name: str | None = None,
     *,
-    folder: Path | None = None,
+    folder: "Path | ClipFiles | None" = None,
     templates: Sequence[str] = ("{}",),
     store: Path | None = None,
 ) -> Embedder:
@@ -132,19 +143,53 @@ def open_embedder(
 
 
 def field_embedder(field: LanguageField, folder: Path | None = None, *, templates: Sequence[str] = ("{}",)) -> Embedder:
-    """The embedder that a field's regions live with: from `folder`, else from where the run had it, if the same model
-    is still there (`locate_sources`). Raises InputError where it cannot be had."""
+    """Opens the embedder that a field's regions were embedded by.
+
+    Args:
+      field: The field.
+      folder: Folder of the model; None looks where the run had it and in the hub's cache, and takes it only if its
+        content is the same.
+      templates: Phrases for the texts, with CLIP.
+
+    Returns:
+      The embedder.
+
+    Raises:
+      InputError: The model is not on this machine, or is another one.
+    """
+    model: Path | ClipFiles | None = folder
     if folder is None:
         sources = locate_sources(field)
-        folder = sources.model if sources.model is not None and _holds(sources.model, sources.embedder) else None
-    return open_embedder(field.embedder, folder=folder, templates=templates)
+        model = _model_of_field(sources)
+        if model is None and (missing := _hub_model(sources)) is not None:
+            problem = f"its texts need the model {missing.address}, which is not on this machine"
+            raise InputError("field", problem, "", f"Fetch it with: {get_command(missing)}. Or add --yes.")
+    return open_embedder(field.embedder, folder=model, templates=templates)
 
 
-def _holds(folder: Path, name: str | None) -> bool:
-    """Whether a folder holds the CLIP model of this name, which follows from the content of its files."""
+def missing_model_of_field(field: LanguageField) -> HubModel | None:
+    """Returns the model of the hub that a field needs and that is not on this machine, or None."""
+    sources = locate_sources(field)
+    return None if _model_of_field(sources) is not None else _hub_model(sources)
+
+
+def _hub_model(sources: Sources) -> HubModel | None:
+    """The model of the hub that a field was made with, or None if its model was a folder."""
+    model = None if sources.address is None else parse_model(sources.address, "embedder", sources.precision)
+    return model if isinstance(model, HubModel) else None
+
+
+def _model_of_field(sources: Sources) -> "ClipFiles | None":
+    """The CLIP model that a field was made with, in its folder or in the hub's cache; None if it is at neither."""
+    if not (sources.embedder or "").startswith("clip-"):
+        return None
     from jsecon.networks.clip import clip_name, find_clip
 
-    try:
-        return clip_name(find_clip(folder)) == name
-    except InputError:  # another thing lies there now: the model is as good as gone
-        return False
+    model = _hub_model(sources)
+    for folder in (sources.model, None if model is None else cached_folder(model)):
+        if folder is not None:
+            with contextlib.suppress(InputError):  # another model is there now
+                files = find_clip(folder, sources.precision)
+                if clip_name(files) == sources.embedder:
+                    return files
+    return None

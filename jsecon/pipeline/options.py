@@ -12,6 +12,7 @@ from typing import Annotated, Literal, TypeAlias, TypeVar
 import tyro
 
 from jsecon.errors import InputError, describe_error
+from jsecon.networks.hub import Precision
 
 T = TypeVar("T")
 
@@ -127,24 +128,30 @@ class ModelOptions:
     """Options of the models that take the place of colours.
 
     Attributes:
-      segmenter: Folder of a SAM model (.onnx) that finds the proposals, instead of colour and texture.
+      models: Takes the recommended models for those that are not named: EdgeTAM finds the masks, SigLIP 2 reads texts.
+      segmenter: SAM model that finds the proposals, instead of colour and texture: a name (edgetam, slimsam, sam2),
+        hub:owner/name of huggingface.co, or a folder. `jsecon models list` has sizes and licences.
       level: Level of SAM's proposals and of LangSplat's files: subparts (s), parts (m), wholes (l), or all (default).
       points_per_side: For SAM, number of points along each side of the grid of prompts.
       crop_layers: For SAM, number of layers of crops that are prompted too, 4^k crops in layer k. LangSplat uses 1,
         which takes five times longer.
-      tracker: Folder of a SAM 2 model (.onnx) that follows the proposals (Algorithm 1 of the paper), instead of
-        consensus.
-      embedder: Folder of a CLIP model (.onnx and tokenizer.json) for regions and texts, instead of colours.
+      tracker: SAM 2 model that follows the proposals (Algorithm 1 of the paper), instead of consensus: a name (sam2,
+        edgetam), hub:owner/name, or a folder.
+      embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
+        hub:owner/name, or a folder.
+      precision: Precision of the models' graphs. By default it is the one that is fastest on a CPU, fp32.
       features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
         texts then need the CLIP model that made them (--embedder, here or of query).
     """
 
+    models: Option[Literal["auto"] | None] = None
     segmenter: Option[Path | None] = None
     level: Option[Literal["default", "s", "m", "l"]] = "l"
     points_per_side: Option[int] = 32
     crop_layers: Option[int] = 0
     tracker: Option[Path | None] = None
     embedder: Option[Path | None] = None
+    precision: Option[Precision | None] = None
     features: Option[Path | None] = None
 
 

@@ -39,7 +39,7 @@ from jsecon.pipeline.options import Options, require_inputs, require_own_folder,
 from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
 from jsecon.pipeline.results import KEY_FILE, Checkpoint, Results, RunContext, Stage, StageInput, StageResult
-from jsecon.pipeline.sources import relative_folders
+from jsecon.pipeline.sources import hub_addresses, relative_folders
 from jsecon.process import compilation_counts
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
 from jsecon.vision.classical import require_contrib
@@ -371,5 +371,6 @@ def _since(before: dict[str, int]) -> dict[str, int]:
 def _provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
     """JSON of where a field comes from; `jsecon.pipeline.sources` reads "embedder" and "folders"."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    origin = {"jsecon": jsecon.__version__, "options": values, "keys": keys, "embedder": embedder}
-    return json.dumps(origin | {"folders": relative_folders(options, out)}, sort_keys=True)
+    origin = {"jsecon": jsecon.__version__, "options": values | hub_addresses(options), "keys": keys, "embedder": embedder}
+    places = {"folders": relative_folders(options, out), "models": hub_addresses(options)}
+    return json.dumps(origin | places, sort_keys=True)

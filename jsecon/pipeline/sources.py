@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from jsecon.errors import InputError
 from jsecon.files import parse_json
+from jsecon.networks.hub import SUFFIXES, Precision, cached_address
 from jsecon.pipeline.options import Options
 from jsecon.types import LanguageField
 
@@ -23,18 +24,30 @@ class Sources(NamedTuple):
     """its folder, if that still exists"""
     capture: Path | None
     """folder of the capture, if that still exists"""
+    address: str | None = None
+    """where the model is on the hub ("hub:owner/name@commit"), if the run took it from there"""
+    precision: Precision | None = None
+    """of its graphs; None for the default"""
 
 
 def relative_folders(options: Options, out: Path) -> dict[str, str]:
     """Returns the hints of a run: folders of options, relative to the output folder."""
     folders = {}
     for name in ("embedder", "capture"):
-        if (folder := getattr(options, name)) is not None:
+        folder = getattr(options, name)
+        if folder is not None and cached_address(folder) is None:
             try:
                 folders[name] = Path(os.path.relpath(os.path.realpath(folder), os.path.realpath(out))).as_posix()
             except ValueError:  # another drive of Windows: the user must name the folder again
                 continue
     return folders
+
+
+def hub_addresses(options: Options) -> dict[str, str]:
+    """The models of a run that come from the hub: option -> "hub:owner/name@commit"."""
+    folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
+    addresses = {name: cached_address(folder) for name, folder in folders.items() if folder is not None}
+    return {name: address for name, address in addresses.items() if address is not None}
 
 
 def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
@@ -52,14 +65,19 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
         provenance = parse_json(field.provenance or "{}")
     except ValueError:
         provenance = None
-    folders, name, options = (_entry(provenance, entry, kind) for entry, kind in _ENTRIES.items())
-    if None in (folders, name, options) or not all(isinstance(hint, str) for hint in folders.values()):
+    entries: list[Any] = [_entry(provenance, entry, kind) for entry, kind in _ENTRIES.items()]
+    folders, name, options, models = entries
+    hints = [] if None in entries else [*folders.values(), *models.values()]
+    if None in entries or not all(isinstance(hint, str) for hint in hints):
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy)
-    return Sources(name or None, *(_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture")))
+    precision = options.get("precision")
+    precision = precision if isinstance(precision, str) and precision in SUFFIXES else None
+    model, capture = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture"))
+    return Sources(name or None, model, capture, models.get("embedder"), precision)
 
 
-_ENTRIES: dict[str, type] = {"folders": dict, "embedder": str, "options": dict}
+_ENTRIES: dict[str, type] = {"folders": dict, "embedder": str, "options": dict, "models": dict}
 
 
 def _entry(provenance: Any, name: str, kind: type) -> Any:
