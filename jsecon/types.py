@@ -62,8 +62,9 @@ class Gaussians:
     """(N, 4) wxyz rotation of the Gaussian's axes into the world; any length but zero."""
     opacity_logits: Array
     """(N,) logit of the opacity."""
-    sh: Array
-    """(N, K, 3) spherical harmonics of colour, K in {1, 4, 9, 16}, degree by degree; rgb = 0.5 + sum, clamped at 0."""
+    sh: Leaf = None
+    """(N, K, 3) spherical harmonics of colour, K in {1, 4, 9, 16}, degree by degree; rgb = 0.5 + sum, clamped at 0.
+    None if only features are rendered."""
 
     @property
     def count(self) -> int:

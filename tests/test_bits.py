@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsecon.splat.bits import WORD, compact_tile_lists, tile_bits
+from jsecon.splat.tiles import WORD, compact_tile_lists, tile_bits
 
 
 @pytest.mark.parametrize(("words", "density"), [(1, 0.5), (7, 0.0), (7, 1.0), (40, 0.03), (2500, 0.25)])

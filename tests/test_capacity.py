@@ -98,7 +98,7 @@ def test_plans_and_votes_hold_what_exceeds_it(covering, cameras):
     for t in range(2):
         one = render_plan(jax.tree.map(lambda a, t=t: a[t], plans), features)
         np.testing.assert_allclose(one.features, render_reference(covering, pair[t], features)[0], atol=2e-4)
-    assert plan_views(covering, pair, most_bytes=1000) is None
+    assert plan_views(covering, pair, max_bytes=1000) is None
 
     labels = np.zeros((2, 40, 48), np.int32)
     votes = region_votes(covering, pair, labels, 1)

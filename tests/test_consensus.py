@@ -86,7 +86,7 @@ def test_a_frame_without_masks_says_nothing_or_that_nothing_belongs_together(wor
     half = scene_of(world, silent_half)
     views = half.all(frames)
     for silent, heard in ((True, 0.0), (False, 1.0)):
-        membership, visible, _ = mask_signatures(views, half.count, silent=silent)
+        membership, visible, _ = mask_signatures(views, half.count, abstain_if_unlabelled=silent)
         without = visible[:, ::2].toarray()
         assert without.max() == heard
         # A Gaussian agrees with itself wherever it is heard and lies whole in one mask.

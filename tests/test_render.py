@@ -1,5 +1,7 @@
 """Rendering against the brute-force float64 twin, its gradients against central differences, and its manners."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +57,20 @@ def test_shapes_that_disagree_raise(scene, camera, cameras):
         render(scene, camera, np.zeros((3, 2), np.float32))
     with pytest.raises(ValueError, match="single camera"):
         render(scene, cameras, random_features(scene.count, 2))
+
+
+def test_features_need_no_spherical_harmonics(scene, camera):
+    features = random_features(scene.count, 2)
+    bare = dataclasses.replace(scene, sh=None)
+    np.testing.assert_array_equal(render(bare, camera, features).features, render(scene, camera, features).features)
+    with pytest.raises(ValueError, match="sh"):
+        render_rgb(bare, camera)
+
+
+def test_forward_mode_is_refused(scene, camera):
+    features = random_features(scene.count, 2)
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jvp(lambda f: render(scene, camera, f).features, (features,), (features,))
 
 
 def squares(features, gaussians, camera):

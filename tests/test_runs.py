@@ -20,7 +20,7 @@ def test_masks_come_back(seed, count, share):
     again = encode_rows(runs.rows())
     for name in ("starts", "stops", "counts"):
         np.testing.assert_array_equal(getattr(again, name), getattr(runs, name))
-    both = runs.followed_by(encode_masks(~masks))
+    both = runs.concatenate(encode_masks(~masks))
     np.testing.assert_array_equal(both.masks(5, 7), np.concatenate([masks, ~masks]))
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from experiments.datasets.depth_points import labels_of_points
 from jsecon.errors import InputError
 from jsecon.fit.depth import points_from_depth, voxel_for
-from jsecon.fit.start import gaussians_from_points, neighbour_distances
+from jsecon.fit.start import gaussians_from_points, neighbour_distances, starting_gaussians
 from jsecon.splat.sh import C0
 from jsecon.types import Camera, Capture
 
@@ -152,3 +152,15 @@ def test_depth_points_need_depth():
         points_from_depth(dataclasses.replace(capture, depths=np.zeros_like(capture.depths)), voxel=0.1)
     with pytest.raises(ValueError, match="exactly one"):
         points_from_depth(capture)
+
+
+def test_a_start_takes_depth_before_sparse_points_and_says_so():
+    capture = wall_capture()
+    points = np.random.default_rng(0).standard_normal((60, 3)).astype(np.float32)
+    sparse = dataclasses.replace(capture, points=points, point_colors=np.zeros((60, 3), np.uint8))
+    start = starting_gaussians(sparse, sh_degree=1)
+    assert "depth frames" in start.origin
+    assert start.gaussians.sh.shape[1:] == (4, 3)
+    start = starting_gaussians(dataclasses.replace(sparse, depths=None))
+    assert start.origin == "60 sparse points of the capture"
+    np.testing.assert_array_equal(start.gaussians.means, points)

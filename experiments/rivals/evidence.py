@@ -67,7 +67,7 @@ def view_plans(evidence: Evidence) -> ViewPlan:
     """The plans of all views of the Gaussians `with_room`, stacked on a leading axis: the geometry is frozen, so each
     is made once."""
     gaussians, cameras = with_room(evidence.gaussians), jax.tree.map(jnp.asarray, evidence.cameras)
-    plans = plan_views(gaussians, cameras, most_bytes=sys.maxsize)
+    plans = plan_views(gaussians, cameras, max_bytes=sys.maxsize)
     assert plans is not None
     return plans
 

@@ -50,7 +50,7 @@ def association(
         return setting.tracked
     if labels is not None:
         return setting.shared.get(by, lambda: associated(setting.levels, labels))
-    how = {"silent": by != "outspoken", "centre": centre, "agreement": agreement}
+    how = {"abstain_if_unlabelled": by != "outspoken", "centre": centre, "agreement": agreement}
     make = lambda: by_consensus(setting.levels, setting.frames, seed=setting.seed, **how)
     return setting.shared.get((by, centre, agreement), make)
 

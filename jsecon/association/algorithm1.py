@@ -1,4 +1,4 @@
-"""Masklets: one identity an object through all frames (Algorithm 1 of the paper), over any segmenter and tracker."""
+"""Masklets by Algorithm 1 of the paper: one identity per object, from any segmenter and tracker. Host code."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,15 +17,15 @@ Progress = Callable[[int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class MaskletState:
-    """How far a sequence has come: all that `masklets` needs to go on in the middle of it. Arrays only."""
+    """State of `masklets` between two frames, to resume from."""
 
     done: int
-    """frames whose proposals were prompted and tracked."""
+    """Number of frames whose proposals were tracked."""
     proposals: dict[str, np.ndarray]
-    """masks of every frame: `rows` (T,) masks per frame; `counts`, `starts`, `stops` of their runs, as in
+    """Proposals of every frame: `rows` (T,) masks per frame; `counts`, `starts`, `stops` of their runs, as in
     `RunLengthMasks`."""
     layers: dict[str, np.ndarray]
-    """the same of what was tracked."""
+    """Tracked masks of every frame, in the same layout."""
 
 
 def masklets(
@@ -43,22 +43,37 @@ def masklets(
     on_checkpoint: Callable[[Callable[[], MaskletState]], None] | None = None,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
-    """Labels (T, H, W) int16 of the masklets of a sequence, -1 = none.
+    """Makes the masklets of a sequence by Algorithm 1 of the paper.
 
-    frames (T, H, W, 3) uint8. For each frame t in order, each proposal that fills at least `min_area` (share of the
-    frame) and whose IoU with every masklet's mask at t is at most `iou_threshold` (the paper's kappa; IoU taken at
-    frame t itself) becomes a prompt, and the frame's prompts are tracked through the whole sequence.
-    Proposals of one frame that repeat each other (IoU above kappa) count once, the better first. At most
-    `max_masklets`, the first found, are tracked. `progress(done, total)` counts frames.
+    For each frame t in order, a proposal becomes a prompt if it fills at least `min_area` of the frame and its IoU with
+    the mask of every masklet in frame t is at most `iou_threshold`. The prompts of a frame are tracked through the
+    whole sequence. Proposals of one frame that repeat each other count once, the better first.
 
-    Parts: of the frames that show two masklets, if more than `join_rate` hold both in one proposal, they are joined
-    (`joined`; 1 leaves that out). Overlaps: a masklet's support is the mean, over the frames that show it, of its best
-    IoU with that frame's proposals. A pixel belongs to the smallest masklet there (in mean area) whose support is at
-    least `min_support`, else to the best supported one. So what the segmenter finds again and again is cut out of what
-    surrounds it, and a fragment or a merger that it found once gives way. Last, `clean_masklets`.
+    Parts: two masklets are joined if more than `join_rate` of the frames that show both have a proposal that contains
+    both (`joined`). Overlaps: the support of a masklet is its mean best IoU with the proposals of the frames that show
+    it. A pixel belongs to the smallest masklet (in mean area) with a support of at least `min_support`, else to the
+    best supported. So objects that are proposed repeatedly are cut out of their surroundings, and single fragments and
+    mergers have no influence. Finally `clean_masklets` is applied.
 
-    `on_checkpoint` gets, after each frame, a function that makes the state (of the size of all masks: not for nothing);
-    given back as `state`, with the same frames and options, the sequence goes on behind that frame to the same result.
+    Args:
+      frames: (T, H, W, 3) uint8 RGB.
+      segment: Proposes masks of a frame.
+      track: Follows masks through all frames.
+      iou_threshold: The paper's kappa.
+      min_area: Least area of a proposal, as a share of the frame.
+      max_masklets: Maximum number of tracked prompts.
+      min_views: As for `clean_masklets`.
+      min_support: See above.
+      join_rate: See above; 1 joins no masklets.
+      state: State of a stopped call with the same frames and options, to resume after its last frame.
+      on_checkpoint: Called after each frame with a function that makes the state, which has the size of all masks.
+      progress: Called with the number of frames done and of all.
+
+    Returns:
+      (T, H, W) int16 labels, -1 for no masklet.
+
+    Raises:
+      ValueError: Frames, masks or labels have a wrong shape, or the state is of another sequence.
     """
     rgb = frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8
     require(rgb, "frames", (frames.shape, frames.dtype), "(T, H, W, 3) uint8", "Stack RGB frames of one size.")
@@ -66,13 +81,13 @@ def masklets(
     proposals, layers = _Layers(count, height, width), _Layers(count, height, width)
     if state is not None:
         done, known = state.done, len(state.layers["rows"])
-        fits, remedy = known == count and 0 <= done <= count, "Give the state of this sequence, or none."
+        fits, remedy = known == count and 0 <= done <= count, "Pass the state of this sequence, or no state."
         require(fits, "state", f"{done} of {known} frames", f"a state of {count} frames", remedy)
         proposals.restore(state.proposals)
         layers.restore(state.layers)
     for t in range(0 if state is None else state.done, count):
         masks = np.asarray(segment(frames[t], t), bool)
-        require_shape("segment", masks, ("M", height, width), "A segmenter returns masks of the frame's own size.")
+        require_shape("segment", masks, ("M", height, width), "A segmenter returns masks of the size of the frame.")
         masks = masks[masks.sum((1, 2)) >= max(min_area * height * width, 1)]
         proposals.add_masks(t, masks)
         prompts = masks[_new(proposals.at(t), layers.at(t), iou_threshold)[: max(max_masklets - layers.size(t), 0)]]
@@ -93,11 +108,19 @@ def masklets(
 
 
 def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tuple["_Layers", np.ndarray, np.ndarray]:
-    """The masklets with the parts of one object joined, their mean area (R,) px and their support (R,).
+    """Joins masklets that are parts of one object.
 
-    Two masklets count as one object in a frame if some proposal there covers more than half of each; they are joined,
-    the most agreed pairs first, where that holds in more than `join_rate` of the frames (two at least) that show both:
-    the view consensus of mask clustering (Yan et al., CVPR 2024), between tracks instead of single masks.
+    Two masklets are one object in a frame if a proposal there covers more than half of each. They are joined if that
+    holds in more than `join_rate` of the frames (at least two) that show both, best pairs first: view consensus (Yan et
+    al., CVPR 2024) between tracks instead of single masks.
+
+    Args:
+      layers: Masklets of all frames.
+      proposals: Proposals of all frames.
+      join_rate: Share of frames.
+
+    Returns:
+      The joined masklets, their mean areas (R,) in px and their support (R,).
     """
     tables: list[tuple[np.ndarray, ...]] = [_overlaps(layers.at(t), proposals.at(t)) for t in range(layers.count)]
     while True:
@@ -109,7 +132,7 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
         rows, columns = np.nonzero(np.triu(rate > join_rate))
         for k in np.lexsort((-both[rows, columns], -rate[rows, columns])):
             a, b = rows[k], columns[k]
-            if free[a] and free[b]:  # one join a round: the next round counts anew with the union
+            if free[a] and free[b]:  # one join per round: the next round counts again with the union
                 groups[b] = a
                 free[a] = free[b] = False
         if np.array_equal(groups, np.arange(len(rate))):
@@ -117,10 +140,10 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
         layers = layers.grouped(groups)
         _, first, members = np.unique(groups, return_index=True, return_counts=True)
         united = np.flatnonzero(members > 1)
-        for t, table in enumerate(tables):  # the others' rows stay what they were
+        for t, table in enumerate(tables):  # rows of the other masklets stay the same
             tables[t] = tuple(rows[first] for rows in table)
-            for rows, own in zip(tables[t], _overlaps(layers.at(t)[united], proposals.at(t))):
-                rows[united] = own
+            for rows, new in zip(tables[t], _overlaps(layers.at(t)[united], proposals.at(t))):
+                rows[united] = new
 
 
 def _agreement(tables: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -140,7 +163,7 @@ def _agreement(tables: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.nda
 
 
 def iou_matrix(first: Bool[np.ndarray, "a p"], second: Bool[np.ndarray, "b p"]) -> Float[np.ndarray, "a b"]:
-    """(A, P) and (B, P) bool masks over P pixels -> (A, B) intersection over union; 0 where both are empty."""
+    """Computes the IoU (A, B) of masks (A, P) and (B, P) over P pixels; 0 if both are empty."""
     return _overlaps(sparse.csr_matrix(first, dtype=np.float32), sparse.csr_matrix(second, dtype=np.float32))[2]
 
 
@@ -154,9 +177,15 @@ def _overlaps(first: Sparse, second: Sparse) -> tuple[np.ndarray, np.ndarray, np
 def clean_masklets(
     labels: Int[np.ndarray, "t h w"], *, min_area: float = 0.001, min_views: int = 2
 ) -> Int16[np.ndarray, "t h w"]:
-    """labels (T, H, W) -> int16 labels without the masklets that fewer than `min_views` frames show, renumbered.
+    """Removes masklets that few frames show, and renumbers the others.
 
-    A frame shows a masklet where it fills at least `min_area` of it; a smaller remnant is removed from that frame.
+    Args:
+      labels: (T, H, W) labels, -1 for no masklet.
+      min_area: Share of a frame below which a masklet is removed from it.
+      min_views: Least number of frames that show a masklet.
+
+    Returns:
+      (T, H, W) int16 labels, in order of first appearance.
     """
     count = int(labels.max(initial=-1)) + 1
     if count == 0:
@@ -166,25 +195,25 @@ def clean_masklets(
     kept = shown.sum(0) >= min_views
     first = np.where(kept, shown.argmax(0), len(labels))
     order = np.lexsort((np.arange(count), first))[: kept.sum()]
-    number = np.full(count + 1, -1, np.int16)  # the last entry answers for label -1
+    number = np.full(count + 1, -1, np.int16)  # the last entry is for label -1
     number[order] = np.arange(len(order))
     table = np.where(np.concatenate([shown, np.zeros((len(labels), 1), bool)], 1), number, -1).astype(np.int16)
     return np.stack([row[image] for row, image in zip(table, labels)])
 
 
 def _new(masks: Sparse, known: Sparse, threshold: float) -> np.ndarray:
-    """Rows (K,) of masks (M, P) whose IoU with all `known`, and with the better masks taken, is at most `threshold`."""
+    """Rows (K,) of masks (M, P) whose IoU with all `known` and with all better chosen masks is at most `threshold`."""
     free = _overlaps(masks, known)[2].max(1, initial=0.0) <= threshold
     among = _overlaps(masks, masks)[2]
-    taken: list[int] = []
+    chosen: list[int] = []
     for m in np.flatnonzero(free):
-        if all(among[m, other] <= threshold for other in taken):
-            taken.append(int(m))
-    return np.asarray(taken, np.int64)
+        if all(among[m, other] <= threshold for other in chosen):
+            chosen.append(int(m))
+    return np.asarray(chosen, np.int64)
 
 
 class _Layers:
-    """Masks of many things in every frame, free to overlap, kept as runs of pixels."""
+    """Masks of many objects in every frame, which may overlap, in run-length encoding."""
 
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
@@ -200,14 +229,14 @@ class _Layers:
 
     def add_masks(self, t: int, masks: np.ndarray) -> None:
         """Appends masks (M, H, W) bool to frame t."""
-        self._runs[t] = self._runs[t].followed_by(encode_masks(masks))
+        self._runs[t] = self._runs[t].concatenate(encode_masks(masks))
 
     def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
         """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
         pixels = np.flatnonzero((labels >= 0) & (labels < number))
         ones = np.ones(len(pixels), np.float32)
         rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
-        self._runs[t] = self._runs[t].followed_by(encode_rows(rows))
+        self._runs[t] = self._runs[t].concatenate(encode_rows(rows))
 
     def record(self) -> dict[str, np.ndarray]:
         """All masks as plain arrays (see MaskletState)."""
@@ -216,15 +245,15 @@ class _Layers:
         }
 
     def restore(self, record: dict[str, np.ndarray]) -> None:
-        """Takes back what `record` gave."""
+        """Restores the masks from the result of `record`."""
         counts = np.split(record["counts"], np.cumsum(record["rows"])[:-1])
-        places = np.cumsum([own.sum() for own in counts])[:-1]
+        places = np.cumsum([part.sum() for part in counts])[:-1]
         starts, stops = (np.split(record[name], places) for name in ("starts", "stops"))
         pixels = self.shape[0] * self.shape[1]
         self._runs = [RunLengthMasks(*frame, pixels) for frame in zip(starts, stops, counts)]
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
-        """The layers with those of one group (R,) united, in the order of the groups."""
+        """Unites the masks of each group (R,), in the order of the groups."""
         names, number = np.unique(groups, return_inverse=True)
         unite = one_hot(number, len(names)).T.tocsr()
         result = _Layers(self.count, *self.shape)

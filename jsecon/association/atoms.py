@@ -1,4 +1,4 @@
-"""Atoms: small regions of one frame, cut along its edges and its proposals, and the weight cast on each of them."""
+"""Atoms: superpixels of a frame, cut along its edges and its proposals, and the votes of Gaussians on them."""
 
 import functools
 from typing import Any, TypeAlias
@@ -21,20 +21,26 @@ from jsecon.vision.region_graph import relabel_sequential
 from jsecon.vision.surfaces import fill_nearest
 
 Sparse: TypeAlias = Any
-"""scipy.sparse.csr_matrix, of which type checkers know too little"""
+"""scipy.sparse.csr_matrix, which type checkers cannot resolve."""
 MIN_ATOM_PX = 12
-"""px: smaller pieces are taken for slivers along an edge"""
+"""Least size in px; smaller pieces are slivers along an edge."""
 _SLOTS = 8
-"""labels of a tile that one walk counts; few tiles of 8x8 pixels show more, and then the view is walked again"""
+"""Number of labels of a tile counted by one walk; for the few tiles of 8x8 pixels with more, the view is walked
+again."""
 
 
 def image_atoms(
     frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], *, count: int
 ) -> Int32[np.ndarray, "h w"]:
-    """About `count` superpixels (SLICO, Achanta et al. 2012) of a frame, cut by the masks' outlines.
+    """Segments a frame into superpixels (SLICO, Achanta et al. 2012) that are cut along the outlines of masks.
 
-    frame (H, W, 3) uint8, masks (M, H, W) bool -> (H, W) int32 labels 0 .. A-1; pieces under SMALLEST pixels go to
-    the nearest other piece.
+    Args:
+      frame: (H, W, 3) uint8 RGB.
+      masks: (M, H, W) bool.
+      count: Approximate number of superpixels before the cut.
+
+    Returns:
+      (H, W) int32 labels 0 .. A-1; pieces below MIN_ATOM_PX pixels join the nearest other piece.
     """
     lab = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2LAB)
     size = max(round(float(np.sqrt(frame.shape[0] * frame.shape[1] / count))), 4)
@@ -52,26 +58,26 @@ def image_atoms(
 def atom_coverage(
     atoms: Int32[np.ndarray, "h w"], masks: Bool[np.ndarray, "m h w"], count: int
 ) -> Float32[np.ndarray, "m a"]:
-    """(M, A) float32 share of each atom's pixels that lie in each mask."""
+    """Returns (M, A) float32 the share of the pixels of each atom, of `count`, that lie in each mask."""
     area = np.bincount(atoms.reshape(-1), minlength=count)
     inside = [np.bincount(atoms[mask], minlength=count) for mask in masks]
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
 
 
 def sum_entries(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
-    """The matrix of all entries, each (values, rows, columns); what repeats is added up."""
+    """Builds a sparse matrix from parts (values, rows, columns); repeated entries are added up."""
     values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
     return sparse.csr_matrix((values, (rows, columns)), shape=shape)
 
 
 def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
-    """(A, R) float32 ones where a row carries a label 0 .. R-1, R = `count`; -1 = none."""
+    """Encodes labels (A,), -1 for no label, as a sparse matrix (A, `count`) of float32 ones."""
     rows = np.flatnonzero(labels >= 0)
     return sparse.csr_matrix((np.ones(len(rows), np.float32), (rows, labels[rows])), shape=(len(labels), count))
 
 
 def label_shares(atoms: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
-    """(A, R) float32 share of each atom's pixels that carry each label."""
+    """Returns a sparse matrix (`rows`, `columns`): the share of the pixels of each atom that carry each label."""
     inside = labels >= 0
     weights = 1.0 / np.bincount(atoms.reshape(-1), minlength=rows)[atoms[inside]]
     return sparse.csr_matrix((weights.astype(np.float32), (atoms[inside], labels[inside])), shape=(rows, columns))
@@ -85,12 +91,20 @@ def atom_votes(
     negligible: float = 0.005,
     centre: float = 0.0,
 ) -> Sparse:
-    """(N, A) sum of alpha T of each Gaussian over each atom's pixels, without what is a `negligible` share of its row;
-    `centre` as for `region_votes`.
+    """Adds up the rendering weights alpha T of each Gaussian on each atom of one view. Host code.
 
-    `region_votes` of one view, where regions are many and a Gaussian sees few of them: every pair of a tile and a
-    Gaussian keeps its own sums over the tile's atoms, and a dense (N, A) never exists. One program for any number of
-    atoms.
+    Unlike `region_votes` it suits many regions of which a Gaussian touches few: sums are kept per pair of a tile and a
+    Gaussian, without a dense (N, A) array, and one program serves any number of atoms.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      camera: Camera of the view.
+      atoms: (H, W) int32 atoms 0 .. A-1.
+      negligible: Share of the total of a Gaussian up to which entries are removed.
+      centre: As for `region_votes`.
+
+    Returns:
+      Sparse matrix (N, A).
     """
     plan = plan_view(gaussians, camera)
     lists = plan.lists
@@ -100,14 +114,14 @@ def atom_votes(
     distinct = np.asarray(_distinct_atoms(atoms, lists.tile))
     entries = []
     for first in range(0, max(int((distinct >= 0).sum(1).max()), 1), _SLOTS):
-        cast = np.asarray(_cast_by_pair(plan, atoms, first, centre))[places]
-        pair, slot = np.nonzero(cast)
-        entries.append((cast[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
-    cast = sum_entries(entries, (gaussians.count, int(atoms.max()) + 1))
-    total = np.repeat(np.asarray(cast.sum(1)).ravel(), np.diff(cast.indptr))
-    cast.data[cast.data <= negligible * total] = 0.0
-    cast.eliminate_zeros()
-    return cast
+        sums = np.asarray(_sums_by_pair(plan, atoms, first, centre))[places]
+        pair, slot = np.nonzero(sums)
+        entries.append((sums[pair, slot], ids[places[pair]], distinct[tile_of_pair[pair], first + slot]))
+    votes = sum_entries(entries, (gaussians.count, int(atoms.max()) + 1))
+    total = np.repeat(np.asarray(votes.sum(1)).ravel(), np.diff(votes.indptr))
+    votes.data[votes.data <= negligible * total] = 0.0
+    votes.eliminate_zeros()
+    return votes
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -116,27 +130,27 @@ def _distinct_atoms(atoms: Array, tile: int) -> Array:
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _cast_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: float) -> Array:
-    """(pairs, _SLOTS) what each pair of the tiles' lists, in their order, casts on its tile's distinct atoms `first`,
-    `first` + 1, ..."""
+def _sums_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: float) -> Array:
+    """(pairs, _SLOTS) weight of each pair of the tile lists on the distinct atoms `first`, `first` + 1, ... of its
+    tile."""
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, plan.width)
     tiles = to_tiles(atoms + 1, lists.tile) - 1
     slots = lax.dynamic_slice_in_dim(distinct_labels(tiles, _SLOTS), first, _SLOTS, axis=1)
     table = make_table(splats)
 
-    def one_batch(cast, ids_of_tiles):
+    def one_batch(sums, ids_of_tiles):
         is_slot = tiles[ids_of_tiles][:, :, None] == slots[ids_of_tiles][:, None, :]
         corners = batches.corners(ids_of_tiles, splats.dtype)
 
-        def body(transmittance, cast, chunk):
+        def body(transmittance, sums, chunk):
             weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             if centre:
                 weight = weight * (1 - centre + centre * at_centre(chunk.attributes, corners, lists.tile))
-            own = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype), precision=FULL_PRECISION)
-            return transmittance, cast.at[chunk.places].set(own, mode="drop")
+            rows = jnp.einsum("bcp,bps->bcs", weight, is_slot.astype(splats.dtype), precision=FULL_PRECISION)
+            return transmittance, sums.at[chunk.places].set(rows, mode="drop")
 
-        return walk(table, lists, batches, ids_of_tiles, body, cast)[0], None
+        return walk(table, lists, batches, ids_of_tiles, body, sums)[0], None
 
     empty = jnp.zeros((lists.gaussians.shape[0], _SLOTS), splats.dtype)
     return lax.scan(one_batch, empty, batches.tiles)[0]

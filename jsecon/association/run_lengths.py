@@ -1,4 +1,4 @@
-"""Masks in little memory: the runs of pixels that they are made of, some hundred numbers per mask and not an image."""
+"""Run-length encoding of masks: some hundred numbers per mask instead of an image. Host code (NumPy)."""
 
 import dataclasses
 import functools
@@ -13,19 +13,19 @@ from jsecon.association.atoms import Sparse
 
 @dataclasses.dataclass(frozen=True)
 class RunLengthMasks:
-    """R masks over P pixels, free to overlap. Arrays only."""
+    """R masks over P pixels, which may overlap."""
 
     starts: np.ndarray
     """(K,) int32 first pixel of each run, ascending within a mask."""
     stops: np.ndarray
-    """(K,) int32 the pixel behind its last."""
+    """(K,) int32 pixel after the last of each run."""
     counts: np.ndarray
-    """(R,) int32 runs of each mask."""
+    """(R,) int32 number of runs of each mask."""
     pixels: int
-    """P."""
+    """P, pixels of an image."""
 
     def rows(self) -> Sparse:
-        """(R, P) float32 ones."""
+        """Returns the masks as a sparse matrix (R, P) of float32 ones."""
         lengths = (self.stops - self.starts).astype(np.int64)
         ends = np.concatenate([[0], np.cumsum(lengths)])
         columns = np.arange(ends[-1]) + np.repeat(self.starts - ends[:-1], lengths)
@@ -34,17 +34,17 @@ class RunLengthMasks:
         return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
 
     def masks(self, height: int, width: int) -> Bool[np.ndarray, "r h w"]:
-        """(R, H, W) bool, where P = H W."""
+        """Returns the masks as an array (R, H, W) bool, where P = H W."""
         return self.rows().astype(bool).toarray().reshape(len(self.counts), height, width)
 
-    def followed_by(self, others: "RunLengthMasks") -> "RunLengthMasks":
-        """These masks and then the others, over the same pixels."""
+    def concatenate(self, others: "RunLengthMasks") -> "RunLengthMasks":
+        """Appends other masks over the same pixels."""
         starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
         return RunLengthMasks(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
 
 
 def encode_rows(rows: Sparse) -> RunLengthMasks:
-    """Runs of the nonzeros of a csr_matrix (R, P) with sorted indices."""
+    """Encodes the nonzeros of a csr_matrix (R, P) with sorted indices."""
     new = np.ones(rows.nnz, bool)
     new[1:] = np.diff(rows.indices) != 1
     new[rows.indptr[:-1][np.diff(rows.indptr) > 0]] = True
@@ -56,20 +56,27 @@ def encode_rows(rows: Sparse) -> RunLengthMasks:
 
 
 def encode_masks(masks: Bool[np.ndarray, "r h w"]) -> RunLengthMasks:
-    """Runs of masks (R, H, W), P = H W."""
+    """Encodes masks (R, H, W) bool, P = H W."""
     return encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
 
 
 def memoized_masks(propose: Callable[[int], Bool[np.ndarray, "m h w"]]) -> Callable[[int], Bool[np.ndarray, "m h w"]]:
-    """`propose`, a function of a frame's index, asked once a frame: its masks are kept as runs."""
+    """Memoizes a function from the index of a frame to its masks, in run-length encoding.
+
+    Args:
+      propose: Maps an index to masks (M, H, W) bool.
+
+    Returns:
+      The function with memory, which calls `propose` once per index.
+    """
 
     @functools.cache
-    def kept(index: int) -> tuple[RunLengthMasks, tuple[int, int]]:
+    def encoded(index: int) -> tuple[RunLengthMasks, tuple[int, int]]:
         masks = propose(index)
         return encode_masks(masks), masks.shape[1:]
 
     def masks_of(index: int) -> Bool[np.ndarray, "m h w"]:
-        runs, size = kept(index)
+        runs, size = encoded(index)
         return runs.masks(*size)
 
     return masks_of

@@ -1,5 +1,7 @@
-"""A tracker without any weights: masks followed through the scene's own Gaussians, whose votes on the frames' atoms
-(jsecon.association.views) lift a mask and render it into the other frames."""
+"""A tracker without a network: it follows masks through the Gaussians of the scene. Host code.
+
+The votes of the Gaussians on the atoms of the frames (views.py) lift a mask and render it into other frames.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -13,16 +15,19 @@ from jsecon.types import Camera, Gaussians
 
 
 class GeometricTracker:
-    """Tracker (jsecon.vision.protocols) through the Gaussians of the scene itself.
+    """Tracker (jsecon.vision.protocols) through the Gaussians of the scene.
 
-    gaussians, cameras, proposals: see `SceneViews`.
+    Prompts are tracked against rivals: the other proposals of their frame, and the rest of it. From that frame the
+    track proceeds to the frame with the largest overlap with a visited one. Every frame adds evidence e_ib, the weight
+    of Gaussian i on the masks of class b; ownership is e_ib^2 / sum_b e_ib^2. In the next frame the classes claim atoms
+    (`claim_atoms`). Occlusion is that of the compositing of the full scene. A Gaussian counts as known in proportion to
+    its clarity in the visited frames, fully from half of its clarity in the present frame.
 
-    The prompts are tracked against their rivals: the other proposals of their frame, and the rest of it. From that
-    frame the track goes outward, always on to the frame that shares the most with one already visited, and every frame
-    adds what it shows: evidence e_ib, the weight that Gaussian i casts on the masks of b; ownership is e_ib^2 / sum_b
-    e_ib^2. In the next frame the atoms are claimed (`claim_atoms`). Occlusion is that of the full scene's compositing.
-    A Gaussian counts as known in proportion to the best look that a visited frame had of it, in full from half of
-    what the frame at hand sees.
+    Args:
+      gaussians: As for `SceneViews`.
+      cameras: As for `SceneViews`.
+      proposals: As for `SceneViews`.
+      atoms_per_frame: As for `SceneViews`.
     """
 
     def __init__(
@@ -38,12 +43,21 @@ class GeometricTracker:
     def __call__(
         self, frames: UInt8[np.ndarray, "t h w 3"], index: int, prompts: Bool[np.ndarray, "b _ _"]
     ) -> Int16[np.ndarray, "t h w"]:
-        """frames (T, H, W, 3) uint8, masks `prompts` (B, H, W) bool of frame `index` -> labels (T, H, W) int16.
+        """Tracks the masks of one frame through all frames.
 
-        The labels at `index` are the prompts themselves (the earlier one where they overlap).
+        Args:
+          frames: (T, H, W, 3) uint8 RGB.
+          index: Frame of the prompts.
+          prompts: (B, H, W) bool masks.
+
+        Returns:
+          (T, H, W) int16 index of a prompt, -1 elsewhere; at `index` the prompts (the earlier one if they overlap).
+
+        Raises:
+          ValueError: The prompts have another size than the frames.
         """
         count, height, width = frames.shape[:3]
-        require_shape("prompts", prompts, ("B", height, width), "Give masks of the frame's own size.")
+        require_shape("prompts", prompts, ("B", height, width), "Pass masks of the size of the frame.")
         labels = np.full((count, height, width), -1, np.int16)
         for b in reversed(range(len(prompts))):
             labels[index][prompts[b]] = b
@@ -54,22 +68,23 @@ class GeometricTracker:
         evidence = np.zeros((self.views.count, len(classes)), np.float32)
         best = np.zeros(len(evidence), np.float32)
         start = views[index]
-        said = start.votes @ atom_coverage(start.atoms, classes, start.votes.shape[1]).T
-        evidence[start.seen] = start.clarity[:, None] * said  # one seen from its side, over an outline, says little
+        weight = start.votes @ atom_coverage(start.atoms, classes, start.votes.shape[1]).T
+        # A Gaussian seen from the side, across an outline, is weak evidence.
+        evidence[start.seen] = start.clarity[:, None] * weight
         best[start.seen] = start.clarity
         owners = {}
         order = self._outward(index)
-        for t in order * 2:  # once outward, and once more with what all other frames say
+        for t in order * 2:  # once outward, and once with the evidence of all other frames
             view = views[t]
             here = evidence[view.seen]
             if t in owners:
-                rows, columns, said = _said(view, owners[t], len(classes))
-                here[rows, columns] -= said
-            if not (here[:, : len(prompts)] > 1e-3).any():  # nothing of the prompts can be seen
+                rows, columns, weight = _evidence(view, owners[t], len(classes))
+                here[rows, columns] -= weight
+            if not (here[:, : len(prompts)] > 1e-3).any():  # no prompt is visible
                 continue
             owners[t] = self._match(view, here, best[view.seen])
-            rows, columns, said = _said(view, owners[t], len(classes))
-            here[rows, columns] += said
+            rows, columns, weight = _evidence(view, owners[t], len(classes))
+            here[rows, columns] += weight
             evidence[view.seen] = here
             best[view.seen] = np.maximum(best[view.seen], view.clarity)
         for t, owner in owners.items():
@@ -77,7 +92,7 @@ class GeometricTracker:
         return labels
 
     def _with_rivals(self, labels: Int16[np.ndarray, "h w"], index: int, count: int) -> Bool[np.ndarray, "c h w"]:
-        """(B + C, H, W) bool: the prompts, and what they share the frame with: its other proposals, and the rest."""
+        """(B + C, H, W) bool masks of the prompts, of the other proposals of the frame, and of its rest."""
         classes = [labels == b for b in range(count)]
         free = labels < 0
         for mask in np.asarray(self.views.propose(index), bool):
@@ -90,15 +105,21 @@ class GeometricTracker:
     def consistent(
         self, frames: UInt8[np.ndarray, "t h w 3"], labels: Int[np.ndarray, "t h w"]
     ) -> Int[np.ndarray, "t h w"]:
-        """labels (T, H, W) with every region given away whose Gaussians belong to another one in the sum of all views.
+        """Merges regions whose Gaussians belong to another region in the sum of all views.
 
-        A region is kept if at least half of the weight that it casts falls on Gaussians on which no other region
-        casts more; otherwise (a part that few frames tell from the rest, a shadow) its pixels become the region's that
-        owns most of it. Numbers of regions are kept, so some may end without a pixel.
+        A region stays if at least half of its weight falls on Gaussians that it has the largest weight on. Otherwise (a
+        part that few frames separate, a shadow) its pixels go to the region that owns most of it.
+
+        Args:
+          frames: (T, H, W, 3) uint8 frames of the scene.
+          labels: (T, H, W) regions, -1 for no region.
+
+        Returns:
+          Labels with the same numbers; some regions may have no pixels left.
         """
         labels = np.array(labels)
         count = int(labels.max(initial=-1)) + 1
-        for _ in range(4 if count else 0):  # what is given away may tip another region; seldom more than two rounds
+        for _ in range(4 if count else 0):  # a merger may affect other regions; rarely more than two rounds
             entries = []
             for t, view in enumerate(self.views.all(frames)):
                 shares = label_shares(view.atoms, labels[t], view.votes.shape[1], count)
@@ -118,8 +139,7 @@ class GeometricTracker:
         return labels
 
     def _outward(self, index: int) -> list[int]:
-        """The other frames in the order in which a maximum spanning tree of what they share grows from `index`
-        (Prim)."""
+        """The other frames in the order in which a maximum spanning tree of their overlap grows from `index` (Prim)."""
         shared = self.views.shared
         nearest, order = shared[index].copy(), []
         left = set(range(len(nearest))) - {index}
@@ -132,16 +152,16 @@ class GeometricTracker:
     def _match(
         self, view: FrameView, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
     ) -> Int[np.ndarray, " a"]:
-        """The class (A,) that owns each atom of a view, -1 = none; evidence (n, B + C) of the Gaussians it shows, and
-        the clarity (n,) of the best look at each in the frames that the evidence is from."""
-        # On an outline a Gaussian leans over the neighbours and is counted with them, in view after view. So one tells
-        # something only once some view has seen about as much of it as this one does, and assigned what it saw.
+        """Class (A,) of each atom of a view, -1 if unassigned, from the evidence (n, B + C) of its Gaussians and their
+        best clarity (n,) in the frames of the evidence."""
+        # A Gaussian on an outline overlaps its neighbours and is counted with them, in view after view. So it counts
+        # only if another view has seen about as much of it as this one does, and has assigned it.
         assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)
         known = np.minimum(np.minimum(best / np.maximum(view.clarity, 1e-6), assigned) / 0.5, 1.0)
         known = np.square(known).astype(np.float32)[:, None]
-        # Of most classes a frame shows nothing, of most of what it shows the visited frames say nothing: left out.
+        # Most classes are invisible in a frame, and most of its Gaussians have no evidence yet: both are skipped.
         rows, classes = np.flatnonzero(known), np.flatnonzero(evidence.any(0))
-        # Gaussians on an outline lean into the neighbours: squares side with the majority.
+        # Gaussians on an outline overlap their neighbours: squares favour the majority.
         owned = np.square(evidence[rows])
         owned *= known[rows] / np.maximum(owned.sum(1, keepdims=True), 1e-12)
         votes = view.votes[rows]
@@ -149,8 +169,8 @@ class GeometricTracker:
         return np.where(owner >= 0, classes[owner], -1)
 
 
-def _said(view: FrameView, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a view that gives its atoms to classes (A,), -1 = none, of `count`, says of its Gaussians: row, class and
-    weight, by the clarity of the look, of each entry that is not 0."""
+def _evidence(view: FrameView, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, classes and weights (times clarity) of the nonzero evidence of a view whose atoms have these classes (A,),
+    -1 if unassigned."""
     cast = (view.votes @ one_hot(owner, count)).tocoo()
     return cast.row, cast.col, view.clarity[cast.row] * cast.data

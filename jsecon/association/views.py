@@ -1,10 +1,9 @@
-"""What each frame says about the Gaussians: the weight alpha T that each of them casts on each atom of the frame.
+"""Votes of the Gaussians on the atoms of each frame, by which masks are associated. Host code.
 
-With the geometry frozen, a frame's image is linear in the Gaussians' features: a pixel is sum_i w_ip f_i with
-w = alpha T, occlusion included. So one pass over each frame, which sums w over the pixels of small image regions
-("atoms": superpixels cut by the frame's proposals), holds all that following masks through the frames needs: lifting a
-mask to the Gaussians and rendering it into another frame are then products with that frame's sparse matrix
-(n Gaussians x A atoms), and no mask costs a render. Masks come out cut along atoms, which follow the image's edges.
+With frozen geometry an image is linear in the features of the Gaussians: a pixel is sum_i w_ip f_i with w = alpha T,
+occlusion included. One pass per frame sums w over the pixels of atoms (superpixels cut along the proposals of the
+frame). Lifting a mask to the Gaussians and rendering it into another frame are then products with sparse matrices
+(n Gaussians x A atoms) instead of renderings. Masks follow the outlines of atoms, and so the edges of the image.
 """
 
 import dataclasses
@@ -21,42 +20,50 @@ from jsecon.parallel import map_over_processes
 from jsecon.process import cores
 from jsecon.types import Camera, Gaussians
 
-PROPOSAL_SHARE, ATOM_SHARE, MERGER, KNOWN_SHARE, COVERED = 0.4, 0.6, 0.5, 0.5, 0.2
-"""see `claim_atoms`"""
+MIN_PROPOSAL_SHARE = 0.4
+MIN_ATOM_SHARE = 0.6
+MIN_MERGED_SHARE = 0.5
+MIN_KNOWN_SHARE = 0.5
+MIN_COVERAGE = 0.2
+"""Thresholds of `claim_atoms`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FrameView:
-    """What one frame says about the Gaussians."""
+    """Votes of the Gaussians in one frame."""
 
     atoms: np.ndarray
     """(H, W) int32 atom of each pixel, 0 .. A-1."""
     seen: np.ndarray
-    """(n,) the Gaussians that the frame shows."""
+    """(n,) indices of the Gaussians that the frame shows."""
     votes: Sparse
-    """(n, A) sum of alpha T over the atom's pixels."""
+    """(n, A) sum of alpha T over the pixels of each atom."""
     proposals: np.ndarray
     """(M, A) float32 share of each atom that lies in each proposal."""
     clarity: np.ndarray
-    """(n,) in (0, 1]: the cross-section that is seen of each, against the frame that sees most of it."""
+    """(n,) in (0, 1]: visible cross-section of each, relative to the frame that sees most of it."""
 
     @property
     def totals(self) -> np.ndarray:
-        """(n,) weight that each Gaussian casts in the frame."""
+        """(n,) total weight of each Gaussian in the frame."""
         return np.asarray(self.votes.sum(1)).ravel()
 
     @property
     def on_masks(self) -> Sparse:
-        """(n, M) weight that each Gaussian casts on each proposal."""
+        """(n, M) weight of each Gaussian on each proposal."""
         return self.votes @ sparse.csr_matrix(self.proposals.T)
 
 
 class SceneViews:
-    """The views of one scene, each computed once.
+    """Votes of one scene in all frames, computed once.
 
-    gaussians: the scene. cameras: batch of T, one per frame. proposals: a function of a frame's index, called in
-    several threads, or a sequence with one entry per frame, giving masks (M, H, W) bool; they may overlap. `centre` as
-    for `region_votes`: above 0 where the answer is judged at the Gaussians' centres.
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras, one per frame.
+      proposals: Masks (M, H, W) bool of each frame, which may overlap: a sequence, or a function of the index of a
+        frame, which is called in several threads.
+      atoms_per_frame: Approximate number of superpixels per frame before the cut along proposals.
+      centre: As for `region_votes`; above 0 if answers are judged at the centres of Gaussians.
     """
 
     def __init__(
@@ -74,24 +81,24 @@ class SceneViews:
         self.propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: list[FrameView] = []
         self.shared = np.zeros((0, 0), np.float32)
-        """(T, T) what any two frames see in common: the cosine of how much they see of each Gaussian. After `all`."""
+        """(T, T) overlap of two frames: the cosine of their visible cross-sections of all Gaussians. Set by `all`."""
 
     def _cut(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple[np.ndarray, np.ndarray]:
-        """(atoms (H, W), proposals (M, A) by the share of each atom that lies in them)."""
+        """Atoms (H, W), and the share (M, A) of each atom in each proposal."""
         masks = np.asarray(self.propose(t), bool)
         atoms = image_atoms(frame, masks, count=self.atoms_per_frame)
         return atoms, atom_coverage(atoms, masks, int(atoms.max()) + 1)
 
-    def _said(self, frames: UInt8[np.ndarray, "t h w 3"], own: Sequence[int]) -> Iterator[tuple]:
-        """Of each frame of `own` its atoms, the Gaussians that it shows, the arrays and the shape of their votes, and
-        the proposals by the share of each atom. While one frame's votes are cast, others are segmented and cut, on all
-        cores."""
+    def _votes(self, frames: UInt8[np.ndarray, "t h w 3"], indices: Sequence[int]) -> Iterator[tuple]:
+        """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of each frame of `indices`. While
+        votes of one frame are added up, other frames are segmented on all cores."""
         pool = ThreadPoolExecutor(cores())
         try:
-            for t, (atoms, within) in zip(own, pool.map(self._cut, (frames[t] for t in own), own)):
-                cast = atom_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
-                seen = np.flatnonzero(np.diff(cast.indptr))
-                votes = cast[seen]
+            cuts = pool.map(self._cut, (frames[t] for t in indices), indices)
+            for t, (atoms, within) in zip(indices, cuts):
+                votes = atom_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
+                seen = np.flatnonzero(np.diff(votes.indptr))
+                votes = votes[seen]
                 yield atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
         finally:
             pool.shutdown(cancel_futures=True)
@@ -99,10 +106,20 @@ class SceneViews:
     def all(
         self, frames: UInt8[np.ndarray, "t h w 3"], progress: Callable[[int, int], None] | None = None
     ) -> list[FrameView]:
-        """All views, each with how clearly it sees its Gaussians; over several processes (`jax.distributed`) they are
-        dealt out. Raises ValueError where the frames are not the cameras'."""
+        """Computes the votes of all frames; several processes (`jax.distributed`) divide the frames.
+
+        Args:
+          frames: (T, H, W, 3) uint8 frames of the cameras, the same at every call.
+          progress: Called with the number of frames done and of all.
+
+        Returns:
+          One `FrameView` per frame.
+
+        Raises:
+          ValueError: The frames have another number or size than the cameras.
+        """
         expected = (*self.cameras.fx.shape, self.cameras.height, self.cameras.width)
-        remedy = "Give the frames of the scene's own cameras, the same at every call."
+        remedy = "Pass the frames of the cameras of the scene."
         require(frames.shape[:3] == expected, "frames", frames.shape, f"{(*expected, 3)}", remedy)
         if not self._views:
             views = [
@@ -110,7 +127,7 @@ class SceneViews:
                     atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32)
                 )
                 for atoms, seen, votes, shape, within in map_over_processes(
-                    len(frames), lambda own: self._said(frames, own), progress
+                    len(frames), lambda indices: self._votes(frames, indices), progress
                 )
             ]
             looks = np.zeros((len(views), self.count), np.float32)
@@ -132,35 +149,43 @@ class SceneViews:
 def claim_atoms(
     view: FrameView, mass: Float[np.ndarray, "a c"], known_mass: Float[np.ndarray, "a 1"]
 ) -> Int[np.ndarray, " a"]:
-    """The class (A,) that owns each atom of a view, -1 = none.
+    """Assigns the atoms of a view to classes of Gaussians.
 
-    `mass` (A, C) is the weight m_ac on each atom of the Gaussians of each class, `known_mass` (A, 1) that, k_a, of all
-    whose class is known; t_a is the weight of all. Sums over a proposal p weigh an atom by the share of it inside of p:
+    With t_a the weight of all Gaussians on an atom a, and sums over a proposal p that weigh an atom by its share in p:
 
-        share of an atom       s_ac = m_ac / k_a,  sure where k_a >= KNOWN_SHARE t_a and t_a >= COVERED px(a)
-        share of a proposal    s_pc = m_pc / k_p,  sure where k_p >= KNOWN_SHARE t_p
+        share of an atom       s_ac = m_ac / k_a,  reliable if k_a >= MIN_KNOWN_SHARE t_a and t_a >= MIN_COVERAGE px(a)
+        share of a proposal    s_pc = m_pc / k_p,  reliable if k_p >= MIN_KNOWN_SHARE t_p
 
-    1. A sure atom goes to the class of its largest share if that is at least ATOM_SHARE.
-    2. Then each sure proposal, from the weakest to the strongest in v = max_c s_pc, if v >= PROPOSAL_SHARE, gives the
-       atoms that lie in it by more than half to the class w of that share. Where it is a merger of w and of the classes
-       with m_pc >= MERGER sum_a m_ac and m_pc >= SMALLEST, a sure atom goes to the one of them with the largest s_ac.
+    1. A reliable atom goes to the class with the largest share, if that is at least MIN_ATOM_SHARE.
+    2. Then each reliable proposal, from the weakest to the strongest in v = max_c s_pc, if v >= MIN_PROPOSAL_SHARE,
+       assigns the atoms that lie in it by more than half to the class w of that share. If the proposal merges w with
+       classes of m_pc >= MIN_MERGED_SHARE sum_a m_ac and m_pc >= MIN_ATOM_PX, a reliable atom goes to the one of them
+       with the largest s_ac.
+
+    Args:
+      view: Votes of one frame.
+      mass: (A, C) weight m_ac on each atom of the Gaussians of each class.
+      known_mass: (A, 1) weight k_a on each atom of the Gaussians whose class is known.
+
+    Returns:
+      (A,) class of each atom, -1 if unassigned.
     """
     total = view.votes.T @ np.ones((len(view.seen), 1), np.float32)
     share_of_atom = mass / np.maximum(known_mass, 1e-6)
     area = np.bincount(view.atoms.reshape(-1), minlength=len(total))
-    sure_atom = (known_mass >= KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= COVERED * area)
+    reliable_atom = (known_mass >= MIN_KNOWN_SHARE * total)[:, 0] & (total[:, 0] >= MIN_COVERAGE * area)
     inside, known_inside = view.proposals @ mass, view.proposals @ known_mass  # (M, C), (M, 1)
     share = inside / np.maximum(known_inside, 1e-6)
-    sure = (known_inside >= KNOWN_SHARE * (view.proposals @ total))[:, 0]
-    merged = (inside >= MERGER * mass.sum(0)) & (inside >= MIN_ATOM_PX)
+    reliable = (known_inside >= MIN_KNOWN_SHARE * (view.proposals @ total))[:, 0]
+    merged = (inside >= MIN_MERGED_SHARE * mass.sum(0)) & (inside >= MIN_ATOM_PX)
 
-    owner = np.where(sure_atom & (share_of_atom.max(1) >= ATOM_SHARE), share_of_atom.argmax(1), -1)
-    strongest = np.where(sure, share.max(1), 0.0) if len(share) else np.zeros(0)
+    owner = np.where(reliable_atom & (share_of_atom.max(1) >= MIN_ATOM_SHARE), share_of_atom.argmax(1), -1)
+    strongest = np.where(reliable, share.max(1), 0.0) if len(share) else np.zeros(0)
     for m in np.argsort(strongest, kind="stable"):
-        if strongest[m] >= PROPOSAL_SHARE:
+        if strongest[m] >= MIN_PROPOSAL_SHARE:
             winner = share[m].argmax()
             merged[m, winner] = True
-            held, rivals = np.flatnonzero(view.proposals[m] > 0.5), np.flatnonzero(merged[m])
-            strongest_rival = rivals[share_of_atom[np.ix_(held, rivals)].argmax(1)]
-            owner[held] = np.where(sure_atom[held], strongest_rival, winner)
+            members, rivals = np.flatnonzero(view.proposals[m] > 0.5), np.flatnonzero(merged[m])
+            strongest_rival = rivals[share_of_atom[np.ix_(members, rivals)].argmax(1)]
+            owner[members] = np.where(reliable_atom[members], strongest_rival, winner)
     return owner

@@ -1,8 +1,8 @@
-"""OpenGaussian's "point level, rendered" protocol on LERF-style labels: select by the text, render what was selected.
+"""OpenGaussian's "point level, rendered" protocol on labels like LERF's. Host code.
 
-For every labelled frame and every category labelled in it: the Gaussians selected for the category (once a scene, not a
-frame) are rendered without all others at the size of the labels, alpha > 0.7 is the mask, its IoU with the labelled
-mask is the pair's. mIoU and mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0.
+For every labelled frame and category, the Gaussians selected for the category (once per scene) are rendered alone at
+the size of the labels. The mask is alpha > 0.7, and its IoU with the labelled mask counts for the pair. mIoU and
+mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0.
 """
 
 import dataclasses
@@ -22,35 +22,35 @@ from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selectio
 from jsecon.types import Camera, Gaussians, Selection
 
 LOCALISATION_WINDOW = 0.04
-"""side of the box filter before the maximum is taken, as a part of the image's height: LangSplat's 30 px of 730"""
+"""Side of the box filter before the maximum is taken, as a share of the image height: LangSplat's 30 px of 730."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One (frame, query) pair."""
+    """Result of one (frame, query) pair."""
 
     frame: str
-    """name of the labelled frame."""
+    """Name of the labelled frame."""
     query: str
-    """category."""
+    """Category."""
     iou: float
-    """of the rendered selection's mask with the labelled one; 0 for a missing prediction."""
+    """IoU of the rendered selection with the labelled mask; 0 for a missing prediction."""
     located: bool
-    """whether `point` lies in a labelled box: localisation by the peak of similarity."""
+    """Localisation by the peak of similarity: whether `point` lies in a labelled box."""
     touched: bool
-    """whether any of the mask's innermost pixels lies in a labelled box: localisation by the mask."""
+    """Localisation by the mask: whether any of its innermost pixels lies in a labelled box."""
     centred: bool
-    """whether the centre of the mask's bounding box lies in a labelled box: the paper's Loc. Acc."""
+    """The paper's Loc. Acc.: whether the centre of the mask's bounding box lies in a labelled box."""
     point: tuple[int, int] | None
-    """x, y px of the localisation maximum; None for a missing prediction."""
+    """x, y px of the peak of similarity; None for a missing prediction."""
     selected: int
-    """Gaussians selected."""
+    """Number of selected Gaussians."""
     region: int
-    """that anchored the query, -1 = none."""
+    """Region that anchored the query, or -1."""
     score: float
-    """of the query."""
+    """Score of the query."""
     mask: np.ndarray = dataclasses.field(repr=False, compare=False)
-    """(H, W) bool the rendered selection's mask, for pictures."""
+    """(H, W) bool mask of the rendered selection, for pictures."""
 
 
 def evaluate_point_level_rendered(
@@ -62,9 +62,10 @@ def evaluate_point_level_rendered(
     alpha_threshold: float = ALPHA_THRESHOLD,
     **options: Any,
 ) -> tuple[list[Row], dict]:
-    """`evaluate_at_thresholds` at one threshold, the protocol's own."""
-    found = evaluate_at_thresholds(gaussians, cameras, labels, select, alpha_thresholds=(alpha_threshold,), **options)
-    return found[alpha_threshold]
+    """Calls `evaluate_at_thresholds` with one threshold, by default that of the protocol; returns its rows and
+    summary."""
+    results = evaluate_at_thresholds(gaussians, cameras, labels, select, alpha_thresholds=(alpha_threshold,), **options)
+    return results[alpha_threshold]
 
 
 def evaluate_at_thresholds(
@@ -77,20 +78,28 @@ def evaluate_at_thresholds(
     expected_pairs: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[float, tuple[list[Row], dict]]:
-    """By silhouette threshold (OpenGaussian's, and VALA's to stand beside it): rows, one for each labelled (frame,
-    query) pair, and their summary, under the module's protocol, from one rendering per pair.
+    """Evaluates selections at several alpha thresholds, from one rendering per pair.
 
-    cameras: by frame name, of any size with the labels' aspect; they are brought to the labels' size.
-    select: category -> Selection over the Gaussians; None (no answer to this text) counts as missing.
-    expected_pairs: the protocol's denominator where it is known (`experiments.datasets.lerf_ovs.LERF_PAIRS`), checked.
+    Localisation has three definitions. summary["loc_box"], the paper's ("Evaluation metrics"): the centre of the
+    bounding box of the mask lies in a labelled box. summary["loc_acc"], by the peak: the maximum of the similarity of
+    the selected Gaussians, composited by sum alpha T s over them alone and averaged over a window of 4 % of the image
+    height, lies in a labelled box of the category, edges included. summary["loc_mask"], by the mask: after the same
+    smoothing of the mask, any of its largest pixels (LangSplat's rule for ties) lies in a box.
 
-    Localisation has three readings. As the paper defines it ("Evaluation metrics"),
-    summary["loc_box"]: the centre of the bounding box of the binary mask lies in a labelled box. By the peak,
-    summary["loc_acc"]: the point of maximum of the selected Gaussians' similarity, composited by sum alpha T s over
-    them alone and smoothed by a mean over a window of 4 % of the image's height, lies in a labelled box of the
-    category, edges included. By the mask, summary["loc_mask"]: the same smoothing of the binary mask, and any of the
-    pixels where it is largest (LangSplat's rule for ties), lies in one. Raises InputError for a labelled frame without
-    a camera or of another aspect, for labels without pairs, and where the number of pairs is not the expected one.
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Camera of each frame by name, of any size with the aspect of the labels.
+      labels: Labelled frames.
+      select: Maps a category to a selection of Gaussians; None, no answer, counts as missing.
+      alpha_thresholds: Thresholds of the mask, by default those of OpenGaussian and VALA.
+      expected_pairs: Number of pairs of the protocol (`experiments.datasets.lerf_ovs.LERF_PAIRS`), which is checked.
+      progress: Called with the number of pairs done and of all.
+
+    Returns:
+      For each threshold the rows, one per labelled (frame, query) pair, and their summary.
+
+    Raises:
+      InputError: A labelled frame has no camera or another aspect, or the number of pairs is 0 or not as expected.
     """
     for frame in labels:
         _check(frame, cameras)
@@ -101,17 +110,17 @@ def evaluate_at_thresholds(
         if category not in answers:
             answers[category] = select(category)
         camera = resize_camera(cameras[frame.name], frame.width, frame.height)
-        found = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds)
-        for threshold, row in zip(alpha_thresholds, found):
+        results = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds)
+        for threshold, row in zip(alpha_thresholds, results):
             rows[threshold].append(row)
         if progress is not None:
             progress(done, len(pairs))
-    return {threshold: (found, summary(found, threshold)) for threshold, found in rows.items()}
+    return {threshold: (pairs, summary(pairs, threshold)) for threshold, pairs in rows.items()}
 
 
 def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> dict:
-    """{"protocol", "pairs", "frames", "queries", "missing", "miou", "macc", "acc_50", and "loc_acc", "loc_mask",
-    "loc_box"}."""
+    """Summarises rows at one alpha threshold: protocol, pairs, frames, queries, missing, miou, macc, acc_50, loc_acc,
+    loc_mask and loc_box."""
     ious = [row.iou for row in rows]
     return {
         "protocol": f"point level, rendered: selected Gaussians alone, alpha > {alpha_threshold:.3g}; mean over pairs",
@@ -129,10 +138,10 @@ def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> di
 
 
 def labelled_pairs(labels: Sequence[LabelledFrame], expected: int | None) -> list[tuple[LabelledFrame, str]]:
-    """All (frame, query) pairs. Raises InputError for none, or another number than `expected`."""
+    """Returns all (frame, query) pairs. Raises InputError if there are no pairs, or not as many as `expected`."""
     pairs = [(frame, query) for frame in labels for query in frame.objects]
     if not pairs or (expected is not None and len(pairs) != expected):
-        remedy = "Evaluate on the very label files of the protocol, all of them."
+        remedy = "Evaluate on all label files of the protocol."
         raise InputError("labels", f"{len(pairs)} (frame, query) pairs", f"{expected or 'at least one'}", remedy)
     return pairs
 
@@ -149,10 +158,8 @@ def _rows(
     count = 0 if selection is None else int(np.asarray(selection.mask).sum())
     region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
     if selection is None or not count:
-        nothing = np.zeros(true.shape, bool)
-        return [
-            Row(frame.name, category, 0.0, False, False, False, None, 0, region, score, nothing) for _ in thresholds
-        ]
+        empty = np.zeros(true.shape, bool)
+        return [Row(frame.name, category, 0.0, False, False, False, None, 0, region, score, empty) for _ in thresholds]
     camera = jax.tree.map(jnp.asarray, camera)
     rendering = render_selection(gaussians, camera, selection.mask, selection.similarity)
     alpha, point = np.asarray(rendering.alpha), _middle(_peak(np.asarray(rendering.features[..., 0])))
@@ -169,14 +176,14 @@ def _rows(
 
 
 def _peak(image: np.ndarray) -> np.ndarray:
-    """(H, W) bool where the smoothed image is largest; nowhere where it is not positive."""
+    """(H, W) bool the largest pixels of the smoothed image, if they are positive."""
     window = 2 * round(LOCALISATION_WINDOW * image.shape[0] / 2) + 1
     smooth = cv2.blur(image.astype(np.float64), (window, window), borderType=cv2.BORDER_REFLECT_101)
     return (smooth >= smooth.max() * (1 - 1e-6)) & (image.max() > 0)
 
 
 def _middle(where: np.ndarray) -> tuple[int, int] | None:
-    """x, y of the pixel of a mask that is nearest to its centre; None for an empty one."""
+    """x, y of the pixel of a mask nearest to its centre; None for an empty mask."""
     y, x = np.nonzero(where)
     if not len(y):
         return None
@@ -185,7 +192,7 @@ def _middle(where: np.ndarray) -> tuple[int, int] | None:
 
 
 def _box_centre(mask: np.ndarray) -> tuple[int, int] | None:
-    """x, y of the pixel in the middle of a mask's bounding box; None for an empty one."""
+    """x, y of the centre of the bounding box of a mask; None for an empty mask."""
     y, x = np.nonzero(mask)
     return (int(x.min() + x.max()) // 2, int(y.min() + y.max()) // 2) if len(y) else None
 
@@ -193,11 +200,13 @@ def _box_centre(mask: np.ndarray) -> tuple[int, int] | None:
 def _check(frame: LabelledFrame, cameras: Mapping[str, Camera]) -> None:
     if frame.name not in cameras:
         some = ", ".join(sorted(cameras)[:3])
-        remedy = "Evaluate with the capture that was labelled, and leave none of its labelled frames out."
-        found = "no frame of that name in the capture"
-        raise InputError(f"labels of {frame.name}", found, f"one of {some}, ...", remedy)
+        remedy = "Evaluate with the labelled capture and all of its labelled frames."
+        problem = f"the capture has no frame of that name; it has {some}, ..."
+        raise InputError(f"labels of {frame.name}", problem, remedy=remedy)
     camera = cameras[frame.name]
     if abs(frame.width / camera.width - frame.height / camera.height) > 0.02 * frame.width / camera.width:
-        found, expected = (f"{size.width}x{size.height}" for size in (frame, camera))
+        labelled, size = (f"{size.width}x{size.height}" for size in (frame, camera))
         remedy = "Label the undistorted frames, or scale the labels to them."
-        raise InputError(f"labels of {frame.name}", found, f"the aspect of the frame, {expected}", remedy)
+        raise InputError(
+            f"labels of {frame.name}", f"{labelled} has another aspect than the frame, {size}", remedy=remedy
+        )

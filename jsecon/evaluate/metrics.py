@@ -1,4 +1,4 @@
-"""Metrics, each with its protocol in its name or docstring. A missing prediction counts as 0, never as left out."""
+"""Metrics, each with its protocol in its name or docstring. A missing prediction counts as 0 and is never skipped."""
 
 from collections.abc import Iterable
 
@@ -10,11 +10,22 @@ from jsecon.errors import require
 from jsecon.types import Array
 
 Point = tuple[float | int, float | int]
-"""x, y px"""
+"""x and y, px."""
 
 
 def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array, ""]:
-    """Intersection over union of two masks of one shape (pixels or points); 1 where both are empty. Jit-safe."""
+    """Computes the intersection over union of two masks (pixels or points). Pure.
+
+    Args:
+      predicted: Mask.
+      true: Mask of the same shape.
+
+    Returns:
+      () IoU, 1 if both masks are empty.
+
+    Raises:
+      ValueError: The shapes differ.
+    """
     got, remedy = f"{predicted.shape} and {true.shape}", "Render the prediction at the size of the truth."
     require(predicted.shape == true.shape, "iou", got, "one shape", remedy)
     both, either = jnp.sum(predicted & true), jnp.sum(predicted | true)
@@ -22,35 +33,50 @@ def iou(predicted: Bool[Array, "..."], true: Bool[Array, "..."]) -> Float[Array,
 
 
 def mean_iou(ious: Iterable[float | None]) -> float:
-    """Plain mean over (frame, query) pairs of their IoU; None or NaN, a missing prediction, counts as 0.
+    """Computes the plain mean of the IoU over (frame, query) pairs.
 
-    The denominator is the number of pairs (208 on LERF, over its 22 frames): pass every pair. NaN for none at all.
+    Args:
+      ious: IoU of every pair (208 pairs in 22 frames of LERF); None or NaN, a missing prediction, counts as 0.
+
+    Returns:
+      The mean, NaN without pairs.
     """
     values = _values(ious)
     return float(values.mean()) if values.size else float("nan")
 
 
 def accuracy_at(ious: Iterable[float | None], threshold: float = 0.25) -> float:
-    """Share of (frame, query) pairs with an IoU strictly above `threshold`; mAcc in the papers is that at 0.25.
+    """Computes the share of (frame, query) pairs with an IoU strictly above a threshold; mAcc of the papers is at 0.25.
 
-    None or NaN, a missing prediction, counts as a failure. NaN for no pairs at all.
+    Args:
+      ious: IoU of every pair; None or NaN, a missing prediction, counts as a failure.
+      threshold: The threshold.
+
+    Returns:
+      The share, NaN without pairs.
     """
     values = _values(ious)
     return float((values > threshold).mean()) if values.size else float("nan")
 
 
 def localization_accuracy(points: Iterable[Point | None], boxes: Iterable[Float[Array, "b 4"]]) -> float:
-    """Share of (frame, query) pairs whose point (x, y) lies inside, edges included, any of the pair's boxes.
+    """Computes the share of (frame, query) pairs whose point lies inside of a box of the pair.
 
-    Boxes are x1 y1 x2 y2. None, a missing prediction, counts as a failure. What the point is, is the caller's
-    definition: say it beside the number, as published ones mean different things. NaN for no pairs.
+    State the definition of the point beside the number: published ones differ.
+
+    Args:
+      points: (x, y) of every pair; None, a missing prediction, counts as a failure.
+      boxes: (B, 4) x1 y1 x2 y2 of every pair, edges included.
+
+    Returns:
+      The share, NaN without pairs.
     """
     hits = [point is not None and in_any_box(point, box) for point, box in zip(points, boxes, strict=True)]
     return float(np.mean(hits)) if hits else float("nan")
 
 
 def in_any_box(point: Point, boxes: Float[Array, "b 4"]) -> bool:
-    """Whether (x, y) lies inside any of the boxes x1 y1 x2 y2, edges included."""
+    """Returns whether a point (x, y) lies inside of any box (B, 4) x1 y1 x2 y2, edges included."""
     x, y = point
     boxes = np.asarray(boxes)
     return bool(((boxes[:, 0] <= x) & (x <= boxes[:, 2]) & (boxes[:, 1] <= y) & (y <= boxes[:, 3])).any())

@@ -2,7 +2,7 @@
 
 The correction of a pose is a twist in the frame of the camera: exp(twist) world_to_camera, zero for no correction. The
 correction of an exposure is an affine map from rendered colours to the colours of the frame (gains, white balance,
-offset). Each view has its own row, which Adam moves when that view is drawn, with moments of its own.
+offset). Each view has a row, which Adam moves when that view is drawn, with separate moments.
 """
 
 import dataclasses
@@ -73,7 +73,7 @@ class RefineOptions:
 
 
 def identity_corrections(views: int) -> Corrections:
-    """Returns corrections of `views` views that change nothing."""
+    """Returns corrections of `views` views without effect."""
     return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
 
 
@@ -125,7 +125,7 @@ def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
 
 
 def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
-    """Moves a camera by a twist in its own frame: exp(twist) world_to_camera."""
+    """Moves a camera by a twist in its frame: exp(twist) world_to_camera."""
     motion, pose = se3_exp(twist), camera.world_to_camera
     # Multiply-and-sum: exact float32 on every backend.
     moved = (motion[:, :, None] * pose[None, :, :].astype(motion.dtype)).sum(1)

@@ -1,4 +1,4 @@
-"""Points from depth frames: back-projected, and subsampled to one a voxel."""
+"""Points from depth frames: back-projection, then one point per voxel. Host code (NumPy)."""
 
 import math
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from jsecon.types import Array, Capture
 
 
 class DepthPoints(NamedTuple):
-    """Back-projected depth after voxel subsampling: one point per voxel, and which pixels fell into it."""
+    """Point cloud after voxel subsampling, and which pixels fell into each voxel."""
 
     points: np.ndarray
     """(P, 3) float32 mean of the voxel's samples, world."""
@@ -28,12 +28,22 @@ class DepthPoints(NamedTuple):
 
 
 def require_depths(capture: Capture) -> None:
+    """Raises InputError unless the capture has depth frames."""
     if capture.depths is None:
-        raise InputError("capture", "no depth frames", "RGB-D frames", "Start from sparse points, or triangulate them.")
+        raise InputError("capture", "no depth frames", "RGB-D frames", "Use sparse points, or triangulate points.")
 
 
 def back_project_frame(capture: Capture, frame: int, stride: int):
-    """World points (S, 3), colours (S, 3) and pixels (S, 2) of the frame's known depths, every `stride` pixels."""
+    """Back-projects the known depths of one frame.
+
+    Args:
+      capture: Capture with depth.
+      frame: Index of the frame.
+      stride: Uses every so many pixels in each direction.
+
+    Returns:
+      World points (S, 3) float64, their colours (S, 3) uint8 and pixels (S, 2) row, column.
+    """
     camera = capture.cameras[frame]
     assert capture.depths is not None
     depth = np.asarray(capture.depths[frame], np.float64)[::stride, ::stride]
@@ -48,15 +58,15 @@ def back_project_frame(capture: Capture, frame: int, stride: int):
 
 
 def _voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
-    """(S,) id of each point's voxel, in 0..P-1 and all of them in use."""
+    """(S,) voxel of each point, numbered 0 .. P-1 without gaps."""
     cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
-    size, enough = cells.max(axis=0) + 1, f"large enough for the extent {np.ptp(points, axis=0)}"
-    require(math.prod(map(float, size)) < 2**62, "voxel", voxel, enough, "Choose a larger voxel.")
+    size, expected = cells.max(axis=0) + 1, f"large enough for the extent {np.ptp(points, axis=0)}"
+    require(math.prod(map(float, size)) < 2**62, "voxel", voxel, expected, "Choose a larger voxel.")
     return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(size)), return_inverse=True)[1]
 
 
 def voxel_for(points: Float[Array, "s 3"], max_points: int) -> float:
-    """The smallest voxel edge (to 2 %) that leaves at most `max_points` occupied voxels."""
+    """Finds the smallest voxel edge (to 2 %) that leaves at most `max_points` voxels of the points (S, 3) occupied."""
     points = np.asarray(points, np.float64)
     high = float(np.max(np.ptp(points, axis=0))) * 1.001 + 1e-9
     low = high / 2**20
@@ -74,20 +84,30 @@ def points_from_depth(
     stride: int = 1,
     frames: Int[np.ndarray, " f"] | None = None,
 ) -> DepthPoints:
-    """Back-projects the known depths and keeps the mean of each occupied voxel.
+    """Back-projects the known depths and averages them in voxels.
 
-    Give the voxel's edge in world units, or `max_points` and the edge is found. Held-out frames are left out unless
-    `frames` names them. `stride` takes every so many pixels in each direction. Raises InputError where the capture has
-    no depth, ValueError where neither or both of `voxel` and `max_points` are given.
+    Args:
+      capture: Capture with depth.
+      voxel: Edge of a voxel, world units.
+      max_points: Maximum number of points, in place of `voxel`: the smallest edge that gives so few is used.
+      stride: Uses every so many pixels in each direction.
+      frames: Indices of the frames to use; by default the training frames.
+
+    Returns:
+      The mean point and colour of each occupied voxel, and the pixels in it.
+
+    Raises:
+      InputError: The capture has no depth.
+      ValueError: Neither or both of `voxel` and `max_points` are given.
     """
-    given, exclusive = (voxel, max_points), (voxel is None) != (max_points is None)
-    require(exclusive, "voxel, max_points", given, "exactly one of the two", "voxel is in world units.")
+    exclusive = (voxel is None) != (max_points is None)
+    require(exclusive, "voxel, max_points", (voxel, max_points), "exactly one of the two", "voxel is in world units.")
     require_depths(capture)
     chosen = np.flatnonzero(~np.asarray(capture.held_out)) if frames is None else np.asarray(frames)
     parts = [back_project_frame(capture, int(t), stride) for t in chosen]
     if not any(len(world) for world, _, _ in parts):
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
-    points, colors, pixels = (np.concatenate(own) for own in zip(*parts))
+    points, colors, pixels = (np.concatenate(columns) for columns in zip(*parts))
     frame = np.repeat(chosen, [len(world) for world, _, _ in parts])
     if voxel is None:
         assert max_points is not None

@@ -153,12 +153,11 @@ def fit_gaussians(
       The fitted Gaussians and the loss of each step.
 
     Raises:
-      ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`, is given, or the state is of
-        another fit.
+      ValueError: Not exactly one of `steps` and `seconds`, or of `start` and `state`, or the state is of another fit.
       InputError: Every frame is held out, or the fit diverges.
     """
-    given = steps, seconds
-    require(given.count(None) == 1, "steps, seconds", given, "exactly one of the two", "Choose one limit.")
+    limits = steps, seconds
+    require(limits.count(None) == 1, "steps, seconds", limits, "exactly one of the two", "Choose one limit.")
     exclusive = (start is None) != (state is None)
     got = start is not None, state is not None
     require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")

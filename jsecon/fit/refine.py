@@ -1,19 +1,19 @@
-"""Refines the poses and exposures of a capture before a fit, and drops frames that nothing explains. Host code.
+"""Refines the poses and exposures of a capture before a fit, and drops frames that no scene explains. Host code.
 
 A probe is a short fit with corrections (corrections.py); it measures how far each frame is off. The result is a capture
 again, in the same world, with its frames as under one exposure.
 
 If the frames have depth, the cameras are first aligned to each other by colour and depth (alignment.py), provided that
 the frames then agree better: one probe is enough after that. Otherwise points from depth lie where the wrong pose of
-their own frame puts them, and hold it there. So such a probe starts from few points, which several frames must share,
+their frame puts them, and keep it there. So such a probe starts from few points, which several frames must share,
 and each further probe starts from points made with the poses of the one before. The first probes see small frames and
 end as soon as the poses are stable; the last sees larger ones.
 
 `decide` corrects only if it helps, measured on training frames kept aside: a first probe with corrections and one
 without are fitted to the other training frames and compared on these. A frame kept aside is aligned to either frozen
-probe on half of its pixels and compared on the other half, so that alignment alone gains nothing. Held-out frames have
-no part in the probes or in the decision. They are aligned to the last probe once it is frozen, each by its own pose and
-exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
+probe on half of its pixels and compared on the other half, so that alignment alone has no advantage. Held-out frames
+have no part in the probes or in the decision. They are aligned to the last probe once it is frozen, each by its pose
+and exposure, as methods that refine poses are measured (Lin et al. 2021, BARF, section 4.2).
 """
 
 import dataclasses
@@ -67,7 +67,7 @@ MIN_COARSE_SIZE = 0.25
 STABLE_PX = 0.25
 """Median movement of the image by a probe, px at full size, below which the poses are stable."""
 MIN_GAIN_DB = 0.5
-"""PSNR that corrections must gain on the frames kept aside. In the demo's room they gain 0.1 dB if nothing is wrong,
+"""PSNR that corrections must gain on the frames kept aside. In the demo's room they gain 0.1 dB without errors,
 0.9 if poses are off by 3 mm and 0.15 degrees, and 2 to 3 at three times as much (experiments/retired.md)."""
 MIN_ASIDE, MAX_ASIDE = 2, 8
 """Number of training frames kept aside for the decision, a third of all at most."""
@@ -154,7 +154,7 @@ class _Prober:
         steps: int,
         rates: LearningRates | None = None,
     ) -> tuple[Gaussians, Corrections]:
-        """A short fit to frames of this size, and the corrections of all frames; identity if none are refined."""
+        """A short fit to frames of this size, and the corrections of all frames; identity without refinement."""
         states: list[FitState] = []
         # Soft Gaussians render a depth before the surface: as a target, depth would push every camera back.
         capture = capture if refine is None else dataclasses.replace(capture, depths=None)
@@ -210,7 +210,7 @@ def refine_capture(
 ) -> Capture:
     """Corrects the poses and exposures of a capture by short fits, and drops frames that these do not explain.
 
-    The world stays the same: the rigid motion that brings the training cameras nearest to their given places is
+    The world stays the same: the rigid motion that brings the training cameras nearest to their original places is
     removed from all corrections, and the mean colour map becomes the identity. A corrected frame is clipped to 8 bits;
     white pixels that become darker are `ignored`.
 
@@ -222,7 +222,7 @@ def refine_capture(
       drop_weak: Whether to drop training frames that the last probe does not explain (`quality.is_weak`).
       decide: Whether to correct only if that lowers the error of training frames kept aside.
       max_fit_steps: Limits the probes to about the time of so many steps of the fit, by fewer visits. If that leaves
-        too few of them, nothing is refined.
+        too few of them, the capture stays as it is.
       visits: Visits of each frame by each probe.
       probes: Maximum number of probes; one if no pose is refined.
       progress: Called with the number of steps done and of all.
@@ -386,7 +386,7 @@ def _project_points(points: Float[np.ndarray, "n 3"], cameras: Camera, t: int) -
 def _apply(
     capture: Capture, corrections: Corrections, refine: RefineOptions | None, *, keep_world: bool = True
 ) -> Capture:
-    """Moves the cameras and undoes the exposures; `keep_world` keeps the given world and the mean colours."""
+    """Moves the cameras and undoes the exposures; `keep_world` keeps the original world and the mean colours."""
     if refine is None:
         return capture
     train, cameras = ~np.asarray(capture.held_out), capture.cameras
@@ -412,15 +412,15 @@ def _apply(
 
 
 def rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], extent: float) -> Float[np.ndarray, "4 4"]:
-    """Computes the rigid motion of the world that brings moved cameras nearest to their given poses (Umeyama 1991).
+    """Computes the rigid motion of the world that brings moved cameras nearest to their original poses (Umeyama 1991).
 
     Args:
       moved: (T, 4, 4) moved world-to-camera poses.
-      poses: (T, 4, 4) given world-to-camera poses.
+      poses: (T, 4, 4) original world-to-camera poses.
       extent: Length of the cameras' axes in world units, whose ends are matched beside the centres.
 
     Returns:
-      (4, 4) map from points of the given world to the world of the moved cameras.
+      (4, 4) map from points of the original world to the world of the moved cameras.
     """
     centre = lambda poses: -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
     a, b = centre(moved), centre(poses)

@@ -1,4 +1,4 @@
-"""Where a fit starts from: what the capture holds, and Gaussians made of points."""
+"""Initial scene of a fit: points of the capture, and Gaussians made from points. Host code (NumPy)."""
 
 import math
 from collections.abc import Callable
@@ -15,10 +15,10 @@ from jsecon.splat.sh import sh_from_rgb
 from jsecon.types import Array, Capture, Gaussians
 
 MIN_SQUARED_DISTANCE = 1e-7
-"""floor under a squared neighbour distance, world units^2 (INRIA): duplicate points still get a scale"""
+"""Least squared distance to the neighbours, world units^2 (INRIA): duplicate points get a scale too."""
 
 MAX_DEPTH_POINTS = 100_000
-"""maximum number of points taken from depth frames"""
+"""Maximum number of points from depth frames."""
 
 
 class Start(NamedTuple):
@@ -77,9 +77,13 @@ def starting_gaussians(
 
 
 def neighbour_distances(points: Float[Array, "p 3"]) -> Float[np.ndarray, " p"]:
-    """Root of the mean squared distance to the three nearest other points, world units (simple-knn of graphdeco-inria).
+    """Computes the RMS distance to the three nearest neighbours (simple-knn of graphdeco-inria).
 
-    With fewer other points, the mean is over those there are; a lone point gets the floor.
+    Args:
+      points: (P, 3) points.
+
+    Returns:
+      (P,) distances in world units, over fewer neighbours if there are fewer; a single point gets the minimum.
     """
     points = np.asarray(points, np.float64)
     count = len(points)
@@ -99,14 +103,24 @@ def gaussians_from_points(
     max_scale: float | None = None,
     sh_degree: int = 0,
 ) -> Gaussians:
-    """One round Gaussian a point (Kerbl et al. 2023, section 5.1).
+    """Makes one round Gaussian per point (Kerbl et al. 2023, section 5.1).
 
-    The standard deviation is `scale` times `neighbour_distances`, at most `max_scale` world units; the colour is the
-    point's in every direction; the rotation is the identity. Raises ValueError where there is no point, a coordinate
-    is not finite, or an option is outside its range.
+    Args:
+      points: (P, 3) centres, world units.
+      colors: (P, 3) uint8 RGB, the same from all directions.
+      opacity: Opacity of all Gaussians, in (0, 1).
+      scale: Standard deviation in units of `neighbour_distances`.
+      max_scale: Largest standard deviation, world units.
+      sh_degree: Degree of the spherical harmonics, 0 to 3.
+
+    Returns:
+      P Gaussians (NumPy float32).
+
+    Raises:
+      ValueError: There is no point, a coordinate is not finite, or an option is out of range.
     """
     points, colors = np.asarray(points), np.asarray(colors)
-    require(len(points) > 0, "points", "none", "at least one", "Triangulate them from the frames (fit.triangulate).")
+    require(len(points) > 0, "points", 0, "at least one", "Triangulate points from the frames (fit.triangulate).")
     bad = int((~np.isfinite(points).all(axis=1)).sum())
     require(not bad, "points", f"{bad} with a coordinate that is not finite", "finite coordinates", "Drop them first.")
     require(0 < opacity < 1, "opacity", opacity, "between 0 and 1", "0.1 is usual, 0.9 on depth.")

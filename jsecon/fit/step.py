@@ -140,7 +140,7 @@ def view_loss(
     """
     camera = view.camera if correction is None else corrected_camera(view.camera, correction.twists)
     colours = map_rows(colours_from_sh, gaussians, camera, mesh)
-    # The votes are the gradient of a fourth channel of zeros: they need no pass of their own.
+    # The votes are the gradient of a fourth channel of zeros: they need no separate pass.
     features = jnp.concatenate([colours, vote_channel], axis=1)
     rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)
     image, votes = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)

@@ -1,8 +1,8 @@
-"""Sparse points for a capture that has poses but no points: SIFT matches between posed views, triangulated.
+"""Triangulates sparse points for a capture with poses but without points, from SIFT matches. Host code (NumPy).
 
-The poses are known, so a match needs no robust estimation: it has to lie on its epipolar line, and a track of matches
-has to reproject within a few pixels from a point in front of every camera with enough parallax (Hartley and Zisserman,
-ch. 12).
+With known poses a match needs no robust estimation: it must lie on its epipolar line, and a track of matches must
+reproject within a few pixels from a point in front of every camera with enough parallax (Hartley and Zisserman, ch.
+12).
 """
 
 from collections.abc import Callable
@@ -15,15 +15,19 @@ from jsecon.errors import InputError
 from jsecon.types import Capture
 
 MIN_POINTS = 50
-"""fewer points than this are no start for a scene: the views do not overlap or have no texture"""
-NEIGHBOURS, MAX_FEATURES = 6, 6000
-"""views that each is matched with, features of a view"""
+"""Least number of points for a scene: with fewer the views do not overlap or have no texture."""
+NEIGHBOURS = 6
+"""Number of views that each view is matched with."""
+MAX_FEATURES = 6000
+"""Maximum number of features per view."""
 CONTRAST = 0.015
-"""SIFT's threshold: its own default is 0.04, lower gives more points"""
+"""Contrast threshold of SIFT; OpenCV's default is 0.04, lower gives more points."""
 RATIO = 0.85
-"""Lowe's, of the distances to the nearest descriptor and the second"""
-ERROR_PX, MIN_ANGLE_DEG = 2.0, 2.0
-"""bounds of the distance to the epipolar line and of the reprojection error; of the parallax"""
+"""Lowe's ratio of the distances to the nearest and the second nearest descriptor."""
+MAX_ERROR_PX = 2.0
+"""Largest distance to the epipolar line and largest reprojection error."""
+MIN_ANGLE_DEG = 2.0
+"""Least parallax."""
 
 
 class _Features(NamedTuple):
@@ -46,7 +50,15 @@ def _detect(frame: np.ndarray) -> _Features:
 
 
 def view_pairs(world_to_camera: np.ndarray, neighbours: int) -> list[tuple[int, int]]:
-    """Each view with those that look most alike: near in place (in units of the median spacing) and direction."""
+    """Pairs each view with the views nearest in place (in units of the median spacing) and direction.
+
+    Args:
+      world_to_camera: (T, 4, 4) poses.
+      neighbours: Number of views that each view is paired with.
+
+    Returns:
+      Sorted pairs (i, j), i < j, without repetition.
+    """
     rotation = world_to_camera[:, :3, :3]
     centres = -np.einsum("tji,tj->ti", rotation, world_to_camera[:, :3, 3])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
@@ -84,11 +96,12 @@ def _match(a: _Features, b: _Features, fundamental: np.ndarray) -> np.ndarray:
     line_j, line_i = x_i @ fundamental.T, x_j @ fundamental
     off = np.abs((x_j * line_j).sum(axis=1))
     distance = np.maximum(off / np.linalg.norm(line_j[:, :2], axis=1), off / np.linalg.norm(line_i[:, :2], axis=1))
-    return pairs[distance < ERROR_PX]
+    return pairs[distance < MAX_ERROR_PX]
 
 
 def _tracks(edges: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
-    """Features (of `views`, one each) that `edges` (M, 2) connect; a component with two of one view is dropped."""
+    """Groups of features that `edges` (M, 2) connect, `views` being the view of each feature; groups with two features
+    of one view are dropped."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -104,9 +117,18 @@ def _tracks(edges: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
 def triangulate_tracks(
     world_to_camera: np.ndarray, intrinsics: np.ndarray, views: np.ndarray, pixels: np.ndarray, seen: np.ndarray
 ):
-    """Points from padded tracks: views (P, V), pixels (P, V, 2), seen (P, V) bool -> points (P, 3), largest error px
-    (P,), smallest depth (P,), largest angle between two rays in radians (P,). Linear start, then five steps of
-    Gauss-Newton on the reprojection.
+    """Triangulates tracks: a linear solution, then five Gauss-Newton steps on the reprojection error.
+
+    Args:
+      world_to_camera: (T, 4, 4) poses.
+      intrinsics: (T, 3, 3) camera matrices, px.
+      views: (P, V) view of each observation of a track, padded.
+      pixels: (P, V, 2) column and row, px.
+      seen: (P, V) bool, false for padding.
+
+    Returns:
+      Points (P, 3), largest reprojection errors in px (P,), smallest depths (P,), and largest angles between two rays
+      in radians (P,).
     """
     projection = intrinsics @ world_to_camera[:, :3]
     p = projection[views]
@@ -147,10 +169,17 @@ def triangulate_tracks(
 def triangulated_points(
     capture: Capture, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sparse points (P, 3) float32 and their colours (P, 3) uint8 from the frames that are not held out. Deterministic.
+    """Triangulates sparse points from the training frames. Deterministic.
 
-    Raises InputError where fewer than MIN_POINTS points remain: the views do not overlap, or the poses do not belong to
-    them.
+    Args:
+      capture: Frames and poses.
+      progress: Called with the number of frames and pairs done and of all.
+
+    Returns:
+      Points (P, 3) float32, world, and their colours (P, 3) uint8.
+
+    Raises:
+      InputError: Fewer than MIN_POINTS points: the views do not overlap, or the poses belong to other frames.
     """
     used = np.flatnonzero(~np.asarray(capture.held_out))
     cameras = capture.cameras[used]
@@ -179,10 +208,10 @@ def triangulated_points(
     pixels[seen] = np.concatenate([np.zeros((0, 2)), *(f.pixels for f in features)])[nodes]
     shade[seen] = np.concatenate([np.zeros((0, 3)), *(f.colors for f in features)])[nodes]
     points, error, depth, angle = triangulate_tracks(poses, intrinsics, views, pixels, seen)
-    good = (error < ERROR_PX) & (depth > 0) & (angle > np.deg2rad(MIN_ANGLE_DEG)) & np.isfinite(points).all(axis=1)
+    good = (error < MAX_ERROR_PX) & (depth > 0) & (angle > np.deg2rad(MIN_ANGLE_DEG)) & np.isfinite(points).all(axis=1)
     if good.sum() < MIN_POINTS:
-        found = f"{good.sum()} points from {len(used)} views by matching their features"
-        remedy = "The views must overlap and have texture, and the poses be theirs; or give points, or --gaussians PLY."
-        raise InputError("capture", found, f"at least {MIN_POINTS}", remedy)
+        problem = f"feature matching gives {good.sum()} points from {len(used)} views"
+        remedy = "Use views that overlap and have texture, with correct poses, or pass points or --gaussians."
+        raise InputError("capture", problem, f"at least {MIN_POINTS}", remedy)
     colors = (shade.sum(axis=1) / seen.sum(axis=1, keepdims=True))[good]
     return points[good].astype(np.float32), np.rint(colors).astype(np.uint8)

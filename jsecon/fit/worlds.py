@@ -1,8 +1,9 @@
-"""Which world a file's Gaussians are in: the one in which they look like the photographs.
+"""Finds the world of the Gaussians in a file: the world in which they look like the photographs. Host code.
 
-A splat has no record of its world. It may be that of the poses, the one before an `applied_transform`, or the one that
-a training normalised. Rendered in its own world, it correlates with each photograph, and more with the camera's own
-than with the others'. That holds for crude splats too, whose PSNR may lie below that of a plain colour.
+A splat file does not record its world. It may be the world of the poses, the world before an `applied_transform`, or
+one that a training program normalises to. Rendered in the right world, a scene correlates with the photographs, and
+more with the photograph of the same camera than with the others. That holds for crude scenes too, whose PSNR may lie
+below that of a plain colour.
 """
 
 from typing import NamedTuple
@@ -18,46 +19,60 @@ from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.splat.render import render_rgb
 from jsecon.types import Capture, Gaussians
 
-VIEWS = 8
-"""training frames that are compared, evenly spaced"""
-SIDE = 64
-"""px of the longer side at which they are compared: a crude splat is right at this size"""
-ALIKE, CRUDE, FEW_ALIKE = 0.85, 0.3, 0.5
-"""mean correlation with the photographs that tells the right world by itself; where the cameras are told apart; with
-fewer than FEW views, which tell too little. Scenes of one Gaussian a sparse point, not fitted at all, have 0.40 (fox)
-and 0.50 (bonsai) in their world, others up to 0.40 in a wrong one; fitted ones 0.8 to 0.97 and -0.1 to 0.1"""
-FEW = 6
-TOLD_APART = 4.0
-"""standard deviations by which the correlation lies above that with shuffled photographs: 4.2 and 4.9 in those right
-worlds, up to 3.6 in wrong ones (a tenth of the scene's size beside: 4.0)"""
+MAX_VIEWS = 8
+"""Number of training frames that are compared, evenly spaced."""
+LONG_SIDE = 64
+"""Longer side in px at which they are compared: crude scenes look right at this size."""
+MIN_CORRELATION = 0.85
+"""Mean correlation with the photographs that identifies the right world. Fitted scenes have 0.8 to 0.97 in their world
+and -0.1 to 0.1 in others."""
+MIN_CRUDE_CORRELATION = 0.3
+"""The same if MIN_CONTRAST holds too. Scenes of one Gaussian per sparse point, not fitted, have 0.40 (fox) and 0.50
+(bonsai) in their world, and up to 0.40 in others."""
+MIN_CORRELATION_FEW_VIEWS = 0.5
+"""The same for fewer than MIN_VIEWS views, whose contrast is not significant."""
+MIN_VIEWS = 6
+MIN_CONTRAST = 4.0
+"""Standard deviations above the correlation with shuffled photographs: 4.2 and 4.9 for these crude scenes in their
+world, up to 3.6 in others (4.0 if shifted by a tenth of the scene's size)."""
 _SHUFFLES = 500
 _COLMAP_TO_NERFSTUDIO = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""(x, y, z) to (x, z, -y), before all else, where nerfstudio reads a COLMAP model itself"""
+"""(x, y, z) to (x, z, -y), which nerfstudio applies first to a COLMAP model that it reads itself."""
 
 
 class PhotoSimilarity(NamedTuple):
-    """How much a scene looks like the photographs."""
+    """Similarity of a scene to the photographs."""
 
     correlation: float
-    """mean over the views, in [-1, 1]"""
-    apart: float
-    """standard deviations above the same with the photographs shuffled among the cameras"""
+    """Mean over the views, in [-1, 1]."""
+    contrast: float
+    """Standard deviations above the correlation with the photographs shuffled among the cameras."""
     psnr: float
-    """mean, dB"""
+    """Mean, dB."""
     views: int
+    """Number of views compared."""
 
     @property
     def explained(self) -> bool:
         """Whether the photographs show this scene from these cameras."""
-        if self.views < FEW:
-            return self.correlation >= FEW_ALIKE
-        return self.correlation >= ALIKE or (self.correlation >= CRUDE and self.apart >= TOLD_APART)
+        if self.views < MIN_VIEWS:
+            return self.correlation >= MIN_CORRELATION_FEW_VIEWS
+        crude = self.correlation >= MIN_CRUDE_CORRELATION and self.contrast >= MIN_CONTRAST
+        return self.correlation >= MIN_CORRELATION or crude
 
 
 def photo_similarity(gaussians: Gaussians, capture: Capture) -> PhotoSimilarity:
-    """How much Gaussians in the capture's world look like its training frames."""
+    """Compares renderings of a scene with training frames.
+
+    Args:
+      gaussians: Scene in the world of the capture.
+      capture: Frames and cameras.
+
+    Returns:
+      Correlation, contrast and PSNR over at most MAX_VIEWS frames.
+    """
     train = np.flatnonzero(~np.asarray(capture.held_out))
-    views = train[evenly_spaced(len(train), VIEWS)]
+    views = train[evenly_spaced(len(train), MAX_VIEWS)]
     cameras = shrink_cameras(capture.cameras, QUICK_LONG_SIDE)
     gaussians = jax.device_put(gaussians)
     rendered, photos, psnr = [], [], []
@@ -71,13 +86,13 @@ def photo_similarity(gaussians: Gaussians, capture: Capture) -> PhotoSimilarity:
     draw, rows = np.random.default_rng(0), np.arange(len(views))
     shuffled = np.array([table[rows, draw.permutation(len(views))].sum() for _ in range(_SHUFFLES)])
     deviation = max(float(shuffled.std()), 1e-9)
-    apart = float((np.trace(table) - shuffled.mean()) / deviation)
-    return PhotoSimilarity(float(np.diag(table).mean()), apart, float(np.mean(psnr)), len(views))
+    contrast = float((np.trace(table) - shuffled.mean()) / deviation)
+    return PhotoSimilarity(float(np.diag(table).mean()), contrast, float(np.mean(psnr)), len(views))
 
 
 def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:
-    """The image as a small vector of length 1 whose channels have mean 0; of length 0 where it is one colour."""
-    size = SIDE / max(image.shape[:2])
+    """The image as a small vector of length 1 whose channels have mean 0; zero for a plain colour."""
+    size = LONG_SIDE / max(image.shape[:2])
     if size < 1:
         shape = max(round(image.shape[1] * size), 1), max(round(image.shape[0] * size), 1)
         image = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
@@ -89,7 +104,7 @@ def _pattern(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " p"]:
 def training_worlds(
     cameras_to_world: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"]
 ) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """The worlds that programs bring a capture into before they train, as far as its cameras and points tell.
+    """Computes the worlds that training programs normalise a capture to, from its cameras and points.
 
     gsplat (examples/datasets/normalize.py): the cameras' up to -y by the smallest turn, the median of the points of
     their axes nearest to the origin to the origin, the median camera to distance 1; then the points' principal axes,
@@ -101,13 +116,13 @@ def training_worlds(
       points: P sparse points there, float64.
 
     Returns:
-      The program and the (4, 4) similarity from the world of the poses to the one that it trains in, each.
+      For each the program and the (4, 4) similarity from the world of the poses to the world that it trains in.
     """
     turns, centres = cameras_to_world[:, :3, :3], cameras_to_world[:, :3, 3]
     up = -turns[:, :, 1].mean(0)
     if not np.linalg.norm(up) > 1e-6:
         return []
-    found = []
+    worlds = []
     turn = _least_turn(up, np.array([0.0, -1.0, 0.0]))
     ahead, places = turns[:, :, 2] @ turn.T, centres @ turn.T
     middle = np.median(places - (ahead * places).sum(1, keepdims=True) * ahead, axis=0)
@@ -122,16 +137,16 @@ def training_worlds(
                 aligned = np.eye(4)
                 aligned[:3, :3] = np.diag(signs) @ axes
                 aligned[:3, 3] = -aligned[:3, :3] @ centre
-                found.append(("gsplat", aligned @ plain))
-        found.append(("gsplat", plain))
+                worlds.append(("gsplat", aligned @ plain))
+        worlds.append(("gsplat", plain))
     for before in (np.eye(4), _COLMAP_TO_NERFSTUDIO):
         turn = _least_turn(before[:3, :3] @ up, np.array([0.0, 0.0, 1.0]))
         places = centres @ (turn @ before[:3, :3]).T
         middle = places.mean(0)
         trained = _scaled(turn, middle, np.abs(places - middle).max())
         if trained is not None:
-            found.append(("nerfstudio", trained @ before))
-    return found
+            worlds.append(("nerfstudio", trained @ before))
+    return worlds
 
 
 def _scaled(turn: np.ndarray, middle: np.ndarray, size: float) -> np.ndarray | None:

@@ -1,14 +1,13 @@
-"""Compositing as jax sees it: its own gradient rule, its own way under vmap, and bad features kept to their pixels.
+"""Rules of compositing for jax: gradient, vmap, and containment of non-finite features. Reverse mode only.
 
-Gradient: symbolic zeros tell whether anybody asked for the geometry's, so that a field distilled into frozen Gaussians
-never pays for it.
+Gradient: symbolic zeros show whether the gradient of the geometry is needed, so that a field that is distilled into
+frozen Gaussians does not compute it.
 
-vmap: a loop with an early exit runs in lockstep when it is batched, as long as its slowest member. So several feature
-sets of one view become more channels of one walk over its tiles, and several views are walked one after another.
+vmap: a batched loop with early exit runs as long as its slowest member. So several feature sets of one view become more
+channels of one walk over its tiles, and several views are walked one after another.
 
-Zero times NaN is NaN, so a feature that is not finite would spread to its whole tile, and by the padding of lists to
-others. Such numbers are therefore composited as zeros, and the pixels they touch are found by a second walk, which is
-taken only where there is a bad number at all.
+Zero times NaN is NaN, so a non-finite feature would spread to its whole tile, and through the padding of lists to other
+tiles. Such features are composited as zeros instead, and a second walk, only if there are any, marks their pixels.
 """
 
 import dataclasses
@@ -34,12 +33,12 @@ from jsecon.types import Array
 def view_lists(
     projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, mesh: Mesh | None = None
 ) -> TileLists:
-    """`tile_lists` of all strips, which share `capacity`; one view after another under vmap; no gradient passes."""
-    each = capacity if mesh is None else -(-capacity // mesh.size)
+    """Makes the tile lists of all strips, which share `capacity`; views run one by one under vmap, without gradient."""
+    per_strip = capacity if mesh is None else -(-capacity // mesh.size)
 
-    def local(strip, dealt, projection):
-        del dealt
-        return tile_lists(projection, width, height, capacity=each, tile=tile, strip=strip)
+    def local(strip, divided, projection):
+        del divided
+        return tile_lists(projection, width, height, capacity=per_strip, tile=tile, strip=strip)
 
     lists = sequential_vmap(lambda p: map_strips(local, (), p, mesh))
     return lists(jax.tree.map(lax.stop_gradient, projection))
@@ -49,21 +48,33 @@ def view_lists(
 def rasterize(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None = None
 ) -> tuple[Array, Array]:
-    """Image (H, W, D) and final transmittance (H, W) of `splats` (N, 6) with `features` (N, D); see composite.py."""
+    """Composites features through tile lists.
+
+    Args:
+      splats: (N, 6) as in `ViewPlan`.
+      features: (N, D) finite features.
+      lists: Tile lists of the view.
+      width: Width of the image, px.
+      height: Height of the image, px.
+      mesh: Devices that hold the strips, or None.
+
+    Returns:
+      Image (H, W, D) and final transmittance (H, W).
+    """
     return _forward(splats, features, lists, width, height, mesh)[:2]
 
 
-def _splat_forward(splats, features, lists, width, height, mesh):
-    wants_geometry = splats.perturbed
+def _rasterize_forward(splats, features, lists, width, height, mesh):
+    needs_geometry = splats.perturbed
     splats, features = splats.value, features.value
     lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
     image, transmittance, seen = _forward(splats, features, lists, width, height, mesh)
     lists = dataclasses.replace(lists, lengths=seen)
-    saved = (image, transmittance) if wants_geometry else None
+    saved = (image, transmittance) if needs_geometry else None
     return (image, transmittance), (splats, features, lists, saved)
 
 
-def _splat_backward(width, height, mesh, residual, cotangents):
+def _rasterize_backward(width, height, mesh, residual, cotangents):
     splats, features, lists, saved = residual
     symbolic = jax.custom_derivatives.SymbolicZero
     bars = [jnp.zeros(bar.shape, splats.dtype) if isinstance(bar, symbolic) else bar for bar in cotangents]
@@ -75,7 +86,7 @@ def _splat_backward(width, height, mesh, residual, cotangents):
     return by_splat, gradient.astype(features.dtype), None
 
 
-rasterize.defvjp(_splat_forward, _splat_backward, symbolic_zeros=True)
+rasterize.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
 
 
 def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
@@ -96,8 +107,8 @@ def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: 
 
 
 def _merging_channels(one: Callable, split: Callable) -> Callable:
-    """`one(splats, channels, lists)` under vmap: batched channels alone (S, ..., D) become S D channels of one call;
-    `split(result, S)` takes it apart and says what of it is batched. Anything else runs one after another."""
+    """`one(splats, channels, lists)` with a rule for vmap: if only channels (S, ..., D) are batched, they become S D
+    channels of one call, whose result `split(result, S)` unmerges. Any other batch runs one after another."""
     function = custom_vmap(one)
 
     @function.def_vmap
@@ -129,11 +140,15 @@ def rasterize_contained(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"]]:
-    """`rasterize`, with NaN in every channel of the pixels that a Gaussian with a NaN or infinite feature touches, and
-    in no other. Those pixels and those numbers have gradient zero."""
-    sound = jnp.isfinite(features)
-    image, transmittance = rasterize(splats, jnp.where(sound, features, 0.0), lists, width, height, mesh)
-    bad = lax.stop_gradient(1.0 - sound.all(1, keepdims=True).astype(splats.dtype))
+    """Composites features of which some may be NaN or infinite; arguments as for `rasterize`.
+
+    Returns:
+      Image (H, W, D), NaN in exactly the pixels that a Gaussian with a non-finite feature touches, and final
+      transmittance (H, W). Those pixels and features have gradient zero.
+    """
+    finite = jnp.isfinite(features)
+    image, transmittance = rasterize(splats, jnp.where(finite, features, 0.0), lists, width, height, mesh)
+    bad = lax.stop_gradient(1.0 - finite.all(1, keepdims=True).astype(splats.dtype))
 
     def walk(bad) -> Array:
         image, _ = cast(tuple[Array, Array], rasterize(lax.stop_gradient(splats), bad, lists, width, height, mesh))
@@ -145,7 +160,7 @@ def rasterize_contained(
 
 @custom_vmap
 def _any(bad: Array) -> Array:
-    """() bool: one is bad. Under vmap: one in the whole batch, so that the choice stays one branch."""
+    """() bool whether any is set; under vmap any of the whole batch, so that a conditional stays one."""
     return jnp.any(bad > 0)
 
 

@@ -1,6 +1,6 @@
-"""Front-to-back alpha compositing of tile lists, and its transpose: the gradient with respect to the features.
+"""Front-to-back alpha compositing of tile lists, and its transpose, the gradient with respect to the features.
 
-A batch's tiles are walked together (walk.py), batch after batch; over several devices, each walks its strip.
+The tiles of a batch are walked together (walk.py), one batch after another. Each device walks one strip.
 """
 
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import CHUNK, blend_weights, make_batches, make_table, to_image, to_tiles, walk
 from jsecon.types import Array
 
-WIDE = 6
-"""from this many channels on, a chunk's weights are computed once and kept; below, anew for each channel"""
+MAX_RECOMPUTED = 6
+"""Number of channels above which the weights of a chunk are stored instead of recomputed for each channel."""
 
 
 def composite(
@@ -27,22 +27,33 @@ def composite(
     height: int,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, "h w d"], Float[Array, "h w"], Int[Array, " tiles"]]:
-    """Features (H, W, D) = sum of alpha T f in the splats' dtype (bfloat16 `features` are read as such), final
-    transmittance (H, W), and how far down each tile's list anything is seen: lists cut there composite to the same, and
-    have the same gradient."""
+    """Composites features: the sum of alpha T f.
+
+    Args:
+      splats: (N, 6) as in `ViewPlan`.
+      features: (N, D); bfloat16 is read as such.
+      lists: Tile lists.
+      width: Width of the image, px.
+      height: Height of the image, px.
+      mesh: Devices that hold the strips, or None.
+
+    Returns:
+      Image (H, W, D) in the dtype of the splats, final transmittance (H, W), and (tiles,) int32 the visible length of
+      each list: lists cut there have the same image and the same gradient.
+    """
     channels = features.shape[1] + 1
-    # Wide features are gathered as they are: a table of them would be written anew in every render.
-    apart = channels > WIDE or features.dtype != splats.dtype
+    # Wide features are gathered from their array: a table with them would be written again in every render.
+    separate = channels > MAX_RECOMPUTED or features.dtype != splats.dtype
 
     def local(strip, lists, common):
         (table, features), batches = common, make_batches(lists, width, strip)
 
         def body(transmittance, total, chunk):
-            if apart:
-                given = features[chunk.ids].astype(table.dtype)
-                chunk = chunk._replace(columns=jnp.concatenate([given, chunk.columns], axis=-1))
-            if channels <= WIDE:
-                return _summed_anew(transmittance, total, chunk)
+            if separate:
+                columns = features[chunk.ids].astype(table.dtype)
+                chunk = chunk._replace(columns=jnp.concatenate([columns, chunk.columns], axis=-1))
+            if channels <= MAX_RECOMPUTED:
+                return _add_recomputed(transmittance, total, chunk)
             weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
             for k in range(CHUNK):
                 total = total + weight[:, None, k] * chunk.columns[:, k, :, None]
@@ -57,15 +68,15 @@ def composite(
         by_tile = jnp.zeros(batches.number + 1, jnp.int32).at[batches.tiles].set(seen)[:-1]
         return image[..., :-1], 1 - image[..., -1], by_tile
 
-    # A last channel of ones sums the weights: the final transmittance is what they leave of 1.
+    # A last channel of ones sums the weights: the final transmittance is 1 minus them.
     ones = jnp.ones_like(splats[:, :1])
-    table = make_table(splats, ones) if apart else make_table(splats, features, ones)
-    image, transmittance, seen = map_strips(local, lists, (table, features if apart else None), mesh)
+    table = make_table(splats, ones) if separate else make_table(splats, features, ones)
+    image, transmittance, seen = map_strips(local, lists, (table, features if separate else None), mesh)
     return join_strips(image, lists.tile, height), join_strips(transmittance, lists.tile, height), seen
 
 
-def _summed_anew(transmittance: Array, total: Array, chunk) -> tuple[Array, Array]:
-    """The recurrence written out inside the kernel of each channel: for few channels cheaper than storing weights."""
+def _add_recomputed(transmittance: Array, total: Array, chunk) -> tuple[Array, Array]:
+    """Adds a chunk with the recurrence in the kernel of each channel: cheaper than stored weights for few channels."""
     left = jnp.broadcast_to(transmittance[:, None], total.shape)
     for k in range(CHUNK):
         weight = left * chunk.alpha[:, None, k]
@@ -79,11 +90,21 @@ def _summed_anew(transmittance: Array, total: Array, chunk) -> tuple[Array, Arra
 def composite_features_vjp(
     splats: Float[Array, "n 6"], lists: TileLists, cotangent: Float[Array, "h w d"], mesh: Mesh | None = None
 ) -> Float[Array, "n d"]:
-    """Gradient with respect to the features alone: W^T cotangent. No gradient of the geometry is computed."""
+    """Computes the gradient with respect to the features alone.
+
+    Args:
+      splats: (N, 6) as in `ViewPlan`.
+      lists: Tile lists.
+      cotangent: (H, W, D) gradient of the image.
+      mesh: Devices that hold the strips, or None.
+
+    Returns:
+      (N, D) W^T cotangent.
+    """
     width, channels = cotangent.shape[1:]
 
-    def local(strip, dealt, table):
-        lists, (image,) = dealt
+    def local(strip, divided, table):
+        lists, (image,) = divided
         batches, cotangents = make_batches(lists, width, strip), to_tiles(image, lists.tile)
 
         def one_batch(gradient, tiles):
@@ -91,8 +112,8 @@ def composite_features_vjp(
 
             def body(transmittance, gradient, chunk):
                 weight, transmittance = materialize(chunk.always, blend_weights, transmittance, chunk.alpha)
-                own = jnp.einsum("bcp,bdp->bcd", weight, values, precision=FULL_PRECISION)
-                return transmittance, gradient.at[chunk.ids].add(own)
+                rows = jnp.einsum("bcp,bdp->bcd", weight, values, precision=FULL_PRECISION)
+                return transmittance, gradient.at[chunk.ids].add(rows)
 
             return walk(table, lists, batches, tiles, body, gradient)[0], None
 

@@ -1,7 +1,7 @@
-"""One value, computed once: a wall between fusions.
+"""Keeps XLA from recomputing a value for each of its readers.
 
-XLA's CPU backend fuses cheap arithmetic into every reader, so that a polynomial, or a test of sixteen tiles, is
-computed anew for each; it drops optimization barriers before it fuses. The outcome of a conditional must lie in memory.
+XLA's CPU backend fuses cheap arithmetic into every reader, so that a polynomial or a test of sixteen tiles is computed
+again for each, and it drops optimization barriers before it fuses. But the result of a conditional must be in memory.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,22 @@ from jsecon.types import Array
 
 
 def materialize(always: Array, compute: Callable, *operands: Any) -> Any:
-    """`compute(*operands)`, computed once and kept in memory whatever reads it; `always` is true, unknown to the
-    compiler."""
+    """Computes `compute(*operands)` once and stores it.
+
+    Args:
+      always: () bool that is true, which the compiler cannot know (`opaque_true`).
+      compute: Pure function of arrays.
+      *operands: Its arguments.
+
+    Returns:
+      Its result.
+    """
     shapes = jax.eval_shape(compute, *operands)
-    nothing = lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
-    return lax.cond(always, compute, nothing, *operands)
+    zeros = lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    return lax.cond(always, compute, zeros, *operands)
 
 
 def opaque_true(number: Array) -> Array:
-    """() bool, true whatever `number` () holds, which the compiler does not find out."""
+    """Returns () bool true for any number (); the compiler cannot infer it."""
     bits = lax.bitcast_convert_type(number, jnp.int32 if number.dtype.itemsize == 4 else jnp.int64)
     return (bits | 1) != 0

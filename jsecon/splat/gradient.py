@@ -1,7 +1,7 @@
-"""The gradient of compositing with respect to everything, by hand.
+"""Hand-written gradient of compositing with respect to splats and features.
 
-It walks front to back as the image did: with G the cotangent, dL/dalpha_i = T_i <G, f_i> - (S - S_i) / (1 - alpha_i),
-where S_i is the running sum of w <G, f> up to i and S its total, known from the image. Nothing is stored per pair.
+It walks front to back like the image: with G the cotangent, dL/dalpha_i = T_i <G, f_i> - (S - S_i) / (1 - alpha_i),
+where S_i is the running sum of w <G, f> up to i and S its total, known from the image. No memory per pair is needed.
 """
 
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jsecon.splat.strips import map_strips, split_into_strips
 from jsecon.splat.tiles import TileLists
 from jsecon.splat.walk import (
     ATTRIBUTES,
-    BATCH_BACKWARD,
+    MAX_BATCH_BACKWARD,
     blend_weights,
     cumulative,
     make_batches,
@@ -28,7 +28,7 @@ from jsecon.splat.walk import (
 from jsecon.types import Array
 
 _UNROLLED = 8
-"""up to this many channels are summed in one kernel, more as a matrix product"""
+"""Number of channels up to which they are summed in one kernel; more are a matrix product."""
 
 
 def composite_vjp(
@@ -41,10 +41,22 @@ def composite_vjp(
     cotangent_transmittance: Float[Array, "h w"],
     mesh: Mesh | None = None,
 ) -> tuple[Array, Array]:
-    """Gradients with respect to the splats (N, 6) and the features (N, D). `image` and `transmittance` are what
-    `composite` returned.
+    """Computes the gradients of `composite`.
 
-    The transmittance is 1 - sum of w, so its cotangent joins the others as minus a channel of constant feature 1.
+    The transmittance is 1 - sum of w: its cotangent acts as minus the cotangent of a channel of ones.
+
+    Args:
+      splats: (N, 6) as in `ViewPlan`.
+      features: (N, D).
+      lists: Tile lists, cut to their visible lengths.
+      image: (H, W, D) result of `composite`.
+      transmittance: (H, W) result of `composite`.
+      cotangent: (H, W, D) gradient of the image.
+      cotangent_transmittance: (H, W) gradient of the transmittance.
+      mesh: Devices that hold the strips, or None.
+
+    Returns:
+      Gradients of the splats (N, 6) and of the features (N, D).
     """
     width, channels = cotangent.shape[1:]
     total = (image * cotangent).sum(-1) - (1 - transmittance) * cotangent_transmittance
@@ -54,9 +66,9 @@ def composite_vjp(
     # All sums over a tile's pixels are moments of one quantity, h = alpha dL/dalpha, about the tile's centre.
     monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
-    def local(strip, dealt, table):
-        lists, (packed,) = dealt
-        batches = make_batches(lists, width, strip, BATCH_BACKWARD)
+    def local(strip, divided, table):
+        lists, (packed,) = divided
+        batches = make_batches(lists, width, strip, MAX_BATCH_BACKWARD)
         in_tiles = to_tiles(packed, lists.tile)
 
         def one_batch(gradient, tiles):

@@ -1,8 +1,13 @@
-"""A view's plan: what repeated renders of frozen geometry share, so that they skip projection and sorting."""
+"""Plans of views: what repeated renderings of frozen geometry share, so that they skip projection and sorting.
+
+`make_plan` and `composite_plan` are pure. `plan_view`, `plan_views` and `render_plan` are their drivers: outside of a
+trace they call compiled programs, and plan again if the capacity overflows.
+"""
 
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,37 +21,58 @@ from jsecon.numerics import NEAR, all_finite, is_traced
 from jsecon.parallel import MESH_OPTIONS, map_rows
 from jsecon.splat.autodiff import rasterize_contained, view_lists
 from jsecon.splat.capacity import default_capacity, enough_capacity, round_capacity
-from jsecon.splat.project import check_shapes, project
+from jsecon.splat.project import check_geometry, project
 from jsecon.splat.tiles import TileLists
 from jsecon.types import Array, Camera, Gaussians, Leaf, Rendering, record, static
 
-PLAN_BYTES = 1 << 30
-"""most that the plans of all views may take together to be kept"""
+MAX_PLAN_BYTES = 1 << 30
+"""Largest memory of the plans of all views, above which they are not kept."""
 
 
 @record
 class ViewPlan:
-    """The splats and tile lists of one view: a pytree, so it passes through jit and is stacked by vmap."""
+    """Splats and tile lists of one view: a pytree, so it passes through jit and vmap stacks it."""
 
     splats: Leaf
-    """(N, 6) centre x, y (px), whitening l11, l21, l22 (1/px, times sqrt(1/2)), opacity; zero where invisible."""
+    """(N, 6) centre x, y (px), whitening l11, l21, l22 (1/px, times sqrt(1/2)), opacity; zero if invisible."""
     depths: Leaf
-    """(N,) z in the camera, world units; zero where invisible."""
-    sound: Leaf
-    """() bool: the camera is finite; one that is not sees NaN."""
+    """(N,) z in the camera, world units; zero if invisible."""
+    camera_is_finite: Leaf
+    """() bool: if false, renderings are NaN."""
     lists: TileLists
-    """which Gaussians reach which tile, front to back."""
+    """Gaussians that reach each tile, front to back."""
     width: int = static()
     """px."""
     height: int = static()
     """px."""
     mesh: Mesh | None = static(default=None)
-    """the devices that hold its strips, or None."""
+    """Devices that hold its strips, or None."""
 
     @property
     def overflow(self) -> Array:
-        """() int32 pairs that did not fit the capacity; 0 means that renders of the plan are exact."""
+        """() int32 pairs beyond the capacity; 0 means that renderings of the plan are exact."""
         return self.lists.overflow.sum(-1)
+
+
+def make_plan(
+    gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array = NEAR, mesh: Mesh | None = None
+) -> ViewPlan:
+    """Projects and lists one view. Pure; arguments as for `plan_view`, with a fixed capacity."""
+    gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
+    projection = map_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
+    lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
+    columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
+    # An invisible Gaussian is in no list; its row is zeroed so that no non-finite number reaches a gradient.
+    splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
+    depths = jnp.where(projection.visible, projection.depths, 0.0)
+    finite = all_finite(*jax.tree.leaves(camera))
+    return ViewPlan(splats, depths, finite, lists, camera.width, camera.height, mesh)
+
+
+# of one device, and over a mesh
+_make_plan_compiled = [
+    jax.jit(make_plan, static_argnums=(2, 4), compiler_options=options) for options in (None, MESH_OPTIONS)
+]
 
 
 def plan_view(
@@ -59,70 +85,75 @@ def plan_view(
 ) -> ViewPlan:
     """Projects and lists one view once, for any number of `render_plan(plan, features)`.
 
-    Differentiable like `render`; where only features are to be differentiated, make the plan outside of what is, and
-    no gradient of the geometry is computed. `capacity` and `mesh` as for `render`: outside a trace and without a
-    capacity it waits for the view's overflow, and where there is any, plans again with enough. Over a mesh, each device
-    plans its strip of the image (strips.py) and keeps it. Raises ValueError on shapes that disagree.
+    Differentiable like `render`. To differentiate only features, make the plan outside of the differentiated function:
+    then no gradient of the geometry is computed.
+
+    Args:
+      gaussians: Scene of N Gaussians; its `sh` may be None.
+      camera: One camera.
+      capacity: As for `render`. By default, outside of a trace, the call waits for the view's overflow and plans again
+        with enough capacity if there is any.
+      near: Near plane, world units.
+      mesh: As for `render`; each device plans and keeps its strip of the image.
+
+    Returns:
+      The plan; `overflow` is 0 if its renderings are exact.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
-    check_shapes(gaussians, camera)
+    check_geometry(gaussians, camera)
     size = capacity
     if size is None:
         strips = 1 if mesh is None else mesh.size
         size = default_capacity(gaussians.means.shape[0], camera.width, camera.height, strips=strips)
-    # Colour has no part in it: Gaussians with and without share one program.
-    bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype))
-    if is_traced((bare, camera, near)):
-        return _plan(bare, camera, size, near, mesh)
-    plan = _plan_compiled[mesh is not None](bare, camera, size, near, mesh)
+    # Colour has no influence: Gaussians with and without it share one program.
+    no_sh = np.zeros((gaussians.means.shape[0], 0, 3), gaussians.means.dtype)
+    geometry = dataclasses.replace(gaussians, sh=no_sh)
+    if is_traced((geometry, camera, near)):
+        return make_plan(geometry, camera, size, near, mesh)
+    compiled = _make_plan_compiled[mesh is not None]
+    plan = compiled(geometry, camera, size, near, mesh)
     if capacity is None and (overflow := np.asarray(plan.lists.overflow)).any():
-        plan = _plan_compiled[mesh is not None](bare, camera, enough_capacity(size, overflow), near, mesh)
+        plan = compiled(geometry, camera, enough_capacity(size, overflow), near, mesh)
     return plan
 
 
-def _plan(gaussians: Gaussians, camera: Camera, capacity: int, near: float | Array, mesh: Mesh | None) -> ViewPlan:
-    gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    projection = map_rows(lambda rows, view: project(rows, view[0], near=view[1]), gaussians, (camera, near), mesh)
-    lists = view_lists(projection, camera.width, camera.height, capacity=capacity, mesh=mesh)
-    columns = [projection.means_px, projection.whitening * math.sqrt(0.5), projection.opacities[:, None]]
-    # An invisible Gaussian is in no list; its row is zeroed so that nothing non-finite reaches a gradient.
-    splats = jnp.where(projection.visible[:, None], jnp.concatenate(columns, axis=1), 0.0)
-    depths = jnp.where(projection.visible, projection.depths, 0.0)
-    sound = all_finite(*jax.tree.leaves(camera))
-    return ViewPlan(splats, depths, sound, lists, camera.width, camera.height, mesh)
-
-
-# of one device, and over a mesh
-_plan_compiled = [jax.jit(_plan, static_argnums=(2, 4), compiler_options=options) for options in (None, MESH_OPTIONS)]
-
-
 def plan_views(
-    gaussians: Gaussians, cameras: Camera, *, capacity: int | None = None, most_bytes: int = PLAN_BYTES
+    gaussians: Gaussians, cameras: Camera, *, capacity: int | None = None, max_bytes: int = MAX_PLAN_BYTES
 ) -> ViewPlan | None:
-    """The plans of all views of a batch (T), stacked on a leading axis: `jax.tree.map(lambda a: a[t], plans)` is that
-    of view t. None where they would take more than `most_bytes` together: then each is to be made when it is wanted.
+    """Plans all views of a batch.
 
-    Outside a trace the lists are cut to what the views need.
+    Args:
+      gaussians: Scene of N Gaussians; its `sh` may be None.
+      cameras: Batch of T cameras.
+      capacity: As for `render`.
+      max_bytes: Memory limit of all plans together.
+
+    Returns:
+      The plans stacked on a leading axis (`jax.tree.map(lambda a: a[t], plans)` is the plan of view t), outside of a
+      trace with lists cut to the longest; or None if they exceed the limit.
     """
     make = functools.partial(plan_view, gaussians, capacity=capacity)
     views, first = cameras.world_to_camera.shape[0], make(cameras[0])
     if is_traced(first):
-        return None if views * _bytes(first) > most_bytes else lax.map(make, cameras)
+        return None if views * _bytes(first) > max_bytes else lax.map(make, cameras)
     plans, largest = [], 0
     for t in range(views):
-        plans.append(_cut(first if t == 0 else make(cameras[t])))
+        plans.append(_cut_lists(first if t == 0 else make(cameras[t])))
         largest = max(largest, _bytes(plans[-1]))
-        if views * largest > most_bytes:
+        if views * largest > max_bytes:
             return None
     length = round_capacity(max(plan.lists.gaussians.shape[0] for plan in plans))
-    return jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows)), *(_cut(plan, length) for plan in plans))
+    return jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows)), *(_cut_lists(plan, length) for plan in plans))
 
 
 def _bytes(plan: ViewPlan) -> int:
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(plan))
 
 
-def _cut(plan: ViewPlan, length: int | None = None) -> ViewPlan:
-    """The plan in NumPy, its lists without what lies behind the last, or filled up to `length`."""
+def _cut_lists(plan: ViewPlan, length: int | None = None) -> ViewPlan:
+    """The plan in NumPy, its lists cut behind the last used entry, or padded to `length`."""
     plan = jax.tree.map(np.asarray, plan)
     used = int((plan.lists.starts + plan.lists.lengths).max(initial=0))
     ids = np.zeros(used if length is None else length, np.int32)
@@ -130,43 +161,55 @@ def _cut(plan: ViewPlan, length: int | None = None) -> ViewPlan:
     return dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, gaussians=ids))
 
 
-def render_plan(
-    plan: ViewPlan, features: Float[Array, "n d"], *, background: Array | None = None, depth: bool = False
-) -> Rendering:
-    """Renders per-Gaussian `features` (N, D) through a plan: `render` without projection and sorting.
-
-    Differentiable, under jit, grad and vmap, on the devices of the plan; features, `background` and `depth` as for
-    `render`. Raises ValueError on shapes that disagree.
-    """
-    require_shape("features", features, (plan.splats.shape[0], "D"), "Give one row of features per Gaussian.")
-    require_background(background, features.shape[1])
-    traced = is_traced((plan, features, background))
-    run = _render_plan if traced else _render_plan_compiled[plan.mesh is not None]
-    return run(plan, features, background, depth)
-
-
-def require_background(background: Array | None, channels: int) -> None:
-    """Raises ValueError unless a background has one number for each channel of the features, or one for all."""
-    if background is not None:
-        got, remedy = np.shape(background), "Give one number for each channel of the features."
-        require(got in ((), (channels,)), "background", got, f"({channels},)", remedy)
-
-
-def _render_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool):
+def composite_plan(plan: ViewPlan, features: Array, background: Array | None, depth: bool) -> Rendering:
+    """Renders features through a plan. Pure; arguments as for `render_plan`."""
     features = jnp.asarray(features)
     if depth or features.dtype != jnp.bfloat16:
         features = features.astype(plan.splats.dtype)
     columns = jnp.concatenate([features, plan.depths[:, None]], axis=1) if depth else features
     image, transmittance = rasterize_contained(plan.splats, columns, plan.lists, plan.width, plan.height, plan.mesh)
-    image, transmittance = (jnp.where(plan.sound, a, jnp.nan) for a in (image, transmittance))
-    alpha, expected = 1 - transmittance, None
+    image, transmittance = (jnp.where(plan.camera_is_finite, a, jnp.nan) for a in (image, transmittance))
+    alpha, expected_depth = 1 - transmittance, None
     if depth:
         covered = alpha > 0
-        expected = jnp.where(covered, image[..., -1] / jnp.where(covered, alpha, 1.0), 0.0)
+        expected_depth = jnp.where(covered, image[..., -1] / jnp.where(covered, alpha, 1.0), 0.0)
         image = image[..., :-1]
     if background is not None:
         image = image + transmittance[..., None] * jnp.reshape(background, (1, 1, -1))
-    return Rendering(image, alpha, plan.overflow, expected)
+    return Rendering(image, alpha, plan.overflow, expected_depth)
 
 
-_render_plan_compiled = [jax.jit(_render_plan, static_argnums=3, compiler_options=o) for o in (None, MESH_OPTIONS)]
+_composite_plan_compiled: list[Any] = [
+    jax.jit(composite_plan, static_argnums=3, compiler_options=options) for options in (None, MESH_OPTIONS)
+]
+
+
+def render_plan(
+    plan: ViewPlan, features: Float[Array, "n d"], *, background: Array | None = None, depth: bool = False
+) -> Rendering:
+    """Renders per-Gaussian features through a plan: `render` without projection and sorting.
+
+    Args:
+      plan: Plan of one view; its devices are used.
+      features: As for `render`.
+      background: As for `render`.
+      depth: As for `render`.
+
+    Returns:
+      Features (H, W, D), alpha and overflow.
+
+    Raises:
+      ValueError: Shapes disagree.
+    """
+    require_shape("features", features, (plan.splats.shape[0], "D"), "Pass one row of features per Gaussian.")
+    require_background(background, features.shape[1])
+    traced = is_traced((plan, features, background))
+    run = composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
+    return run(plan, features, background, depth)
+
+
+def require_background(background: Array | None, channels: int) -> None:
+    """Raises ValueError unless a background has one number per channel of the features, or one for all."""
+    if background is not None:
+        got, remedy = np.shape(background), "Pass one number per channel of the features."
+        require(got in ((), (channels,)), "background", got, f"({channels},)", remedy)

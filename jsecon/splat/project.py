@@ -1,6 +1,6 @@
-"""From 3D Gaussians to 2D splats: EWA projection with a determinant that does not cancel and tight, exact extents.
+"""Projects 3D Gaussians to 2D splats: EWA splatting with a determinant without cancellation and exact, tight extents.
 
-Numbers that are none: which Gaussians they make unusable, and how many there are. Nothing is dropped unsaid.
+Non-finite inputs disable the affected Gaussians; `count_non_finite` reports how many.
 """
 
 import dataclasses
@@ -18,10 +18,16 @@ from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
 
 def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
-    """(N,) the Gaussians that can be drawn; the others are hidden, and harm neither image nor gradient of the rest.
+    """Finds the Gaussians that can be rendered; the others are hidden, without effect on image and gradients.
 
-    A NaN, an infinite mean or quaternion, or an infinite size is no Gaussian. Minus infinity as a log scale is the
-    logarithm of a size of 0, and an infinite opacity logit that of an opacity of 0 or 1: both are drawn.
+    A NaN, an infinite mean or quaternion, or an infinite size disables a Gaussian. A log scale of minus infinity is a
+    size of 0 and an infinite opacity logit an opacity of 0 or 1: both are rendered.
+
+    Args:
+      gaussians: N Gaussians.
+
+    Returns:
+      (N,) bool.
     """
     geometry = jnp.concatenate([gaussians.means, gaussians.quaternions], axis=1)
     sizes = jnp.isnan(gaussians.log_scales) | jnp.isposinf(gaussians.log_scales)
@@ -29,12 +35,16 @@ def is_usable(gaussians: Gaussians) -> Bool[Array, " n"]:
 
 
 def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
-    """(M,) rows of one of the fields of `Gaussians` that no file holds, on the host: what `is_usable` excludes, colours
-    that are not finite, and quaternions of length 0.
+    """Finds rows of a field of `Gaussians` that no file may hold. Host code (NumPy).
+
+    These are the rows that `is_usable` excludes, colours that are not finite, and quaternions of length 0.
 
     Args:
-      name: The field, "log_scales" for example.
+      name: Name of the field, for example "log_scales".
       numbers: (M, ...) its values.
+
+    Returns:
+      (M,) bool.
     """
     if name == "opacity_logits":
         wrong = np.isnan(numbers)
@@ -48,20 +58,26 @@ def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
 
 
 def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None = None) -> Int[Array, ""]:
-    """() int32 Gaussians that are not usable, or whose features (None: their spherical harmonics) are not finite.
+    """Counts Gaussians that `render` hides or shows as NaN.
 
-    `render` hides the former, and shows the latter as NaN on the pixels that they touch.
+    Args:
+      gaussians: N Gaussians.
+      features: (N, D) features to check; by default the spherical harmonics.
+
+    Returns:
+      () int32 number of Gaussians that are not usable (hidden) or whose features are not finite (NaN in the pixels that
+      they touch).
     """
     channels = gaussians.sh.reshape(gaussians.sh.shape[0], -1) if features is None else features
     return jnp.sum(~(is_usable(gaussians) & jnp.isfinite(channels).all(1)), dtype=jnp.int32)
 
 
-# An axis longer than this (px) is flat over any image; it is shrunk to it, so that squares stay in float32.
-_WIDEST_PX = 1e15
-# No splat reaches back from here (px): its axes end at _WIDEST_PX.
-_FARTHEST_PX = 1e17
-# exp(60) is beyond any scene and its products with a focal length over a depth still fit float32.
-_LARGEST_LOG_SCALE = 60.0
+_MAX_AXIS_PX = 1e15
+"""Longest axis of a splat in px, flat over any image; longer axes are shrunk to it, so that squares fit float32."""
+_MAX_OFFSET_PX = 1e17
+"""Distance in px from which no splat reaches the image, as its axes end at _MAX_AXIS_PX."""
+_MAX_LOG_SCALE = 60.0
+"""exp(60) is beyond any scene, and its products with a focal length over a depth still fit float32."""
 
 
 @record
@@ -69,7 +85,7 @@ class Projection:
     """N splats of one view."""
 
     means_px: Leaf
-    """(N, 2) centres, px. This and the following mean nothing where `visible` is False."""
+    """(N, 2) centres, px. This and the following fields are arbitrary where `visible` is False."""
     whitening: Leaf
     """(N, 3) l11, l21, l22 of the lower-triangular L with inverse covariance = L L^T, 1/px: with d = pixel - centre,
     the squared Mahalanobis distance is (l11 dx + l21 dy)^2 + (l22 dy)^2, never negative and without the cancellation
@@ -81,7 +97,7 @@ class Projection:
     extents: Leaf
     """(N, 2) half-width and half-height, px, of the box outside which alpha < 1/255."""
     visible: Leaf
-    """(N,) bool: `is_usable`, in front of the near plane, able to reach alpha 1/255, box touching the image."""
+    """(N,) bool: usable, in front of the near plane, opacity of at least 1/255, box touching the image."""
 
     @property
     def conics(self) -> Array:
@@ -91,7 +107,7 @@ class Projection:
 
 
 def _rotation(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
-    """The entries (N,) of the rotation matrices of unit quaternions, row by row; the zero quaternion turns nothing."""
+    """Entries (N,) of the rotation matrices of unit quaternions, row by row; identity for the zero quaternion."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -100,49 +116,61 @@ def _rotation(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
 
 
 def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tuple) -> tuple[list[Array], list[Array]]:
-    """The rows, three (N,) each, of the 2x3 matrix M = J R S whose M M^T is the 2D covariance: J is the ray's Jacobian,
-    R turns the Gaussian's axes into the camera's, S scales them."""
+    """Two rows, three (N,) each, of the 2x3 matrix M = J R S, where M M^T is the 2D covariance, J the Jacobian of the
+    ray, R the rotation from the axes of the Gaussian to those of the camera, and S its scales."""
     rotation = _rotation(*unit)
     x_ratio, y_ratio, focal_x, focal_y = rays
     row_1, row_2 = [], []
     for axis in range(3):
-        scale = jnp.exp(jnp.minimum(log_scales[:, axis], _LARGEST_LOG_SCALE))
+        scale = jnp.exp(jnp.minimum(log_scales[:, axis], _MAX_LOG_SCALE))
         along = [sum(w2c[i, k] * rotation[k][axis] for k in range(3)) * scale for i in range(3)]
         row_1.append(focal_x * (along[0] - x_ratio * along[2]))
         row_2.append(focal_y * (along[1] - y_ratio * along[2]))
     longest = [jnp.maximum(jnp.abs(first), jnp.abs(second)) for first, second in zip(row_1, row_2)]
-    shrink = [jax.lax.stop_gradient(jnp.where(size > _WIDEST_PX, _WIDEST_PX / size, 1.0)) for size in longest]
+    shrink = [jax.lax.stop_gradient(jnp.where(size > _MAX_AXIS_PX, _MAX_AXIS_PX / size, 1.0)) for size in longest]
     return [entry * by for entry, by in zip(row_1, shrink)], [entry * by for entry, by in zip(row_2, shrink)]
 
 
 def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
-    """(N,) variances of x and y, blur included, and l11, l21, l22 of the inverse covariance's root."""
+    """(N,) variances of x and y with blur, and l11, l21, l22 of the root of the inverse covariance."""
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     norm_1, norm_2 = dot(row_1, row_1), dot(row_2, row_2)
     cov_xx, cov_yy = norm_1 + BLUR_PX2, norm_2 + BLUR_PX2
-    # In y, the unit is from here on the splat's own height (constant to the gradient: it cancels): 1 / cov_yy^2, which
-    # the derivative of a quotient contains, would vanish in float32 from heights of 1e9 px on.
+    # From here on the unit in y is the height of the splat (constant to the gradient, where it cancels): 1 / cov_yy^2,
+    # part of the derivative of a quotient, would underflow in float32 for heights of 1e9 px.
     per_height = jax.lax.stop_gradient(jax.lax.rsqrt(cov_yy))
     row_2 = [entry * per_height for entry in row_2]
     blur_y = BLUR_PX2 * per_height * per_height
-    own_yy = dot(row_2, row_2) + blur_y
-    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x given y. Nothing cancels.
+    scaled_yy = dot(row_2, row_2) + blur_y
+    # det(M M^T + e I) as a sum of positive terms, over cov_yy: the variance of x for fixed y. No cancellation.
     cross = [row_1[(i + 1) % 3] * row_2[(i + 2) % 3] - row_1[(i + 2) % 3] * row_2[(i + 1) % 3] for i in range(3)]
-    l11 = jax.lax.rsqrt((dot(cross, cross) + blur_y * norm_1 + BLUR_PX2 * own_yy) / own_yy)
-    return cov_xx, cov_yy, l11, -(dot(row_1, row_2) / own_yy * per_height) * l11, jax.lax.rsqrt(own_yy) * per_height
+    l11 = jax.lax.rsqrt((dot(cross, cross) + blur_y * norm_1 + BLUR_PX2 * scaled_yy) / scaled_yy)
+    return (
+        cov_xx,
+        cov_yy,
+        l11,
+        -(dot(row_1, row_2) / scaled_yy * per_height) * l11,
+        jax.lax.rsqrt(scaled_yy) * per_height,
+    )
 
 
 def check_shapes(gaussians: Gaussians, camera: Camera) -> None:
-    """Raises ValueError where the arrays of `gaussians` disagree, spherical harmonics included, or `camera` is a
-    batch."""
+    """Raises ValueError if the shapes of `gaussians` disagree, including `sh`, or `camera` is a batch."""
     check_gaussians(gaussians)
     _check_camera(camera)
 
 
-def check_gaussians(gaussians: Gaussians) -> None:
-    """Raises ValueError where the arrays of `gaussians` disagree, or its spherical harmonics are of no whole degree."""
+def check_geometry(gaussians: Gaussians, camera: Camera) -> None:
+    """Raises ValueError if the shapes of `gaussians` disagree, except `sh`, or `camera` is a batch."""
     _check_geometry(gaussians)
-    require_shape("gaussians.sh", gaussians.sh, (gaussians.count, "K", 3), "Give one row for each of the means.")
+    _check_camera(camera)
+
+
+def check_gaussians(gaussians: Gaussians) -> None:
+    """Raises ValueError if the shapes of `gaussians` disagree or its spherical harmonics have an incomplete degree."""
+    _check_geometry(gaussians)
+    require(gaussians.sh is not None, "gaussians.sh", None, "an array (N, K, 3)", "Pass spherical harmonics.")
+    require_shape("gaussians.sh", gaussians.sh, (gaussians.count, "K", 3), "Pass one row per Gaussian.")
     shape = tuple(gaussians.sh.shape)
     require(
         shape[1] in COEFFICIENT_COUNTS, "gaussians.sh", shape, "(N, K, 3) with K of 1, 4, 9 or 16", "Pad it with zeros."
@@ -150,47 +178,57 @@ def check_gaussians(gaussians: Gaussians) -> None:
 
 
 def _check_geometry(gaussians: Gaussians) -> None:
-    require_shape("gaussians.means", gaussians.means, ("N", 3), "Give one centre per Gaussian.")
+    require_shape("gaussians.means", gaussians.means, ("N", 3), "Pass one centre per Gaussian.")
     for name, rest in (("log_scales", (3,)), ("quaternions", (4,)), ("opacity_logits", ())):
         expected = gaussians.count, *rest
-        require_shape(f"gaussians.{name}", getattr(gaussians, name), expected, "Give one row for each of the means.")
+        require_shape(f"gaussians.{name}", getattr(gaussians, name), expected, "Pass one row per Gaussian.")
 
 
 def _check_camera(camera: Camera) -> None:
-    remedy = "Give a single camera: index the batch (cameras[t]) or use jax.vmap over it."
+    remedy = "Pass a single camera: index the batch (cameras[t]) or use jax.vmap over it."
     require_shape("camera.world_to_camera", camera.world_to_camera, (4, 4), remedy)
 
 
 def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR) -> Projection:
     """Projects N Gaussians into one view (Zwicker et al. 2001 as in Kerbl et al. 2023).
 
-    Differentiable in every array of both. Raises ValueError on shapes that disagree. Gaussians that are not usable
-    (NaN, infinite) come back invisible, with gradient zero; before a camera that is not finite, all do.
+    Pure, and differentiable in every array of both arguments, in forward mode too.
+
+    Args:
+      gaussians: Scene of N Gaussians; its `sh` has no influence.
+      camera: One camera.
+      near: Near plane, world units.
+
+    Returns:
+      N splats. Gaussians that are not usable (NaN, infinite) are invisible, with gradient zero; if the camera is not
+      finite, all are.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
-    _check_geometry(gaussians)  # colours have no part in it: planning leaves them out
-    _check_camera(camera)
-    gaussians, camera, drawn = _guarded(*jax.tree.map(jnp.asarray, (gaussians, camera)))
+    check_geometry(gaussians, camera)
+    gaussians, camera, drawn = _replace_non_finite(*jax.tree.map(jnp.asarray, (gaussians, camera)))
     w2c = camera.world_to_camera
     width, height = camera.width, camera.height
 
-    # A number per row, written out: exact float32 on every backend, and loops over rows that XLA makes vectors of.
-    # Matrices of 3x3 as arrays took five times as long.
+    # Written out in columns: exact float32 on every backend, and XLA vectorises over the rows. Arrays of 3x3 matrices
+    # take five times as long.
     mean_x, mean_y, mean_z = (gaussians.means[:, i] for i in range(3))
     x, y, z = (mean_x * w2c[i, 0] + mean_y * w2c[i, 1] + mean_z * w2c[i, 2] + w2c[i, 3] for i in range(3))
-    # What lies aside beyond all measure is hidden here, before its ratio overflows.
-    farthest = _FARTHEST_PX * z
-    in_front = drawn & (z > near) & (jnp.abs(camera.fx * x) < farthest) & (jnp.abs(camera.fy * y) < farthest)
+    # Gaussians extremely far aside are hidden before their ratio overflows.
+    max_offset = _MAX_OFFSET_PX * z
+    in_front = drawn & (z > near) & (jnp.abs(camera.fx * x) < max_offset) & (jnp.abs(camera.fy * y) < max_offset)
     z_safe = jnp.where(in_front, z, 1.0)
     x_ratio, y_ratio = jnp.where(in_front, x, 0.0) / z_safe, jnp.where(in_front, y, 0.0) / z_safe
     mean_px, mean_py = camera.fx * x_ratio + camera.cx, camera.fy * y_ratio + camera.cy
 
-    # Inside the Jacobian only, the ray is kept to a multiple of the field of view, on each side of the principal point.
+    # Inside the Jacobian only, the ray is clamped to a multiple of the field of view on each side.
     margin_x = (FRUSTUM_MARGIN - 1) * 0.5 * width / camera.fx
     margin_y = (FRUSTUM_MARGIN - 1) * 0.5 * height / camera.fy
     x_ratio = jnp.clip(x_ratio, -camera.cx / camera.fx - margin_x, (width - camera.cx) / camera.fx + margin_x)
     y_ratio = jnp.clip(y_ratio, -camera.cy / camera.fy - margin_y, (height - camera.cy) / camera.fy + margin_y)
 
-    # Each stage once, not once for every reader of its results: above all the gradient gains (4 times).
+    # Each stage is stored, not recomputed by every reader: the gradient becomes four times faster.
     always = opaque_true(gaussians.means[0, 0]) if gaussians.means.shape[0] else jnp.asarray(True)
     unit = materialize(always, lambda q: [normalize(q)[:, i] for i in range(4)], gaussians.quaternions)
     rays = (x_ratio, y_ratio, camera.fx / z_safe, camera.fy / z_safe)
@@ -199,7 +237,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
 
     opacities = sigmoid(gaussians.opacity_logits)
     reach = jnp.sqrt(2 * jnp.log(jnp.maximum(opacities / MIN_ALPHA, 1.0)))
-    # widened to cover the rounding of the box against that of the exponent
+    # widened to cover rounding of the box and of the exponent
     extent_x, extent_y = (
         jax.lax.stop_gradient(reach * jnp.sqrt(variance)) * (1 + 1e-5) + 1e-3 for variance in (cov_xx, cov_yy)
     )
@@ -214,14 +252,14 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     return Projection(means_px, whitening, opacities, z, extents, visible)
 
 
-def _guarded(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
-    """Both with harmless numbers in place of bad ones, and (N,) bool the Gaussians that are themselves: a bad number
-    must be gone before the first product, or its gradient, zero times NaN, is NaN and reaches the pose."""
-    sound = all_finite(*jax.tree.leaves(camera))
-    drawn = is_usable(gaussians) & sound
+def _replace_non_finite(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
+    """Both with finite numbers in place of others, and (N,) bool the unchanged Gaussians. Non-finite numbers must be
+    replaced before the first product: otherwise a gradient of zero times NaN is NaN and reaches the pose."""
+    finite = all_finite(*jax.tree.leaves(camera))
+    drawn = is_usable(gaussians) & finite
     keep = lambda array: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)
     harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)
     harmless = dataclasses.replace(harmless, world_to_camera=jnp.eye(4, dtype=camera.world_to_camera.dtype))
     kept = {name: keep(getattr(gaussians, name)) for name in ("means", "log_scales", "quaternions", "opacity_logits")}
-    camera = jax.tree.map(lambda a, b: jnp.where(sound, a, b), camera, harmless)
+    camera = jax.tree.map(lambda a, b: jnp.where(finite, a, b), camera, harmless)
     return dataclasses.replace(gaussians, **kept), camera, drawn

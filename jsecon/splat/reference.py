@@ -1,4 +1,4 @@
-"""The slow readable twin: brute force over all Gaussians in NumPy float64. This is the definition of the image."""
+"""Slow, readable reference: brute force over all Gaussians in NumPy float64. It defines the image."""
 
 import numpy as np
 
@@ -7,8 +7,16 @@ from jsecon.types import Camera, Gaussians
 
 
 def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
-    """means_px (N, 2), covariances (N, 2, 2) px^2 and their inverses' a, b, c (N, 3), depths (N,), opacities (N,),
-    in_front (N,), one Gaussian at a time."""
+    """Projects Gaussians, one at a time.
+
+    Args:
+      gaussians: N Gaussians.
+      camera: One camera.
+
+    Returns:
+      means_px (N, 2), covariances (N, 2, 2) px^2, conics (N, 3) a, b, c of their inverses, depths (N,), opacities (N,)
+      and in_front (N,) bool.
+    """
     means, log_scales, quaternions, logits = (
         np.asarray(a, np.float64)
         for a in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits)
@@ -32,7 +40,7 @@ def project_reference(gaussians: Gaussians, camera: Camera) -> dict[str, np.ndar
         jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
         scaled = jacobian @ w2c[:3, :3] @ _rotation(quaternions[i]) @ np.diag(np.exp(log_scales[i]))
         covariance = out["covariances"][i] = scaled @ scaled.T + BLUR_PX2 * np.eye(2)
-        # det(M M^T + e I) as a sum of positive terms: beside a needle's length its width would cancel, in float64 too.
+        # det(M M^T + e I) as a sum of positive terms: the width of a needle would cancel, even in float64.
         squares = (np.cross(*scaled) ** 2).sum() + BLUR_PX2 * (scaled**2).sum() + BLUR_PX2**2
         out["conics"][i] = covariance[1, 1] / squares, -covariance[0, 1] / squares, covariance[0, 0] / squares
     return out
@@ -51,7 +59,7 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """(H, W, N) alpha T of every Gaussian at every pixel, front to back, equal depths in index order."""
+    """Returns (H, W, N) the weight alpha T of every Gaussian at every pixel; equal depths in index order."""
     splats = project_reference(gaussians, camera)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     weights = np.zeros((camera.height, camera.width, len(splats["depths"])))
@@ -72,6 +80,6 @@ def weights_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def render_reference(gaussians: Gaussians, camera: Camera, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, D) features and (H, W) alpha in float64: W f, and the sum of W."""
+    """Returns the image (H, W, D) of features (N, D), and alpha (H, W), in float64."""
     weights = weights_reference(gaussians, camera)
     return weights @ np.asarray(features, np.float64), weights.sum(-1)

@@ -1,4 +1,6 @@
-"""Rendering: D-channel features, colour, depth, of one view; differentiable in every array."""
+"""Renders features, colour and depth of one view. Differentiable in every array, in reverse mode."""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -6,11 +8,20 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from jsecon.errors import require_shape
-from jsecon.numerics import NEAR, is_traced
+from jsecon.numerics import NEAR
 from jsecon.splat.plan import plan_view, render_plan, require_background
-from jsecon.splat.project import check_shapes
+from jsecon.splat.project import check_geometry, check_shapes
 from jsecon.splat.sh import colours_from_sh
 from jsecon.types import Array, Camera, Gaussians, Rendering
+
+
+class DepthImage(NamedTuple):
+    """Rendered depth of one view."""
+
+    depth: Float[Array, "h w"]
+    """(H, W) expected z-depth, world units; 0 where no Gaussian is rendered."""
+    alpha: Float[Array, "h w"]
+    """(H, W) sum of alpha T, in [0, 1)."""
 
 
 def render(
@@ -24,33 +35,42 @@ def render(
     depth: bool = False,
     mesh: Mesh | None = None,
 ) -> Rendering:
-    """Renders per-Gaussian `features` (N, D) into one view: sum over the depth-sorted Gaussians of alpha T f.
+    """Renders per-Gaussian features into one view: the sum of alpha T f over the Gaussians, front to back.
 
-    Exact by definition: equal to the brute-force sum over all Gaussians, whatever the tiling.
-    Differentiable in every array, under jit, grad, and vmap over cameras and over feature sets. With frozen geometry,
-    `plan_view` once and `render_plan`.
+    The image equals the brute-force sum over all Gaussians; tiles and chunks affect only speed. It works under jit,
+    grad, and vmap over cameras and feature sets, and is differentiable in every array. Only reverse mode works (grad,
+    vjp, jacrev): jax.jvp and jax.jacfwd raise TypeError. For frozen geometry, call `plan_view` once and `render_plan`.
 
-    The tile lists have room for a static number of (block, Gaussian) pairs, by default `default_capacity`: a multiple
-    of what scenes need, from the sizes alone, so one program serves all views of a size. A view that needs more is
-    rendered again with enough room outside a trace. Inside one (jit, grad, vmap) that cannot be: what did not fit is
-    counted in `.overflow`, never dropped unsaid; 0 there means that the image is exact. Such a scene takes an explicit
-    `capacity` (`plan_capacity`), which is taken as it is, in and outside of a trace.
+    Tile lists have a static capacity. Outside of a trace, a view that needs more is planned again with enough. Inside
+    of a trace (jit, grad, vmap) that is impossible: `Rendering.overflow` counts the pairs that are missing, and 0 means
+    that the image is exact.
 
-    Gaussians with NaN or infinite numbers are hidden, and a feature that is not finite makes NaN of the pixels that its
-    Gaussian touches; neither has a gradient, nor spoils another's (`project.count_non_finite` counts them). A camera
-    that is not finite sees NaN.
+    Non-finite inputs disable the affected Gaussians; a non-finite feature gives NaN in the pixels that its Gaussian
+    touches. Neither has a gradient or affects another's (`project.count_non_finite` counts them). A camera that is not
+    finite gives NaN everywhere.
 
-    `mesh` (`jsecon.parallel.host_mesh()`) spreads the work over several devices of this process, in value and
-    gradient: a program that calls `jsecon.process.prepare_process()` before jax starts has all cores of a CPU that way.
-    A jit of your own around it is faster with `compiler_options=jsecon.parallel.MESH_OPTIONS`. Without it, one device.
+    Args:
+      gaussians: Scene of N Gaussians. Its `sh` has no influence and may be None.
+      camera: One camera.
+      features: (N, D). bfloat16 features are read as such and summed in the dtype of the Gaussians: the error is that
+        of rounding the features (experiments/retired.md), the time on a CPU is the same.
+      background: (D,), added with weight 1 - alpha.
+      capacity: Number of (block, Gaussian) pairs; by default `default_capacity`, a multiple of what scenes need, so
+        that one program serves all views of a size. A given capacity is used as it is (`plan_capacity`).
+      near: Near plane, world units.
+      depth: Whether to render the expected z-depth sum(w z) / sum(w) in the same pass (`Rendering.depth`).
+      mesh: Devices of this process to divide the work among (`jsecon.host_mesh()`), in value and gradient; None uses
+        one device. A CPU has several devices only if `jsecon.process.prepare_process()` runs before jax starts. A jit
+        around the call is faster with `compiler_options=jsecon.parallel.MESH_OPTIONS`.
 
-    Features in bfloat16 are read as such, which halves what a wide walk gathers, and summed in the Gaussians' dtype,
-    that of the image: the error is that of rounding the features (experiments/retired.md), the time the
-    same on a CPU. `background` (D,) is added with weight 1 - alpha. With `depth` the same pass also gives `.depth`, the
-    expected z-depth sum(w z) / sum(w). Raises ValueError on shapes that disagree.
+    Returns:
+      Features (H, W, D), alpha and overflow.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
-    check_shapes(gaussians, camera)
-    require_shape("features", features, (gaussians.count, "D"), "Give one row of features per Gaussian.")
+    check_geometry(gaussians, camera)
+    require_shape("features", features, (gaussians.count, "D"), "Pass one row of features per Gaussian.")
     require_background(background, features.shape[1])
     if gaussians.means.shape[0] == 0:
         image = jnp.zeros((camera.height, camera.width, features.shape[1]), gaussians.means.dtype)
@@ -58,7 +78,7 @@ def render(
         image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
         return Rendering(image, alpha, jnp.int32(0), alpha if depth else None)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near, mesh=mesh)
-    # Outside a trace two programs: whatever else is rendered of a scene of this size shares the first.
+    # Outside of a trace these are two programs: all renderings of scenes of this size share the first.
     return render_plan(plan, features, background=background, depth=depth)
 
 
@@ -71,26 +91,52 @@ def render_rgb(
     near: float = NEAR,
     mesh: Mesh | None = None,
 ) -> Rendering:
-    """Renders colour from spherical harmonics: features (H, W, 3), not clamped above 1. See `render`."""
+    """Renders colour from spherical harmonics.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      camera: One camera.
+      background: (3,) colour, added with weight 1 - alpha.
+      capacity: As for `render`.
+      near: As for `render`.
+      mesh: As for `render`.
+
+    Returns:
+      Features (H, W, 3), not clamped above 1, alpha and overflow.
+
+    Raises:
+      ValueError: Shapes disagree.
+    """
     check_shapes(gaussians, camera)
-    colours = colours_from_sh if is_traced((gaussians, camera)) else _colours_compiled
-    rgb = colours(gaussians, camera)
+    rgb = _colours(gaussians, camera)
     return render(gaussians, camera, rgb, background=background, capacity=capacity, near=near, mesh=mesh)
 
 
-_colours_compiled = jax.jit(colours_from_sh)
+_colours = jax.jit(colours_from_sh)
 
 
 def render_depth(
     gaussians: Gaussians, camera: Camera, *, capacity: int | None = None, near: float = NEAR
-) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Expected z-depth (H, W) = sum(w z) / sum(w), world units, 0 where nothing is covered; and alpha (H, W). NaN where
-    pairs overflowed the capacity, which has no other place here (see `render`)."""
-    nothing = jnp.zeros((gaussians.means.shape[0], 0), jnp.asarray(gaussians.means).dtype)
-    return _unless_overflow(render(gaussians, camera, nothing, capacity=capacity, near=near, depth=True))
+) -> DepthImage:
+    """Renders the expected z-depth sum(w z) / sum(w).
+
+    Args:
+      gaussians: Scene of N Gaussians; its `sh` may be None.
+      camera: One camera.
+      capacity: As for `render`.
+      near: As for `render`.
+
+    Returns:
+      Depth and alpha, (H, W) each; NaN if pairs overflowed the capacity.
+
+    Raises:
+      ValueError: Shapes disagree.
+    """
+    no_features = jnp.zeros((gaussians.means.shape[0], 0), jnp.asarray(gaussians.means).dtype)
+    return _nan_on_overflow(render(gaussians, camera, no_features, capacity=capacity, near=near, depth=True))
 
 
 @jax.jit
-def _unless_overflow(rendering: Rendering) -> tuple[Array, Array]:
-    mark = lambda image: jnp.where(rendering.overflow > 0, jnp.nan, image)
-    return jax.tree.map(mark, (rendering.depth, rendering.alpha))
+def _nan_on_overflow(rendering: Rendering) -> DepthImage:
+    mask = lambda image: jnp.where(rendering.overflow > 0, jnp.nan, image)
+    return DepthImage(mask(rendering.depth), mask(rendering.alpha))

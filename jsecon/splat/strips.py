@@ -1,7 +1,7 @@
-"""An image dealt out in strips: strip k of n holds the rows of blocks k, k + n, k + 2 n and so on.
+"""Strips of an image, one per device: strip k of n holds the rows of blocks k, k + n, k + 2 n and so on.
 
-Each device lists and composites its own strip and needs nothing of another's; neighbouring rows are dealt to different
-devices, so that all have like work.
+Each device lists and composites one strip independently. Neighbouring rows go to different devices, which balances the
+work.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from jsecon.parallel import map_over_devices
 from jsecon.types import Array
 
 BLOCK = 4
-"""edge of a block, tiles; the BLOCK * BLOCK bits of a (block, Gaussian) pair fit half a word"""
+"""Edge of a block in tiles; the BLOCK * BLOCK bits of a (block, Gaussian) pair fit into half a word."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,29 +26,29 @@ class Strip:
     count: int = 1
 
     def first_row(self, rows: Array) -> Array:
-        """Own rows of blocks before the image's row: where the rows [a, b) of the image begin and end among its own."""
+        """Returns the number of the strip's rows of blocks before a row of blocks of the image."""
         return (rows - self.index + self.count - 1) // self.count
 
-    def block_row(self, own: Array) -> Array:
-        """The image's row of blocks that its own row `own` is."""
-        return own * self.count + self.index
+    def block_row(self, row: Array) -> Array:
+        """Returns the row of blocks of the image for a row of blocks of the strip."""
+        return row * self.count + self.index
 
-    def tile_row(self, own: Array) -> Array:
-        """The image's row of tiles that its own row of tiles `own` is."""
-        return self.block_row(own // BLOCK) * BLOCK + own % BLOCK
+    def tile_row(self, row: Array) -> Array:
+        """Returns the row of tiles of the image for a row of tiles of the strip."""
+        return self.block_row(row // BLOCK) * BLOCK + row % BLOCK
 
 
 FULL_IMAGE = Strip()
-"""the image as one strip"""
+"""The image as one strip."""
 
 
 def tile_rows(height: int, tile: int, count: int) -> int:
-    """Rows of tiles of each of `count` strips of an image `height` px high."""
+    """Returns the number of rows of tiles in each of `count` strips of an image of that height in px."""
     return -(-height // tile) if count == 1 else -(-height // (BLOCK * tile * count)) * BLOCK
 
 
 def split_into_strips(image: Array, tile: int, count: int) -> Array:
-    """(H, W, ...) -> (count, rows of a strip, W, ...) in px, zero below the image."""
+    """Divides an image (H, W, ...) into strips (count, rows of a strip in px, W, ...), zero below the image."""
     height, *rest = image.shape
     rows = tile_rows(height, tile, count) * tile
     image = jnp.pad(image, [(0, count * rows - height)] + [(0, 0)] * len(rest))
@@ -58,7 +58,7 @@ def split_into_strips(image: Array, tile: int, count: int) -> Array:
 
 
 def join_strips(strips: Array, tile: int, height: int) -> Array:
-    """`split_into_strips` undone: (count, rows, W, ...) -> (H, W, ...)."""
+    """Joins strips (count, rows, W, ...) to an image (H, W, ...): the inverse of `split_into_strips`."""
     count, rows, *rest = strips.shape
     if count == 1:
         return strips[0, :height]
@@ -66,11 +66,20 @@ def join_strips(strips: Array, tile: int, height: int) -> Array:
     return blocks.reshape(count * rows, *rest)[:height]
 
 
-def map_strips(local: Callable, dealt: Any, common: Any, mesh: Mesh | None, *, total: bool = False) -> Any:
-    """`local(strip, dealt, common)` for the strip of each device of `mesh`, see `map_over_devices`; without a mesh for
-    the whole image."""
+def map_strips(local: Callable, divided: Any, common: Any, mesh: Mesh | None, *, total: bool = False) -> Any:
+    """Computes `local(strip, divided, common)` on every device of a mesh, each with its strip.
+
+    Args:
+      local: Pure function.
+      divided: Arrays that are divided among the devices along their leading axes.
+      common: Arrays that every device gets entirely.
+      mesh: Devices, or None for one strip, the whole image.
+      total: Whether to add up the results instead of joining them along their leading axes.
+
+    Returns:
+      The joined or added results.
+    """
     if mesh is None:
-        return local(FULL_IMAGE, dealt, common)
-    return map_over_devices(
-        lambda index, *rest: local(Strip(index, mesh.size), *rest), dealt, common, mesh, total=total
-    )
+        return local(FULL_IMAGE, divided, common)
+    run = lambda index, *arrays: local(Strip(index, mesh.size), *arrays)
+    return map_over_devices(run, divided, common, mesh, total=total)

@@ -1,61 +1,71 @@
-"""Which Gaussians touch which tile of the image, front to back.
+"""Tile lists: the Gaussians that reach each tile of the image, front to back.
 
-Pairs are first made of Gaussians and blocks of BLOCK x BLOCK tiles, several times fewer than pairs of tiles, and put
-in order by one packed single-key sort of (block, depth). Each sorted pair then gets one bit for every tile of its block
-that the Gaussian's ellipse reaches, and the tiles' lists are read off the bits (bits.py): a stable distribution needs
-no second sort, and the ellipses leave a fifth fewer pairs than boxes (garden).
+Pairs are first made of Gaussians and blocks of BLOCK x BLOCK tiles, several times fewer than pairs of tiles, and sorted
+by one packed key (block, depth). Each sorted pair then gets one bit for every tile of its block that the ellipse of the
+Gaussian reaches, and the lists are compacted from the bits: this is stable without a second sort, and ellipses give a
+fifth fewer pairs than boxes (garden).
+
+A scatter of every bit to its place would take most of the time (garden: 38 of 52 ms on one core). Instead every slot of
+the output searches its bit, which needs vector arithmetic and a few nearby loads (6 ms). Pairs come in words of 32. The
+bits of one word for one tile are a segment, whose set bits fill consecutive slots.
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt
 
 from jsecon.errors import require
-from jsecon.splat.bits import WORD, compact_tile_lists, loop_in_chunks, tile_bits
+from jsecon.splat.fusion import materialize
 from jsecon.splat.project import Projection
 from jsecon.splat.strips import BLOCK, FULL_IMAGE, Strip, tile_rows
 from jsecon.types import Array, Leaf, record, static
 
 TILE = 8
-"""tile edge, px; speed only"""
+"""Edge of a tile, px; affects only speed."""
 _TILES = BLOCK * BLOCK
-PAIRS = 8192
-"""pairs at a time: what they need fits the second cache, and what is not there takes no time"""
-# Slack of the ellipse test, px: far above the rounding of a float32 exponent at the rim, far below a pixel.
+CHUNK_PAIRS = 8192
+"""Number of pairs per chunk: their arrays fit the second-level cache, and empty chunks take no time."""
 _SLACK_PX = 0.02
+"""Slack of the ellipse test: far above the rounding of a float32 exponent at the rim, far below a pixel."""
+WORD = 32
+"""Number of pairs in a word of bits."""
+_CHUNK_SLOTS = 32768
+"""Number of output slots per chunk: their arrays fit the second-level cache."""
 
 
 @record
 class TileLists:
-    """For each tile, row by row, the Gaussians that reach a pixel of it, by depth (equal depths in index order).
+    """Gaussians that reach a pixel of each tile, by depth (equal depths in index order); tiles row by row.
 
-    Over several devices each holds the lists of its strip, one strip after another along every axis.
+    Over several devices, each holds the lists of its strip; strips are joined along every axis.
     """
 
     gaussians: Leaf
-    """(16 capacity,) int32 Gaussian ids; each tile's list is one run of it."""
+    """(16 capacity,) int32 Gaussian ids; the list of each tile is one run of it."""
     starts: Leaf
-    """(tiles,) int32 where each tile's list begins."""
+    """(tiles,) int32 start of each list."""
     lengths: Leaf
-    """(tiles,) int32 how long it is."""
+    """(tiles,) int32 length of each list."""
     overflow: Leaf
-    """(strips,) int32 (block, Gaussian) pairs that did not fit: those of the Gaussians with the highest indices."""
+    """(strips,) int32 pairs beyond the capacity: those of the Gaussians with the highest indices."""
     tile: int = static()
-    """tile edge, px."""
+    """Edge of a tile, px."""
 
 
 def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
-    """Tiles across and down."""
+    """Returns the number of tiles across and down an image of that size in px."""
     return -(-width // tile), -(-height // tile)
 
 
 def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
-    """Inclusive-exclusive ranges (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat's box touches;
-    empty where invisible."""
+    """Half-open ranges (x0, x1, y0, y1) of the strip's blocks of `edge` px that the box of each splat touches; empty if
+    invisible."""
     across, down = tile_grid(width, height, edge)
     ranges = []
     for axis, limit in ((0, across), (1, down)):
@@ -72,16 +82,33 @@ def _rectangles(projection: Projection, width: int, height: int, edge: int, stri
 def pair_counts(
     projection: Projection, width: int, height: int, *, tile: int = TILE, strip: Strip = FULL_IMAGE
 ) -> Int[Array, " n"]:
-    """(N,) int32 number of the strip's blocks of BLOCK x BLOCK tiles that each splat's box touches."""
+    """Counts the blocks of BLOCK x BLOCK tiles that each splat touches.
+
+    Args:
+      projection: N splats.
+      width: Width of the image, px.
+      height: Height of the image, px.
+      tile: Edge of a tile, px.
+      strip: Strip whose blocks count.
+
+    Returns:
+      (N,) int32.
+    """
     x0, x1, y0, y1 = _rectangles(projection, width, height, BLOCK * tile, strip)
     return (x1 - x0) * (y1 - y0)
 
 
 def depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
-    """Indices that sort positive depths, ties in index order.
+    """Sorts positive depths, ties in index order.
 
     Positive float32 sort like their bits, so depth and index pack into one 64-bit key: XLA's CPU sort of one key is
-    about five times faster than its sort of a key and a value. Float64 depths fall back to a stable argsort.
+    about five times faster than its sort of a key and a value. Float64 depths use a stable argsort.
+
+    Args:
+      depths: (N,) positive.
+
+    Returns:
+      (N,) int32 indices.
     """
     if depths.dtype != jnp.float32:
         return jnp.argsort(depths, stable=True).astype(jnp.int32)
@@ -90,8 +117,8 @@ def depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
 
 
 def _sort_packed(*fields: tuple[Array, int]) -> list[Array]:
-    """Sorts by the fields, each an array of non-negative integers and its number of bits, 64 together at most, the
-    first the most significant; returns them sorted, as int32. 64-bit only inside, by context."""
+    """Sorts by fields of non-negative integers with their numbers of bits, at most 64 together, the most significant
+    first; returns the sorted fields as int32. 64-bit types are enabled only inside."""
     with jax.enable_x64(True):
         wide = [lax.convert_element_type(values, jnp.uint64) for values, _ in fields]
         key = wide[0]
@@ -106,10 +133,10 @@ def _sort_packed(*fields: tuple[Array, int]) -> list[Array]:
 
 
 def _sorted_pairs(blocks: Array, owner: Array, depths: Array, number: int) -> tuple[Array, Array]:
-    """(blocks, owner) sorted by block (0 .. number), then by the owner's depth, then by its index.
+    """(blocks, owner) sorted by block (0 .. number), then by depth and index of the owner.
 
-    Block, depth and index in one key where they fit 64 bits (the sign of a depth in view is known); else the depths
-    are sorted first, and their ranks take the place of both.
+    Block, depth and index form one key if they fit 64 bits (depths in view are positive); otherwise the depths are
+    sorted first, and their ranks replace both.
     """
     for_block, for_index = number.bit_length(), max((depths.shape[0] - 1).bit_length(), 1)
     if depths.dtype == jnp.float32 and for_block + 31 + for_index <= 64:
@@ -129,19 +156,34 @@ def _sorted_pairs_by_rank(blocks: Array, owner: Array, depths: Array) -> tuple[A
 def tile_lists(
     projection: Projection, width: int, height: int, *, capacity: int, tile: int = TILE, strip: Strip = FULL_IMAGE
 ) -> TileLists:
-    """One strip's lists of up to `capacity` (block, Gaussian) pairs; what does not fit is counted in `overflow`."""
-    most = (2**31 - 1) // _TILES - WORD  # whose tiles int32 can count
-    require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render so large an image in parts.")
+    """Makes the tile lists of one strip.
+
+    Args:
+      projection: N splats.
+      width: Width of the image, px.
+      height: Height of the image, px.
+      capacity: Maximum number of (block, Gaussian) pairs; more are counted in `overflow`.
+      tile: Edge of a tile, px.
+      strip: The strip.
+
+    Returns:
+      The lists.
+
+    Raises:
+      ValueError: The capacity is not positive or exceeds int32.
+    """
+    most = (2**31 - 1) // _TILES - WORD  # so that int32 can count their tiles
+    require(0 < capacity <= most, "capacity", capacity, f"1 to {most} pairs", "Render such a large image in parts.")
     capacity = round_up_to_words(capacity)
-    chunk = min(PAIRS, capacity)
+    chunk = min(CHUNK_PAIRS, capacity)
     room = -(-capacity // chunk) * chunk
     edge = BLOCK * tile
     rows = tile_rows(height, tile, strip.count)
     across, down = tile_grid(width, rows * tile, edge)
     number = across * down
     x0, x1, y0, y1 = _rectangles(projection, width, height, edge, strip)
-    # Pairs are laid out Gaussian after Gaussian; `owner` says whose pair the k-th is. int32 cumulative sums would wrap
-    # past 2^31 pairs, so the sum saturates: beyond the capacity its exact value is needed only for the overflow.
+    # Pairs are laid out Gaussian after Gaussian; `owner` is the Gaussian of each. The cumulative sum saturates instead
+    # of wrapping at 2^31 pairs: beyond the capacity its exact value affects only the overflow.
     areas = (x1 - x0) * (y1 - y0)
     ends = _saturating_cumsum(areas)
     starts, total = ends - areas, jnp.minimum(ends[-1], capacity)
@@ -155,13 +197,13 @@ def tile_lists(
         within = pair - box[:, 0]
         block = (box[:, 2] + within // box[:, 3]) * across + box[:, 1] + within % box[:, 3]
         block = jnp.where(pair < total, block, number)
-        put = lambda whole, part: lax.dynamic_update_slice(whole, part, (first,))
+        put = lambda array, part: lax.dynamic_update_slice(array, part, (first,))
         return owner[-1], put(blocks, block), put(owners, owner)
 
-    nothing = jnp.full(room, number, jnp.int32), jnp.zeros(room, jnp.int32)
-    _, blocks, owner = loop_in_chunks(total, chunk, lay_out, (jnp.int32(-1), *nothing))
-    nowhere = jnp.asarray(1.0, projection.depths.dtype)
-    depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), nowhere))
+    no_pairs = jnp.full(room, number, jnp.int32), jnp.zeros(room, jnp.int32)
+    _, blocks, owner = loop_in_chunks(total, chunk, lay_out, (jnp.int32(-1), *no_pairs))
+    default = jnp.asarray(1.0, projection.depths.dtype)
+    depths = lax.stop_gradient(jnp.where(projection.visible, jnp.maximum(projection.depths, 0), default))
     blocks, owner = _sorted_pairs(blocks, owner, depths, number)
 
     ellipses = [projection.means_px, projection.whitening, projection.opacities[:, None]]
@@ -170,7 +212,7 @@ def tile_lists(
     members, before = tile_bits(reach, owner, blocks, _TILES, total, chunk)
     gaussians = compact_tile_lists(members, before, owner, total, chunk)
 
-    # A tile's list runs from its block's first pair to the next block's.
+    # The list of a tile runs from the first pair of its block to the first pair of the next block.
     first = jnp.searchsorted(blocks, lax.iota(jnp.int32, number + 1)).astype(jnp.int32)
     word = jnp.minimum(first // WORD, members.shape[0] - 1)
     earlier = (first - word * WORD).astype(jnp.uint32)[:, None]
@@ -193,18 +235,17 @@ def tile_lists(
 def _reached_tiles(
     ellipses: Array, owner: Array, blocks: Array, *, across: int, number: int, tile: int, strip: Strip
 ) -> Array:
-    """(pairs,) uint32: bit (row * BLOCK + column) is set where the ellipse alpha >= 1/255 reaches the rectangle between
-    that tile's pixel centres; 0 for the block `number`. `ellipses` (N, 6) are centre, whitening and opacity.
+    """(pairs,) uint32: bit (row * BLOCK + column) is set if the ellipse alpha >= 1/255 reaches the rectangle between
+    the pixel centres of that tile; 0 for the block `number`. `ellipses` (N, 6) are centre, whitening and opacity.
 
-    Exact up to a slack that only adds tiles: within a row of tiles the ellipse is convex, so the interval of x that it
-    covers ends where its rim is widest, or at the row's edge if that lies beyond. Comparisons are written so that a NaN
-    counts as reached.
+    Exact up to a slack that only adds tiles: the ellipse is convex, so within a row of tiles its interval of x ends at
+    its widest point, or at the edge of the row if that point lies beyond. A NaN counts as reached.
     """
     x, y, l11, l21, l22, opacity = jnp.moveaxis(ellipses[owner], 1, 0)
     radius2 = 2 * jnp.log(jnp.maximum(opacity * 255, 1.0)) * (1 + 1e-4) + 1e-4
     radius, slope = jnp.sqrt(radius2), l21 / l11
     highest = radius / l22
-    widest = -l21 * highest / jnp.sqrt(l22 * l22 + l21 * l21)  # dy where the rim is farthest right
+    widest = -l21 * highest / jnp.sqrt(l22 * l22 + l21 * l21)  # dy of its rightmost point
     left = (blocks % across * (BLOCK * tile)).astype(x.dtype) - x
     top = (strip.block_row(blocks // across) * (BLOCK * tile)).astype(y.dtype) - y
     slack = _SLACK_PX + 1e-5 * jnp.abs(slope * highest)
@@ -225,7 +266,7 @@ def _reached_tiles(
 
 
 def _saturating_cumsum(areas: Array) -> Array:
-    """int32 cumulative sum that stays at its largest value instead of wrapping."""
+    """int32 cumulative sum that saturates instead of wrapping."""
     largest = jnp.iinfo(jnp.int32).max
     exact = jnp.cumsum(areas.astype(jnp.int32))
     approximate = jnp.cumsum(areas.astype(jnp.float32))
@@ -234,5 +275,127 @@ def _saturating_cumsum(areas: Array) -> Array:
 
 
 def round_up_to_words(pairs: int) -> int:
-    """Pairs rounded up to whole words of bits."""
+    """Rounds a number of pairs up to whole words of bits."""
     return -(-pairs // WORD) * WORD
+
+
+def loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
+    """Runs `carry = step(first, carry)` for first = 0, size, 2 size, ... below `total`, and returns the last carry."""
+    advance = lambda state: (state[0] + size, step(*state))
+    return lax.while_loop(lambda state: state[0] < total, advance, (jnp.int32(0), carry))[1]
+
+
+def transpose_words(reached: UInt[Array, " pairs"], tiles: int) -> UInt[Array, "words t"]:
+    """(pairs / 32, tiles) words whose bit k is the bit of the tile in pair k."""
+    words = reached.reshape(-1, WORD)
+    bits = ((words[:, :, None] >> lax.iota(jnp.uint32, tiles)) & 1) << lax.iota(jnp.uint32, WORD)[:, None]
+    return lax.reduce(bits, jnp.uint32(0), lax.bitwise_or, (1,))
+
+
+def tile_bits(
+    reach: Callable[[Array, Array], Array], owner: Array, blocks: Array, tiles: int, total: Array, chunk: int
+) -> tuple[UInt[Array, "words t"], Int[Array, "words t"]]:
+    """Computes the bits of all segments, and the number of set bits before each.
+
+    Args:
+      reach: Maps owners and blocks of a chunk of pairs to their bits, uint32.
+      owner: (pairs,) Gaussian of each pair, in whole chunks.
+      blocks: (pairs,) block of each pair.
+      tiles: Number of tiles of a block.
+      total: () number of pairs in use.
+      chunk: Number of pairs per chunk.
+
+    Returns:
+      (words, tiles) bits, and (words, tiles) the number of set bits before, counted tile after tile and word after word
+      within a tile.
+    """
+    part = lambda a, first: lax.dynamic_slice(a, (first,), (chunk,))
+
+    def step(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        so_far, members, before = carry
+        reached = materialize(first < total, reach, part(owner, first), part(blocks, first))
+        bits = transpose_words(reached, tiles)
+        ends = so_far + lax.cumsum(lax.population_count(bits).astype(jnp.int32))
+        put = lambda array, part: lax.dynamic_update_slice_in_dim(array, part, first // WORD, 0)
+        return ends[-1], put(members, bits), put(before, ends - lax.population_count(bits).astype(jnp.int32))
+
+    words = owner.shape[0] // WORD
+    zeros = jnp.zeros(tiles, jnp.int32), jnp.zeros((words, tiles), jnp.uint32), jnp.zeros((words, tiles), jnp.int32)
+    of_tile, members, before = loop_in_chunks(total, chunk, step, zeros)
+    # Unused words come after all others of their tile.
+    filled = (lax.iota(jnp.int32, words) * WORD < total)[:, None]
+    return members, jnp.where(filled, before, of_tile) + (lax.cumsum(of_tile) - of_tile)
+
+
+def compact_tile_lists(
+    members: UInt[Array, "words t"],
+    before: Int[Array, "words t"],
+    owner: Int[Array, " pairs"],
+    total: Array,
+    chunk: int,
+) -> Array:
+    """Lists the owners of the set bits.
+
+    Args:
+      members: (words, tiles) bits of `tile_bits`.
+      before: (words, tiles) number of set bits before each word.
+      owner: (pairs,) Gaussian of each pair.
+      total: () number of pairs in use.
+      chunk: Number of pairs per chunk.
+
+    Returns:
+      (32 words tiles,) int32 owners in the order of `before`; arbitrary after the last.
+    """
+    words, tiles = members.shape
+    slots, chunk = -(-WORD * words * tiles // _CHUNK_SLOTS) * _CHUNK_SLOTS, chunk // WORD
+    # The non-empty segments without gaps: bits, first slot, first pair; and one bit for each slot where one begins.
+    out_of_range = words * tiles, slots // WORD
+    counts = (members > 0).sum(0, dtype=jnp.int32)
+
+    def gather(first: Array, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Array, Array, Array]:
+        so_far, table, begins = carry
+        bits, starts = (lax.dynamic_slice_in_dim(a, first, chunk) for a in (members, before))
+        filled = bits > 0
+        ends = so_far + lax.cumsum(filled.astype(jnp.int32))
+        pairs = jnp.broadcast_to((first + lax.iota(jnp.int32, chunk))[:, None] * WORD, bits.shape)
+        rows = jnp.stack([lax.bitcast_convert_type(bits, jnp.int32), starts, pairs], -1)
+        table = table.at[jnp.where(filled, ends - 1, out_of_range[0])].set(rows, mode="promise_in_bounds")
+        mark = jnp.uint32(1) << (starts % WORD).astype(jnp.uint32)
+        place = jnp.where(filled, starts // WORD, out_of_range[1])
+        return ends[-1], table, begins.at[place].add(mark, mode="promise_in_bounds")
+
+    zeros = jnp.zeros((out_of_range[0] + 1, 3), jnp.int32), jnp.zeros(out_of_range[1] + 1, jnp.uint32)
+    _, table, begins = loop_in_chunks(-(-total // WORD), chunk, gather, (lax.cumsum(counts) - counts, *zeros))
+    columns = [table[:, i] for i in range(3)]
+    until = (jnp.uint32(2) << lax.iota(jnp.uint32, WORD)) - 1
+
+    def segment_of(begins: Array, begun: Array) -> Array:
+        return (begun[:, None] + lax.population_count(begins[:, None] & until).astype(jnp.int32) - 1).reshape(-1)
+
+    def pair_of(first: Array, bits: Array, start: Array, pair: Array) -> Array:
+        """The pair of set bit number slot - start, by bisection of the word."""
+        bits, k = lax.bitcast_convert_type(bits, jnp.uint32), first + lax.iota(jnp.int32, _CHUNK_SLOTS) - start
+        half = WORD // 2
+        while half:
+            lower = lax.population_count(bits & jnp.uint32((1 << half) - 1)).astype(jnp.int32)
+            above = k >= lower
+            k, pair = jnp.where(above, k - lower, k), jnp.where(above, pair + half, pair)
+            bits = jnp.where(above, bits >> half, bits)
+            half //= 2
+        return jnp.minimum(pair, owner.shape[0] - 1)
+
+    last = before[-1, -1] + lax.population_count(members[-1, -1]).astype(jnp.int32)
+
+    def fill(first: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        begun, out = carry
+        begin_bits = lax.dynamic_slice(begins, (first // WORD,), (_CHUNK_SLOTS // WORD,))
+        begun = begun + lax.cumsum(lax.population_count(begin_bits).astype(jnp.int32))
+        always = first < last
+        segment = materialize(
+            always, segment_of, begin_bits, begun - lax.population_count(begin_bits).astype(jnp.int32)
+        )
+        pairs = materialize(always, pair_of, first, *materialize(always, lambda s: [c[s] for c in columns], segment))
+        return begun[-1], lax.dynamic_update_slice(out, owner[pairs], (first,))
+
+    out = loop_in_chunks(last, _CHUNK_SLOTS, fill, (jnp.int32(0), jnp.zeros(slots, jnp.int32)))[1]
+    return out[: WORD * words * tiles]

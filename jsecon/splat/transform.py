@@ -1,4 +1,4 @@
-"""Gaussians carried from one world into another by a similarity: turned, scaled and shifted, colours included."""
+"""Transforms Gaussians between worlds by a similarity: rotation, scale and shift, colours included."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -12,20 +12,26 @@ from jsecon.errors import require
 from jsecon.splat.sh import sh_basis
 from jsecon.types import Array, Camera, Gaussians
 
-ROWS = 1 << 18
-"""Gaussians carried at a time"""
+BLOCK_ROWS = 1 << 18
+"""Number of Gaussians transformed at a time."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite stays so, for the caller to tell
+@np.errstate(over="ignore", invalid="ignore")  # non-finite numbers stay so; callers check
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
-    """The Gaussians in the world that `similarity` (4, 4) leads to: x' = s R x + t, with R a rotation and s > 0.
+    """Transforms Gaussians: positions, sizes, orientations and spherical harmonics.
 
-    Positions, sizes, orientations and the spherical harmonics all follow, so a camera that is carried along sees the
-    same image. Arrays keep their kind (NumPy, jax) and their type: float64 means (NumPy) are carried in float64. The
-    identity returns the Gaussians as they are.
+    A camera that is transformed too sees the same image. Arrays keep their kind (NumPy, jax) and dtype: float64 means
+    (NumPy) are transformed in float64.
+
+    Args:
+      gaussians: N Gaussians.
+      similarity: (4, 4) concrete matrix of x' = s R x + t, with R a rotation and s > 0.
+
+    Returns:
+      The Gaussians in the new world; the same object for the identity.
 
     Raises:
-      ValueError: The matrix is no similarity.
+      ValueError: The matrix is not a similarity.
     """
     matrix = np.asarray(similarity, np.float64)
     if np.array_equal(matrix, np.eye(4)):
@@ -34,7 +40,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     rotation = matrix[:3, :3] / scale if scale > 0 else np.zeros((3, 3))
     rigid = scale > 0 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     similar = bool(rigid and np.allclose(matrix[3], [0, 0, 0, 1]))
-    expected, remedy = "a rotation, one positive scale and a shift", "Leave out shear, mirrors and unequal scales."
+    expected, remedy = "a rotation, one positive scale and a shift", "Remove shear, mirrors and unequal scales."
     require(similar, "similarity", matrix.tolist(), expected, remedy)
     xp = gaussians.means.__array_namespace__()
     like = lambda column, array: xp.asarray(array, column.dtype)
@@ -50,16 +56,16 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
 
 
 def transform_gaussians_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -> Gaussians:
-    """`transform_gaussians` on the host, with the means in float64 before and after: NumPy arrays.
+    """Calls `transform_gaussians` on the host with float64 means before and after (NumPy).
 
-    Use it into a world of large coordinates (a map projection's), where float32 holds no millimetres, and out of it.
+    Needed into and out of worlds with large coordinates (map projections), where float32 cannot represent millimetres.
     """
     host = jax.tree.map(np.asarray, gaussians)
     return transform_gaussians(dataclasses.replace(host, means=host.means.astype(np.float64)), similarity)
 
 
 def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
-    """(N,) by how much float32 rounds each of the means, in units of the Gaussian's largest standard deviation."""
+    """Returns (N,) the rounding of each mean by float32, in units of the largest standard deviation of its Gaussian."""
     means = np.asarray(gaussians.means)
     moved = np.abs(means - means.astype(np.float32).astype(np.float64)).max(axis=1, initial=0.0)
     sizes = np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf)
@@ -68,9 +74,9 @@ def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
 
 
 def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians:
-    """`transform_gaussians` between right-handed or left-handed axes: `axes` (4, 4) may also mirror.
+    """Calls `transform_gaussians` with a matrix (4, 4) that may also mirror.
 
-    A Gaussian is its own mirror image along its axes, so that a mirrored one is a turned one.
+    A Gaussian equals its mirror image along its axes, so mirroring is a rotation.
     """
     matrix = np.asarray(axes, np.float64)
     if np.linalg.det(matrix[:3, :3]) > 0:
@@ -92,29 +98,41 @@ def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians
 def transform_blocks(
     gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
 ) -> Iterator[tuple[slice, Gaussians]]:
-    """`transform_gaussians_float64` of ROWS Gaussians after the other, and which they are: mapped columns need not fit
-    into memory. Without a similarity they come as they are, NumPy."""
-    for first in range(0, gaussians.count, ROWS):
-        own = slice(first, min(first + ROWS, gaussians.count))
-        part = jax.tree.map(lambda a, own=own: np.asarray(a[own]), gaussians)
-        yield own, part if similarity is None else transform_gaussians_float64(part, similarity)
+    """Transforms Gaussians in blocks of BLOCK_ROWS rows; memory-mapped columns need not fit into memory.
+
+    Args:
+      gaussians: N Gaussians.
+      similarity: As for `transform_gaussians`; None copies the blocks to NumPy.
+
+    Yields:
+      The rows of each block, and its Gaussians (NumPy).
+    """
+    for first in range(0, gaussians.count, BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))
+        part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
+        yield rows, part if similarity is None else transform_gaussians_float64(part, similarity)
 
 
 def recenter(
     gaussians: Gaussians, cameras: Camera, *, origin: Float[np.ndarray, "3"] | None = None
 ) -> tuple[Gaussians, Camera, Float[np.ndarray, "4 4"]]:
-    """The same scene and cameras (one, or a batch) in a world whose origin lies at `origin`, by default the middle of
-    the means; and the (4, 4) float64 shift that leads back.
+    """Shifts a scene and its cameras to another origin. Host code.
 
-    Float32 holds a coordinate of 1e6 m to 6 cm, and a camera beside it no better: such a scene (a map projection's
-    coordinates, say) can't be rendered as it is. Positions and poses are shifted in float64 and returned in float32;
-    the cameras keep what they see. Host code. Give it float64 arrays where there are any: what float32 rounded before
-    stays rounded.
+    Float32 resolves a coordinate of 1e6 m to 6 cm, so that a scene in such coordinates (a map projection's) cannot be
+    rendered directly. The shift is computed in float64; pass float64 arrays if there are any.
+
+    Args:
+      gaussians: N Gaussians.
+      cameras: One camera or a batch.
+      origin: (3,) new origin; by default the median of the means.
+
+    Returns:
+      Gaussians and cameras in float32, and the (4, 4) float64 shift back.
     """
     means = np.asarray(gaussians.means, np.float64)
     if origin is None:
-        sound = means[np.isfinite(means).all(1)]
-        origin = np.median(sound, axis=0) if len(sound) else np.zeros(3)
+        finite = means[np.isfinite(means).all(1)]
+        origin = np.median(finite, axis=0) if len(finite) else np.zeros(3)
     poses = np.array(cameras.world_to_camera, np.float64)
     poses[..., :3, 3] += poses[..., :3, :3] @ origin
     back = np.eye(4)
@@ -124,7 +142,7 @@ def recenter(
 
 
 def quaternion_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Unit wxyz of a rotation matrix: an eigenvector (Bar-Itzhack 2000), stable at every angle."""
+    """Returns the unit quaternion (4,) wxyz of a rotation (3, 3): an eigenvector (Bar-Itzhack 2000), always stable."""
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
     symmetric = np.array(
         [
@@ -138,15 +156,15 @@ def quaternion_from_matrix(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarr
 
 
 def _product_matrix(q: np.ndarray) -> np.ndarray:
-    """(4, 4) M of a quaternion (4,): r M is the Hamilton product q r, which turns by r first, then by q."""
+    """(4, 4) matrix M of a quaternion (4,): r M is the Hamilton product q r, a rotation by r, then by q."""
     w, x, y, z = q
     return np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
 
 
 def _sh_rotation(rotation: np.ndarray, bands: int) -> np.ndarray:
-    """(K, K) that turns coefficients: the basis at d must give what the old one gave at R^T d.
+    """(K, K) rotation of coefficients: the new ones at d give the value of the old ones at R^T d.
 
-    Each degree is closed under rotation, so that least squares over enough directions is exact.
+    Each degree is closed under rotation, so least squares over enough directions is exact.
     """
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

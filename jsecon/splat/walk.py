@@ -1,13 +1,13 @@
-"""The walk down a batch of tiles' lists: Gaussians in chunks, front to back, until nothing is left to be seen.
+"""Walks down the lists of a batch of tiles: Gaussians in chunks, front to back, until all pixels are opaque.
 
-A batch is of tiles with lists of like length. Arrays of a walk are (tiles, ..., pixels): a tile's pixels lie innermost
-and fill the vectors; what belongs to a Gaussian is a number that a whole row of pixels shares.
+A batch holds tiles with lists of similar length. Arrays of a walk are (tiles, ..., pixels): the pixels of a tile are
+innermost and fill the vectors; numbers of a Gaussian are shared by a row of pixels.
 
-What XLA's CPU backend makes of this decides the speed; all of it measured on garden (benchmarks/results.md):
-- A scan over single Gaussians starts four kernels for each and reads its slices unvectorised; a chunk at a time, the
-  recurrence written out inside one kernel, took a third of that.
-- Fusion recomputes cheap arithmetic for every reader, and a chunk's exponentials written as a polynomial are cheap to
-  it. Only a conditional whose outcome it can't know makes it store them once: `materialize`.
+XLA's CPU backend decides the speed; measured on garden (benchmarks/results.md):
+- A scan over single Gaussians starts four kernels for each and reads slices unvectorised. A chunk at a time, with the
+  recurrence inside of one kernel, takes a third of that.
+- Fusion recomputes cheap arithmetic for every reader, such as the exponentials of a chunk as polynomials. `materialize`
+  prevents it.
 """
 
 import functools
@@ -25,39 +25,51 @@ from jsecon.splat.strips import FULL_IMAGE, Strip
 from jsecon.splat.tiles import TileLists, tile_grid
 from jsecon.types import Array
 
-BATCH = 64
-"""tiles walked side by side, at most; speed only"""
-BATCH_BACKWARD = 32
-"""the same for gradients, which keep more arrays of a chunk at once"""
+MAX_BATCH = 64
+"""Maximum number of tiles that are walked side by side; affects only speed."""
+MAX_BATCH_BACKWARD = 32
+"""The same for gradients, which hold more arrays of a chunk at once."""
 
 
 class Batches(NamedTuple):
-    """Tiles sorted by list length, in batches of B; the last is filled up with empty tiles."""
+    """Tiles sorted by list length, in batches of B; the last is padded with empty tiles."""
 
     tiles: Array
     """(batches, B) tile ids; `number` = an empty tile outside the image."""
     starts: Array
-    """(number + 1,) where a tile's list begins."""
+    """(number + 1,) start of the list of each tile."""
     lengths: Array
     """(number + 1,) its length."""
     across: int
+    """Tiles in a row of the strip."""
     number: int
+    """Tiles of the strip."""
     tile: int
+    """Edge of a tile, px."""
     strip: Strip
 
     def corners(self, tiles: Array, dtype) -> tuple[Array, Array]:
-        """x and y of the tiles' upper left corners in the image, px."""
+        """Returns x and y of the upper left corners of tiles in the image, px."""
         x, y = tiles % self.across, self.strip.tile_row(tiles // self.across)
         return (x * self.tile).astype(dtype), (y * self.tile).astype(dtype)
 
 
 def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: int | None = None) -> Batches:
-    """The batches of one strip's lists, the longest first, of at most `most` tiles (default BATCH).
+    """Groups the tiles of one strip into batches, longest lists first.
 
-    A batch walks as far as its longest list: where tiles are few their lists differ more, and batches are smaller.
+    A batch walks as far as its longest list. If there are few tiles, their lists differ more and batches are smaller.
+
+    Args:
+      lists: Tile lists of the strip.
+      width: Width of the image, px.
+      strip: The strip.
+      most: Maximum number of tiles of a batch, by default MAX_BATCH.
+
+    Returns:
+      The batches.
     """
     number = lists.lengths.shape[0]
-    batch = min(most or BATCH, max(16, 1 << (max(number // 12, 1).bit_length() - 1)))
+    batch = min(most or MAX_BATCH, max(16, 1 << (max(number // 12, 1).bit_length() - 1)))
     order = jnp.argsort(-lists.lengths).astype(jnp.int32)
     order = jnp.concatenate([order, jnp.full(-number % batch, number, jnp.int32)])
     empty = jnp.zeros(1, jnp.int32)
@@ -66,7 +78,7 @@ def make_batches(lists: TileLists, width: int, strip: Strip = FULL_IMAGE, most: 
 
 
 def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> Float[Array, "h w d"]:
-    """(batches, B, D, pixels) -> (rows, W, D), all rows of the strip's tiles."""
+    """Arranges batches (batches, B, D, pixels) as the image (rows, W, D) of the strip."""
     down, tile, channels = batches.number // batches.across, batches.tile, batched.shape[2]
     slots = batches.tiles.reshape(-1)
     place = jnp.zeros(batches.number + 1, jnp.int32).at[slots].set(lax.iota(jnp.int32, slots.shape[0]))[:-1]
@@ -76,7 +88,7 @@ def to_image(batched: Float[Array, "k b d p"], batches: Batches, width: int) -> 
 
 
 def to_tiles(image: Array, tile: int) -> Array:
-    """(H, W, ...) -> (tiles + 1, tile * tile, ...), zero outside the image; the last tile is the empty one."""
+    """Divides an image (H, W, ...) into tiles (tiles + 1, tile * tile, ...), zero outside; the last tile is empty."""
     height, width, *rest = image.shape
     across, down = tile_grid(width, height, tile)
     padding = [(0, down * tile - height), (0, across * tile - width)] + [(0, 0)] * len(rest)
@@ -86,13 +98,13 @@ def to_tiles(image: Array, tile: int) -> Array:
 
 
 CHUNK = 16
-"""Gaussians of each list at a time; speed only"""
+"""Number of Gaussians of each list per step; affects only speed."""
 _GROUP = 4
-"""recurrences over a chunk run within and over groups of this many"""
+"""Recurrences over a chunk run within and over groups of this many."""
 ATTRIBUTES = 6
-"""columns of splats (N, 6): centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see plan.py"""
+"""Columns of splats (N, 6): centre x, y (px), l11, l21, l22 (1/px, times sqrt(1/2)), opacity; see plan.py"""
 
-# 2^f on [-1/2, 1/2] to a relative error of 7.5e-8 (minimax, by iterated reweighting), highest power first.
+# 2^f on [-1/2, 1/2] with a relative error of 7.5e-8 (minimax, by iterated reweighting), highest power first.
 _EXP2 = (
     1.3276472064403862e-3,
     9.675541407375587e-3,
@@ -107,11 +119,11 @@ class Chunk(NamedTuple):
     """CHUNK Gaussians of each tile of a batch."""
 
     ids: Array
-    """(B, CHUNK) Gaussian ids; past a list's end anything, with alpha 0."""
+    """(B, CHUNK) Gaussian ids; arbitrary beyond the end of a list, with alpha 0."""
     places: Array
-    """(B, CHUNK) where the lists hold them; past a list's end beyond all lists."""
+    """(B, CHUNK) their positions in the lists; out of range beyond the end of a list."""
     columns: Array
-    """(B, CHUNK, K) the columns of the table that were asked for."""
+    """(B, CHUNK, K) the additional columns of the table."""
     attributes: Array
     """(B, CHUNK, 6) the columns of splats."""
     alpha: Array
@@ -121,14 +133,14 @@ class Chunk(NamedTuple):
 
 
 def make_table(splats: Float[Array, "n 6"], *columns: Array) -> Float[Array, "n k"]:
-    """What a walk gathers for each Gaussian: its splat, the binary logarithm of its opacity, and `columns` (N, ...)."""
+    """Makes the table that a walk gathers from: splats, binary logarithms of opacities, and `columns` (N, ...)."""
     opacity = splats[:, 5:]
     binary = jnp.where(opacity > 0, jnp.log2(jnp.where(opacity > 0, opacity, 1.0)), -jnp.inf)
     return jnp.concatenate([splats, binary, *columns], axis=1)
 
 
 def _exp2(e: Array) -> Array:
-    """2^e where -64 < e < 64, anything elsewhere; float64 takes the library's."""
+    """2^e for -64 < e < 64, arbitrary elsewhere; float64 uses the library function."""
     if e.dtype != jnp.float32:
         return jnp.exp2(e)
     whole = lax.round(e, lax.RoundingMethod.TO_NEAREST_EVEN)
@@ -142,7 +154,7 @@ def _exp2(e: Array) -> Array:
 
 
 def pixel_centres(tile: int, dtype) -> tuple[Array, Array]:
-    """x and y (pixels,) of a tile's pixels from its upper left corner."""
+    """Returns x and y (pixels,) of the pixels of a tile from its upper left corner."""
     local = (np.arange(tile) + 0.5).astype(dtype)
     return np.tile(local, tile), np.repeat(local, tile)
 
@@ -159,7 +171,7 @@ def _alphas(coefficients: Array, tile: int) -> Array:
 
 
 def _coefficients(rows: Array, corner_x: Array, corner_y: Array, exponent: Array) -> Array:
-    """(B, CHUNK, 6) for `_alphas`, of splats in the columns of `rows` (B, CHUNK, >= 5)."""
+    """(B, CHUNK, 6) coefficients for `_alphas` of the splats in `rows` (B, CHUNK, >= 5)."""
     scale = np.sqrt(1 / np.log(2)).astype(rows.dtype)  # from natural to binary exponents
     x, y = rows[..., 0] - corner_x, rows[..., 1] - corner_y
     l11, l21, l22 = (rows[..., i] * scale for i in (2, 3, 4))
@@ -167,22 +179,38 @@ def _coefficients(rows: Array, corner_x: Array, corner_y: Array, exponent: Array
 
 
 def pixel_alphas(splats: Float[Array, "p 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "p pixels"]:
-    """alpha of P splats in each pixel of a tile of their own, whose upper left corners are `corners` (P,), (P,) px."""
+    """Computes the alpha of splats in the pixels of one tile each.
+
+    Args:
+      splats: (P, 6) splats.
+      corners: x and y (P,) of the upper left corner of the tile of each splat, px.
+      tile: Edge of a tile, px.
+
+    Returns:
+      (P, pixels) alpha.
+    """
     exponent = make_table(splats)[:, ATTRIBUTES]
     return _alphas(_coefficients(splats, *corners, exponent)[:, None], tile)[:, 0]
 
 
 def cumulative(combine: Callable, start: Array, values: Array) -> tuple[Array, Array]:
-    """Along the second axis of `values` (B, CHUNK, pixels): `start` (B, pixels) combined with all values before
-    each, and with all.
+    """Computes an exclusive scan along the second axis.
 
-    Written out in groups, so that each value is read a handful of times rather than CHUNK times by a fused kernel.
+    It runs in groups, so that a fused kernel reads each value a few times instead of CHUNK times.
+
+    Args:
+      combine: Associative operation.
+      start: (B, pixels) initial value.
+      values: (B, CHUNK, pixels).
+
+    Returns:
+      (B, CHUNK, pixels) `start` combined with all earlier values, and (B, pixels) with all values.
     """
     groups = values.reshape(values.shape[0], -1, _GROUP, values.shape[-1])
-    whole = functools.reduce(combine, [groups[:, :, k] for k in range(_GROUP)])
+    totals = functools.reduce(combine, [groups[:, :, k] for k in range(_GROUP)])
     starts = [start]
     for g in range(groups.shape[1]):
-        starts.append(combine(starts[-1], whole[:, g]))
+        starts.append(combine(starts[-1], totals[:, g]))
     before = [jnp.stack(starts[:-1], axis=1)]
     for k in range(_GROUP - 1):
         before.append(combine(before[-1], groups[:, :, k]))
@@ -190,10 +218,17 @@ def cumulative(combine: Callable, start: Array, values: Array) -> tuple[Array, A
 
 
 def blend_weights(transmittance: Array, alpha: Array) -> tuple[Array, Array]:
-    """alpha T of a chunk (B, CHUNK, pixels), and the transmittance behind it (B, pixels).
+    """Computes the weights alpha T of a chunk.
 
-    The transmittance is the plain product of 1 - alpha: it only falls, so a pixel has stopped before the first
-    Gaussian that would take it to MIN_TRANSMITTANCE exactly where the product is still above.
+    The transmittance is the plain product of 1 - alpha. It only falls, so a Gaussian has weight exactly if the product
+    behind it is still above MIN_TRANSMITTANCE.
+
+    Args:
+      transmittance: (B, pixels) before the chunk.
+      alpha: (B, CHUNK, pixels).
+
+    Returns:
+      Weights (B, CHUNK, pixels), and the transmittance (B, pixels) behind the chunk.
     """
     before, after = cumulative(jnp.multiply, transmittance, 1 - alpha)
     weight = before * alpha
@@ -209,11 +244,19 @@ def walk(
     state: Any,
     left: Array | None = None,
 ) -> tuple[Any, Array]:
-    """Applies `transmittance, state = body(transmittance, state, chunk)` chunk by chunk down the lists of one batch of
-    `tiles` (B,), until the longest has ended or every pixel has stopped.
+    """Walks down the lists of one batch, until the longest ends or every pixel is opaque.
 
-    Returns the last state, and (B,) int32 how far down its list each tile had a pixel that had not stopped: nothing
-    behind is seen. transmittance (B, pixels) starts at 1, or at what earlier lists `left`. `table` is `make_table`'s.
+    Args:
+      table: Result of `make_table`.
+      lists: Tile lists.
+      batches: Batches of the lists.
+      tiles: (B,) tiles of this batch.
+      body: `transmittance, state = body(transmittance, state, chunk)`, with transmittance (B, pixels).
+      state: Initial state.
+      left: (B, pixels) initial transmittance, by default 1.
+
+    Returns:
+      The last state, and (B,) int32 the visible length of each list.
     """
     start, length = batches.starts[tiles, None], batches.lengths[tiles, None]
     corner_x, corner_y = (corner[:, None] for corner in batches.corners(tiles, table.dtype))

@@ -1,4 +1,4 @@
-"""Region proposals without any weights: colour, texture and, where known, depth and normals.
+"""Region proposals without a network, by colour, texture and, if known, depth and normals. Host code.
 
 The frame is smoothed, cut into small regions that follow its edges (graph segmentation: Felzenszwalb & Huttenlocher
 2004), and neighbours are merged over the graph of these regions (`region_graph`).
@@ -21,55 +21,67 @@ GRANULARITIES: dict[str, dict[str, Any]] = {
     "medium": {"merge_distance": 16.0},
     "coarse": {"merge_distance": 28.0, "depth_jump": 0.06},
 }
-"""settings of ClassicalSegmenter by how large its regions are; the coarse one joins the colours of one thing, and so
-needs depth to part things"""
+"""Settings of ClassicalSegmenter by the size of its regions. The coarse one joins the colours of an object, and so
+needs depth to separate objects."""
 
 
 def require_contrib() -> None:
-    """Raises InputError where OpenCV has no contrib modules: its packages write to one folder, one over the other."""
+    """Raises InputError if OpenCV has no contrib modules: its packages overwrite each other's folder."""
     if not hasattr(getattr(cv2, "ximgproc", None), "createSuperpixelSLIC"):
         remedy = (
             "Run: pip uninstall opencv-python opencv-python-headless opencv-contrib-python; then: "
             "pip install --force-reinstall opencv-contrib-python-headless"
         )
-        found = f"version {cv2.__version__} without ximgproc, as another of its packages leaves it"
-        raise InputError("OpenCV", found, "the package opencv-contrib-python-headless alone", remedy)
+        problem = f"version {cv2.__version__} without ximgproc, because another OpenCV package overwrote it"
+        raise InputError("OpenCV", problem, remedy=remedy)
 
 
 @dataclasses.dataclass(frozen=True)
 class ClassicalSegmenter:
-    """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units (a just noticeable step is
-    ~2)."""
+    """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units, of which two are just
+    noticeable."""
 
     merge_distance: float = 16.0
-    """neighbours less dissimilar than this are one region, CIELAB units"""
+    """Dissimilarity below which neighbours are joined, CIELAB units."""
     lightness_weight: float = 1.0
-    """weight of L beside a and b: less joins more shading, and more things alike in hue"""
+    """Weight of L relative to a and b; a lower weight joins more shading, and more objects of similar hue."""
     smoothing: float = 20.0
-    """colour radius of the mean-shift filter, 8-bit units; 0 leaves it out"""
+    """Colour radius of the mean-shift filter, 8-bit units; 0 skips it."""
     min_area: float = 0.0012
-    """smaller regions are given to their most alike neighbour or dropped; share of the frame"""
+    """Least area of a region, as a share of the frame; smaller ones join their most similar neighbour or are
+    dropped."""
     max_regions: int = 64
-    """the best so many are returned"""
+    """Maximum number of regions, best first."""
     depths: Callable[[int], np.ndarray] | None = None
-    """z-depth (H, W) of a frame, 0 = unknown: a jump between neighbours keeps them apart"""
+    """Returns the z-depth (H, W) of a frame, 0 = unknown; a jump separates neighbours."""
     depth_jump: float = 0.04
-    """relative step of depth that counts as much as `merge_distance`"""
+    """Relative step of depth equivalent to `merge_distance`."""
     crease_degrees: float = 50.0
-    """angle between normals that counts as much as `merge_distance`"""
+    """Angle between normals equivalent to `merge_distance`."""
     surfaces: Callable[[int], Surface | None] | None = None
-    """the surface of a frame, None = unknown, in place of `depths`: a crease keeps neighbours apart, too, and a step of
-    depth is one off the plane, since on a wall seen from its side depth jumps all along"""
+    """Returns the surface of a frame, None = unknown, in place of `depths`. Creases separate neighbours too, and steps
+    of depth are measured from the plane, because the depth of a wall seen from the side changes everywhere."""
 
     def __call__(self, frame: np.ndarray, index: int) -> Bool[np.ndarray, "m h w"]:
-        """frame (H, W, 3) uint8 -> masks (M, H, W) bool, a partition of the frame but for specks, best first."""
+        """Segments a frame (H, W, 3) uint8 into masks (M, H, W) bool, best first: a partition without specks."""
         labels = self.partition(frame, index)
         return masks_best_first(frame, labels, max_regions=self.max_regions, min_area=self.min_area)
 
     def partition(self, frame: np.ndarray, index: int) -> Int32[np.ndarray, "h w"]:
-        """frame (H, W, 3) uint8 -> labels (H, W) int32, 0 .. M-1, every pixel labelled, each label connected."""
+        """Partitions a frame into connected regions.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+          index: Index of the frame, for `depths` and `surfaces`.
+
+        Returns:
+          (H, W) int32 labels 0 .. M-1.
+
+        Raises:
+          ValueError: The frame, its depth or its surface has a wrong shape or dtype.
+        """
         fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
-        require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Give RGB frames as 8-bit arrays.")
+        require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
         features = colour_features(frame, lightness_weight=self.lightness_weight, smoothing=self.smoothing)
         minimum = self.min_area * frame.shape[0] * frame.shape[1]
         surface = None if self.surfaces is None else self.surfaces(index)
@@ -81,7 +93,7 @@ class ClassicalSegmenter:
         shape = None
         if self.depths is not None:
             depth = self.depths(index)
-            require_shape("depths", depth, frame.shape[:2], "Give depth of the frame's own size.")
+            require_shape("depths", depth, frame.shape[:2], "Pass depth of the size of the frame.")
             shape = log_depth(depth) * np.float32(self.merge_distance / np.log1p(self.depth_jump))
         atoms = oversegment(features if shape is None else np.concatenate([features, shape], -1))
         return merge_regions(
@@ -89,10 +101,10 @@ class ClassicalSegmenter:
         )
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 6) colour and normal, in which a crease weighs as a step of `merge_distance`; and (H, W, 7) what small
-        regions are cut by: the same, the normal at half its weight, with depth."""
+        """(H, W, 6) colours and normals, where a crease equals a step of `merge_distance`; and (H, W, 7) features for
+        the oversegmentation: colours, normals at half weight, and depth."""
         for array in (surface.points, surface.normals):
-            require_shape("surface", array, colour.shape, "Give surfaces of the frame's own size.")
+            require_shape("surface", array, colour.shape, "Pass surfaces of the size of the frame.")
         crease = 2.0 * np.sin(np.radians(self.crease_degrees) / 2.0)
         turned = surface.normals * np.float32(self.merge_distance / crease)
         jump = np.float32(0.5 * self.merge_distance / np.log1p(self.depth_jump))
@@ -103,7 +115,7 @@ class ClassicalSegmenter:
 def colour_features(
     frame: UInt8[np.ndarray, "h w 3"], *, lightness_weight: float, smoothing: float
 ) -> Float32[np.ndarray, "h w 3"]:
-    """(H, W, 3) uint8 -> (H, W, 3) float32: weighted L, a and b of the smoothed frame, CIELAB units."""
+    """Computes weighted L, a and b (H, W, 3) float32, CIELAB units, of a smoothed frame (H, W, 3) uint8."""
     smooth = adapt_exposure(frame)
     if smoothing > 0:
         smooth = cv2.pyrMeanShiftFiltering(smooth, 5, smoothing, maxLevel=0)
@@ -115,12 +127,20 @@ def colour_features(
 def adapt_exposure(
     frame: UInt8[np.ndarray, "h w 3"], *, dark: float = 0.22, light: float = 0.3, most: float = 8.0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """(H, W, 3) uint8 with lifted shadows or lowered lights, where the median of linear luminance is below `dark` (a
-    mid grey) or above `light`.
+    """Brightens dark frames and darkens bright ones, by the median of their linear luminance.
 
-    CIELAB's steps are those of an eye adapted to the scene's white; in a dark photograph those between dark things are
-    too small, in a bright one those between white walls. x -> g x / (1 + (g - 1) x) multiplies the odds by g, at most
-    `most` or its inverse, and leaves black and white where they are.
+    Steps in CIELAB are those of an eye adapted to the white of the scene: they are too small between dark objects of a
+    dark photograph and between white walls of a bright one. The map x -> g x / (1 + (g - 1) x) multiplies the odds by g
+    and keeps black and white.
+
+    Args:
+      frame: (H, W, 3) uint8 RGB.
+      dark: Median below which a frame is brightened to it (a mid grey).
+      light: Median above which a frame is darkened to it.
+      most: Largest g, and inverse of the smallest.
+
+    Returns:
+      (H, W, 3) uint8.
     """
     linear = (np.arange(256, dtype=np.float32) / 255.0) ** 2.2
     luminance = linear[frame] @ np.asarray([0.2126, 0.7152, 0.0722], np.float32)
@@ -134,7 +154,7 @@ def adapt_exposure(
 def oversegment(
     features: Float32[np.ndarray, "h w c"], *, scale: float = 30.0, min_size: int = 16
 ) -> Int32[np.ndarray, "h w"]:
-    """(H, W, C) -> (H, W) int32 small connected regions that follow the edges (Felzenszwalb & Huttenlocher 2004)."""
+    """Segments features (H, W, C) into small connected regions (H, W) int32 (Felzenszwalb & Huttenlocher 2004)."""
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=scale, min_size=min_size)
     return np.asarray(graph.processImage(np.ascontiguousarray(features)), np.int32)
 
@@ -142,9 +162,16 @@ def oversegment(
 def masks_best_first(
     frame: UInt8[np.ndarray, "h w 3"], labels: Int32[np.ndarray, "h w"], *, max_regions: int, min_area: float
 ) -> Bool[np.ndarray, "m h w"]:
-    """labels (H, W) -> masks (M, H, W) bool, the most contrasted and the larger first; specks dropped.
+    """Ranks regions by the mean edge strength along their borders times the square root of their area.
 
-    A region's rank is the mean edge strength along its border times the square root of its area: a long clear outline.
+    Args:
+      frame: (H, W, 3) uint8 RGB.
+      labels: (H, W) int32 regions.
+      max_regions: Maximum number of masks.
+      min_area: Share of the frame below which regions are dropped.
+
+    Returns:
+      (M, H, W) bool masks, best first.
     """
     lab = cv2.cvtColor(frame.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
     gradient = np.hypot(cv2.Sobel(lab, cv2.CV_32F, 1, 0), cv2.Sobel(lab, cv2.CV_32F, 0, 1)).sum(-1)

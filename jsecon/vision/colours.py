@@ -1,7 +1,7 @@
-"""The default embedder, without any weights: regions and texts in one space of named colours.
+"""Default embedder without a network: a joint space of regions and texts made of named colours. Host code.
 
-Both sides become a distribution over points of CIELAB, and by a smooth kernel a vector at the prototypes of a palette,
-whose names are the basic colour terms (Berlin & Kay 1969) and the common mixed ones.
+Regions and texts become distributions over CIELAB, and by a smooth kernel vectors over the prototypes of a palette,
+which has the basic colour terms (Berlin & Kay 1969) and common mixed ones.
 """
 
 import itertools
@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 from jsecon.errors import InputError, require_shape
 from jsecon.process import cores
 
-# name -> sRGB of a typical matt object of that name. A name of two words is a variant of the basic term in it.
+# sRGB of a typical matt object of each name. A name of two words is a variant of the basic term in it.
 # fmt: off
 PALETTE: dict[str, tuple[int, int, int]] = {
     "black": (22, 22, 24), "dark grey": (72, 72, 74), "grey": (128, 128, 128), "light grey": (190, 190, 190),
@@ -45,7 +45,7 @@ _SYNONYMS = {
     "sapphire": "blue", "ebony": "black", "snowy": "white", "sandy": "tan", "wine": "burgundy", "rosy": "rose",
     "creamy": "cream", "rusty": "dark orange", "peachy": "peach",
 }
-# Words of what surrounds the things in a room; they turn the extent's coordinate towards large regions.
+# Words for the surroundings of objects; they turn the extent's coordinate towards large regions.
 _SURROUNDINGS = {
     "wall", "walls", "floor", "ceiling", "ground", "carpet", "rug", "background", "table", "tabletop", "tablecloth",
     "curtain", "curtains", "desk", "counter", "countertop", "lawn",
@@ -53,7 +53,7 @@ _SURROUNDINGS = {
 # fmt: on
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
-# A bare basic term names a family: itself and these shades. What is near a shade (burgundy, sky) is near it too.
+# A bare basic term names a family of colours: itself and these shades, and so their neighbours (burgundy, sky) too.
 _SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for basic in BASIC} | {
     "black": ("charcoal",),
     "white": (),
@@ -62,27 +62,25 @@ _SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for b
 _DARK, _LIGHT = {"dark", "deep", "darker"}, {"light", "pale", "pastel", "lighter", "faint", "soft"}
 _PLAIN = {"bright", "vivid", "pure", "plain", "medium", "mid", "saturated", "solid"}
 _NEGATION = {"not", "no", "non", "without", "except", "isnt", "never"}
-# A colour word names a range: its point, and a darker and a lighter neighbour.
+# A colour word names a range: its point, a darker and a lighter neighbour.
 _SPREAD = np.asarray([[0, 0, 0], [-10, 0, 0], [10, 0, 0]], np.float32)
 _SPREAD_WEIGHTS = np.asarray([0.7, 0.15, 0.15], np.float32)
 SHADE, GREY_SHADE = 0.7, 0.85
-"""likeness of a bare basic term with the shades of its family, where that with its typical colour is 1: a dark red wall
-is red, and a red mug before it is redder. Greys differ in nothing but lightness, and the canonical neutrals take a
-part of it away"""
+"""Similarity of a bare basic term to the shades of its family, relative to its typical colour: a dark red wall is red,
+and a red mug before it is redder. Greys differ only in lightness, part of which the canonical neutrals remove."""
 
 KERNEL_WIDTH = 22.0
-"""CIELAB units at which the likeness of two colours has fallen to exp(-1/2): about the step from plain to dark or
-light"""
+"""CIELAB distance at which the similarity of two colours is exp(-1/2): about the step from plain to dark or light."""
 LIGHTNESS_WEIGHT = 0.8
-"""of L beside a and b in the kernel's distance: lighting changes L, and names depend on it all the same"""
+"""Weight of L relative to a and b in the kernel: lighting changes L, but names depend on it too."""
 EXTENT_WEIGHT = 0.12
-"""share of the cosine that says how much of the frame a region fills: `white plate` is not the white wall"""
+"""Share of the cosine for the size of a region in the frame: `white plate` is not the white wall."""
 EXTENT_FULL = 0.25
-"""share of the frame from which a region counts as surroundings and not as a thing"""
+"""Share of the frame from which a region counts fully as surroundings."""
 
 
 def lab_of(rgb: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-    """(n, 3) sRGB 0..255 -> (n, 3) float32 CIELAB (D65)."""
+    """Converts sRGB (n, 3) in 0 .. 255 to CIELAB (n, 3) float32 (D65)."""
     pixels = np.asarray(rgb, np.float32).reshape(-1, 1, 3) / 255.0
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB).reshape(-1, 3)
 
@@ -90,20 +88,19 @@ def lab_of(rgb: np.ndarray) -> Float32[np.ndarray, "n 3"]:
 class ColourEmbedder:
     """Embedder (jsecon.vision.protocols) over named colours; see the module for the space.
 
-    What it understands of a text: colour names, their dark and light variants, `-ish` and compound forms
-    (`bluish-green`), bare basic terms with all shades of their family (`red` includes dark red and burgundy, `bright
-    red` and `dark red` do not include each other), several colours of one thing (`red and white striped box`: each
-    counts alike), and whether the thing is part of the surroundings (wall, floor, table ...). Nouns otherwise carry no
-    meaning, shapes and materials neither.
+    It understands colour names, their dark and light variants, `-ish` and compound forms (`bluish-green`), bare basic
+    terms with all shades of their family (`red` includes dark red and burgundy, `bright red` and `dark red` exclude
+    each other), several colours of one object (`red and white striped box`, with equal weights), and whether the object
+    is part of the surroundings (wall, floor, table ...). Other nouns, shapes and materials have no influence.
 
     An embedding is the kernel mean over the palette's P prototypes, times sqrt(1 - EXTENT_WEIGHT), followed by two
     coordinates of length sqrt(EXTENT_WEIGHT) that turn from `thing` to `surroundings` with the share of the frame.
 
-    `canonical` holds what a colour query must beat in LERF's relevancy, in the role of object / things / stuff /
-    texture: the palette's mean (any colour), mid grey, and a pale and a dark neutral (walls, shadow).
+    `canonical` has the place of object / things / stuff / texture in LERF's relevancy: the mean of the palette (any
+    colour), mid grey, and a pale and a dark neutral (walls, shadow).
 
-    `reference` are things of two colours, of each pair of basic terms and their shades. Most colours are somewhere in
-    most rooms, and few pairs are on one thing: a region that has one of the two says how similar half of a text is.
+    `reference` has objects of two colours, for each pair of basic terms and their shades. Most rooms contain most
+    colours but few such pairs: a region with one of the two measures the similarity of half a text.
     """
 
     name = "colours-1"
@@ -113,8 +110,8 @@ class ColourEmbedder:
         self._points = lab_of(np.asarray(list(PALETTE.values())))
         self._by_name = dict(zip(self.names, self._points))
         gram = _kernel(self._points, self._points)
-        # k(x, .) is projected on the span of the prototypes' features: phi(x) = K^(-1/2) k(x). Small eigenvalues carry
-        # nothing but rounding and are left out.
+        # k(x, .) is projected on the span of the prototypes: phi(x) = K^(-1/2) k(x). Small eigenvalues are rounding
+        # errors and are skipped.
         values, vectors = np.linalg.eigh(gram.astype(np.float64))
         kept = values > 1e-3 * values[-1]
         self._projection = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
@@ -129,8 +126,8 @@ class ColourEmbedder:
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
     ) -> Float32[np.ndarray, "m e"]:
-        """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
-        require_shape("masks", masks, ("M", *frame.shape[:2]), "Give masks of the frame's own size.")
+        """Embeds masks (M, H, W) bool of a frame (H, W, 3) uint8: (M, E) float32 unit, zero for an empty mask."""
+        require_shape("masks", masks, ("M", *frame.shape[:2]), "Pass masks of the size of the frame.")
         lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
 
         out = np.zeros((len(masks), self.dim), np.float32)
@@ -146,7 +143,7 @@ class ColourEmbedder:
         return out
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
-        """Q texts -> (Q, E) float32 unit. Raises InputError for a text without a colour word, or with a negation."""
+        """Embeds Q texts: (Q, E) float32 unit. Raises InputError for a text without colour words or with a negation."""
         out = np.zeros((len(texts), self.dim), np.float32)
         for row, text in zip(out, texts):
             named = [self._distribution(phrase) for phrase in self._phrases(text)]
@@ -156,36 +153,36 @@ class ColourEmbedder:
         return out
 
     def _mean(self, points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-        """Unit kernel mean of CIELAB points (n, 3), weighted or all alike, in the span of the palette."""
+        """Unit kernel mean of CIELAB points (n, 3), optionally weighted, in the span of the palette."""
         likeness = _kernel(points, self._points)
         weights = np.ones(len(points)) if weights is None else weights
         mean = (weights.astype(np.float32) @ likeness / weights.sum()) @ self._projection
         return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
     def _family(self, basic: str) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, " p"]]:
-        """The colours that a bare basic term names, and their weights.
+        """Colours of a bare basic term, and their weights.
 
-        The weights are the least (non-negative) that bring the likeness with the typical colour to 1 and that with
-        each shade to SHADE, so that shades that lie close together do not count twice.
+        The weights are the least non-negative ones with a similarity of 1 to the typical colour and of SHADE to each
+        shade, so that nearby shades do not count twice.
         """
         points = np.stack([self._by_name[name] for name in (basic, *_SHADES[basic])])
         shade = GREY_SHADE if basic == "grey" else SHADE
-        wanted = np.where(np.arange(len(points)) == 0, 1.0, shade)
-        return points, nnls(_kernel(points, points).astype(np.float64), wanted)[0].astype(np.float32)
+        similarity = np.where(np.arange(len(points)) == 0, 1.0, shade)
+        return points, nnls(_kernel(points, points).astype(np.float64), similarity)[0].astype(np.float32)
 
     def _distribution(self, phrase: list[str]) -> tuple[np.ndarray, np.ndarray]:
-        """A run of modifiers and colour words -> its points (P, 3) CIELAB and their weights (P,)."""
+        """CIELAB points (P, 3) and weights (P,) of a run of modifiers and colour words."""
         base, ish = self._base(phrase[0])
         if len(phrase) == 1 and base in self._families and not ish:
             return self._families[base]
         return self._colour(phrase)[None], np.ones(1, np.float32)
 
     def _phrases(self, text: str) -> list[list[str]]:
-        """Splits a text into runs of modifiers and colour words, one run a colour."""
+        """Splits a text into runs of modifiers and colour words, one run per colour."""
         words = _words(text, separators=True)
         if _NEGATION & set(words):
-            remedy = "Say what colour it is, instead of what it is not."
-            raise InputError(f"query {text!r}", "a negation", "the colours that the thing has", remedy)
+            remedy = "Name the colours of the object instead."
+            raise InputError(f"query {text!r}", "the text has a negation", remedy=remedy)
         phrases: list[list[str]] = []
         modifiers: list[str] = []
         run_open = False  # the last word was a colour
@@ -201,15 +198,17 @@ class ColourEmbedder:
             else:
                 modifiers, run_open = [], False
         if not phrases:
-            expected = "a text that names a colour, such as 'dark green bottle' or 'red and white box'"
             known = ", ".join(sorted({n for n in self.names if " " not in n}))
-            remedy = f"The embedder in use knows things by their colours only ({known}; dark, light, -ish). Name the "
-            remedy += "thing's colour, or query by a pixel with --at FRAME X Y, or use a field built with CLIP weights."
-            raise InputError(f"query {text!r}", "no colour word", expected, remedy)
+            remedy = (
+                "Name the colour of the object, as in 'dark green bottle' or 'red and white box'. This embedder knows "
+                f"only colours ({known}; dark, light, -ish). Or query a pixel with --at FRAME X Y, or use a field "
+                "built with CLIP."
+            )
+            raise InputError(f"query {text!r}", "the text has no colour word", remedy=remedy)
         return phrases
 
     def _base(self, word: str) -> tuple[str | None, bool]:
-        """The palette name behind a word, and whether it came as `-ish` (reddish, bluish, greyish)."""
+        """Palette name of a word, or None, and whether the word ends in `-ish` (reddish, bluish, greyish)."""
         word = _SYNONYMS.get(word, word)
         if word in self._by_name:
             return word, False
@@ -223,9 +222,9 @@ class ColourEmbedder:
         return None, False
 
     def _colour(self, phrase: list[str]) -> np.ndarray:
-        """A run like [dark, bluish, green] -> (3,) CIELAB."""
-        found = [self._base(word) for word in phrase]
-        names = [(base, ish) for base, ish in found if base is not None]
+        """CIELAB (3,) of a run like [dark, bluish, green]."""
+        bases = [self._base(word) for word in phrase]
+        names = [(base, ish) for base, ish in bases if base is not None]
         dark, light = bool(_DARK & set(phrase)), bool(_LIGHT & set(phrase))
         prefix = "dark " if dark and not light else "light " if light and not dark else ""
         points, weights = [], []
@@ -235,7 +234,7 @@ class ColourEmbedder:
                 step = -22.0 if dark else 22.0 if light else 0.0
                 shaded = self._by_name[base] + np.asarray([step, 0.0, 0.0], np.float32)
             points.append(shaded)
-            # 'bluish green' is more green than blue; 'navy blue' is navy, its basic term only says what kind navy is.
+            # 'bluish green' is more green than blue; 'navy blue' is navy, and its basic term only classifies it.
             weights.append(0.25 if base in BASIC and weights and names[0][0] not in BASIC else 0.5 if ish else 1.0)
         weight = np.asarray(weights, np.float32)[:, None]
         mixed = (np.stack(points) * weight).sum(0) / weight.sum()
@@ -245,7 +244,7 @@ class ColourEmbedder:
 
 
 def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(n, 3), (m, 3) CIELAB -> (n, m) Gaussian likeness, 1 for equal colours."""
+    """(n, m) Gaussian similarity of CIELAB colours (n, 3) and (m, 3), 1 for equal ones."""
     scale = np.asarray([LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32) / KERNEL_WIDTH
     x, y = x * scale, y * scale
     products = x @ y.T
@@ -258,21 +257,20 @@ def _kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _spread(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (P, 3) and weights (P,) -> each with its darker and lighter neighbour (3 P, 3), and their weights."""
+    """Colours (P, 3) with their darker and lighter neighbours (3 P, 3), and their weights."""
     spread = (points[:, None] + _SPREAD).clip([0, -128, -128], [100, 128, 128]).reshape(-1, 3)
     return spread.astype(np.float32), (weights[:, None] * _SPREAD_WEIGHTS).reshape(-1)
 
 
 def _joined(colour: np.ndarray, extent: float) -> np.ndarray:
-    """Unit colour vector and extent (0 thing .. 1 surroundings) -> unit vector of the joint space."""
+    """Unit vector of the joint space from a unit colour vector and an extent (0 object .. 1 surroundings)."""
     angle = 0.5 * np.pi * min(max(float(extent), 0.0), 1.0)
     turned = np.sqrt(EXTENT_WEIGHT) * np.asarray([np.cos(angle), np.sin(angle)])
     return np.concatenate([np.sqrt(1.0 - EXTENT_WEIGHT) * colour, turned]).astype(np.float32)
 
 
 def _pixels_inside(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(n, 3) the pixels of a mask without its one-pixel rim, whose colours mix with the neighbours'; all of them where
-    little is left."""
+    """Pixels (n, 3) of a mask without its rim of one px, where colours mix; all pixels if few are left."""
     x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
     box = slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1)
     mask = mask[box]
@@ -281,15 +279,13 @@ def _pixels_inside(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _without_shadow_and_shine(lab: np.ndarray) -> np.ndarray:
-    """(n, 3) CIELAB pixels -> those between the 30th and the 95th percentile of lightness.
-
-    The lit side of a thing carries its name; the shadow side is cut more than the highlights, which are few.
-    """
+    """CIELAB pixels between the 30th and the 95th percentile of lightness: the lit side determines the colour name, and
+    shadows are more frequent than highlights."""
     low, high = np.percentile(lab[:, 0], [30.0, 95.0])
     kept = (lab[:, 0] >= low) & (lab[:, 0] <= high)
-    return lab[kept] if kept.any() else lab  # of two pixels, none lies between
+    return lab[kept] if kept.any() else lab  # two pixels have no percentile between them
 
 
 def _words(text: str, *, separators: bool = False) -> list[str]:
-    """Lower-case words; with `separators`, also commas, semicolons, slashes and ampersands, which end a colour."""
+    """Lower-case words; with `separators` also commas, semicolons, slashes and ampersands, which end a colour."""
     return re.findall(r"[a-z]+|[,;/&+]" if separators else r"[a-z]+", text.lower().replace("'", ""))

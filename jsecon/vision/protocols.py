@@ -1,7 +1,6 @@
-"""What looks at pixels, behind three small protocols, so that OpenCV, SAM, SAM 2, CLIP or files from disk can take each
-place.
+"""Protocols of segmenters, trackers and embedders, which OpenCV, SAM, SAM 2, CLIP or files implement.
 
-Everything here lives on the host: NumPy in, NumPy out. Frames are uint8 RGB.
+Host code: NumPy in, NumPy out. Frames are uint8 RGB.
 """
 
 import dataclasses
@@ -11,7 +10,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 CANONICAL = ("object", "things", "stuff", "texture")
-"""LERF's canonical phrases: what a query must beat"""
+"""LERF's canonical phrases, which a query must exceed."""
 
 
 @runtime_checkable
@@ -19,7 +18,15 @@ class Segmenter(Protocol):
     """Proposes regions of one frame."""
 
     def __call__(self, frame: np.ndarray, index: int) -> np.ndarray:
-        """frame (H, W, 3) uint8 RGB, its index in the capture -> masks (M, H, W) bool, best first; they may overlap."""
+        """Proposes masks.
+
+        Args:
+          frame: (H, W, 3) uint8 RGB.
+          index: Index of the frame in the capture.
+
+        Returns:
+          (M, H, W) bool masks, best first; they may overlap.
+        """
         ...
 
 
@@ -28,25 +35,31 @@ class Tracker(Protocol):
     """Follows regions of one frame through all frames."""
 
     def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
-        """frames (T, H, W, 3) uint8, frame `index`, its masks `prompts` (B, H, W) bool -> labels (T, H, W) int16.
+        """Tracks masks.
 
-        A label is the index of a prompt, or -1 for none: prompts that overlap are resolved by the tracker.
+        Args:
+          frames: (T, H, W, 3) uint8 RGB.
+          index: Frame of the prompts.
+          prompts: (B, H, W) bool masks.
+
+        Returns:
+          (T, H, W) int16 index of a prompt, or -1; the tracker resolves overlaps.
         """
         ...
 
 
 class Network(Protocol):
-    """What holds a network in memory."""
+    """A component that holds a network in memory."""
 
     name: str
-    """of its content and settings"""
+    """Identifies content and settings."""
 
     def check(self) -> None:
-        """Raises InputError where it cannot work."""
+        """Raises InputError if it cannot work."""
         ...
 
     def close(self) -> None:
-        """Drops what it holds in memory, until it is needed again."""
+        """Frees the memory of the network until it is needed again."""
         ...
 
 
@@ -64,28 +77,28 @@ class NamedTracker(Tracker, Network, Protocol):
 class Embedder(Protocol):
     """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity.
 
-    An embedder may also have `reference`, (W, E) float32 unit: texts that have nothing to do with a scene. Without it
+    An embedder may also have `reference`, (W, E) float32 unit: embeddings of texts unrelated to any scene. Without it
     `REFERENCE_WORDS` are embedded (`reference_words.reference_of`).
     """
 
     name: str
-    """identifies the space: fields and texts must come from the same"""
+    """Identifies the space, which a field and its texts must share."""
     dim: int
     """E"""
     canonical: np.ndarray
-    """(C, E) float32 unit: what a query must beat, such as `CANONICAL`"""
+    """(C, E) float32 unit embeddings that a query must exceed, such as those of `CANONICAL`."""
 
     def embed_regions(self, frame: np.ndarray, masks: np.ndarray) -> np.ndarray:
-        """frame (H, W, 3) uint8, masks (M, H, W) bool -> (M, E) float32 unit; zero for an empty mask."""
+        """Embeds masks (M, H, W) bool of a frame (H, W, 3) uint8: (M, E) float32 unit, zero for an empty mask."""
         ...
 
     def embed_text(self, texts: list[str]) -> np.ndarray:
-        """Q texts -> (Q, E) float32 unit. Raises InputError on a text that this space has no words for."""
+        """Embeds Q texts: (Q, E) float32 unit. Raises InputError for a text that this space cannot represent."""
         ...
 
 
 class Logits(NamedTuple):
-    """What makes a probability of a cosine: P(a text is true of an image) = sigmoid(scale * cosine + bias)."""
+    """Calibration of a cosine: P(text is true of image) = sigmoid(scale * cosine + bias)."""
 
     scale: float
     bias: float
@@ -93,24 +106,24 @@ class Logits(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Networks:
-    """What looks at a run's frames. Networks are opened when first needed, and closed when their stage is done."""
+    """Models of a run. Networks are opened when first needed and closed when their stage is done."""
 
     embedder: Embedder
     segmenter: NamedSegmenter | None = None
-    """None: what needs no weights."""
+    """None: by colour and texture."""
     tracker: NamedTracker | None = None
     """None: through the Gaussians."""
 
     def require_ready(self, stages: Collection[str]) -> None:
-        """Raises InputError where a network cannot do what `stages` want of it: before the long work starts."""
+        """Raises InputError if a network cannot serve these stages, before the long work starts."""
         for stage, used in (("masklets", self.segmenter), ("masklets", self.tracker), ("regions", self.embedder)):
             check = getattr(used, "check", None)
             if stage in stages and check is not None:
                 check()
 
     def close(self) -> None:
-        """Drops what they hold in memory, until it is needed again."""
+        """Frees the memory of the networks until they are needed again."""
         for used in (self.embedder, self.segmenter, self.tracker):
-            drop = getattr(used, "close", None)
-            if drop is not None:
-                drop()
+            close = getattr(used, "close", None)
+            if close is not None:
+                close()

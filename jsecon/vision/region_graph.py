@@ -1,4 +1,4 @@
-"""The graph of an image's small regions: who borders on whom and how hard, and its merging into large ones.
+"""Region adjacency graph of an image, and its merging into large regions. Host code.
 
 Neighbours are merged in order of dissimilarity (as in hierarchical grouping: Uijlings et al. 2013), which mixes the
 step of colour across their common border with the difference of their means: shading makes the means of one surface
@@ -16,26 +16,25 @@ from jaxtyping import Float32, Int, Int32, Int64
 from jsecon.vision.surfaces import Surface
 
 BORDER_SHARE = 0.4
-"""of the step across the border in a dissimilarity; the rest is the difference of the means"""
+"""Weight of the step across the border in a dissimilarity; the rest is the difference of the means."""
 GROWN_AREA = 0.006
-"""share of the frame from which a region counts in full"""
+"""Area from which a region has full dissimilarity, as a share of the frame."""
 SMALLEST_FACTOR = 0.22
-"""least factor on the dissimilarity of a small region, which grows with the root of its area: texture is made of
-these"""
+"""Least factor on the dissimilarity of small regions, which texture consists of; it grows with the root of the area."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RegionBorders:
-    """The region graph's edges: one row a pair of neighbours."""
+    """Edges of the graph, one row per pair of neighbours."""
 
     pairs: np.ndarray
-    """(E, 2) atoms, the smaller number first."""
+    """(E, 2) regions, the smaller number first."""
     length: np.ndarray
-    """(E,) px of common border."""
+    """(E,) length of the common border, px."""
     colour: np.ndarray
-    """(E,) step of colour across the border, summed over its length, CIELAB units."""
+    """(E,) sum of the step of colour across the border, CIELAB units."""
     shape: np.ndarray
-    """(E,) step of depth and normal, likewise; at most twice the unit a pixel; 0 where nothing is known."""
+    """(E,) sum of the step of shape across the border; 0 if the shape is unknown."""
 
 
 def region_borders(
@@ -46,11 +45,19 @@ def region_borders(
     steepness: float = 1.0,
     most: float = 40.0,
 ) -> RegionBorders:
-    """Who borders on whom, and how hard.
+    """Measures the borders between regions.
 
-    A step is measured between pixels two to either side of the border, so that the blur of an edge does not hide it. A
-    step of shape is one of its channels (H, W, C), or `steepness` times how far a surface leaves its plane; it counts
-    `most` at most: one far background does not outweigh the rest of an outline.
+    Steps are measured between pixels two px to either side of a border, so that the blur of an edge does not hide them.
+
+    Args:
+      atoms: (H, W) regions 0 .. A-1.
+      features: (H, W, D) colour features.
+      shape: (H, W, C) features of shape, or the surface of the frame, or None.
+      steepness: Factor on the distance from a surface's plane.
+      most: Largest step of shape per pixel, so that one distant background does not outweigh the rest of an outline.
+
+    Returns:
+      The borders of all neighbours.
     """
     keys, colours, shapes = [], [], []
     for axis in (0, 1):
@@ -90,14 +97,23 @@ def merge_regions(
     distance: float,
     min_area: float,
 ) -> Int32[np.ndarray, "h w"]:
-    """Merges neighbours, the most alike first, until none is nearer than `distance`; then gives away what is too small
-    (below `min_area`, px) or too thin to its most alike neighbour.
+    """Merges the most similar neighbours first, until all are at least `distance` apart.
 
-    Dissimilarity: the step of colour across the border and the difference of the mean colours, mixed, less for small
-    regions (they are what texture is made of); and the step of shape, as the other leg of a right triangle. Returns
-    labels (H, W) int32 0 .. M-1.
+    The dissimilarity mixes the step of colour across the border with the difference of the mean colours, with a lower
+    weight for small regions, which texture consists of; the step of shape is the other leg of a right triangle. Finally
+    regions that are too small or too thin join their most similar neighbour.
+
+    Args:
+      atoms: (H, W) regions 0 .. A-1.
+      features: (H, W, D) colour features.
+      edges: Borders of the regions.
+      distance: Dissimilarity from which neighbours stay separate.
+      min_area: Least area, px.
+
+    Returns:
+      (H, W) int32 labels 0 .. M-1.
     """
-    # Numbered as a reader meets them, so that ties fall the same way whatever the atoms are called.
+    # Numbered by first appearance, so that ties do not depend on the numbers of the atoms.
     flat = relabel_sequential(atoms.reshape(-1))
     count = int(flat.max()) + 1
     first = np.empty(count, np.int64)
@@ -106,7 +122,7 @@ def merge_regions(
     atoms, pairs = number[flat].reshape(atoms.shape), np.sort(number[edges.pairs], axis=-1)
     flat = atoms.reshape(-1)
     sums_of = np.stack([edges.colour, edges.shape, edges.length], -1)
-    # Plain numbers from here on: NumPy takes longer over a handful of them than the sums themselves.
+    # Python numbers from here on: they are faster than small NumPy arrays.
     area = np.bincount(flat, minlength=count).astype(np.float64).tolist()
     channels = [np.bincount(flat, features[..., c].reshape(-1), count) for c in range(features.shape[-1])]
     sums = np.stack(channels, -1).tolist()
@@ -128,7 +144,7 @@ def merge_regions(
         return math.hypot(grown * (BORDER_SHARE * colour / border + (1.0 - BORDER_SHARE) * gap), shape / border)
 
     def absorb(a: int, b: int) -> None:
-        """b becomes part of a."""
+        """Joins b to a."""
         parent[b] = a
         area[a] += area[b]
         sums[a] = [x + y for x, y in zip(sums[a], sums[b])]
@@ -162,14 +178,14 @@ def merge_regions(
 
 
 def relabel_sequential(ids: Int[np.ndarray, "*shape"]) -> Int64[np.ndarray, "*shape"]:
-    """Small ids >= 0 as 0 .. K-1 in their own order: np.unique's inverse by a table, which takes no sorting."""
+    """Renumbers small ids >= 0 to 0 .. K-1 in the same order, like the inverse of np.unique but without sorting."""
     used = np.zeros(int(ids.max()) + 1, bool)
     used[ids] = True
     return (np.cumsum(used) - 1)[ids]
 
 
 def _roots(parents: list[int]) -> np.ndarray:
-    """Where each chain of parents ends; each pass halves the chains."""
+    """Root of each chain of parents; each pass halves the chains."""
     parent = np.asarray(parents)
     while not np.array_equal(parent, parent[parent]):
         parent = parent[parent]
@@ -177,7 +193,7 @@ def _roots(parents: list[int]) -> np.ndarray:
 
 
 def _cores(labels: np.ndarray) -> np.ndarray:
-    """The labels that hold a 5x5 square: the others are slivers along an edge, blurred between its two sides."""
+    """Labels that contain a 5x5 square; the others are slivers along a blurred edge."""
     image = labels.astype(np.float32)
     square = np.ones((5, 5), np.uint8)
     return np.unique(labels[cv2.dilate(image, square) == cv2.erode(image, square)])

@@ -1,14 +1,10 @@
-"""Embeddings kept on disk by content: the same mask of the same frame is embedded once by the same model.
+"""Caches on disk by content: embeddings of masks, and masks of frames. Host code.
 
-    FOLDER/<digest of model and frame>.safetensors      keys (M, 16) uint8 of its masks, vectors (M, E) float32
-
-So a run that was stopped embeds only what is missing, and so does one whose masks have changed in part.
-
-A segmenter whose masks are kept on disk by content: a frame is cut once by the same model with the same settings.
-
+    FOLDER/<digest of model and frame>.safetensors                keys (M, 16) uint8 of masks, vectors (M, E) float32
     FOLDER/<digest of model, settings and frame>.safetensors      bits (M, ceil(H W / 8)) uint8, shape (3,)
 
-SAM takes minutes per frame on a CPU; a run that is stopped in the middle of its frames goes on where it stopped.
+A run that was stopped, or whose masks changed partly, computes only what is missing. SAM takes minutes per frame on a
+CPU.
 """
 
 import dataclasses
@@ -24,14 +20,14 @@ from jsecon.vision.protocols import NamedSegmenter
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddingStore:
-    """What one model has embedded."""
+    """Cache of the embeddings of one model."""
 
     folder: Path
     model: str
-    """names the model by its content."""
+    """Identifies the model by its content."""
 
     def read(self, frame: UInt8[np.ndarray, "h w 3"]) -> dict[bytes, np.ndarray]:
-        """Mask key -> vector (E,) float32 of a frame. A file that cannot be read holds nothing: it only saves time."""
+        """Returns the vectors (E,) float32 of a frame by mask key; empty if the file cannot be read."""
         try:
             _, stored = read_arrays(self._path(frame))
             pairs = zip(stored["keys"], stored["vectors"], strict=True)
@@ -40,7 +36,7 @@ class EmbeddingStore:
             return {}
 
     def write(self, frame: UInt8[np.ndarray, "h w 3"], vectors: dict[bytes, np.ndarray]) -> None:
-        """Keeps the vectors of a frame, in place of those kept before. Raises InputError where it cannot write."""
+        """Replaces the cached vectors of a frame. Raises InputError if the file cannot be written."""
         if not vectors:
             return
         keys = np.stack([np.frombuffer(key, np.uint8) for key in vectors])
@@ -56,21 +52,30 @@ def _write(path: Path, **arrays: np.ndarray) -> None:
 
 
 def frame_digest(model: str, frame: UInt8[np.ndarray, "h w 3"]) -> str:
-    """32 hex digits that name a frame as one model sees it."""
+    """Returns 32 hex digits that identify a frame (H, W, 3) for one model."""
     digest = hashlib.blake2b(f"{model} {frame.shape}".encode(), digest_size=16)
     digest.update(np.ascontiguousarray(frame).data)
     return digest.hexdigest()
 
 
 def mask_key(mask: Bool[np.ndarray, "h w"]) -> bytes:
-    """16 bytes that name a mask."""
+    """Returns 16 bytes that identify a mask (H, W)."""
     return hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=16).digest()
 
 
 def lookup_vectors(
     known: dict[bytes, np.ndarray], keys: list[bytes], dim: int
 ) -> tuple[Float32[np.ndarray, "m e"], list[int]]:
-    """Rows (M, E) of the keys that are known, zero for the others, and the indices of those others."""
+    """Collects cached vectors.
+
+    Args:
+      known: Vectors by mask key.
+      keys: Keys of M masks.
+      dim: E.
+
+    Returns:
+      (M, E) vectors, zero if missing, and the indices of the missing ones.
+    """
     rows = np.zeros((len(keys), dim), np.float32)
     missing = []
     for index, key in enumerate(keys):
@@ -82,10 +87,14 @@ def lookup_vectors(
 
 
 class StoredSegmenter:
-    """Segmenter (jsecon.vision.protocols) that asks `segmenter` for what `folder` does not hold.
+    """Segmenter (jsecon.vision.protocols) with a cache on disk.
 
-    The segmenter's `name` must tell it from others, and from itself with other settings. A file that cannot be read is
-    computed again. Raises InputError where the folder cannot be written.
+    The `name` of the segmenter must identify its model and settings. A file that cannot be read is computed again.
+    Calls raise InputError if the folder cannot be written.
+
+    Args:
+      segmenter: Computes masks that are not cached.
+      folder: Folder of the cache.
     """
 
     def __init__(self, segmenter: NamedSegmenter, folder: str | Path):
@@ -93,7 +102,7 @@ class StoredSegmenter:
         self._segmenter, self._folder = segmenter, Path(folder)
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
-        """frame (H, W, 3) uint8 -> masks (M, H, W) bool, as the segmenter gave them."""
+        """Returns the masks (M, H, W) bool of the segmenter for a frame (H, W, 3) uint8."""
         path = self._folder / f"{frame_digest(self.name, frame)}.safetensors"
         try:
             bits, pixels = read_arrays(path)[1]["bits"], frame.shape[0] * frame.shape[1]
@@ -107,9 +116,9 @@ class StoredSegmenter:
         return masks
 
     def check(self) -> None:
-        """Raises InputError where the segmenter cannot work."""
+        """Raises InputError if the segmenter cannot work."""
         self._segmenter.check()
 
     def close(self) -> None:
-        """Drops what the segmenter holds in memory."""
+        """Frees the memory of the segmenter."""
         self._segmenter.close()

@@ -1,8 +1,7 @@
-"""What depth says about a frame's surfaces: where each pixel lies, and the normal there, smooth because many views made
-it.
+"""Surfaces of a frame from depth: the position and the normal of each pixel, smoothed over many views. Host code.
 
-A single depth frame is too noisy, or too coarsely stored, for normals. All frames' points together are not: each point
-of the joint cloud gets the normal of its neighbourhood, and each pixel that of the point nearest to where it lies.
+A single depth frame is too noisy, or quantised too coarsely, for normals. The joint cloud of all frames is not: each of
+its points gets the normal of its neighbourhood, and each pixel the normal of the nearest point.
 """
 
 from collections.abc import Callable
@@ -17,9 +16,16 @@ from jsecon.types import Camera
 
 
 def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, rounds: int = 3) -> np.ndarray:
-    """z-depth (H, W), 0 = unknown, as Gaussians render it -> the same without what is noise (relative steps below about
-    `noise`), its jumps kept: a median, then bilateral filters on its logarithm. Unknown pixels are filled from the
-    nearest known one; all 0 stays so."""
+    """Removes noise from rendered z-depth and keeps its jumps: a median, then bilateral filters of its logarithm.
+
+    Args:
+      depth: (H, W), 0 = unknown.
+      noise: Relative step up to which differences are noise.
+      rounds: Number of bilateral filters.
+
+    Returns:
+      (H, W) with unknown pixels filled from the nearest known one; unchanged if all are unknown.
+    """
     known = np.asarray(depth > 0)
     if not known.any():
         return depth
@@ -30,14 +36,15 @@ def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, roun
 
 
 def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
-    """Natural logarithm of z-depth (H, W), 0 = unknown, filled from the nearest known pixel; 0 where none is known."""
+    """Returns the logarithm (H, W, 1) of z-depth (H, W), 0 = unknown; filled from the nearest known pixel, 0
+    without."""
     known = np.asarray(depth > 0)
     depth = fill_nearest(depth, known) if known.any() else np.ones_like(depth)
     return np.log(np.maximum(depth, 1e-12))[..., None].astype(np.float32)
 
 
 def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-    """values (H, W) with those of the unknown pixels taken from the nearest known one."""
+    """Fills unknown pixels of `values` (H, W) from the nearest of the `known` ones (H, W) bool."""
     _, nearest = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -48,33 +55,48 @@ def fill_nearest(values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w
 
 
 NEIGHBOURS = 24
-"""points whose plane is a point's own"""
+"""Number of points that the normal of a point is fitted to."""
 _ROUNDS = 4
 _SHARPNESS = 0.1
-"""of 1 - cosine: neighbours whose normals differ more do not smooth each other"""
+"""Scale of 1 - cosine: neighbours whose normals differ more do not smooth each other."""
 
 
 class Surface(NamedTuple):
-    """A frame's surfaces."""
+    """Surfaces of a frame."""
 
     points: np.ndarray
-    """(H, W, 3) float32 in the camera's axes, world units."""
+    """(H, W, 3) float32 in camera axes, world units."""
     normals: np.ndarray
     """(H, W, 3) float32 unit, towards the camera."""
 
     def off_plane(self, axis: int, near: Int[np.ndarray, " n"], far: Int[np.ndarray, " n"]) -> Float[np.ndarray, "_ _"]:
-        """How far pixels `far` along an axis lie off the plane of the pixels `near` and the other way round, the
-        smaller of the two, as a share of the nearer one's z: 0 along any plane, however steeply it is seen."""
+        """Computes the distance of pixels from each other's planes, 0 along any plane however steeply it is seen.
+
+        Args:
+          axis: Image axis of the indices.
+          near: Indices of the first pixels.
+          far: Indices of the second pixels.
+
+        Returns:
+          The smaller of both distances, as a share of the smaller z.
+        """
         a, b = np.take(self.points, near, axis), np.take(self.points, far, axis)
         off = [np.abs(np.einsum("...k,...k", b - a, np.take(self.normals, which, axis))) for which in (near, far)]
         return np.minimum(*off) / np.maximum(np.minimum(a[..., 2], b[..., 2]), 1e-6)
 
 
 def cloud_normals(points: Float[np.ndarray, "p 3"], *, neighbours: int = NEIGHBOURS) -> Float64[np.ndarray, "p 3"]:
-    """Unit normals (P, 3), of either sign, of a cloud of surface points (P, 3), P >= 3.
+    """Estimates the normals of a point cloud.
 
-    The direction in which the `neighbours` nearest points spread least; then, some rounds over, the mean of the
-    neighbours' normals, each weighted by how well it agrees, which leaves creases sharp (a bilateral filter).
+    A normal is the direction of least spread of the nearest points. Rounds of averaging weigh neighbours by agreement,
+    which keeps creases sharp (a bilateral filter).
+
+    Args:
+      points: (P, 3) surface points, P >= 3.
+      neighbours: Number of nearest points.
+
+    Returns:
+      (P, 3) unit normals of either sign.
     """
     points = np.asarray(points, np.float64)
     near = np.asarray(KDTree(points).query(points, k=min(neighbours, len(points)), workers=-1)[1])
@@ -93,10 +115,15 @@ def cloud_normals(points: Float[np.ndarray, "p 3"], *, neighbours: int = NEIGHBO
 def surfaces_from_depth(
     depths: Float[np.ndarray, "t h w"], cameras: Camera, points: Float[np.ndarray, "p 3"]
 ) -> Callable[[int], Surface | None]:
-    """A function of a frame's index: its surface from depths (T, H, W), 0 = unknown, of `cameras` (a batch of T).
+    """Makes a function from the index of a frame to its surface.
 
-    points (P, 3), world: those of all frames together, thinned (a few centimetres apart in a room). The depth is
-    steadied (`smooth_depth`), which also fills what is unknown. None for a frame without any depth.
+    Args:
+      depths: (T, H, W) z-depth, 0 = unknown; smoothed and filled by `smooth_depth`.
+      cameras: Batch of T cameras.
+      points: (P, 3) points of all frames together, world, thinned (a few centimetres apart in a room).
+
+    Returns:
+      The function; it returns None for a frame without depth.
     """
     tree, normals = KDTree(points), cloud_normals(points)
     poses = np.asarray(cameras.world_to_camera, np.float64)
@@ -106,18 +133,18 @@ def surfaces_from_depth(
             return None
         rotation, camera = poses[t, :3, :3], cameras[t]
         here = camera_points(smooth_depth(np.asarray(depths[t], np.float32)), camera)
-        # Normals change slowly: every second pixel is asked, in each direction.
-        asked = here[::2, ::2].reshape(-1, 3)
-        own = normals[tree.query((asked - poses[t, :3, 3]) @ rotation, workers=-1)[1]] @ rotation.T
-        own = own.reshape(*here[::2, ::2].shape).repeat(2, 0).repeat(2, 1)[: here.shape[0], : here.shape[1]]
-        away = np.einsum("hwk,hwk->hw", own, here) > 0
-        return Surface(here.astype(np.float32), np.where(away[..., None], -own, own).astype(np.float32))
+        # Normals change slowly: every second pixel in each direction is enough.
+        sampled = here[::2, ::2].reshape(-1, 3)
+        normal = normals[tree.query((sampled - poses[t, :3, 3]) @ rotation, workers=-1)[1]] @ rotation.T
+        normal = normal.reshape(*here[::2, ::2].shape).repeat(2, 0).repeat(2, 1)[: here.shape[0], : here.shape[1]]
+        away = np.einsum("hwk,hwk->hw", normal, here) > 0
+        return Surface(here.astype(np.float32), np.where(away[..., None], -normal, normal).astype(np.float32))
 
     return surface_of
 
 
 def camera_points(depth: Float32[np.ndarray, "h w"], camera: Camera) -> Float64[np.ndarray, "h w 3"]:
-    """z-depth (H, W) -> points (H, W, 3) in the camera's axes; pixel centres lie at halves."""
+    """Back-projects z-depth (H, W) to points (H, W, 3) in camera axes; pixel centres lie at halves."""
     rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
     x = (columns - float(camera.cx)) / float(camera.fx)
     y = (rows - float(camera.cy)) / float(camera.fy)
