@@ -130,19 +130,19 @@ class SceneViews:
                     len(frames), lambda indices: self._votes(frames, indices), progress
                 )
             ]
-            looks = np.zeros((len(views), self.count), np.float32)
+            cross_sections = np.zeros((len(views), self.count), np.float32)
             for t, view in enumerate(views):
                 camera = self.cameras[t]
                 pose = np.asarray(camera.world_to_camera)
                 depths = np.asarray(self.gaussians.means)[view.seen] @ pose[2, :3] + pose[2, 3]
-                looks[t, view.seen] = view.totals * depths**2 / float(camera.fx * camera.fy)
-            highest = np.maximum(looks.max(0), 1e-30)
+                cross_sections[t, view.seen] = view.totals * depths**2 / float(camera.fx * camera.fy)
+            highest = np.maximum(cross_sections.max(0), 1e-30)
             self._views = [
-                dataclasses.replace(view, clarity=look[view.seen] / highest[view.seen])
-                for view, look in zip(views, looks)
+                dataclasses.replace(view, clarity=area[view.seen] / highest[view.seen])
+                for view, area in zip(views, cross_sections)
             ]
-            looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-30)
-            self.shared = looks @ looks.T
+            cross_sections /= np.maximum(np.linalg.norm(cross_sections, axis=1, keepdims=True), 1e-30)
+            self.shared = cross_sections @ cross_sections.T
         return self._views
 
 

@@ -311,9 +311,9 @@ def _decide(capture: Capture, prober: _Prober, refine: RefineOptions, plan: _Pla
     """Compares a probe with corrections and one without on training frames kept aside."""
     train = np.flatnonzero(~np.asarray(capture.held_out))
     count = min(MAX_ASIDE, len(train) // 3)
+    too_few = "poses and exposures stay as they are: there are too few training frames to test on some of them"
     if count < MIN_ASIDE:
-        note = "poses and exposures stay as they are: there are too few training frames to test on some of them"
-        return _Decision(None, note)
+        return _Decision(None, too_few)
     aside = np.zeros(len(capture.names), bool)
     aside[train[((np.arange(count) + 0.5) * len(train) / count).astype(int)]] = True
     # Frames kept aside are aligned on the squares of one colour of a chessboard, and compared on the others.
@@ -332,6 +332,8 @@ def _decide(capture: Capture, prober: _Prober, refine: RefineOptions, plan: _Pla
     counted = even & ~ignored
     corrected_db = _mean_psnr(scene, aligned, corrections, aside, counted, size)
     plain_db = _mean_psnr(plain_scene, capture, plain, aside, counted, size)
+    if math.isnan(corrected_db):  # every pixel to compare is ignored
+        return _Decision(None, too_few)
     helps = corrected_db >= plain_db + MIN_GAIN_DB
     verdict = "are corrected" if helps else "stay as they are"
     note = (
