@@ -371,6 +371,7 @@ def _since(before: dict[str, int]) -> dict[str, int]:
 def _provenance(options: Options, keys: dict[str, str], embedder: str, out: Path) -> str:
     """JSON of where a field comes from; `jsecon.pipeline.sources` reads "embedder" and "folders"."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    origin = {"jsecon": jsecon.__version__, "options": values | hub_addresses(options), "keys": keys, "embedder": embedder}
-    places = {"folders": relative_folders(options, out), "models": hub_addresses(options)}
+    models = hub_addresses(options)
+    origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
+    places = {"folders": relative_folders(options, out), "models": models}
     return json.dumps(origin | places, sort_keys=True)
