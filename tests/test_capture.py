@@ -9,8 +9,8 @@ from scipy.optimize import linprog
 
 from jsecon.data.capture import check_views_overlap, load_capture
 from jsecon.data.colmap import write_colmap
+from jsecon.data.coordinates import camera_jumps
 from jsecon.data.frames import evenly_spaced, holdout_mask
-from jsecon.data.poses import camera_jumps
 from jsecon.types import Camera
 
 CAPTURE = small_capture()
@@ -26,7 +26,7 @@ def test_formats_are_detected(tmp_path):
     (tmp_path / "nerfstudio/images").rename(tmp_path / "elsewhere")
     with refused("nerfstudio", "without poses", "transforms_train.json"):
         load_capture(tmp_path / "nerfstudio")
-    with refused("nowhere", "nothing there"):
+    with refused("nowhere", "no such file or folder"):
         load_capture(tmp_path / "nowhere")
     write_transforms(CAPTURE, tmp_path / "colmap", {**transforms(CAPTURE), "frames": []})
     assert len(load_capture(tmp_path / "colmap").points) == len(CAPTURE.points)
@@ -56,9 +56,9 @@ def test_frames_are_taken_by_name(tmp_path):
     assert loaded.names == names[::-1]  # in the capture's order
     np.testing.assert_array_equal(loaded.frames, CAPTURE.frames[[1, 3]])
     np.testing.assert_allclose(loaded.cameras.world_to_camera, CAPTURE.cameras.world_to_camera[[1, 3]], atol=1e-6)
-    with refused("5 frames", "one called nothing"):
+    with refused("no frame called nothing among the 5"):
         load_capture(tmp_path, only=["nothing", names[0]])
-    with refused("one called ..."):
+    with refused("no frame called ..."):
         load_capture(tmp_path, only=[])
 
 
@@ -112,12 +112,12 @@ def back_to_back() -> np.ndarray:
 
 
 def test_views_apart_are_told():
-    with refused("2 views that look apart"):
+    with refused("2 views look apart"):
         check_views_overlap(with_cameras(back_to_back()))
     with refused("a single view"):
         check_views_overlap(with_cameras(np.eye(4)[None]))
     points = np.array([[0, 0, 5], [0, 0, -5], [50, 0, 0]], np.float32)
-    with refused("no two of which", "3 sparse points"):
+    with refused("no two of its", "3 sparse points"):
         check_views_overlap(with_cameras(back_to_back(), points=points))
 
 

@@ -8,8 +8,7 @@ import pytest
 from capture_files import refused, ring_poses, small_capture, write_images, write_text_model
 
 from jsecon.data.capture import load_capture
-from jsecon.data.colmap import write_colmap
-from jsecon.data.colmap_model import read_images
+from jsecon.data.colmap import read_images, write_colmap
 from jsecon.data.images import write_image
 from jsecon.errors import InputError
 from jsecon.types import Camera

@@ -74,7 +74,7 @@ def test_an_opencv_without_its_contrib_modules_is_told_before_anything_runs(capt
 
 def test_frames_that_lie_on_a_full_disk_are_told(no_room, monkeypatch):
     """They are mapped: a page without a place on the disk would end the process."""
-    monkeypatch.setattr(frames, "IN_MEMORY", 500)
+    monkeypatch.setattr(frames, "MAX_IN_MEMORY", 500)
     with refused("for 0.0 GiB of frames", "TMPDIR"):
         frames.allocate_frames((2, 20, 30, 3))
     assert frames.allocate_frames((1, 10, 30, 3)).shape == (1, 10, 30, 3)

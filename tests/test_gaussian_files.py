@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib.util
 import json
 import zipfile
 
@@ -13,7 +14,6 @@ from capture_files import refused
 from scipy.spatial.transform import Rotation
 from splat_files import RUB, opacity, scene
 
-from jsecon.data.gaussians import files as gaussian_files
 from jsecon.data.gaussians.files import load_gaussians, save_gaussians
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
@@ -185,7 +185,7 @@ def test_a_sog_with_a_short_codebook(tmp_path):
     [
         ("scene.ksplat", "npx @playcanvas/splat-transform scene.ksplat scene.ply"),
         ("meta.json", "npx @playcanvas/splat-transform meta.json meta.ply"),
-        ("scene", "ends in nothing"),
+        ("scene", "ends in no suffix"),
         ("scene.gltf", "one .glb file"),
         ("scene.obj", "Export the scene as a .ply"),
     ],
@@ -203,8 +203,8 @@ def test_missing_files_endings_and_packages(tmp_path, monkeypatch):
     with refused("scene.sog", ".ply or .spz or .glb", "splat-transform"):
         save_gaussians(tmp_path / "scene.sog", gaussians(SCENE))
     (tmp_path / "a.sog").write_bytes(splat_files.sog(PLAIN))
-    monkeypatch.setattr(gaussian_files.importlib.util, "find_spec", lambda name: None)
-    with refused("no package gsply", "pip install 'jsecon[formats]'"):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with refused("needs the package gsply", "pip install 'jsecon[formats]'"):
         load_gaussians(tmp_path / "a.sog")
     for name in ("three.spz", "a.compressed.ply", "a.splat"):  # which take no package
         (tmp_path / name).write_bytes(FILES[name][0](FILES[name][1]))

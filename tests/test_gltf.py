@@ -217,7 +217,7 @@ def test_nothing_to_write_and_nowhere_to_write_it(tmp_path, monkeypatch):
         save_glb(tmp_path / "a.glb", gaussians(scene(0, 1)))
     (tmp_path / "file").write_text("in the way")
     with monkeypatch.context() as patched, refused("a.glb", "at most 4 GiB"):
-        patched.setattr(gltf, "_MOST", 1000)
+        patched.setattr(gltf, "_MAX_BYTES", 1000)
         save_glb(tmp_path / "a.glb", gaussians(scene(3, 1)))
     with refused("a.glb", "a folder"):
         save_glb(tmp_path / "file" / "a.glb", gaussians(scene(3, 1)))

@@ -40,7 +40,7 @@ def test_masks_come_back_with_their_own_rows(written):
 
 def test_what_is_missing_or_disagrees_is_told(written):
     folder, _, rows = written
-    with refused("frame_2_f.npy", "nothing readable"):
+    with refused("frame_2_f.npy", "cannot be read"):
         load_features(folder, ["frame_0", "frame_2"], (12, 16))
     np.save(folder / "frame_1_f.npy", rows[1][:2])
     with refused("frame_1_f.npy", "(2, 5) for ids up to 2"):
@@ -59,7 +59,7 @@ def test_a_folder_without_embeddings_is_refused(tmp_path):
     with refused(tmp_path, "no _f.npy"):
         embedding_size(tmp_path)
     (tmp_path / "a_f.npy").write_bytes(b"no array")
-    with refused("a_f.npy", "nothing readable"):
+    with refused("a_f.npy", "cannot be read"):
         embedding_size(tmp_path)
 
 

@@ -167,10 +167,10 @@ def test_langsplat_misfits(tmp_path):
     with refused("level", "'xl'"):
         load_labels(tmp_path, NAMES, SIZE, level="xl")
     path.write_bytes(path.read_bytes()[:300])
-    with refused("b_s.npy", "no whole array"):
+    with refused("b_s.npy", "damaged or missing"):
         load_labels(tmp_path, NAMES, SIZE)
     path.write_bytes(b"")
-    with refused("b_s.npy", "no whole array"):
+    with refused("b_s.npy", "damaged or missing"):
         load_labels(tmp_path, NAMES, SIZE)
     write_masks(tmp_path, IDS)
     with refused("both .png and _s.npy"):
@@ -194,7 +194,7 @@ def test_damaged_mask_and_progress(tmp_path):
     load_labels(tmp_path, NAMES, SIZE, progress=lambda *call: calls.append(call))
     assert calls == [(1, 3), (2, 3), (3, 3)]
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-20])
-    with refused("a.png", "breaks off"):
+    with refused("a.png", "damaged"):
         load_labels(tmp_path, NAMES, SIZE)
 
 

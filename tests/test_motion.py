@@ -1,14 +1,14 @@
 """Poses of bare photographs: found up to a similarity, kept, gone on with, and refused where they can't be."""
 
-import contextlib
 import dataclasses
 import importlib.util
+import io
+import itertools
+import json
 import os
 import shutil
-import sqlite3
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.app import cli
-from jsecon.data import motion_steps, sfm
+from jsecon.data import sfm
 from jsecon.data.capture import load_capture
 from jsecon.data.images import read_image
 from jsecon.data.sfm import find_poses, list_photographs
@@ -52,7 +52,7 @@ def found(photos, tmp_path_factory):
 def test_poses_are_found_up_to_a_similarity(photos, found):
     told, folder, _, _ = found
     assert len(told.registered) == COUNT
-    assert not told.left_out
+    assert not told.skipped
     assert told.error_px < 0.5
     capture = load_capture(folder, holdout=0)
     assert capture.names == tuple(f"photo {n:02d}" for n in range(COUNT))  # names with spaces
@@ -64,21 +64,19 @@ def test_poses_are_found_up_to_a_similarity(photos, found):
     np.testing.assert_allclose(capture.cameras.fx, FOCAL, rtol=0.03)
 
 
-def test_where_all_at_once_fails_photographs_are_placed_one_by_one(photos, found, tmp_path, monkeypatch):
+def test_an_incremental_model_replaces_a_global_one_that_fails(photos, found, tmp_path, monkeypatch):
     import pycolmap
 
-    shutil.copytree(found[2], tmp_path / "work", symlinks=True)
-    database, links = tmp_path / "work" / "database.db", tmp_path / "work" / "links"
-    nothing = pycolmap.Reconstruction()
-    assert not motion_steps._firm(database, nothing)
-    monkeypatch.setattr(motion_steps, "_at_once", lambda *_: (nothing, 1))
-    model, models = motion_steps._mapping(pycolmap, COUNT, database, links, lambda *_: None)
-    assert (model.num_reg_images(), models) == (COUNT, 1)
-    assert motion_steps._firm(database, model)
-    assert motion_steps._misplaced(database, model) == []
-    poses = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
-    found = np.stack([np.vstack([poses[name], (0, 0, 0, 1)]) for name in sorted(poses)])
-    distances, degrees = apart(found, photos[1])
+    work = shutil.copytree(found[2], tmp_path / "work", symlinks=True)
+    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_: {0: pycolmap.Reconstruction()})
+    monkeypatch.setattr(sfm.os, "dup2", lambda *_: None)
+    monkeypatch.setattr(sfm.os, "fdopen", lambda *_: io.StringIO())
+    (work / "result.json").unlink()
+    sfm.main(work)
+    result = json.loads((work / "result.json").read_text())
+    assert (len(result["registered"]), result["models"]) == (COUNT, 1)
+    capture = load_capture(work / "capture", holdout=0)
+    distances, degrees = apart(np.asarray(capture.cameras.world_to_camera, np.float64), photos[1])
     assert distances.max() < 0.005
     assert degrees.max() < 0.3
 
@@ -96,13 +94,10 @@ def test_what_was_stopped_goes_on_with_what_was_found(photos, found, tmp_path):
     """Features and pairs of a process that was killed are not looked for again; nothing is left of what it half did."""
     shutil.copytree(found[2], tmp_path / "work", symlinks=True)
     told = []
-    (tmp_path / "work" / "found.json").unlink()
+    (tmp_path / "work" / "result.json").unlink()
     seconds = found[0].seconds
     more, _ = find_poses(list_photographs(photos[0]), tmp_path / "work", progress=lambda *at: told.append(at))
-    assert {total for _, total in told} <= {COUNT, motion_steps.AT_ONCE_STEPS + 1}  # no pairs, only registrations
-    steps = [done for done, total in told if total != COUNT]
-    assert 2 <= len(steps) <= motion_steps.AT_ONCE_STEPS + 1
-    assert steps == list(range(len(steps)))
+    assert {total for _, total in told} == {COUNT}  # no pairs
     assert more.seconds["features"] < 0.5 * seconds["features"] + 0.5
     assert more.registered == found[0].registered
     assert more.error_px == pytest.approx(found[0].error_px, rel=0.05)
@@ -122,47 +117,61 @@ def test_one_lens_for_the_photographs_of_one_camera_and_focal_length(photos, tmp
     for number, focal in enumerate((35, 35, 50, None)):
         exif = Image.Exif()
         if focal is not None:
-            exif[sfm._MODEL], exif.get_ifd(sfm._EXIF)[sfm._FOCAL] = "camera", float(focal)
+            exif[sfm._MODEL], exif.get_ifd(sfm._EXIF_FOLDER)[sfm._FOCAL] = "camera", float(focal)
         Image.new("RGB", (32, 24)).save(tmp_path / f"{number}.jpg", exif=exif)
-    assert sfm._lenses(list_photographs(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
-    assert sfm._lenses(list_photographs(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
-    assert sfm._lenses(list_photographs(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
+    assert sfm._lens_groups(list_photographs(tmp_path), 4 * [(32, 24)]) == [[0, 1], [2], [3]]
+    assert sfm._lens_groups(list_photographs(tmp_path), [(32, 24), *(3 * [(24, 32)])]) == [[0], [1], [2], [3]]
+    assert sfm._lens_groups(list_photographs(photos[0]), COUNT * [(WIDTH, HEIGHT)]) == [list(range(COUNT))]
 
 
-def test_pairs_are_the_neighbours_and_the_frames_that_look_alike(monkeypatch, tmp_path):
-    monkeypatch.setattr(motion_steps, "ALIKE", 1)
-    count, apart_by = 60, 40
-    turned = np.eye(count)
-    turned[np.arange(count - apart_by), np.arange(count - apart_by) + apart_by] = 0.9  # the walk's second round
-    monkeypatch.setattr(motion_steps, "_likeness", lambda *_: turned + turned.T)
-    images = list(range(1, count + 1))
-    pairs = motion_steps._pairs(tmp_path / "none", images)
-    assert {(1, 2), (1, 11), (1, 41), (20, 60)} <= pairs
-    assert (1, 12) not in pairs
-    assert len(motion_steps._pairs(tmp_path / "none", images[:40])) == 40 * 39 // 2
+def test_many_photographs_are_matched_with_neighbours_and_with_those_that_look_alike(found, tmp_path, monkeypatch):
+    """Every photograph as often as once before: its double is far away in the order of names."""
+    import pycolmap
+
+    monkeypatch.setattr(sfm, "ALL_PAIRS", 4)
+    monkeypatch.setattr(sfm, "NEIGHBOURS", 1)
+    monkeypatch.setattr(sfm, "ALIKE", 1)
+    with (
+        pycolmap.Database.open(found[2] / "database.db") as once,
+        pycolmap.Database.open(tmp_path / "database.db") as db,
+    ):
+        for image in sorted(once.read_all_images(), key=lambda image: image.name):
+            if not db.num_cameras():
+                camera = once.read_camera(image.camera_id)
+                camera_id = db.write_camera(camera)
+            for turn in range(2):
+                copy = pycolmap.Image(name=f"{turn}{image.name}", camera_id=camera_id)
+                number = db.write_image(copy)
+                db.write_keypoints(number, once.read_keypoints(image.image_id))
+                db.write_descriptors(number, once.read_descriptors(image.image_id))
+        names = {image.image_id: image.name for image in db.read_all_images()}
+    listed = []
+    monkeypatch.setattr(
+        pycolmap, "match_image_pairs", lambda *_, **__: listed.append((tmp_path / "pairs.txt").read_text())
+    )
+    sfm._match(pycolmap, tmp_path, lambda *_: None)
+    pairs = {frozenset(line.split()) for text in listed for line in text.splitlines()}
+    for name in names.values():
+        if name.startswith("0"):
+            assert {name, "1" + name[1:]} in pairs
+    ordered = sorted(names.values())
+    assert all({a, b} in pairs for a, b in itertools.pairwise(ordered))
+    assert len(pairs) < 4 * len(ordered)
 
 
-def test_a_photograph_whose_matches_become_no_points_is_in_a_wrong_place(tmp_path):
-    """Five photographs of the same 20 things; the last one's are points of its own, but for two."""
-    count, things = 5, 20
-    rows = np.stack([np.arange(things)] * 2, axis=-1).astype(np.uint32)
-    with contextlib.closing(sqlite3.connect(tmp_path / "database.db")) as held, held:
-        held.execute("create table two_view_geometries (pair_id, rows, data)")
-        for a in range(1, count + 1):
-            for b in range(a + 1, count + 1):
-                held.execute("insert into two_view_geometries values (?, ?, ?)", (a * motion_steps.PAIR + b, 20, rows))
+def test_a_photograph_whose_matches_become_no_points_makes_a_model_inconsistent(found):
+    import pycolmap
 
-    def image(numbers):
-        points = [
-            SimpleNamespace(point3D_id=number, has_point3D=lambda number=number: number > 0) for number in numbers
-        ]
-        return SimpleNamespace(has_pose=True, points2D=points)
-
-    right, wrong = image([*range(1, 18), 0, 0, 0]), image([1, 2, *range(101, 119)])
-    model = SimpleNamespace(images={number: right for number in range(1, count)} | {count: wrong})
-    assert motion_steps._misplaced(tmp_path / "database.db", model) == [count]
-    model.images[count] = right
-    assert motion_steps._misplaced(tmp_path / "database.db", model) == []
+    database = found[2] / "database.db"
+    model = pycolmap.Reconstruction(found[1] / "sparse" / "0")
+    assert sfm._is_consistent(pycolmap, database, model, COUNT)
+    assert not sfm._is_consistent(pycolmap, database, model, COUNT + 1)
+    assert not sfm._is_consistent(pycolmap, database, None, COUNT)
+    image = next(iter(model.images.values()))
+    for index, point in enumerate(image.points2D):
+        if point.has_point3D():
+            model.delete_observation(image.image_id, index)
+    assert not sfm._is_consistent(pycolmap, database, model, COUNT)
 
 
 def test_without_pycolmap_the_message_has_the_line_to_run(photos, tmp_path, monkeypatch, capsys):
@@ -183,7 +192,7 @@ def _of_two_endings(path):
     shutil.copy(path, path.with_suffix(".jpg"))
 
 
-@pytest.mark.parametrize(("spoil", "says"), [(_damaged, "breaks off"), (_of_two_endings, "photo 03.jpg")])
+@pytest.mark.parametrize(("spoil", "says"), [(_damaged, "damaged"), (_of_two_endings, "photo 03.jpg")])
 def test_photographs_that_are_damaged_or_called_the_same_are_refused(photos, tmp_path, spoil, says):
     folder = shutil.copytree(photos[0], tmp_path / "walk")
     spoil(folder / "photo 03.png")
@@ -256,13 +265,13 @@ def test_photographs_that_show_nothing_in_common_are_refused(photos, tmp_path):
         find_poses(list_photographs(photos[0])[:2], tmp_path / "work", where=photos[0])
     for number in range(3):
         Image.new("RGB", (64, 48), (80 * number, 9, 9)).save(tmp_path / f"{number}.png")
-    with refused("brought together"):
+    with refused("match each other"):
         find_poses(list_photographs(tmp_path), tmp_path / "work")
 
 
-def test_an_end_of_colmap_of_its_own_is_told_with_its_log(photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(motion_steps, "__name__", "jsecon.data.no_such_module")
-    with refused("code 1", "log.txt", "no_such_module"):
+def test_a_crash_of_colmap_is_reported_with_its_log(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm.sys, "executable", shutil.which("false"))
+    with refused("code 1", "log.txt"):
         find_poses(list_photographs(photos[0]), tmp_path)
 
 

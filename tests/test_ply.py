@@ -8,7 +8,7 @@ import pytest
 from capture_files import refused
 
 from experiments.datasets.mesh_files import read_faces, write_mesh
-from jsecon.data.gaussians.ply import SH_DC, load_ply, load_point_cloud, save_ply
+from jsecon.data.gaussians.ply import load_ply, load_point_cloud, save_ply
 from jsecon.errors import InputError
 from jsecon.types import Gaussians
 
@@ -122,7 +122,6 @@ def test_colours_instead_of_harmonics(tmp_path):
     loaded = load_ply(tmp_path / "a.ply")
     assert loaded.sh.shape == (50, 1, 3)
     np.testing.assert_allclose(0.5 + 0.28209479177387814 * loaded.sh[:, 0], rgb, atol=1e-6)
-    np.testing.assert_allclose(SH_DC, 0.28209479177387814)
     np.testing.assert_array_equal(loaded.means, gaussians.means)
     with pytest.raises(ValueError, match="Give one colour per Gaussian"):
         save_ply(tmp_path / "a.ply", gaussians, rgb=rgb[:49])
@@ -209,7 +208,10 @@ def test_opacity_of_one_and_no_rotation(tmp_path):
         (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "element vertex many"),
         (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty quad x\nend_header\n", "property quad x"),
         (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty list uchar int x\nend_header\n", "no properties"),
-        (b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float x\nend_header\n", "twice"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float x\nend_header\n",
+            "two properties",
+        ),
         (b"ply\nformat ascii 1.0\nelement vertex 2\nend_header\n\n\n", "no properties"),
         (b"ply\nformat ascii 1.0\nelement vertex 999999999999999\nproperty float x\nend_header\n1\n", "cut short"),
         (b"ply\nformat ascii 1.0\nelement vertex -1\nproperty float x\nend_header\n", "element vertex -1"),
@@ -290,7 +292,7 @@ def test_blocks_of_rows_and_another_world(tmp_path, monkeypatch):
     save_ply(tmp_path / "whole.ply", scene)
     save_ply(tmp_path / "rgb.ply", scene, rgb=np.linspace(0, 1, 120).reshape(40, 3))
     monkeypatch.setattr(transform, "ROWS", 7)
-    monkeypatch.setattr(ply, "_ROWS", 9)
+    monkeypatch.setattr(ply, "_BLOCK", 9)
     save_ply(tmp_path / "blocks.ply", scene)
     save_ply(tmp_path / "rgb_blocks.ply", scene, rgb=np.linspace(0, 1, 120).reshape(40, 3))
     assert (tmp_path / "blocks.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()

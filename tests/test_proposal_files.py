@@ -136,12 +136,12 @@ def test_every_mask_comes_back(seed, height, width, density):
     [
         ({"size": [9, 10], "counts": "61X13mN000"}, "69 of 9x10"),
         ({"size": [9, 10], "counts": "61X13mN000`"}, "breaks off"),
-        ({"size": [9, 10], "counts": "61 X"}, "is no digit"),
+        ({"size": [9, 10], "counts": "61 X"}, "is not a digit"),
         ({"size": [9, 10], "counts": [-10, 100]}, "90 of 9x10"),
         ({"size": [0, 10], "counts": []}, "0 of 0x10"),
         ({"size": [9, 10]}, "'counts' is missing"),
         ([[10, 10, 20, 20, 10, 20]], "another kind"),
-        ({"size": [2, 2], "counts": "abc\u00e9"}, "is no digit"),
+        ({"size": [2, 2], "counts": "abc\u00e9"}, "is not a digit"),
     ],
 )
 def test_what_is_no_mask_is_refused_where_it_lies(rle, words):

@@ -271,7 +271,7 @@ def test_tum_names_with_spaces(tmp_path):
         ("tum", "rgb.txt", "1305031102.17\n", "rgb.txt"),
         ("tum", "rgb.txt", "# nothing\n", "rgb.txt"),
         ("tum", "intrinsics.txt", "500 500\n", "intrinsics.txt"),
-        ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers behind"),
+        ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers after"),
         ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
         ("arkitscenes", "lowres_wide_intrinsics/41069021_100.000.pincam", "24 16 x\n", "pincam"),
         ("polycam", "keyframes/corrected_cameras/101.json", "{", "101.json"),

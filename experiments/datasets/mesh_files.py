@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jsecon.data.gaussians.ply_file import ORDERS, ply_error, read_ply_file
+from jsecon.data.gaussians.ply import ORDERS, ply_error, read_ply_file
 from jsecon.files import atomic_write
 
 

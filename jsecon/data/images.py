@@ -1,17 +1,15 @@
-"""Image files: RGB frames, integer label images, depth maps.
+"""Image files on the host: RGB frames, label images of integers, depth maps.
 
-Pillow reads them, and refuses files that are cut short. OpenCV reads TIFF, of which Pillow warns and libtiff writes to
-the standard error; and writes all: after `import pycolmap`, Pillow ends the process where it saves a PNG.
+Pillow decodes them and raises on truncated files. OpenCV decodes TIFF, of which Pillow warns and libtiff writes to the
+standard error, and encodes: after `import pycolmap`, Pillow ends the process when it saves a PNG.
 
-Images come upright, as their EXIF orientation asks. Poses may belong to the stored pixels instead: the readers of
-captures decide that (jsecon.data.frames), and read those with `upright=False`.
+Images are returned upright, as their EXIF orientation asks. If poses belong to the stored pixels (`jsecon.data.frames`
+decides that), images are read with `upright=False`.
 """
 
 import io
 import os
 import struct
-import zlib
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,115 +26,90 @@ from PIL.WebPImagePlugin import WebPImageFile
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, atomic_write, map_npy
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
-IMAGE_SUFFIXES = (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))
-"""endings tried, in this order, where a capture names an image without one"""
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif")
+IMAGE_SUFFIXES = (*_SUFFIXES, *(suffix.upper() for suffix in _SUFFIXES))
+"""suffixes tried, in this order, if a capture names an image without one"""
+MAX_PIXELS = 1 << 27
+"""pixels of an image: 134 million"""
+TRANSPOSED = (5, 6, 7, 8)
+"""EXIF orientations that swap width and height"""
+ID_REMEDY = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\0", b"MM\0*")
 _HEIC = (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftyphevc")
-_EXIF = b"Exif\0\0"
-_HIDDEN = b"unread"
-"""in place of _EXIF: Pillow warns of damaged EXIF when it opens a JPEG"""
-ID_REMEDY = "Write one id per pixel as an 8 or 16 bit grey PNG without transparency, or as integers in a .npy."
-_PIXELS = (b"IDAT", b"IHDR", b"PLTE", b"tRNS")
-"""the chunks of a PNG that make its pixels; Pillow refuses a file for a long text or a damaged colour profile"""
-_MODES = {"1": "L", "L": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
-"""Pillow's mode of a file -> that of its pixels here; others become RGB"""
-_NUMBERS = ("I;16", "I;16B", "I", "F")
-"""modes of more than 8 bits, which are kept"""
-_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-"""of a PNG, by its colour type"""
-MAX_PIXELS = 1 << 27
-"""of an image: 134 million"""
-_SHRINKS = (1, 2, 4, 8)
-"""by which a JPEG can be shrunk while it is decoded"""
+_EXIF, _HIDDEN_EXIF = b"Exif\0\0", b"unread"
+"""Start of an EXIF block, and what replaces it in a JPEG: Pillow warns of damaged EXIF when it opens one."""
 _ORIENTATION = 0x0112
-"""EXIF's tag; 1 is upright, 6 the commonest of a phone held upright: turn clockwise by 90 degrees"""
-TRANSPOSED = (5, 6, 7, 8)
-"""the orientations that swap width and height"""
+"""EXIF tag: 1 is upright; 6, the commonest of a phone held upright, asks for a turn clockwise by 90 degrees"""
+_MODES = {"1": "L", "L": "L"} | dict.fromkeys(("RGBA", "PA", "LA", "La", "RGBa"), "RGBA")
+"""Pillow's mode of a file -> mode of the returned pixels; other modes become RGB"""
+_DEEP_MODES = ("I;16", "I;16B", "I", "F")
+"""Pillow's modes of more than 8 bits, which are kept"""
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""PNG colour type -> channels"""
 
 
 def _unreadable(path: Path, problem: str) -> InputError:
-    return InputError(path, problem, "a whole image", "Copy or export the file again.")
+    """The error of a file that is not a complete image."""
+    return InputError(path, problem, remedy="Copy or export the file again.")
 
 
 def _read_bytes(path: Path) -> bytes:
+    """Reads a file that must not be empty."""
     try:
         data = path.read_bytes()
-    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
-        raise _unreadable(path, getattr(error, "strerror", None) or str(error)) from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise _unreadable(path, describe_error(error)) from error
     if not data:
         raise _unreadable(path, "the file is empty")
     return data
 
 
-def _png(chunks: Iterable[tuple[bytes, bytes]]) -> bytes:
-    """A PNG of these chunks."""
-    parts = (struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(b, zlib.crc32(k))) for k, b in chunks)
-    return _PNG + b"".join(parts) + b"\0\0\0\0IEND\xaeB`\x82"
+def _open(path: Path, data: bytes, *, check: bool = False) -> tuple[Image.Image, int]:
+    """Opens an image, with its EXIF orientation; `check` also compares the checksums of a PNG.
 
-
-def _png_chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """(type, body) of each chunk, checked: Pillow does not compare the checksums of pixels."""
-    offset = len(_PNG)
-    while True:
-        kind = data[offset + 4 : offset + 8]
-        end = offset + 8 + int.from_bytes(data[offset : offset + 4])
-        if end + 4 > len(data):
-            raise _unreadable(path, f"the PNG breaks off after {len(data)} bytes")
-        if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise _unreadable(path, f"chunk {kind.decode('latin1')} at byte {offset} of the PNG fails its checksum")
-        if (kind == b"IHDR") != (offset == len(_PNG)):
-            raise _unreadable(path, "the PNG has no header, or two")
-        yield kind, data[offset + 8 : end]
-        if kind == b"IEND":
-            return
-        offset = end + 4
-
-
-def _opened(path: Path, data: bytes) -> tuple[Image.Image, int]:
-    """The image of a file's bytes, of which only the header is read (but of a TIFF), and its EXIF orientation, 1 to 8.
-
-    A HEIC has 1: its decoder applies the file's own rotation, and EXIF's does not count there.
+    The orientation of a HEIC is 1: its decoder applies the file's own rotation.
     """
-    block = b""
+    exif = b""
     try:
         if data.startswith(_PNG):
-            chunks = list(_png_chunks(path, data))
-            image = PngImageFile(io.BytesIO(_png(chunk for chunk in chunks if chunk[0] in _PIXELS)))
-            block = next((body for kind, body in chunks if kind == b"eXIf"), b"")
+            if check:
+                PngImageFile(io.BytesIO(data)).verify()
+            image = PngImageFile(io.BytesIO(data))
+            exif = image.info.get("exif", b"").removeprefix(_EXIF)
         elif data.startswith(_JPEG):
-            image = JpegImageFile(io.BytesIO(data.replace(_EXIF, _HIDDEN)))
-            block = next((body for _, body in image.applist if body.startswith(_HIDDEN)), b"").removeprefix(_HIDDEN)
+            image = JpegImageFile(io.BytesIO(data.replace(_EXIF, _HIDDEN_EXIF)))
+            blocks = [body for _, body in image.applist if body.startswith(_HIDDEN_EXIF)]
+            exif = blocks[0].removeprefix(_HIDDEN_EXIF) if blocks else b""
         elif data[4:12] in _HEIC:
             image = _heic_class(path)(io.BytesIO(data))
         elif data.startswith(b"RIFF"):
             image = WebPImageFile(io.BytesIO(data))
-            block = image.info.get("exif", b"").removeprefix(_EXIF)
+            exif = image.info.get("exif", b"").removeprefix(_EXIF)
         elif data.startswith(b"BM"):
             image = BmpImageFile(io.BytesIO(data))
         else:
-            image = _tiff(data)
-            block = data[: 1 << 16]
+            image = _decode_tiff(data)
+            exif = data[: 1 << 16]
     except InputError:
         raise
-    except Exception as error:  # Pillow's own kinds have no common base but this
-        raise _unreadable(path, f"its {len(data)} bytes are no image ({describe_error(error)})") from error
-    shrink = _shrink(*image.size) if isinstance(image, JpegImageFile) else 1
+    except Exception as error:  # Pillow's errors have no other common base
+        raise _unreadable(path, f"the image is damaged or of an unknown kind ({describe_error(error)})") from error
+    shrink = _decoder_shrink(image)
     width, height = (-(-side // shrink) for side in image.size)
     if width * height > MAX_PIXELS:
         problem = f"the image has {width}x{height} pixels ({width * height / 1e6:.0f} million)"
         remedy = "Shrink it, for instance to half its width and height."
         raise InputError(path, problem, f"at most {MAX_PIXELS // 10**6} million", remedy)
-    return image, _orientation(block)
+    return image, _orientation(exif)
 
 
-def _tiff(data: bytes) -> Image.Image:
-    """A TIFF, upright."""
+def _decode_tiff(data: bytes) -> Image.Image:
+    """Decodes a TIFF, upright."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if data[:4] not in _TIFF or pixels is None:
-        raise ValueError("it is of another kind, or damaged")
+        raise ValueError("it is not a TIFF that can be read")
     if pixels.ndim == 2:
         return Image.fromarray(pixels)
     if pixels.dtype == np.uint16:
@@ -145,36 +118,45 @@ def _tiff(data: bytes) -> Image.Image:
 
 
 def _heic_class(path: Path) -> type[ImageFile]:
+    """Pillow's reader of HEIC photographs, from the extra formats."""
     try:
         from pillow_heif import HeifImageFile
     except ImportError as error:
         remedy = "Run: pip install 'jsecon[formats]' (or export the photographs as JPEG)."
-        found = "a HEIC photograph cannot be read without pillow-heif"
-        raise InputError(path, found, "it installed", remedy) from error
+        raise InputError(path, "a HEIC photograph needs pillow-heif, which is not installed", remedy=remedy) from error
     return HeifImageFile
 
 
-def _shrink(width: int, height: int) -> int:
-    """The least number by which a JPEG is shrunk on decoding so that MAX_PIXELS hold it, else 1."""
-    return next((n for n in _SHRINKS if -(-width // n) * -(-height // n) <= MAX_PIXELS), 1)
+def _decoder_shrink(image: Image.Image) -> int:
+    """The least factor, of those that a JPEG decoder can shrink by, that brings a JPEG to MAX_PIXELS; else 1."""
+    factors = (1, 2, 4, 8) if isinstance(image, JpegImageFile) else ()
+    return next((n for n in factors if -(-image.width // n) * -(-image.height // n) <= MAX_PIXELS), 1)
 
 
-def _orientation(block: bytes) -> int:
-    """The orientation, 1 to 8, of an EXIF block, which is a TIFF; 1 where it has none."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
-    if order is None or len(block) < 8:
+def _orientation(exif: bytes) -> int:
+    """The orientation, 1 to 8, of an EXIF block, which is a TIFF; 1 if it has none."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if order is None or len(exif) < 8:
         return 1
-    (start,) = struct.unpack_from(f"{order}I", block, 4)
-    count = struct.unpack_from(f"{order}H", block, start)[0] if start + 2 <= len(block) else 0
-    for entry in range(start + 2, min(start + 2 + 12 * count, len(block) - 11), 12):
-        tag, kind, values, value = struct.unpack_from(f"{order}HHIH", block, entry)
+    (start,) = struct.unpack_from(f"{order}I", exif, 4)
+    count = struct.unpack_from(f"{order}H", exif, start)[0] if start + 2 <= len(exif) else 0
+    for entry in range(start + 2, min(start + 2 + 12 * count, len(exif) - 11), 12):
+        tag, kind, values, value = struct.unpack_from(f"{order}HHIH", exif, entry)
         if (tag, kind, values) == (_ORIENTATION, 3, 1):  # one 16-bit integer
             return value if 1 <= value <= 8 else 1
     return 1
 
 
 def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
-    """The upright image (H, W, ...) of stored pixels with this EXIF orientation."""
+    """Turns stored pixels upright.
+
+    Args:
+      image: (H, W, ...) stored pixels.
+      orientation: Their EXIF orientation, 1 to 8.
+
+    Returns:
+      The upright image, contiguous.
+    """
     if orientation in TRANSPOSED:
         image = image.swapaxes(0, 1)
     if orientation in (2, 3, 6, 7):
@@ -184,123 +166,135 @@ def apply_orientation(image: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(image)
 
 
-def _decoded(path: Path, image: Image.Image, *, native: bool = False) -> np.ndarray:
-    """Pixels: grey, RGB or RGBA, of TIFF and HEIC upright. Of 16 bits of colour, Pillow has the upper 8.
+def _decode(path: Path, image: Image.Image, *, native: bool = False) -> np.ndarray:
+    """Decodes to grey, RGB or RGBA, upright for TIFF and HEIC; 16 bits of colour become 8.
 
-    `native`: the indices of a palette, and colours that are declared transparent.
+    `native` keeps the indices of a palette, and colours that are declared transparent.
     """
     try:
-        if isinstance(image, JpegImageFile) and (shrink := _shrink(*image.size)) > 1:
+        shrink = _decoder_shrink(image)
+        if isinstance(image, JpegImageFile) and shrink > 1:
             image.draft(None, (image.width // shrink, image.height // shrink))
         image.load()
-        mode = image.mode if native or image.mode in _NUMBERS else _MODES.get(image.mode, "RGB")
+        mode = image.mode if native or image.mode in _DEEP_MODES else _MODES.get(image.mode, "RGB")
         if mode in ("L", "RGB") and "transparency" in image.info and not native:
             mode = "RGBA"
         pixels = np.asarray(image if mode == image.mode else image.convert(mode))
         return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
-    except Exception as error:  # Pillow's own kinds have no common base but this
+    except Exception as error:  # Pillow's errors have no other common base
         raise _unreadable(path, f"the image cannot be decoded ({describe_error(error)})") from error
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """Returns the image file that a capture names, or None.
+    """Finds the image file that a capture names.
 
-    Tried are the name itself, with "\\" as a separator (where a Windows program wrote it), with its ending in upper or
-    lower case, and, where it has none of an image, with an ending added.
+    Tried are the name itself, with backslashes as separators (of a Windows program), with its suffix in upper or lower
+    case, and, if it has no suffix of an image, with one added.
+
+    Args:
+      folder: Folder that the name is relative to.
+      name: The name in the capture.
+
+    Returns:
+      The file, or None.
     """
     for base in dict.fromkeys((name, name.replace("\\", "/"))):
-        stem, ending = os.path.splitext(base)
-        added = () if ending.lower() in IMAGE_SUFFIXES else IMAGE_SUFFIXES  # a.jpg.png is a mask of a.jpg
-        for candidate in (base, stem + ending.lower(), stem + ending.upper(), *(base + end for end in added)):
+        stem, suffix = os.path.splitext(base)
+        added = () if suffix.lower() in IMAGE_SUFFIXES else IMAGE_SUFFIXES  # a.jpg.png is a mask of a.jpg
+        for candidate in (base, stem + suffix.lower(), stem + suffix.upper(), *(base + end for end in added)):
             if os.path.isfile(folder / candidate):  # False also for a name that no file can have
                 return folder / candidate
     return None
 
 
 class ImageHeader(NamedTuple):
-    """What an image file says of its size."""
+    """Size and orientation of an image file."""
 
     stored: tuple[int, int]
-    """(width, height) px of the stored pixels."""
+    """(width, height) of the stored pixels, px."""
     orientation: int
     """EXIF's, 1 to 8."""
 
     @property
     def upright(self) -> tuple[int, int]:
-        """(width, height) px once the orientation is applied."""
+        """(width, height) once the orientation is applied, px."""
         width, height = self.stored
         return (height, width) if self.orientation in TRANSPOSED else (width, height)
 
-    def about(self, cx: object, cy: object) -> tuple[int, int]:
-        """`upright`, unless a principal point (px) lies nearer to the middle of the stored pixels."""
-        if not all(isinstance(value, int | float) for value in (cx, cy)):
+    def closest_to_centre(self, cx: object, cy: object) -> tuple[int, int]:
+        """The stored or the upright size, whichever a principal point (px) is nearer to the middle of."""
+        if not isinstance(cx, int | float) or not isinstance(cy, int | float):
             return self.upright
-        away = lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1])  # type: ignore[operator]
-        return min(self.upright, self.stored, key=away)
+        return min(self.upright, self.stored, key=lambda size: abs(2 * cx - size[0]) + abs(2 * cy - size[1]))
 
 
 def image_header(path: str | Path) -> ImageHeader:
-    """Reads the size and the orientation of an image file, not its pixels.
+    """Reads size and orientation of an image file; decodes no pixels unless it is a TIFF.
 
     Args:
       path: An image file.
 
+    Returns:
+      Its header.
+
     Raises:
-      InputError: The file is missing, empty, too large, or no image.
+      InputError: The file is missing, empty, too large, or not an image.
     """
-    path = Path(path)
-    data = _read_bytes(path)
-    image, orientation = _opened(path, data)
+    data = _read_bytes(Path(path))
+    image, orientation = _open(Path(path), data)
     width, height = image.size
     if data[:4] in _TIFF and orientation in TRANSPOSED:
         width, height = height, width
-    shrink = _shrink(width, height) if isinstance(image, JpegImageFile) else 1
+    shrink = _decoder_shrink(image)
     return ImageHeader((-(-width // shrink), -(-height // shrink)), orientation)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """(width, height) in pixels of an image file as it is read, upright. Raises InputError as `image_header` does."""
+    """Reads the upright (width, height) of an image file, px. Raises InputError as `image_header` does."""
     return image_header(path).upright
 
 
 def read_pixels(path: Path, *, upright: bool = True) -> np.ndarray:
-    """Reads the values of an image file as they are stored.
+    """Reads an image file without a conversion of its values.
 
     Args:
       path: An image file.
-      upright: Apply the EXIF orientation; False has the stored pixels.
+      upright: Apply the EXIF orientation; False returns the stored pixels.
 
     Returns:
       Grey (H, W), RGB or RGBA (H, W, C).
 
     Raises:
-      InputError: The file is missing, damaged, too large, or no image.
+      InputError: The file is missing, damaged, too large, or not an image.
     """
     data = _read_bytes(path)
-    image, orientation = _opened(path, data)
-    pixels = _decoded(path, image)
+    image, orientation = _open(path, data, check=True)
+    pixels = _decode(path, image)
     if orientation == 1 or (data[:4] in _TIFF) == upright:
         return pixels
     return apply_orientation(pixels, orientation if upright else {6: 8, 8: 6}.get(orientation, orientation))
 
 
 def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndarray, "h w 3"], bool]:
-    """RGB, and whether any pixel was transparent: such pixels are laid over black, as in a render of nothing.
+    """Reads an image file as RGB of 8 bits.
 
-    Grey becomes RGB, 16 bits become 8. A JPEG of more than MAX_PIXELS is read at a half, a quarter or an eighth of its
-    size.
+    Transparent pixels are blended with black, as in a render without background. A JPEG of more than MAX_PIXELS is
+    decoded at a half, a quarter or an eighth of its size.
 
     Args:
       path: An image file.
-      upright: Apply the EXIF orientation, as every viewer does; False has the stored pixels.
+      upright: Apply the EXIF orientation, as viewers do; False returns the stored pixels.
+
+    Returns:
+      The image, and whether it had transparent pixels.
 
     Raises:
-      InputError: The file is missing, empty, cut short, too large, or no image.
+      InputError: The file is missing, damaged, too large, or not an image.
     """
     path = Path(path)
     image = read_pixels(path, upright=upright)
     if image.dtype == np.uint16:
-        image = cv2.convertScaleAbs(image, alpha=255 / 65535)  # rounded to the nearest
+        image = cv2.convertScaleAbs(image, alpha=255 / 65535)  # rounds to nearest
     if image.dtype != np.uint8:
         problem = f"its pixels are of type {image.dtype}"
         raise InputError(path, problem, "8 or 16 bits a channel", "Convert it to PNG or JPEG.")
@@ -313,28 +307,41 @@ def read_image(path: str | Path, *, upright: bool = True) -> tuple[UInt8[np.ndar
 
 
 def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Writes RGB to `path`, whole or not at all; its ending says the format."""
+    """Writes an RGB image atomically.
+
+    Args:
+      path: The file; its suffix chooses the format.
+      image: (H, W, 3) uint8 RGB.
+
+    Raises:
+      InputError: The suffix is not that of an image format, or the folder cannot be written.
+    """
     path = Path(path)
-    bgr = cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR)
     try:
-        done, data = cv2.imencode(path.suffix, bgr)
+        encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR))
     except cv2.error:
-        done = False
-    if not done:
-        raise InputError(path, f"no image format has the ending {path.suffix!r}", ".png or .jpg", "Choose another.")
+        encoded = False
+    if not encoded:
+        raise InputError(path, f"no image format has the suffix {path.suffix!r}", remedy="Use .png or .jpg.")
     with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
 
 
 def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
-    """A label image as integers (H, W), and whether they are colours.
+    """Reads a label image as integers.
 
-    PNG: grey of 1 to 16 bits has its values; a palette the indices into it, never its colours; RGB of 8 bits
-    R*65536 + G*256 + B, with True beside it. Pixels that are wholly transparent are 0; where all colours are black, the
-    mask is what is opaque. .npy: whole numbers or booleans (H, W), negative = none.
+    A grey PNG of 1 to 16 bits has its values as ids; a palette PNG the indices into it, never its colours; an RGB PNG
+    of 8 bits R*65536 + G*256 + B. Fully transparent pixels are 0; if all colours are black, the opaque pixels are the
+    mask. A .npy has whole numbers or booleans (H, W), negative where there is no label.
+
+    Args:
+      path: A .png or .npy file.
+
+    Returns:
+      (H, W) ids, and whether they are colours.
 
     Raises:
-      InputError: The file is none of these, or damaged.
+      InputError: The file is of another kind, or damaged.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
@@ -342,56 +349,61 @@ def read_label_image(path: str | Path) -> tuple[Int[np.ndarray, "h w"], bool]:
     data = _read_bytes(path)
     expected = "ids as grey values (8 or 16 bits), palette indices or 8 bit colours"
     if not data.startswith(_PNG):
-        raise InputError(path, "the mask is no PNG", expected, ID_REMEDY)
-    opened, orientation = _opened(path, data)
+        raise InputError(path, "the mask is not a PNG", expected, ID_REMEDY)
+    opened, orientation = _open(path, data, check=True)
     bits, colour_type = data[24], data[25]
-    image = apply_orientation(_decoded(path, opened, native=True), orientation)
+    image = apply_orientation(_decode(path, opened, native=True), orientation)
     if colour_type in (0, 3):
         ids = image.astype(np.int32)
         return ids // (255 // (2**bits - 1)) if opened.mode == "L" else ids, False  # Pillow stretches 2 and 4 bits
     if bits > 8 or image.ndim != 3:
-        raise InputError(
-            path, f"the mask has {bits} bits in each of {_CHANNELS[colour_type]} channels", expected, ID_REMEDY
-        )
-    grey = colour_type == 4
+        problem = f"the mask has {bits} bits in each of {_PNG_CHANNELS[colour_type]} channels"
+        raise InputError(path, problem, expected, ID_REMEDY)
+    is_grey = colour_type == 4
     colours = image.astype(np.int32)
-    ids = colours[..., 0] if grey else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
+    ids = colours[..., 0] if is_grey else colours[..., :3] @ np.array([65536, 256, 1], np.int32)
     if image.shape[2] in (2, 4):
         alpha = image[..., -1]
         opaque = alpha == 255
         if not (opaque | (alpha == 0)).all():
-            raise InputError(path, "the mask has pixels that are half transparent (4 channels)", expected, ID_REMEDY)
+            raise InputError(path, "the mask has half transparent pixels (4 channels)", expected, ID_REMEDY)
         ids = np.where(opaque, ids, 0) if ids.any() else opaque.astype(np.int32)
-    return ids, not grey
+    return ids, not is_grey
 
 
-def _read_id_array(path: Path) -> np.ndarray:
-    """The ids (H, W) int64 of a .npy."""
-    expected = "whole numbers of shape (H, W)"
+def _read_id_array(path: Path) -> Int[np.ndarray, "h w"]:
+    """Reads the ids of a .npy."""
+    expected, remedy = "whole numbers of shape (H, W)", "Write the mask again."
     try:
         image = map_npy(path)
     except READ_ERRORS as error:
-        raise InputError(
-            path, f"the array cannot be read: {describe_error(error)}", expected, "Write the mask again."
-        ) from error
+        raise InputError(path, f"the array cannot be read: {describe_error(error)}", expected, remedy) from error
     image = np.asarray(image.squeeze() if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]) else image)
     if image.ndim == 3:
         remedy = "Give such stacks with --proposals, or write one image of ids for each frame."
         raise InputError(path, f"the array is a stack of shape {image.shape}", expected, remedy)
     if image.ndim != 2 or not image.size:
-        raise InputError(path, f"the array has shape {image.shape}", expected, "Write the mask again.")
+        raise InputError(path, f"the array has shape {image.shape}", expected, remedy)
     with np.errstate(invalid="ignore"):
         whole = image.dtype.kind in "biu" or bool((image == np.floor(image)).all())
         whole = whole and bool((image < 1 << 62).all() and (image > -(1 << 62)).all())
     if not whole:
-        raise InputError(path, "the array holds numbers that are no ids", expected, "Write the mask again.")
+        raise InputError(path, "the array has numbers that are not ids", expected, remedy)
     return image.astype(np.int64)
 
 
 def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
-    """A depth map times `unit` (nerfstudio: 0.001, from millimetres), float32, 0 = unknown. A PNG of 16 bits, or .npy.
+    """Reads a depth map.
 
-    Raises InputError where the file is damaged or of another kind.
+    Args:
+      path: A PNG of one channel of 16 bits, or a .npy of shape (H, W).
+      unit: World units of one count (nerfstudio: 0.001, from millimetres).
+
+    Returns:
+      (H, W) float32 z-depth in world units, 0 = unknown.
+
+    Raises:
+      InputError: The file is damaged or of another kind.
     """
     path = Path(path)
     expected = "one channel of 16 bits (PNG), or a .npy of shape (H, W)"
@@ -400,16 +412,15 @@ def read_depth(path: str | Path, unit: float) -> Float[np.ndarray, "h w"]:
         try:
             depth = map_npy(path)
         except READ_ERRORS as error:
-            raise InputError(
-                path, f"the depth map cannot be read: {describe_error(error)}", expected, remedy
-            ) from error
+            problem = f"the depth map cannot be read: {describe_error(error)}"
+            raise InputError(path, problem, expected, remedy) from error
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
-        if depth.ndim != 2 or not depth.size:
-            raise InputError(path, f"the depth map has shape {depth.shape}", expected, remedy)
+        valid = depth.ndim == 2 and depth.size > 0
     else:
         depth = read_pixels(path)
-        if depth.dtype != np.uint16 or depth.ndim != 2:
-            raise InputError(path, f"the depth map has shape {depth.shape} of {depth.dtype}", expected, remedy)
-    with np.errstate(over="ignore", invalid="ignore"):  # infinite is unknown
+        valid = depth.ndim == 2 and depth.dtype == np.uint16
+    if not valid:
+        raise InputError(path, f"the depth map has shape {depth.shape} of {depth.dtype}", expected, remedy)
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite: unknown
         depth = depth.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

@@ -1,4 +1,4 @@
-"""LERF-style labels in LangSplat's annotation: frame_XXXXX.json with polygons and boxes by category.
+"""LERF-style labels in LangSplat's annotation, on the host: frame_XXXXX.json with polygons and boxes by category.
 
 Reading follows LangSplat's eval/utils.py: polygon corners cut to integers, filled with cv2.fillPoly (corners and edges
 belong to the mask), the objects of a category OR-ed, their boxes side by side.
@@ -27,7 +27,7 @@ _REMEDY = "Label the frame again (LangSplat's format, as its LERF-OVS labels hav
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class LabelledFrame:
-    """What was annotated in one frame; a pytree."""
+    """The annotation of one frame; a pytree."""
 
     name: str = dataclasses.field(metadata={"static": True})
     """the frame's name without ending, as in Capture.names."""
@@ -40,10 +40,19 @@ class LabelledFrame:
 
 
 def load_lerf_labels(folder: str | Path) -> list[LabelledFrame]:
-    """Every `*.json` in `folder`, in name order. Raises InputError where there is none, or one is damaged.
+    """Reads the labels of a folder.
 
-    `iscrowd` is not used. Polygons may lie partly outside the image. Objects of one category with the same box count as
+    `iscrowd` is ignored. Polygons may lie partly outside the image. Objects of one category with the same box count as
     one box.
+
+    Args:
+      folder: Folder of `*.json` files.
+
+    Returns:
+      The labelled frames, in name order.
+
+    Raises:
+      InputError: There is no label file, or one is damaged.
     """
     folder = Path(folder)
     files = sorted(folder.glob("*.json"))
@@ -52,24 +61,27 @@ def load_lerf_labels(folder: str | Path) -> list[LabelledFrame]:
     return [_read(file) for file in files]
 
 
-def _bad(file: Path, found: str, expected: str) -> InputError:
-    return InputError(file, found, expected, _REMEDY)
+def _error(file: Path, problem: str, expected: str) -> InputError:
+    """An error of a label file."""
+    return InputError(file, problem, expected, _REMEDY)
 
 
 def _get(file: Path, record: Any, key: str, kind: type | tuple[type, ...], where: str) -> Any:
+    """A required value of some type; `where` names the record."""
     if not isinstance(record, dict) or not isinstance(record.get(key), kind):
         expected = "info (name, width, height) and objects (category, segmentation, bbox)"
-        raise _bad(file, f"there is no usable {key!r} in {where}", expected)
+        raise _error(file, f"there is no usable {key!r} in {where}", expected)
     return record[key]
 
 
 def _read(file: Path) -> LabelledFrame:
+    """Reads one label file."""
     content = read_json(file, "a label file", _REMEDY)
     info = _get(file, content, "info", dict, "the file")
     name = Path(_get(file, info, "name", str, "info")).stem
     width, height = (int(_get(file, info, key, int, "info")) for key in ("width", "height"))
     if min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise _bad(file, f"the image is {width}x{height}", f"a positive size, at most {MAX_PIXELS} pixels")
+        raise _error(file, f"the image is {width}x{height}", f"a positive size, at most {MAX_PIXELS} pixels")
     objects: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for index, entry in enumerate(_get(file, content, "objects", list, "the file")):
         where = f"object {index}"
@@ -86,18 +98,28 @@ def _read(file: Path) -> LabelledFrame:
 
 
 def _numbers(file: Path, values: list, shape: tuple[int, int], what: str) -> np.ndarray:
+    """An array of a list of numbers; a dimension of `shape` may be -1."""
     try:
         array = np.array(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
-        found = f"the {what} is no list of {shape[1]} numbers each"
-        raise _bad(file, found, "[x, y] corners, and x1 y1 x2 y2") from error
+        problem = f"the {what} is not a list of {shape[1]} numbers each"
+        raise _error(file, problem, "[x, y] corners, and x1 y1 x2 y2") from error
     if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
-        raise _bad(file, f"the {what} is empty or out of all range", "pixels")
+        raise _error(file, f"the {what} is empty or out of all range", "pixels")
     return array
 
 
 def polygon_mask(corners: Real[np.ndarray, "k 2"], width: int, height: int) -> Bool[np.ndarray, "{height} {width}"]:
-    """The pixels of a polygon, its edges included; corners are cut to integers (see the module's docstring)."""
+    """Draws a polygon, its edges included; corners are cut to integers, as LangSplat does.
+
+    Args:
+      corners: (K, 2) x y, px.
+      width: Width of the image, px.
+      height: Height of the image, px.
+
+    Returns:
+      (height, width) mask.
+    """
     canvas = np.zeros((height, width), np.uint8)
     cv2.fillPoly(canvas, [np.asarray(corners).astype(np.int32)], 1)
     return canvas.astype(bool)
@@ -106,18 +128,25 @@ def polygon_mask(corners: Real[np.ndarray, "k 2"], width: int, height: int) -> B
 def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, image_ending: str = ".png") -> None:
     """Writes `<name>.json` of each frame; `load_lerf_labels` gives the same masks and boxes back.
 
-    Polygons can hold neither several pieces nor holes, so a mask is written as several objects of its category: one
-    for each connected piece, and a piece with holes is cut along pixel rows until none has any. Each carries that box
-    of the category's which it fits best. Raises ValueError on a category without pixels or boxes, InputError where the
-    folder cannot be written.
+    A polygon has one piece and no holes, so a mask is written as several objects of its category: one for each
+    connected piece, and pieces with holes are cut along pixel rows. Each has the category's box that fits it best.
+
+    Args:
+      folder: The folder.
+      frames: The labelled frames.
+      image_ending: Suffix of the frames' images.
+
+    Raises:
+      ValueError: A category has no pixels or boxes.
+      InputError: The folder cannot be written.
     """
     for frame in frames:
         objects = []
         for group, (category, (mask, boxes)) in enumerate(frame.objects.items(), start=1):
             fits = mask.shape == (frame.height, frame.width) and bool(mask.any()) and len(boxes) > 0
             got = f"mask {mask.shape} with {int(mask.sum())} pixels, {len(boxes)} boxes"
-            wanted = f"({frame.height}, {frame.width}), with pixels and a box"
-            require(fits, f"{frame.name}: {category}", got, wanted, "Leave out what the frame does not show.")
+            expected = f"({frame.height}, {frame.width}), with pixels and a box"
+            require(fits, f"{frame.name}: {category}", got, expected, "Leave out what the frame does not show.")
             for polygon, box in _with_boxes(mask_polygons(mask), np.asarray(boxes, np.float64)):
                 shape = {"segmentation": polygon.astype(float).tolist(), "area": float(mask.sum()), "layer": 1.0}
                 rest = {"bbox": box.tolist(), "iscrowd": 0, "note": ""}
@@ -127,7 +156,14 @@ def write_lerf_labels(folder: str | Path, frames: Iterable[LabelledFrame], *, im
 
 
 def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
-    """Polygons (K, 2), integer x y, without holes, whose `polygon_mask`s OR-ed are the mask exactly."""
+    """Outlines a mask by polygons without holes, whose `polygon_mask`s OR-ed are the mask exactly.
+
+    Args:
+      mask: (H, W) mask.
+
+    Returns:
+      Polygons (K, 2), integer x y, px.
+    """
     polygons = []
     image = np.ascontiguousarray(mask, np.uint8)
     _, labels = cv2.connectedComponents(image, connectivity=8)
@@ -139,7 +175,7 @@ def mask_polygons(mask: Bool[np.ndarray, "h w"]) -> list[np.ndarray]:
         if hole < 0:
             polygons.append(outline)
             continue
-        # Cut along the middle row of a hole: it opens into a notch of either part. The hole nearest to the piece's own
+        # Cut along the middle row of a hole: it opens into a notch of either part. The hole nearest to the piece's
         # middle, so that many holes are halved at each cut.
         cuts = []
         while hole >= 0:

@@ -1,8 +1,7 @@
-"""What a dataset's masks mean, on disk: LangSplat's `language_features/` and OpenGaussian's `text_features.json`.
+"""LangSplat's `language_features/`, on the host: masks of single frames with an embedding each.
 
 `<frame>_s.npy` float32 (4, H, W): ids by level (default, s, m, l), -1 = none, which are rows of `<frame>_f.npy` float32
-(M, E), unit (minghanqin/LangSplat, preprocess.py). Masks are those of single frames: the same thing has another row in
-each.
+(M, E), unit (minghanqin/LangSplat, preprocess.py). The same thing has another row in each frame.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jsecon.data.mask_names import find_masks
-from jsecon.data.masks import Fit, compact, read_level
+from jsecon.data.masks import MaskFitter, compact_ids, find_masks, read_level
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, map_npy
 from jsecon.numerics import is_finite_and_bounded
@@ -41,40 +39,53 @@ def load_features(
     order: Sequence[str] | None = None,
     files: Mapping[str, ImageFile] | None = None,
 ) -> FrameMasks:
-    """Reads one level of the masks of the frames `names`, at `size` (H, W), with their embeddings.
+    """Reads one level of the masks of frames, with their embeddings.
 
-    Files are found by name as by `jsecon.data.masks.load_labels`, which says what `order` and `files` are. Masks
-    that vanish at the size asked for are left out. Raises InputError where a frame has no file, where the two files of
-    a frame disagree, and on embeddings that are not finite.
+    Files are named as in `jsecon.data.masks`. Masks that vanish at the size asked for are skipped.
+
+    Args:
+      folder: The language_features folder.
+      names: T frames.
+      size: (H, W) of the labels.
+      level: A name of LEVELS.
+      order: All frames of the capture.
+      files: The image of each frame, by its name.
+
+    Returns:
+      Labels, embeddings and the frame of each mask.
+
+    Raises:
+      InputError: A frame has no file, its two files disagree, or embeddings are not finite.
     """
-    found = find_masks(folder, order if order is not None else names, ("_s.npy", "_f.npy"), _is_object, files=files)
-    by_ending = {kind.ending: kind.path for kind in found}
+    every = order if order is not None else names
+    kinds = find_masks(folder, every, ("_s.npy", "_f.npy"), lambda path: False, files=files)
+    by_suffix = {kind.suffix: kind.path for kind in kinds}
 
-    def file_of(name: str, ending: str) -> Path:
-        path = by_ending[ending](name) if ending in by_ending else None
-        return folder / f"{name}{ending}" if path is None else path  # which cannot be read
+    def path_of(name: str, suffix: str) -> Path:
+        path = by_suffix[suffix](name) if suffix in by_suffix else None
+        return folder / f"{name}{suffix}" if path is None else path  # a missing file is an error of its reader
 
-    fit = Fit(files or {}, size, lambda name: read_level(file_of(name, "_s.npy"), level).shape)
+    fit = MaskFitter(files or {}, size, lambda name: read_level(path_of(name, "_s.npy"), level).shape)
     labels = np.full((len(names), *size), -1, np.int32)
     rows: list[np.ndarray] = []
     frame: list[int] = []
     for t, name in enumerate(names):
-        file, masks = file_of(name, "_f.npy"), file_of(name, "_s.npy")
+        file, masks = path_of(name, "_f.npy"), path_of(name, "_s.npy")
         table = _read_table(file)
         if rows and table.shape[-1] != len(rows[0]):
-            problem, wanted = f"it has rows of {table.shape[-1]} numbers", f"{len(rows[0])}, as in the frames before"
-            raise InputError(file, problem, wanted, "Write all frames' files with the same model.")
-        ids, indices = compact(masks, read_level(masks, level))
+            problem, expected = f"it has rows of {table.shape[-1]} numbers", f"{len(rows[0])}, as in the frames before"
+            raise InputError(file, problem, expected, "Write all frames' files with the same model.")
+        ids, indices = compact_ids(masks, read_level(masks, level))
         last = max(ids.tolist(), default=-1)
         if table.ndim != 2 or not is_finite_and_bounded(table) or last >= len(table):
-            wanted = "a finite row for each id of the _s.npy beside it"
             problem = f"it is an array {table.shape} for ids up to {last}"
-            raise InputError(file, problem, wanted, "Write both files of the frame again.")
-        own = fit(masks, indices, name)
-        kept = np.unique(own[own >= 0])
-        place = np.full(len(ids) + 1, -1, np.int32)
-        place[kept] = len(rows) + np.arange(len(kept))
-        labels[t] = place[own]
+            expected = "a finite row for each id of the _s.npy beside it"
+            raise InputError(file, problem, expected, "Write both files of the frame again.")
+        fitted = fit(masks, indices, name)
+        kept = np.unique(fitted[fitted >= 0])
+        row_of = np.full(len(ids) + 1, -1, np.int32)
+        row_of[kept] = len(rows) + np.arange(len(kept))
+        labels[t] = row_of[fitted]
         rows += [table[ids[k]] for k in kept]
         frame += [t] * len(kept)
     width = rows[0].shape[-1] if rows else 0
@@ -82,13 +93,8 @@ def load_features(
     return FrameMasks(labels, embeddings, np.array(frame, np.int32))
 
 
-def _is_object(path: Path) -> bool:
-    """Whether a file holds the mask of one object alone: LangSplat's hold those of many."""
-    return False
-
-
 def embedding_size(folder: Path) -> int:
-    """E of the embeddings in `folder`. Raises InputError where it holds no `_f.npy`, or the first is damaged."""
+    """Reads the size E of the embeddings in a folder. Raises InputError if it has no `_f.npy`, or a damaged one."""
     files = sorted(folder.rglob("*_f.npy"))
     if not files:
         remedy = "Give the language_features folder that LangSplat's preprocess.py wrote."
@@ -97,11 +103,15 @@ def embedding_size(folder: Path) -> int:
 
 
 def _read_table(file: Path) -> np.ndarray:
+    """Reads an array of embeddings."""
     try:
         table = map_npy(file)
         if table.ndim == 0:
             raise ValueError("a single number")
     except READ_ERRORS as error:
-        wanted, remedy = "a (M, E) array, one row per mask", "Run LangSplat's preprocess.py on every frame."
-        raise InputError(file, f"there is nothing readable ({describe_error(error)})", wanted, remedy) from error
+        problem, remedy = (
+            f"it cannot be read ({describe_error(error)})",
+            "Run LangSplat's preprocess.py on every frame.",
+        )
+        raise InputError(file, problem, "a (M, E) array, one row per mask", remedy) from error
     return table

@@ -1,7 +1,7 @@
-"""Lenses as captures state them, and the pinhole lens that stands in for a distorted one.
+"""Lenses of captures, on the host, and the pinhole lens that replaces a distorted one.
 
-OpenCV projects its own two models, Brown's and Kannala and Brandt's. Those that only COLMAP has are projected here, by
-the formulas of its src/colmap/sensor/models.h.
+OpenCV projects two models, Brown's and Kannala and Brandt's. COLMAP's others are projected here, by the formulas of its
+src/colmap/sensor/models.h: pycolmap, which has them too, is an optional package.
 
 Pixels are counted as everywhere here (and in COLMAP): the centre of the first pixel is at (0.5, 0.5). OpenCV puts it at
 (0, 0), hence the half pixels below.
@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jsecon.errors import InputError
 
-WIDEST, NARROWEST = 0.5, 8.0
+MIN_ZOOM, MAX_ZOOM = 0.5, 8.0
 """zooms searched for a pinhole lens without empty pixels: below the one the centre would lose over half its resolution,
 above the other the coefficients are nonsense"""
 RAY_STEPS, BORDER_STEPS = 64, 48
@@ -55,7 +55,7 @@ class Lens:
         return self.fisheye or self.model is not None or any(k != 0 for k in self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:
-        """The lens of the same image at another size."""
+        """Returns the lens of the same image at another size."""
         x, y = width / self.width, height / self.height
         return dataclasses.replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
@@ -135,17 +135,26 @@ PROJECTIONS: dict[str, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
     "DIVISION": _division,
     "EUCM": _unified,
 }
-"""COLMAP's models beside OpenCV's: (x/z, y/z) and coefficients -> (u - cx) / fx, (v - cy) / fy"""
+"""COLMAP's other models: (x/z, y/z) and coefficients -> (u - cx) / fx, (v - cy) / fy"""
 
 
 def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Camera matrix and distortion coefficients as OpenCV has them."""
     matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
     size = 4 if lens.fisheye else next(n for n in (4, 5, 8) if n >= len(lens.distortion))
     return matrix, np.pad(np.array(lens.distortion, np.float64), (0, size - len(lens.distortion)))
 
 
 def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """(x/z, y/z) of directions in the camera's frame -> pixels of the distorted image."""
+    """Projects directions into the distorted image.
+
+    Args:
+      lens: The lens.
+      directions: (N, 2) x/z and y/z in the camera's frame.
+
+    Returns:
+      (N, 2) u v, px.
+    """
     if lens.model is not None:
         across, down = PROJECTIONS[lens.model](*np.asarray(directions, np.float64).T, *lens.distortion)
         return np.stack([lens.fx * across + lens.cx, lens.fy * down + lens.cy], axis=-1)
@@ -159,9 +168,9 @@ def distort(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     return pixels.reshape(-1, 2) + 0.5
 
 
-@np.errstate(all="ignore")  # what overflows is not covered
+@np.errstate(all="ignore")  # an overflow means: not covered
 def _covered(lens: Lens, zoom: float) -> bool:
-    """Whether a pinhole lens of this zoom sees only what the distorted image holds, where its model is one to one.
+    """Whether a pinhole lens of this zoom sees only pixels of the distorted image, where its model is one to one.
 
     Looks along rays from the principal point to the border: the distorted radius must grow all the way (a polynomial
     folds back beyond its range, which would show the same pixels twice) and end inside the image.
@@ -181,19 +190,27 @@ def _covered(lens: Lens, zoom: float) -> bool:
 
 
 def undistorted_pinhole(lens: Lens, where: object) -> Lens:
-    """The widest pinhole lens, same size and principal point, each of whose pixels the distorted image holds.
+    """Finds the widest pinhole lens, of the same size and principal point, whose image has no empty border.
 
-    No empty border is made, since nothing could tell it from black things. `where` names the file in the InputError
-    that is raised where no such lens exists (principal point outside the image, or absurd coefficients).
+    An empty border could not be told from black things.
+
+    Args:
+      lens: The distorted lens.
+      where: Name of its file for errors.
+
+    Returns:
+      The pinhole lens; `lens` itself if it is not distorted.
+
+    Raises:
+      InputError: There is no such lens: the principal point lies outside the image, or coefficients are absurd.
     """
     if not lens.distorted:
         return dataclasses.replace(lens, distortion=())
     # Covered at a zoom means covered at every larger one: its rays are the same, but shorter. So bisection is exact.
-    low, high = WIDEST, NARROWEST
+    low, high = MIN_ZOOM, MAX_ZOOM
     if not _covered(lens, high):
-        expected = "coefficients under which the image is one to one around its principal point"
         remedy = "Calibrate again, or undistort the images first (colmap image_undistorter)."
-        raise InputError(where, f"distortion {lens.distortion} that leaves no undistorted image", expected, remedy)
+        raise InputError(where, f"the distortion {lens.distortion} leaves no undistorted image", remedy=remedy)
     if _covered(lens, low):
         high = low
     while high - low > 1e-4:
@@ -203,7 +220,15 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
 
 
 def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """For each pixel of the pinhole image, where it lies in the distorted one: two tables for cv2.remap."""
+    """Computes where each pixel of the undistorted image lies in the distorted one.
+
+    Args:
+      lens: The distorted lens.
+      pinhole: Its pinhole lens.
+
+    Returns:
+      Two tables (H, W) float32 for cv2.remap.
+    """
     if lens.model is not None:
         columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
         rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
@@ -217,7 +242,16 @@ def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray
 
 
 def resample_depth(depth: Float[np.ndarray, "h w"], lens: Lens, other: Lens) -> Float[np.ndarray, "p q"]:
-    """The depth map of the pinhole `lens` as `other` sees it from the same place: the nearest pixel, 0 outside."""
+    """Resamples a depth map for another lens at the same place.
+
+    Args:
+      depth: (H, W) z-depth.
+      lens: Its pinhole lens.
+      other: The other pinhole lens.
+
+    Returns:
+      (P, Q) depth of the nearest pixel, 0 outside.
+    """
     columns = np.floor((np.arange(other.width) + 0.5 - other.cx) / other.fx * lens.fx + lens.cx).astype(int)
     rows = np.floor((np.arange(other.height) + 0.5 - other.cy) / other.fy * lens.fy + lens.cy).astype(int)
     height, width = depth.shape

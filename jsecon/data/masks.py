@@ -1,41 +1,336 @@
-"""Masklets from disk: one label image per frame, or one black and white mask per object and frame, matched by name."""
+"""Masks from disk, on the host: which file belongs to which frame, and the labels of tracked regions.
+
+A mask is named like its frame: `<frame>.png`, like the image's whole name (`<frame>.jpg.png`, as COLMAP has it), or
+with a word for what it is (`<frame>_mask.png`). It lies in the folder itself, or in subfolders named like those of the
+images (`cam0/<frame>.png`). Any other subfolder stands for an object (`<object>/<frame>.png`, black and white, as SAM 2
+writes them with --per_obj_png_file), or merely divides the files.
+"""
 
 from __future__ import annotations
 
 import collections
+import os
+import re
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int16
+from jaxtyping import Int, Int16
 
 from jsecon.data.frames import Progress
-from jsecon.data.images import TRANSPOSED, apply_orientation, read_label_image
-from jsecon.data.mask_names import Masks, find_masks, object_ids
+from jsecon.data.images import IMAGE_SUFFIXES, TRANSPOSED, apply_orientation, read_label_image
 from jsecon.errors import InputError, describe_error
-from jsecon.files import READ_ERRORS, map_npy
+from jsecon.files import READ_ERRORS, is_output_folder, map_npy
 from jsecon.types import ImageFile
 
 LEVELS = ("default", "s", "m", "l")
-"""LangSplat's levels in the order of its `_s.npy`: all of SAM's masks, subpart, part, whole"""
-MOST_REGIONS = int(np.iinfo(np.int16).max)
-MOST_IDS = 1 << 24
-"""what float32, in which LangSplat writes ids, holds without a gap"""
-GREY = 65793
-"""the number of the colour (1, 1, 1), R*65536 + G*256 + B"""
-_SUFFIX = "_s.npy"
+"""levels of LangSplat's `_s.npy`, in their order: all of SAM's masks, subparts, parts, whole objects"""
+MAX_REGIONS = int(np.iinfo(np.int16).max)
+MAX_ID = 1 << 24
+"""ids below which float32, LangSplat's type of ids, holds every integer"""
+GREY_COLOUR = 65793
+"""number of the colour (1, 1, 1), R*65536 + G*256 + B"""
+MAX_DEPTH = 4
+"""nested subfolders that are searched for masks"""
+SAMPLED_MASKS = 64
+"""masks whose values are read to tell cameras from objects"""
+_LEVELS_SUFFIX = "_s.npy"
+_WORD = r"masks?|seg|segs|segmentations?|labels?|ids?|instances?|objects?|annotations?"
+_AFFIX = re.compile(rf"(?:(?:{_WORD})[_.-])?(.+?)(?:[_.-](?:{_WORD}))?", re.IGNORECASE)
+"""a frame's name within that of its mask"""
+_LOWER_SUFFIXES = frozenset(suffix.lower() for suffix in IMAGE_SUFFIXES)
+_UNSUPPORTED = (*sorted(_LOWER_SUFFIXES), ".npz", ".gif", ".exr")
+"""suffixes of files that may be meant as masks and are not read as such"""
 
 
-class MasksFromDisk(NamedTuple):
-    """Labels as the pipeline wants them, and what they were called in the files."""
+class MaskFiles(NamedTuple):
+    """Mask files of one suffix by frame: either one file a frame, or one for each object in it."""
+
+    files: dict[str, Path]
+    """Frame -> file."""
+    objects: dict[str, dict[str, Path]]
+    """Frame -> folder of an object -> file."""
+    suffix: str
+    notes: tuple[str, ...]
+    """How the files were understood, a sentence each."""
+
+    def path(self, name: str) -> Path | None:
+        """The file of a frame, or one of those of its objects."""
+        return self.files.get(name) or next(iter(self.objects.get(name, {}).values()), None)
+
+
+class _Frame(NamedTuple):
+    """A frame: its name, its image's name without suffix, and its image's folders."""
+
+    name: str
+    stem: str
+    folders: tuple[str, ...]
+
+
+class _Match(NamedTuple):
+    """A mask file that is named like a frame."""
+
+    frame: str
+    extra: tuple[str, ...]
+    """Its folders that the frame's image does not have."""
+    rank: tuple[int, int]
+    """The lower, the closer is the file's name to the frame's."""
+    folders: tuple[str, ...]
+    path: Path
+
+
+class FrameNames:
+    """Looks up frames by the name of a mask.
+
+    Args:
+      names: All frames of the capture.
+      files: The frames' images, by frame name.
+    """
+
+    def __init__(self, names: Sequence[str], files: Mapping[str, ImageFile] | None = None):
+        """Indexes the frames."""
+        frames = [_frame(name, (files or {}).get(name)) for name in names]
+        self._by_name: dict[str, list[_Frame]] = collections.defaultdict(list)
+        by_first_part: dict[str, list[_Frame]] = collections.defaultdict(list)
+        for frame in frames:
+            for key in {frame.name, frame.stem}:
+                self._by_name[key].append(frame)
+            by_first_part[frame.stem.split(".")[0]].append(frame)
+        # LangSplat cuts names at the first dot.
+        self._by_first_part = {key: frames for key, frames in by_first_part.items() if len(frames) == 1}
+
+    def match(self, path: Path, folders: tuple[str, ...], suffix: str) -> _Match | None:
+        """Finds the frame of a mask.
+
+        Args:
+          path: The mask file.
+          folders: Its subfolders below the folder of masks.
+          suffix: Its suffix.
+
+        Returns:
+          The match; None if there is none, or if two frames fit equally well.
+        """
+        base = path.name[: len(path.name) - len(suffix)]
+        for rank, key in enumerate(_frame_keys(base)):
+            frames = self._by_name.get(key) or (self._by_first_part.get(key) if rank == 0 else None)
+            if not frames:
+                continue
+            fits = sorted((_compare_folders(folders, frame, key), frame.name) for frame in frames)
+            if len(fits) > 1 and fits[0][0][:2] == fits[1][0][:2]:
+                return None
+            (_, _, extra), name = fits[0]
+            return _Match(name, extra, (rank, -len(folders)), folders, path)
+        return None
+
+
+def _frame(name: str, file: ImageFile | None) -> _Frame:
+    """The names of a frame and its image."""
+    if file is None:
+        return _Frame(name, name, ())
+    path = PurePosixPath(file.path)
+    stem = path.stem if path.suffix.lower() in _LOWER_SUFFIXES else path.name
+    return _Frame(name, stem, tuple(part for part in path.parts[:-1] if part not in ("/", ".", "..")))
+
+
+def _frame_keys(base: str) -> list[str]:
+    """The names that a mask's frame may have, the likeliest first."""
+    keys = [base, _without_image_suffix(base)]
+    if word := _AFFIX.fullmatch(base):
+        keys += [word[1], _without_image_suffix(word[1])]
+    return list(dict.fromkeys(keys))
+
+
+def _without_image_suffix(name: str) -> str:
+    """The name without the suffix of an image."""
+    stem, suffix = os.path.splitext(name)
+    return stem if suffix.lower() in _LOWER_SUFFIXES else name
+
+
+def _compare_folders(folders: tuple[str, ...], frame: _Frame, key: str) -> tuple[int, int, tuple[str, ...]]:
+    """Compares a mask's folders with the last ones of a frame's image.
+
+    Returns the number of folders that the image does not have, minus the number that agree, and the former.
+    """
+    of_image = frame.folders if key == frame.stem else ()
+
+    def agree(some: tuple[str, ...]) -> bool:
+        return some == of_image[len(of_image) - len(some) :]
+
+    if agree(folders):
+        return 0, -len(folders), ()
+    for place, folder in enumerate(folders):
+        if agree(rest := folders[:place] + folders[place + 1 :]):
+            return 1, -len(rest), (folder,)
+    common = next(n for n in range(len(folders), -1, -1) if agree(folders[len(folders) - n :]))
+    return len(folders) - common, -common, folders[: len(folders) - common]
+
+
+def _list_files(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
+    """Lists the visible files below a folder with their subfolders, in order, without output of jsecon."""
+    files = []
+    for place, inner, names in os.walk(folder, followlinks=True):
+        folders = Path(place).relative_to(folder).parts
+        visible = (name for name in inner if not name.startswith(".") and not is_output_folder(Path(place) / name))
+        inner[:] = sorted(visible) if len(folders) < MAX_DEPTH else []
+        files += [(Path(place) / name, folders) for name in sorted(names) if not name.startswith(".")]
+    return files
+
+
+def find_masks(
+    folder: Path,
+    names: Sequence[str],
+    suffixes: Sequence[str],
+    is_black_and_white: Callable[[Path], bool],
+    *,
+    files: Mapping[str, ImageFile] | None = None,
+    numbered: bool = False,
+) -> list[MaskFiles]:
+    """Finds the masks of frames.
+
+    Args:
+      folder: Where the masks are.
+      names: All frames of the capture.
+      suffixes: Suffixes of masks, the longer before the shorter.
+      is_black_and_white: Whether a file holds the mask of one object: it tells folders of objects from those of cameras
+        if their names do not.
+      files: The frames' images, whose folders are those of the cameras.
+      numbered: If no file is named like a frame, take number n for the n-th frame, if all frames have one.
+
+    Returns:
+      The masks of each suffix that any frame has.
+
+    Raises:
+      InputError: The folder is missing, or no file in it is named like a frame.
+    """
+    if not folder.is_dir():
+        problem = "this is a file" if folder.exists() else "there is no such folder"
+        raise InputError(folder, problem, "a folder of masks", "Check the path.")
+    frame_names = FrameNames(names, files)
+    matched: dict[str, list[_Match]] = collections.defaultdict(list)
+    unmatched: dict[str, list[tuple[Path, tuple[str, ...]]]] = collections.defaultdict(list)
+    others = []
+    for path, folders in _list_files(folder):
+        suffix = next((suffix for suffix in suffixes if path.name.lower().endswith(suffix)), None)
+        match = None if suffix is None else frame_names.match(path, folders, suffix)
+        if match is not None:
+            matched[suffix].append(match)
+        elif suffix is not None:
+            unmatched[suffix].append((path, folders))
+        else:
+            others.append((path, folders))
+    if not matched and numbered:
+        for suffix, pairs in unmatched.items():
+            stems = [(path.name[: -len(suffix)], path, folders) for path, folders in pairs]
+            by_number = [(int(stem), path, folders) for stem, path, folders in stems if stem.isdecimal()]
+            if {number for number, _, _ in by_number} == set(range(len(names))):
+                matched[suffix] = [_Match(names[n], folders, (0, 0), folders, path) for n, path, folders in by_number]
+                unmatched[suffix] = []
+    if not matched:
+        for path, folders in others:
+            if path.suffix.lower() in _UNSUPPORTED and frame_names.match(path, folders, path.suffix) is not None:
+                raise _unsupported(path)
+        numbers = f"; or a PNG for each number from 0 to {len(names) - 1}" if numbered else ""
+        expected = f"{' or '.join(names[0] + suffix for suffix in suffixes)} and so on{numbers}"
+        count = sum(map(len, unmatched.values()))
+        problem = f"it holds {count} masks{', none of which is called like a frame' if count else ''}"
+        raise InputError(folder, problem, expected, "Name each mask like its frame.")
+    return [_arrange(suffix, some, unmatched[suffix], is_black_and_white) for suffix, some in matched.items()]
+
+
+def _unsupported(path: Path) -> InputError:
+    """The error of a mask in a format that is not read."""
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        remedy = "Export the masks again as PNG: one that is converted from JPEG keeps the wrong ids."
+        return InputError(path, "the mask is a JPEG, whose compression changes ids", "a PNG or .npy", remedy)
+    return InputError(path, f"masks are not read from {path.suffix.lower()} files", "a PNG or .npy", "Convert it.")
+
+
+def _arrange(
+    suffix: str,
+    matches: list[_Match],
+    unmatched: list[tuple[Path, tuple[str, ...]]],
+    is_black_and_white: Callable[[Path], bool],
+) -> MaskFiles:
+    """Arranges the files of one suffix, as one of each frame or one of each object in it."""
+    plain = [match for match in matches if not match.extra]
+    others = [match for match in matches if match.extra]
+    by_frame: dict[str, list[_Match]] = collections.defaultdict(list)
+    for match in sorted(matches, key=lambda match: (len(match.extra), match.rank)):
+        by_frame[match.frame].append(match)
+    notes = []
+    if unmatched:
+        verb = "belongs" if len(unmatched) == 1 else "belong"
+        example = unmatched[0][0].name
+        notes = [f"{len(unmatched)} of the {suffix} files {verb} to no frame of this capture (the first: {example})."]
+    if _are_objects(plain, others, by_frame, is_black_and_white):
+        folders = sorted({_object_of(match) for match in matches}, key=_natural_order)
+        notes = [f"The folders {_shorten(folders)} are read as objects: each has black and white masks of one.", *notes]
+        by_object = {frame: {_object_of(m): m.path for m in reversed(some)} for frame, some in by_frame.items()}
+        objects = {frame: {name: some[name] for name in folders if name in some} for frame, some in by_object.items()}
+        return MaskFiles({}, objects, suffix, tuple(notes))
+    best = {frame: some[0] for frame, some in by_frame.items() if not (plain and some[0].extra)}
+    if plain and others:
+        places = _shorten(sorted({"/".join(match.folders) for match in others}))
+        notes = [f"{len(others)} masks in other folders ({places}) were not used.", *notes]
+    if len(folders := sorted({match.folders for match in best.values()})) > 1:
+        places = _shorten(["/".join(each) or "." for each in folders])
+        reason = "they are named like those of the images" if plain else "their masks are not black and white"
+        notes = [f"The folders {places} are read as cameras, not as objects: {reason}.", *notes]
+    return MaskFiles({frame: match.path for frame, match in best.items()}, {}, suffix, tuple(notes))
+
+
+def _are_objects(
+    plain: list[_Match],
+    others: list[_Match],
+    by_frame: Mapping[str, list[_Match]],
+    is_black_and_white: Callable[[Path], bool],
+) -> bool:
+    """Whether the subfolders stand for objects, not for cameras."""
+    if not others or any(not match.folders for match in plain):
+        return False
+    several = any(len(some) > 1 for some in by_frame.values())
+    extra = {match.extra[-1] for match in others}
+    if not several and (plain or (len(extra) == 1 and not all(map(str.isdecimal, extra)))):
+        return False
+    if several and not plain:
+        return True
+    paths = [match.path for some in by_frame.values() for match in some]
+    return all(is_black_and_white(path) for path in paths[:: -(-len(paths) // SAMPLED_MASKS)])
+
+
+def _object_of(match: _Match) -> str:
+    """The folder that stands for the object of a mask."""
+    return match.extra[-1] if match.extra else match.folders[-1]
+
+
+def _natural_order(name: str) -> tuple[str, int, str]:
+    """Sort key that puts 9 before 10."""
+    return re.sub(r"\d+", lambda number: number[0].zfill(20), name), len(name), name
+
+
+def _shorten(names: Sequence[str]) -> str:
+    """Joins the first of some names."""
+    return ", ".join(names[:4]) + (f", ... ({len(names)})" if len(names) > 4 else "")
+
+
+def _object_ids(folders: Sequence[str]) -> dict[str, int]:
+    """The id of each object: the number in its folder's name if all are named alike (001, obj_2), else 1, 2, ..."""
+    parts = [re.fullmatch(r"(\D*)([0-9]+)", name) for name in folders]
+    if all(parts) and len({part[1] for part in parts if part}) == 1:
+        return {name: int(part[2]) for name, part in zip(folders, parts) if part}
+    return {name: number for number, name in enumerate(sorted(folders, key=_natural_order), start=1)}
+
+
+class TrackedMasks(NamedTuple):
+    """Labels of tracked regions, and their ids in the files."""
 
     labels: Int16[np.ndarray, "t h w"]
     """-1 = none, else 0..R-1, the same region in every frame."""
     ids: tuple[int, ...]
-    """R ids as they are in the files (of a colour: R*65536 + G*256 + B)."""
+    """R ids as the files have them (of a colour: R*65536 + G*256 + B)."""
     notes: tuple[str, ...]
-    """what was left out or changed, a sentence each."""
+    """What was skipped or changed, a sentence each."""
 
 
 def load_labels(
@@ -49,67 +344,63 @@ def load_labels(
     order: Sequence[str] | None = None,
     files: Mapping[str, ImageFile] | None = None,
     progress: Progress = None,
-) -> MasksFromDisk:
-    """Reads the masks in `folder` of the frames called `names` as labels (T, H, W).
+) -> TrackedMasks:
+    """Reads masks whose ids mean the same object in every frame.
 
-    A mask is called like its frame: `<name>.png`, also `<name>.jpg.png` or `<name>_mask.png`. It has an id per pixel:
-    8 or 16 bit grey, a palette PNG (its indices), RGB (each colour an id, R*65536 + G*256 + B), or whole numbers in a
-    `.npy`. Such are Gaussian Grouping's object_mask and SAM 2's PNGs. Or it is LangSplat's `<name>_s.npy` (4, H, W),
-    -1 = none.
+    A mask has an id per pixel: 8 or 16 bit grey, a palette PNG (its indices), RGB (each colour an id), or whole numbers
+    in a `.npy`, as Gaussian Grouping's object_mask and SAM 2's PNGs; or LangSplat's `<name>_s.npy` (4, H, W). Files are
+    named, and subfolders read, as this module says; where masks of objects overlap, the lower id lies on top.
 
-    Subfolders named like those of the images are cameras. Other subfolders of black and white masks are objects, as SAM
-    2 writes them with --per_obj_png_file (`<id>/<name>.png`); where they overlap the lower id lies on top.
-
-    Masks must be of the frames as the capture was loaded, undistorted. Another size is resized to theirs (nearest)
-    where the aspect agrees to a pixel; masks of stored pixels are turned like their images. A frame without a mask file
-    is wholly -1. The notes tell all of it.
+    Masks must be of the frames as the capture was loaded, undistorted. Other sizes of the same aspect are resized
+    (nearest), and masks of stored pixels are turned like their images. A frame without a mask is -1 everywhere.
 
     Args:
       folder: The masks.
       names: T frames.
       size: (H, W) of the labels.
-      background: The id of no region; None: every id is one.
-      level: LangSplat's level: "default", "s", "m", "l", or its index.
+      background: Id that is not a region; None: every id is one.
+      level: LangSplat's level, a name of LEVELS or its index.
       shared: Whether an id means the same object in every frame. By default so for all but `_s.npy`: LangSplat numbers
-        the masks of each frame afresh, and each is a region of its own. Say True for tracked ones.
-      order: All frames of the capture. Where no file is called like a frame and the files are numbered from 0 to
+        the masks of each frame afresh, and each is a region of its own.
+      order: All frames of the capture. If no file is named like a frame and the files are numbered from 0 to
         len(order) - 1, as SAM 2 wants them, number n is the mask of order[n].
-      files: The image of each frame, by its name: its folders are the cameras', its orientation that of its masks.
+      files: The image of each frame, by its name.
       progress: Called with (frames done, frames).
 
+    Returns:
+      The labels, their ids and notes.
+
     Raises:
-      InputError: No frame has a mask, a file is damaged, or of another aspect or kind, or there are more than 32767
-        regions.
+      InputError: No frame has a mask, a file is damaged, or of another aspect or kind, or there are more than
+        MAX_REGIONS regions.
     """
     folder = Path(folder)
-    height, width = size
-    found = _masks_of(folder, names, order, files)
-    shared = found.ending != _SUFFIX if shared is None else shared
-    reader = _Reader(found, names, level, None if found.objects else background, files or {}, size)
-    labels = np.full((len(names), height, width), -1, np.int16)
-    own_ids: list[np.ndarray] = []
+    masks = _find_one_kind(folder, names, order, files)
+    shared = masks.suffix != _LEVELS_SUFFIX if shared is None else shared
+    reader = _LabelReader(masks, names, level, files or {}, size)
+    labels = np.full((len(names), *size), -1, np.int16)
+    frame_ids: list[np.ndarray] = []
     for index, name in enumerate(names):
-        own, labels[index] = reader.read(name)
-        own_ids.append(own)
+        ids, labels[index] = reader.read(name)
+        frame_ids.append(ids)
         if progress is not None:
             progress(index + 1, len(names))
-    own_ids = reader.without_background(folder, own_ids)
-
+    frame_ids = reader.without_background(folder, frame_ids, background)
     if shared:
-        ids = np.unique(np.concatenate(own_ids))
+        ids = np.unique(np.concatenate(frame_ids))
         ids = ids[ids >= 0]
-        tables = [np.where(own >= 0, np.searchsorted(ids, own), -1) for own in own_ids]
+        tables = [np.where(each >= 0, np.searchsorted(ids, each), -1) for each in frame_ids]
     else:
-        kept = [own >= 0 for own in own_ids]
-        ids = np.concatenate([own[keep] for own, keep in zip(own_ids, kept)])
+        kept = [each >= 0 for each in frame_ids]
+        ids = np.concatenate([each[keep] for each, keep in zip(frame_ids, kept)])
         starts = np.cumsum([0, *(int(keep.sum()) for keep in kept)])
         tables = [np.where(keep, np.cumsum(keep) - 1 + start, -1) for keep, start in zip(kept, starts)]
-    if len(ids) > MOST_REGIONS:
-        remedy = "Take a coarser level, fewer frames, or say shared=True if the ids are tracked."
-        raise InputError(folder, f"there are {len(ids)} regions", f"at most {MOST_REGIONS}", remedy)
+    if len(ids) > MAX_REGIONS:
+        remedy = "Take a coarser level or fewer frames, or give shared=True if the ids are tracked."
+        raise InputError(folder, f"there are {len(ids)} regions", f"at most {MAX_REGIONS}", remedy)
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
-    return MasksFromDisk(labels, reader.named(ids), (*reader.notes(not shared), *found.notes))
+    return TrackedMasks(labels, reader.file_ids(ids), (*reader.notes(background, shared), *masks.notes))
 
 
 def check_labels(
@@ -121,189 +412,198 @@ def check_labels(
     order: Sequence[str] | None = None,
     files: Mapping[str, ImageFile] | None = None,
 ) -> None:
-    """Raises InputError where `load_labels` would, as far as the names of the masks and the first of them tell."""
-    found = _masks_of(Path(folder), names, order, files)
-    first = next(name for name in names if found.path(name) is not None)
+    """Checks masks by their names and the first of them; arguments and errors are those of `load_labels`."""
+    masks = _find_one_kind(Path(folder), names, order, files)
+    first = next(name for name in names if masks.path(name) is not None)
     load_labels(folder, [first], size, level=level, order=order, files=files)
 
 
-def _masks_of(
+def _find_one_kind(
     folder: Path, names: Sequence[str], order: Sequence[str] | None, files: Mapping[str, ImageFile] | None
-) -> Masks:
-    """The mask files of the frames. Raises InputError where there are none, or of two kinds."""
+) -> MaskFiles:
+    """Finds the mask files of the frames, which must be of one kind."""
     every = order if order is not None else names
-    kinds = find_masks(
-        folder, every, (".png", _SUFFIX, ".npy"), black_and_white, files=files, numbered=order is not None
-    )
+    suffixes = (".png", _LEVELS_SUFFIX, ".npy")
+    kinds = find_masks(folder, every, suffixes, is_black_and_white, files=files, numbered=order is not None)
     if len(kinds) > 1:
-        both = f"there are both {kinds[0].ending} and {kinds[1].ending} masks of these frames"
-        raise InputError(folder, both, "one kind", "Keep each kind in a folder of its own.")
+        problem = f"there are both {kinds[0].suffix} and {kinds[1].suffix} masks of these frames"
+        raise InputError(folder, problem, "one kind", "Put each kind into a folder of its own.")
     if not any(name in kinds[0].files or name in kinds[0].objects for name in names):
-        problem = f"it has masks, but of none of the {len(names)} frames that are worked with"
+        problem = f"it has masks, but of none of the {len(names)} frames in use"
         raise InputError(folder, problem, f"a mask of {names[0]} and others", "Name each mask like its frame.")
     return kinds[0]
 
 
-def black_and_white(path: Path) -> bool:
-    """Whether a mask has no value but 0 and 1, or 0 and the largest of its kind."""
-    image, coloured = read_label_image(path)
+def is_black_and_white(path: Path) -> bool:
+    """Whether a label image has only the values 0 and 1, or 0 and the largest of its type."""
+    image, is_colour = read_label_image(path)
     values = np.unique(image)
-    values = values // GREY if coloured and not (values % GREY).any() else values
+    values = values // GREY_COLOUR if is_colour and not (values % GREY_COLOUR).any() else values
     return len(values) <= 2 and set(values.tolist()) <= {0, int(values.max())} and values.max() in (0, 1, 255, 65535)
 
 
-class _Reader:
-    """Reads the labels of one frame after the other, and remembers what a note should tell."""
+class _LabelReader:
+    """Reads the labels of frame after frame, and collects what the notes report."""
 
-    def __init__(self, found: Masks, names, level, background, files: Mapping[str, ImageFile], size):
-        self.found, self.names, self.level, self.background = found, names, level, background
-        self.files, self.size = files, size
-        folders = {folder for masks in found.objects.values() for folder in masks}
-        self.ids = object_ids(sorted(folders))
-        self.folders = sorted(folders, key=lambda folder: (self.ids[folder], folder))
-        self.coloured: dict[Path | None, bool] = {}
-        self.negative = False
-        self.fit = Fit(files, size, self._shape)
+    def __init__(
+        self,
+        masks: MaskFiles,
+        names: Sequence[str],
+        level: str | int,
+        files: Mapping[str, ImageFile],
+        size: tuple[int, int],
+    ):
+        self.masks, self.names, self.level, self.size = masks, names, level, size
+        folders = {folder for by_object in masks.objects.values() for folder in by_object}
+        self.object_ids = _object_ids(sorted(folders))
+        self.folders = sorted(folders, key=lambda folder: (self.object_ids[folder], folder))
+        self.is_colour: dict[Path | None, bool] = {}
+        self.has_negative = False
+        self.fit = MaskFitter(files, size, self._shape)
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
-        path = self.found.path(name)
+        path = self.masks.path(name)
         return None if path is None else self._values(path).shape
 
     def _values(self, path: Path) -> np.ndarray:
-        """The ids (H, W) of a file."""
-        if self.found.ending == _SUFFIX:
+        """(H, W) ids of a file."""
+        if self.masks.suffix == _LEVELS_SUFFIX:
             return read_level(path, self.level)
-        image, self.coloured[path] = read_label_image(path)
-        self.negative |= bool(image.min() < 0)
+        image, self.is_colour[path] = read_label_image(path)
+        self.has_negative |= bool(image.min() < 0)
         return image
 
     def read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """The ids of a frame, ascending, and its labels (H, W) as indices into them, -1 = none."""
-        if name in self.found.objects:
-            return self._objects(name, self.found.objects[name])
-        if name not in self.found.files:
+        if name in self.masks.objects:
+            return self._read_objects(name, self.masks.objects[name])
+        if name not in self.masks.files:
             return np.zeros(0, np.int64), np.full(self.size, -1, np.int16)
-        path = self.found.files[name]
-        return compact(path, self.fit(path, self._values(path), name))
+        path = self.masks.files[name]
+        return compact_ids(path, self.fit(path, self._values(path), name))
 
-    def _objects(self, name: str, masks: Mapping[str, Path]) -> tuple[np.ndarray, np.ndarray]:
-        """The objects of a frame as indices into `folders`; the first lies on top."""
+    def _read_objects(self, name: str, paths: Mapping[str, Path]) -> tuple[np.ndarray, np.ndarray]:
+        """As `read`, of one mask for each object; an id is the index of its folder, and the first lies on top."""
         labels = np.full(self.size, -1, np.int16)
-        shown = []
         for index, folder in reversed(list(enumerate(self.folders))):
-            if folder in masks:
-                image = self.fit(masks[folder], read_label_image(masks[folder])[0], name)
-                self._require_one_object(masks[folder], image)
+            if folder in paths:
+                image = self.fit(paths[folder], read_label_image(paths[folder])[0], name)
+                values = np.unique(image[image > 0])
+                if len(values) > 1:
+                    objects = ", ".join(self.folders[:4])
+                    problem = f"the mask has {len(values)} values besides 0, but the folders {objects} hold objects"
+                    remedy = "Name folders of cameras like those of the images; make masks of objects black and white."
+                    raise InputError(paths[folder], problem, "one value for the object", remedy)
                 labels[image > 0] = index
-        shown = np.unique(labels[labels >= 0]).astype(np.int64)
-        return shown, np.where(labels >= 0, np.searchsorted(shown, labels), -1).astype(np.int16)
+        ids = np.unique(labels[labels >= 0]).astype(np.int64)
+        return ids, np.where(labels >= 0, np.searchsorted(ids, labels), -1).astype(np.int16)
 
-    def _require_one_object(self, path: Path, image: np.ndarray) -> None:
-        inside = image[image > 0]
-        if inside.size and (inside != inside[0]).any():
-            count = len(np.unique(inside))
-            problem = (
-                f"the mask has {count} values besides 0, but the folders {', '.join(self.folders[:4])} hold objects"
-            )
-            remedy = (
-                "Name the folders like those of the images where they are cameras, or make each mask black and white."
-            )
-            raise InputError(path, problem, "one value for the object", remedy)
-
-    def without_background(self, folder: Path, own_ids: list[np.ndarray]) -> list[np.ndarray]:
-        """The frames' ids with -1 in place of the background's. Grey that is stored as colours has its grey values."""
-        if self.found.objects or self.found.ending == _SUFFIX:
-            return own_ids
-        coloured = [self.coloured.get(self.found.path(name), False) for name in self.names]
-        if not any((own % GREY).any() for own, colour in zip(own_ids, coloured) if colour):
-            own_ids = [own // GREY if colour else own for own, colour in zip(own_ids, coloured)]
-            self.coloured = {}
-        count = sum(self.coloured.values())
-        if 0 < count < len(self.coloured):
-            problem = f"there are {count} colour images among {len(self.coloured)} masks"
+    def without_background(self, folder: Path, frame_ids: list[np.ndarray], background: int | None) -> list[np.ndarray]:
+        """Replaces the background's id by -1, and colours that are all grey by their grey values."""
+        if self.masks.objects or self.masks.suffix == _LEVELS_SUFFIX:
+            return frame_ids
+        colours = [self.is_colour.get(self.masks.path(name), False) for name in self.names]
+        if not any((ids % GREY_COLOUR).any() for ids, colour in zip(frame_ids, colours) if colour):
+            frame_ids = [ids // GREY_COLOUR if colour else ids for ids, colour in zip(frame_ids, colours)]
+            self.is_colour = {}
+        count = sum(self.is_colour.values())
+        if 0 < count < len(self.is_colour):
+            problem = f"there are {count} colour images among {len(self.is_colour)} masks"
             raise InputError(folder, problem, "ids in all, or colours in all", "Write all as 16 bit grey PNGs.")
-        if self.background is None or (self.negative and self.background == 0):
-            return own_ids
-        return [np.where(own == self.background, -1, own) for own in own_ids]
+        if background is None or (self.has_negative and background == 0):
+            return frame_ids
+        return [np.where(ids == background, -1, ids) for ids in frame_ids]
 
-    def named(self, ids: np.ndarray) -> tuple[int, ...]:
+    def file_ids(self, ids: np.ndarray) -> tuple[int, ...]:
         """The ids as the files, or the folders of objects, have them."""
-        return tuple(self.ids[self.folders[int(index)]] if self.found.objects else int(index) for index in ids)
+        return tuple(self.object_ids[self.folders[int(i)]] if self.masks.objects else int(i) for i in ids)
 
-    def notes(self, per_frame: bool) -> list[str]:
-        notes, paths = [], {name: self.found.path(name) for name in self.names}
-        missing = [name for name, path in paths.items() if path is None]
-        if missing:
-            without = f"{len(missing)} of {len(self.names)} frames have no mask"
-            notes.append(f"{without} (the first: {missing[0]}); they are unlabelled.")
+    def notes(self, background: int | None, shared: bool) -> list[str]:
+        """What was skipped or changed."""
+        notes, paths = [], {name: self.masks.path(name) for name in self.names}
+        if missing := [name for name, path in paths.items() if path is None]:
+            problem = f"{len(missing)} of {len(self.names)} frames have no mask (the first: {missing[0]})"
+            notes.append(f"{problem}; they are unlabelled.")
         notes += self.fit.notes()
-        if any(self.coloured.values()):
+        if any(self.is_colour.values()):
             notes.append("The masks are colour images: each colour is a region, numbered R*65536 + G*256 + B.")
-        if self.negative and self.background == 0:
-            notes.append("The masks hold negative ids: these are taken for no region, and 0 for one.")
-        numbered = [
-            (name, path) for name, path in paths.items() if path and path.stem.isdecimal() and _other(name, path)
-        ]
-        if numbered:
-            name, path = numbered[0]
-            notes.append(f"The masks are numbered, and taken in the order of the frames: {path.name} is {name}.")
-        if per_frame:
+        if self.has_negative and background == 0:
+            notes.append("The masks hold negative ids: these count as unlabelled, and 0 as a region.")
+        for name, path in paths.items():
+            if path and path.stem.isdecimal() and name != path.stem and not name.endswith(f"_{path.stem}"):
+                notes.append(f"The masks are numbered, and taken in the order of the frames: {path.name} is {name}.")
+                break
+        if not shared:
             notes.append("Each frame's masks count as regions of their own, since their ids are not shared.")
         if not all(folder.isdecimal() for folder in self.folders):
-            told = ", ".join(f"{folder} is {self.ids[folder]}" for folder in self.folders[:8])
-            notes.append(f"The objects are numbered: {told}{' ...' if len(self.folders) > 8 else ''}.")
+            numbers = ", ".join(f"{folder} is {self.object_ids[folder]}" for folder in self.folders[:8])
+            notes.append(f"The objects are numbered: {numbers}{' ...' if len(self.folders) > 8 else ''}.")
         return notes
 
 
-def _other(name: str, path: Path) -> bool:
-    """Whether a numbered mask is not called like its frame."""
-    return name != path.stem and not name.endswith(f"_{path.stem}")
+def read_level(path: Path, level: str | int) -> Int[np.ndarray, "h w"]:
+    """Reads one level of LangSplat's `_s.npy`.
 
+    Args:
+      path: The file.
+      level: A name of LEVELS, or its index.
 
-def read_level(path: Path, level: str | int) -> np.ndarray:
-    """ids (H, W) of one level of a `_s.npy`, -1 = none. Raises InputError where it is no such file."""
+    Returns:
+      (H, W) ids, -1 = none.
+
+    Raises:
+      InputError: The level is unknown, or the file is damaged or of another kind.
+    """
     if level not in (*LEVELS, 0, 1, 2, 3):
         raise InputError("level", f"there is no level {level!r}", f"one of {', '.join(LEVELS)}", "l is the coarsest.")
     try:
         image = map_npy(path)
     except READ_ERRORS as error:
-        wanted = f"a .npy of shape ({len(LEVELS)}, H, W)"
-        raise InputError(
-            path, f"there is no whole array ({describe_error(error)})", wanted, "Write the masks again."
-        ) from error
+        problem = f"the array is damaged or missing ({describe_error(error)})"
+        raise InputError(path, problem, f"a .npy of shape ({len(LEVELS)}, H, W)", "Write the masks again.") from error
     if image.ndim != 3 or len(image) != len(LEVELS) or not image.size:
-        wanted, remedy = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}", "Give _s.npy files, not the _f.npy ones."
-        raise InputError(path, f"the array has shape {image.shape}", wanted, remedy)
+        expected = f"({len(LEVELS)}, H, W): levels {', '.join(LEVELS)}"
+        raise InputError(
+            path, f"the array has shape {image.shape}", expected, "Give _s.npy files, not the _f.npy ones."
+        )
     with np.errstate(invalid="ignore"):  # of a signalling NaN
         image = np.asarray(image[LEVELS.index(level) if isinstance(level, str) else level], np.float64)
-    if not ((image >= -MOST_IDS) & (image < MOST_IDS) & (image == image.round())).all():
-        problem = "the array holds numbers that are no integers or too large"
+    if not ((image >= -MAX_ID) & (image < MAX_ID) & (image == image.round())).all():
+        problem = "the array has numbers that are no integers or too large"
         raise InputError(path, problem, "ids, -1 = none", "Write the masks again.")
     return image.astype(np.int64)
 
 
 def resize_nearest(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """An image (H, W) of integers at another size: each pixel has the value at its centre."""
+    """Resizes an image of integers: each pixel has the value at its centre.
+
+    Args:
+      image: (H, W) integers.
+      width: New width, px.
+      height: New height, px.
+
+    Returns:
+      (height, width) integers.
+    """
     rows, columns = image.shape
     down = (2 * np.arange(height) + 1) * rows // (2 * height)
     across = (2 * np.arange(width) + 1) * columns // (2 * width)
     return image[down[:, None], across]
 
 
-def _alike(rows: int, columns: int, width: int, height: int) -> bool:
-    """Whether an image has this size's aspect, within a pixel of the coarser of the two, whose size was rounded."""
+def _same_aspect(rows: int, columns: int, width: int, height: int) -> bool:
+    """Whether an image has the aspect of a size, to a pixel of the coarser of the two, whose size was rounded."""
     return min(abs(columns * height / rows - width), abs(width * rows / height - columns)) <= 1
 
 
-class Fit:
-    """Brings masks to their frames' size, and counts what that took.
+class MaskFitter:
+    """Brings masks to the size of the frames, and counts the changes.
 
     Args:
       files: The frames' images by name. Masks have their size, upright or as stored, at any scale.
       size: (H, W) of the frames.
-      shape: The shape (H, W) of a frame's mask by name, None where it has none. Where masks of images that lie on their
-        side turn out to be of the stored pixels, so are those of images that stand on their head, whose size cannot
-        tell.
+      shape: Returns the shape (H, W) of a frame's mask by name, or None. If masks of images that lie on their side are
+        of the stored pixels, so are those of images that stand on their head, whose size cannot tell.
     """
 
     def __init__(
@@ -312,43 +612,55 @@ class Fit:
         size: tuple[int, int],
         shape: Callable[[str], tuple[int, ...] | None],
     ):
+        """Decides whether masks are of the stored pixels."""
         self.files, (self.height, self.width) = files, size
         self.count: collections.Counter[str] = collections.Counter()
-        self.stored = False
+        self.of_stored_pixels = False
         if any(1 < file.orientation < 5 for file in files.values()):
             lying = [name for name, file in files.items() if file.orientation in TRANSPOSED]
-            self.stored = any(self._of_stored(files[name], shape(name)) for name in lying[:8])
+            self.of_stored_pixels = any(self._fits_stored_only(files[name], shape(name)) for name in lying[:8])
 
-    def _of_stored(self, file: ImageFile, shape: tuple[int, ...] | None) -> bool:
-        """Whether a mask of this shape can only be one of the stored pixels of an image that lies on its side."""
+    def _fits_stored_only(self, file: ImageFile, shape: tuple[int, ...] | None) -> bool:
+        """Whether a mask fits the stored pixels of an image, and not its upright ones."""
         if shape is None:
             return False
-        rows, columns = shape
-        stored = _alike(rows, columns, file.height, file.width)
-        return stored and not _alike(rows, columns, file.width, file.height)
+        stored = _same_aspect(shape[0], shape[1], file.height, file.width)
+        return stored and not _same_aspect(shape[0], shape[1], file.width, file.height)
 
     def __call__(self, path: Path, image: np.ndarray, name: str) -> np.ndarray:
-        """The mask (H, W) of the frame `name` at the frames' size; itself where it has that. Raises InputError, at
-        `path`, where its aspect is another."""
+        """Turns and resizes the mask of a frame.
+
+        Args:
+          path: Its file, for errors.
+          image: (h, w) the mask.
+          name: The frame.
+
+        Returns:
+          (H, W) the mask at the frames' size; `image` itself if it has that.
+
+        Raises:
+          InputError: Its aspect is another.
+        """
         file = self.files.get(name)
         upright = (self.width, self.height) if file is None else (file.width, file.height)
-        turn = 1 if file is None else file.orientation
-        stored = upright[::-1] if turn in TRANSPOSED else upright
+        orientation = 1 if file is None else file.orientation
+        stored = upright[::-1] if orientation in TRANSPOSED else upright
         rows, columns = image.shape
-        if turn != 1 and _alike(rows, columns, *stored) and (self.stored or not _alike(rows, columns, *upright)):
-            image = apply_orientation(image, turn)
+        fits_upright = _same_aspect(rows, columns, *upright)
+        if orientation != 1 and _same_aspect(rows, columns, *stored) and (self.of_stored_pixels or not fits_upright):
+            image = apply_orientation(image, orientation)
             self.count["turned"] += 1
-        elif not _alike(rows, columns, *upright) and not _alike(rows, columns, self.width, self.height):
+        elif not fits_upright and not _same_aspect(rows, columns, self.width, self.height):
             remedy = "Make the masks from the frames as they are loaded (undistorted, upright), at any scale."
-            wanted = f"{upright[0]}x{upright[1]} like its frame, or that aspect"
-            raise InputError(path, f"the mask is {columns}x{rows}", wanted, remedy)
+            expected = f"{upright[0]}x{upright[1]} like its frame, or that aspect"
+            raise InputError(path, f"the mask is {columns}x{rows}", expected, remedy)
         if image.shape == (self.height, self.width):
             return image
         self.count["resized"] += 1
         return resize_nearest(image, self.width, self.height)
 
     def notes(self) -> list[str]:
-        """What was done to the masks, a sentence each."""
+        """The changes, a sentence each."""
         notes = []
         if count := self.count["resized"]:
             notes.append(f"{count} masks were resized to {self.width}x{self.height} (nearest).")
@@ -357,8 +669,19 @@ class Fit:
         return notes
 
 
-def compact(path: Path, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The ids of an image in ascending order, and the image as indices into them: -1 for negative ids."""
+def compact_ids(path: Path, image: np.ndarray) -> tuple[np.ndarray, Int16[np.ndarray, "h w"]]:
+    """Replaces the ids of a label image by their indices.
+
+    Args:
+      path: Its file, for errors.
+      image: (H, W) ids, negative = none.
+
+    Returns:
+      The ids, ascending, and (H, W) indices into them, -1 = none.
+
+    Raises:
+      InputError: There are more ids than regions can be.
+    """
     if image.max(initial=0) < 1 << 20:
         # A table instead of a sort: some ten times faster, and most masks have small ids.
         seen = np.zeros(int(image.max(initial=0)) + 2, bool)
@@ -367,9 +690,9 @@ def compact(path: Path, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     else:
         ids = np.unique(image)
         ids = ids[ids >= 0]
-    if len(ids) > MOST_REGIONS + 1:  # and the background
+    if len(ids) > MAX_REGIONS + 1:  # and the background
         remedy = "Give label images, not photographs."
-        raise InputError(path, f"the mask has {len(ids)} ids", f"at most {MOST_REGIONS}", remedy)
+        raise InputError(path, f"the mask has {len(ids)} ids", f"at most {MAX_REGIONS}", remedy)
     if not len(ids):
         return ids, np.full(image.shape, -1, np.int16)
     position = np.minimum(np.searchsorted(ids, image), len(ids) - 1)

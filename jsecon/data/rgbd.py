@@ -1,7 +1,7 @@
-"""Posed folders of depth cameras and phones: ScanNet's, TUM's, ARKitScenes', Polycam's and Record3D's.
+"""Captures of depth cameras and phones, on the host: ScanNet, TUM, ARKitScenes, Polycam and Record3D.
 
 Formats: ScanNet SensReader/python; TUM's RGB-D benchmark (file_formats); ARKitScenes DATA.md; nerfstudio process_data
-polycam_utils.py and record3d_utils.py. Each keeps its own world; phones look along -z with y up.
+polycam_utils.py and record3d_utils.py. Each keeps its world; phones look along -z with y up.
 """
 
 import contextlib
@@ -16,239 +16,270 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jsecon.data.frames import LEAST_FOCAL, PosedImage, PosedImages
+from jsecon.data.coordinates import invert_pose
+from jsecon.data.frames import MIN_FOCAL, PosedImage, PosedImages
 from jsecon.data.images import MAX_PIXELS, image_header, image_size
 from jsecon.data.lens import Lens
-from jsecon.data.poses import invert_pose
 from jsecon.errors import InputError, describe_error
 from jsecon.files import READ_ERRORS, parse_json, read_text
 from jsecon.numerics import is_finite_and_bounded
 
-_TUM = {
+_TUM_INTRINSICS = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "3": (535.4, 539.2, 320.1, 247.6),
 }
 """fx fy cx cy k1 k2 p1 p2 k3 of the benchmark's cameras freiburg1 to 3, the centre of the first pixel at (0, 0)"""
-_TUM_UNIT = 1 / 5000
-_TOGETHER = 0.02
-"""seconds between an image and the pose or depth that are taken for its own"""
-_PHONE = np.diag([1.0, -1.0, -1.0, 1.0])
+_TUM_DEPTH_UNIT = 1 / 5000
+_MAX_GAP = 0.02
+"""seconds between an image and its pose or depth"""
+_PHONE_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+_EXPORT = "Export the capture again."
 
 
 def find_rgbd(path: Path) -> Callable[[Path], PosedImages] | None:
-    """What reads the folder, where it is one of these. It raises InputError on what is damaged, and leaves out frames
-    without a pose, which it tells in the notes."""
-    fits = lambda marks: all((path / mark).exists() for mark in marks)
-    found = next((read for marks, read in _FOLDERS.items() if fits(marks)), None)
+    """Finds the reader of a folder by the files in it.
+
+    Args:
+      path: Folder of a capture.
+
+    Returns:
+      A function that reads the folder, or None. It skips frames without a pose, which its notes count, and raises
+      InputError on damaged files.
+    """
+    for marks, reader in _FOLDERS.items():
+        if all((path / mark).exists() for mark in marks):
+            return _with_input_errors(reader)
+    return None
+
+
+def _with_input_errors(reader: Callable[[Path], PosedImages]) -> Callable[[Path], PosedImages]:
+    """Makes the errors of a reader InputErrors."""
 
     def read(path: Path) -> PosedImages:
-        assert found is not None
-        with _reading(path), np.errstate(invalid="ignore", over="ignore"):
-            return found(path)
+        with _parsing(path), np.errstate(invalid="ignore", over="ignore"):
+            return reader(path)
 
-    return read if found is not None else None
+    return read
 
 
 @contextlib.contextmanager
-def _reading(file: Path) -> Iterator[None]:
-    """Tells what goes wrong on taking numbers out of a file as an InputError."""
+def _parsing(file: Path) -> Iterator[None]:
+    """Makes errors in parsing a file InputErrors."""
     try:
         yield
     except InputError:
         raise
     except READ_ERRORS as error:
-        found = f"it cannot be read ({describe_error(error)})"
-        raise InputError(file, found, "the numbers of its format", "Export the capture again.") from error
+        raise InputError(file, f"it cannot be read ({describe_error(error)})", remedy=_EXPORT) from error
 
 
-def _words(file: Path) -> list[list[str]]:
-    lines = [line.split() for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")]
-    return lines or [[]]
+def _lines(file: Path) -> list[str]:
+    """Lines of a text file that are neither empty nor comments."""
+    return [line for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")]
 
 
-def _rows(file: Path, columns: int, count: int = -1) -> Float[np.ndarray, "n m"]:
-    with _reading(file):
-        return np.array(_words(file), np.float64).reshape(count, columns)
+def _numbers(file: Path, columns: int, rows: int = -1) -> Float[np.ndarray, "n m"]:
+    """The table of numbers of a text file."""
+    with _parsing(file):
+        return np.array([line.split() for line in _lines(file)] or [[]], np.float64).reshape(rows, columns)
 
 
-def _images(folder: Path) -> list[Path]:
-    found = [file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png")]
-    found = sorted(file for file in found if not file.name.startswith("."))
-    if not found:
-        raise InputError(folder, "no image", "the capture's images", "Export the capture again.")
-    return found
+def _list_images(folder: Path) -> list[Path]:
+    """The images of a folder, of which there must be some."""
+    images = [file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg", ".png")]
+    images = sorted(file for file in images if not file.name.startswith("."))
+    if not images:
+        raise InputError(folder, "it holds no image", remedy=_EXPORT)
+    return images
 
 
-def _beside(folder: Path, stem: str, ending: str) -> Path:
-    """The file of a frame, also where its ending is in upper case."""
-    upper = folder / f"{stem}{ending.upper()}"
-    return upper if upper.is_file() else folder / f"{stem}{ending}"
+def _sibling(folder: Path, stem: str, suffix: str) -> Path:
+    """The file of a frame, also with its suffix in upper case."""
+    upper = folder / f"{stem}{suffix.upper()}"
+    return upper if upper.is_file() else folder / f"{stem}{suffix}"
 
 
 def _matrix(rotation: Rotation, translation: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """A pose."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), translation
     return pose
 
 
-def _lens(width: Any, height: Any, *numbers: Any) -> Lens:
-    """Of numbers as a file has them. Raises ValueError for a frame without pixels, without a focal length, or whose
-    centre lies outside of it: the numbers are then those of another size."""
-    fx, fy, cx, cy = map(float, numbers)
-    if not (
-        1 <= width <= MAX_PIXELS
-        and 1 <= height <= MAX_PIXELS
-        and is_finite_and_bounded(numbers)
-        and min(fx, fy) >= LEAST_FOCAL
-    ):
+def _lens(width: Any, height: Any, *intrinsics: Any) -> Lens:
+    """A pinhole lens of fx, fy, cx, cy as a file has them.
+
+    Raises ValueError if the frame has no pixels or focal length, or its principal point lies outside: the intrinsics
+    then are those of another size.
+    """
+    fx, fy, cx, cy = map(float, intrinsics)
+    has_size = 1 <= width <= MAX_PIXELS and 1 <= height <= MAX_PIXELS
+    if not (has_size and is_finite_and_bounded(intrinsics) and min(fx, fy) >= MIN_FOCAL):
         raise ValueError(f"a frame of {width}x{height} with focal lengths {fx:g}, {fy:g}")
     if not (0 < cx < width and 0 < cy < height):
         raise ValueError(f"a frame of {width}x{height} with its centre at {cx:g}, {cy:g}")
     return Lens(int(width), int(height), fx, fy, cx, cy)
 
 
-def _shot(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
-    seen = None if depth is None or not depth.is_file() else depth
-    return PosedImage(image.name, image, lens, invert_pose(camera_to_world, image, image.name), seen)
+def _posed_image(image: Path, lens: Lens, camera_to_world: np.ndarray, depth: Path | None = None) -> PosedImage:
+    """A frame, with its depth map if that exists."""
+    depth = None if depth is None or not depth.is_file() else depth
+    return PosedImage(image.name, image, lens, invert_pose(camera_to_world, image, image.name), depth)
 
 
-def _posed(path: Path, shots: list[PosedImage], count: int, *notes: str) -> PosedImages:
-    lost = count - len(shots)
-    told = (f"{lost} of {count} frames were left out, since they have no pose.",) if lost else ()
-    return PosedImages(shots, path, notes=(*told, *notes))
+def _posed_images(path: Path, images: list[PosedImage], count: int, *notes: str) -> PosedImages:
+    """The frames with a pose, of `count` images."""
+    lost = count - len(images)
+    lost_note = (f"{lost} of {count} frames were left out, since they have no pose.",) if lost else ()
+    return PosedImages(images, path, notes=(*lost_note, *notes))
 
 
-def _scannet(path: Path) -> PosedImages:
-    images, lenses = _images(path / "color"), {}
+def _read_scannet(path: Path) -> PosedImages:
+    """ScanNet's exported folders."""
+    images, lenses = _list_images(path / "color"), {}
     for kind in ("color", "depth"):
         file = path / "intrinsic" / f"intrinsic_{kind}.txt"
-        first = images[0] if kind == "color" else _beside(path / "depth", images[0].stem, ".png")
+        first = images[0] if kind == "color" else _sibling(path / "depth", images[0].stem, ".png")
         if file.is_file() and first.is_file():
-            k = _rows(file, 4, 4)
-            with _reading(file):
+            k = _numbers(file, 4, 4)
+            with _parsing(file):
                 lenses[kind] = _lens(*image_size(first), k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-    shots = []
+    posed = []
     for image in images:
-        pose = _rows(path / "pose" / f"{image.stem}.txt", 4, 4)
+        pose = _numbers(path / "pose" / f"{image.stem}.txt", 4, 4)
         if np.isfinite(pose).all():  # infinite where tracking was lost
-            shot = _shot(image, lenses["color"], pose, _beside(path / "depth", image.stem, ".png"))
-            shots.append(dataclasses.replace(shot, depth_lens=lenses.get("depth")))
-    return _posed(path, shots, len(images))
+            frame = _posed_image(image, lenses["color"], pose, _sibling(path / "depth", image.stem, ".png"))
+            posed.append(dataclasses.replace(frame, depth_lens=lenses.get("depth")))
+    return _posed_images(path, posed, len(images))
 
 
-def _listed(file: Path) -> tuple[np.ndarray, list[Path]]:
-    """Times and files of TUM's lists."""
-    with _reading(file):
-        lines = [line for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")] or [""]
-        rows = [line.strip().split(maxsplit=1) for line in lines]  # a name may have spaces
+def _read_tum_list(file: Path) -> tuple[np.ndarray, list[Path]]:
+    """Times and files of one of TUM's lists."""
+    with _parsing(file):
+        rows = [line.strip().split(maxsplit=1) for line in _lines(file) or [""]]  # a name may have spaces
         return np.array([float(row[0]) for row in rows]), [file.parent / row[1] for row in rows]
 
 
-def _together(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The index of the time nearest to each that is wanted; -1 where it lies more than _TOGETHER away."""
+def _nearest_times(times: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """(Q,) index of the time nearest to each query; -1 if it is more than _MAX_GAP away."""
     if not len(times):
-        return np.full(len(wanted), -1)
-    gap, index = KDTree(times[:, None]).query(wanted[:, None])
-    return np.where(gap <= _TOGETHER, index, -1)
+        return np.full(len(queries), -1)
+    gap, index = KDTree(times[:, None]).query(queries[:, None])
+    return np.where(gap <= _MAX_GAP, index, -1)
 
 
-def _tum(path: Path) -> PosedImages:
-    (times, images), poses = _listed(path / "rgb.txt"), _rows(path / "groundtruth.txt", 8)
+def _read_tum(path: Path) -> PosedImages:
+    """TUM's RGB-D benchmark."""
+    (times, images), poses = _read_tum_list(path / "rgb.txt"), _numbers(path / "groundtruth.txt", 8)
     file = path / "intrinsics.txt"
-    known = re.search(r"(?:freiburg|fr)([123])", path.resolve().name)
-    if not file.is_file() and known is None:
-        remedy = "Write fx fy cx cy (px) there, and k1 k2 p1 p2 k3 where the lens is distorted."
-        wanted = "the camera's intrinsics, or freiburg1 to 3 in the folder's name"
-        raise InputError(file, "nothing there", wanted, remedy)
-    with _reading(file):
-        fx, fy, cx, cy, *distortion = map(float, _words(file)[0]) if file.is_file() or not known else _TUM[known[1]]
+    camera = re.search(r"(?:freiburg|fr)([123])", path.resolve().name)
+    if not file.is_file() and camera is None:
+        remedy = "Write fx fy cx cy (px) there, and k1 k2 p1 p2 k3 if the lens is distorted."
+        problem = "there is no such file, and the folder's name has no freiburg1 to 3"
+        raise InputError(file, problem, "the camera's intrinsics", remedy)
+    with _parsing(file):
+        intrinsics = _lines(file)[0].split() if file.is_file() or camera is None else _TUM_INTRINSICS[camera[1]]
+        fx, fy, cx, cy, *distortion = map(float, intrinsics)
         if len(distortion) > 8:
-            raise ValueError(f"{len(distortion)} numbers behind fx fy cx cy, at most k1 k2 p1 p2 k3 k4 k5 k6 can be")
-        seen = _listed(path / "depth.txt") if (path / "depth.txt").is_file() else (np.zeros(0), [])
+            raise ValueError(f"{len(distortion)} numbers after fx fy cx cy, at most k1 k2 p1 p2 k3 k4 k5 k6 can be")
+        has_depth = (path / "depth.txt").is_file()
+        depth_times, depths = _read_tum_list(path / "depth.txt") if has_depth else (np.zeros(0), [])
         lens = Lens(*image_size(images[0]), fx, fy, cx + 0.5, cy + 0.5, tuple(distortion))
-    shots = []
-    for image, own, beside in zip(images, _together(poses[:, 0], times), _together(seen[0], times)):
-        if own >= 0:
-            with _reading(path / "groundtruth.txt"):
-                pose = _matrix(Rotation.from_quat(poses[own, 4:]), poses[own, 1:4])
-            shot = _shot(image, lens, pose, seen[1][beside] if beside >= 0 else None)
-            shots.append(dataclasses.replace(shot, depth_unit=_TUM_UNIT))
-    return _posed(path, shots, len(images))
+    posed = []
+    pose_of, depth_of = _nearest_times(poses[:, 0], times), _nearest_times(depth_times, times)
+    for image, row, depth in zip(images, pose_of, depth_of):
+        if row >= 0:
+            with _parsing(path / "groundtruth.txt"):
+                pose = _matrix(Rotation.from_quat(poses[row, 4:]), poses[row, 1:4])
+            frame = _posed_image(image, lens, pose, depths[depth] if depth >= 0 else None)
+            posed.append(dataclasses.replace(frame, depth_unit=_TUM_DEPTH_UNIT))
+    return _posed_images(path, posed, len(images))
 
 
-def _arkitscenes(path: Path) -> PosedImages:
-    images, rows = _images(path / "lowres_wide"), _rows(path / "lowres_wide.traj", 7)
-    files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
-    with _reading(path / "lowres_wide"):
-        times, of_lens = (np.array([float(f.stem.rpartition("_")[2]) for f in each]) for each in (images, files))
-    shots = []
-    # The intrinsics of a frame can be called a millisecond earlier or later than its image.
-    for image, own, lens in zip(images, _together(rows[:, 0], times), _together(of_lens, times)):
-        if own >= 0 and lens >= 0:
-            width, height, *numbers = _rows(files[lens], 6)[0]
-            pose = _matrix(Rotation.from_rotvec(rows[own, 1:4]), rows[own, 4:])  # from the world
+def _read_arkitscenes(path: Path) -> PosedImages:
+    """ARKitScenes' low resolution frames."""
+    images, rows = _list_images(path / "lowres_wide"), _numbers(path / "lowres_wide.traj", 7)
+    lens_files = sorted((path / "lowres_wide_intrinsics").glob("*.pincam"))
+    with _parsing(path / "lowres_wide"):
+        times, lens_times = (
+            np.array([float(f.stem.rpartition("_")[2]) for f in each]) for each in (images, lens_files)
+        )
+    posed = []
+    # The name of a frame's intrinsics can be a millisecond earlier or later than that of its image.
+    for image, row, lens in zip(images, _nearest_times(rows[:, 0], times), _nearest_times(lens_times, times)):
+        if row >= 0 and lens >= 0:
+            width, height, *intrinsics = _numbers(lens_files[lens], 6)[0]
+            world_to_camera = _matrix(Rotation.from_rotvec(rows[row, 1:4]), rows[row, 4:])
             depth = path / "lowres_depth" / image.name
-            with _reading(files[lens]):
-                shots.append(_shot(image, _lens(width, height, *numbers), np.linalg.inv(pose), depth))
-    return _posed(path, shots, len(images))
+            with _parsing(lens_files[lens]):
+                lens_of_frame = _lens(width, height, *intrinsics)
+                posed.append(_posed_image(image, lens_of_frame, np.linalg.inv(world_to_camera), depth))
+    return _posed_images(path, posed, len(images))
 
 
-def _polycam(path: Path) -> PosedImages:
+def _read_polycam(path: Path) -> PosedImages:
+    """Polycam's raw data."""
     frames = path / "keyframes"
-    corrected = all((frames / f"corrected_{kind}").is_dir() for kind in ("images", "cameras"))
-    kind = "corrected_" if corrected else ""
-    if not (frames / f"{kind}images").is_dir() or not (frames / f"{kind}cameras").is_dir():
+    is_corrected = all((frames / f"corrected_{kind}").is_dir() for kind in ("images", "cameras"))
+    prefix = "corrected_" if is_corrected else ""
+    if not (frames / f"{prefix}images").is_dir() or not (frames / f"{prefix}cameras").is_dir():
         remedy = "Export the raw data from Polycam again, with its developer mode on."
-        raise InputError(frames, "no images/ or no cameras/", "both, of a Polycam capture", remedy)
-    images, shots = _images(frames / f"{kind}images"), []
+        raise InputError(frames, "it has no images/ or no cameras/", remedy=remedy)
+    images, posed = _list_images(frames / f"{prefix}images"), []
     for image in images:
-        file = _beside(frames / f"{kind}cameras", image.stem, ".json")
+        file = _sibling(frames / f"{prefix}cameras", image.stem, ".json")
         if file.is_file():
-            with _reading(file):
-                told = parse_json(file.read_bytes())
-                size = _polycam_size(told, _beside(frames / "cameras", image.stem, ".json"), image)
-                lens = _lens(*size, *(told[name] for name in ("fx", "fy", "cx", "cy")))
-                pose = np.array([[told[f"t_{i}{j}"] for j in range(4)] for i in range(3)] + [[0, 0, 0, 1]], np.float64)
-            shots.append(_shot(image, lens, pose @ _PHONE, _beside(frames / "depth", image.stem, ".png")))
-    return _posed(path, shots, len(images))
+            with _parsing(file):
+                camera = parse_json(file.read_bytes())
+                size = _polycam_size(camera, _sibling(frames / "cameras", image.stem, ".json"), image)
+                lens = _lens(*size, *(camera[name] for name in ("fx", "fy", "cx", "cy")))
+                rows = [[camera[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
+                pose = np.array([*rows, [0, 0, 0, 1]], np.float64) @ _PHONE_AXES
+            posed.append(_posed_image(image, lens, pose, _sibling(frames / "depth", image.stem, ".png")))
+    return _posed_images(path, posed, len(images))
 
 
-def _polycam_size(told: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
-    """(width, height) that a camera's numbers are for: as its file says, or that of the image before its correction, or
-    else the image's own. Recent corrected_cameras/ have no sizes; the images can be smaller than their numbers say."""
-    if "width" in told and "height" in told:
-        return told["width"], told["height"]
-    own = image_header(image).about(told.get("cx"), told.get("cy"))
+def _polycam_size(camera: Any, uncorrected: Path, image: Path) -> tuple[Any, Any]:
+    """(width, height) that a camera's intrinsics are for.
+
+    That is the size in its file, or in that of the uncorrected camera, or else the image's. Recent corrected_cameras/
+    have no sizes, and images can be smaller than their intrinsics say.
+    """
+    if "width" in camera and "height" in camera:
+        return camera["width"], camera["height"]
+    size = image_header(image).closest_to_centre(camera.get("cx"), camera.get("cy"))
     before = parse_json(uncorrected.read_bytes()) if uncorrected.is_file() else {}
-    width, height = before.get("width", own[0]), before.get("height", own[1])
-    return (width, height) if abs(width * own[1] - height * own[0]) <= max(width, height) else own
+    width, height = before.get("width", size[0]), before.get("height", size[1])
+    return (width, height) if abs(width * size[1] - height * size[0]) <= max(width, height) else size
 
 
-def _record3d(path: Path) -> PosedImages:
-    unpacked = (path / "rgbd").is_dir()  # a .r3d is an archive
-    images, shots = _images(path / ("rgbd" if unpacked else "rgb")), []
-    file = path / ("metadata" if unpacked else "metadata.json")
-    with _reading(file):
-        told = parse_json(file.read_bytes())
-        k = told["K"]  # by columns
-        numbers = told.get("perFrameIntrinsicCoeffs") or [(k[0], k[4], k[6], k[7])] * len(told["poses"])
-        poses = np.array(told["poses"], np.float64).reshape(-1, 7)
+def _read_record3d(path: Path) -> PosedImages:
+    """Record3D's exported or unpacked folders."""
+    is_unpacked = (path / "rgbd").is_dir()  # a .r3d is an archive
+    images, posed = _list_images(path / ("rgbd" if is_unpacked else "rgb")), []
+    file = path / ("metadata" if is_unpacked else "metadata.json")
+    with _parsing(file):
+        metadata = parse_json(file.read_bytes())
+        k = metadata["K"]  # by columns
+        intrinsics = metadata.get("perFrameIntrinsicCoeffs") or [(k[0], k[4], k[6], k[7])] * len(metadata["poses"])
+        poses = np.array(metadata["poses"], np.float64).reshape(-1, 7)
         for image in images:
             n = int(image.stem)
             if n < len(poses):
-                pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE
-                size = (told["w"], told["h"]) if "w" in told and "h" in told else image_size(image)
-                shots.append(_shot(image, _lens(*size, *numbers[n]), pose))
-    return _posed(path, shots, len(images), "Record3D's depth was not read: it has a compression of its own.")
+                pose = _matrix(Rotation.from_quat(poses[n, :4]), poses[n, 4:]) @ _PHONE_AXES
+                has_size = "w" in metadata and "h" in metadata
+                size = (metadata["w"], metadata["h"]) if has_size else image_size(image)
+                posed.append(_posed_image(image, _lens(*size, *intrinsics[n]), pose))
+    return _posed_images(path, posed, len(images), "Record3D's depth was not read: its compression is not supported.")
 
 
 _FOLDERS: dict[tuple[str, ...], Callable[[Path], PosedImages]] = {
-    ("color", "pose", "intrinsic/intrinsic_color.txt"): _scannet,
-    ("rgb.txt", "groundtruth.txt"): _tum,
-    ("lowres_wide", "lowres_wide.traj"): _arkitscenes,
-    ("keyframes",): _polycam,
-    ("rgb", "metadata.json"): _record3d,
-    ("rgbd", "metadata"): _record3d,
+    ("color", "pose", "intrinsic/intrinsic_color.txt"): _read_scannet,
+    ("rgb.txt", "groundtruth.txt"): _read_tum,
+    ("lowres_wide", "lowres_wide.traj"): _read_arkitscenes,
+    ("keyframes",): _read_polycam,
+    ("rgb", "metadata.json"): _read_record3d,
+    ("rgbd", "metadata"): _read_record3d,
 }
-"""what a folder holds -> what reads it"""
+"""files and folders of a capture -> its reader"""

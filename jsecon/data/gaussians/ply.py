@@ -1,47 +1,329 @@
-"""Gaussians and point clouds as .ply files, in the layout of INRIA's 3D Gaussian Splatting and its relatives'."""
+"""Gaussians and point clouds as .ply files, on the host.
+
+The container is read whatever its properties: text or binary, either byte order, lists (http://paulbourke.net/
+dataformats/ply). The package plyfile is not used: it is under GPLv3+ and jsecon under Apache-2.0. Gaussians have the
+layout of INRIA's 3D Gaussian Splatting and its relatives.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jsecon.data.gaussians.ply_file import ply_error, property_types, read_vertices, vertex_blocks
-from jsecon.errors import InputError, require_shape
+from jsecon.errors import InputError, describe_error, require_shape
 from jsecon.files import atomic_write
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.splat.project import check_gaussians, unusable_rows
+from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_blocks, transform_gaussians_float64
 from jsecon.types import Array, Gaussians
 
-SH_DC = 0.5 / np.sqrt(np.pi)
-"""the constant basis function of spherical harmonics: rgb = 0.5 + SH_DC f_dc"""
+ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+"""format of a .ply -> NumPy's byte order"""
 GREY = 128
-"""colour of points whose file has none"""
+"""colour of points without one"""
+MAX_WRITE_ROUNDING, MAX_READ_ROUNDING = 0.02, 0.25
+"""Rounding of a Gaussian's centre by float32, relative to its largest standard deviation: above the first, centres are
+written in float64; above the second, a file is not read."""
+_TYPE_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
+_TYPES = {name: kind for kind, old in (_TYPE_NAMES | {"f8": "double"}).items() for name in (old, np.dtype(kind).name)}
+"""a property's type, by its old name or with its size (uchar, uint8) -> NumPy's"""
+_END = re.compile(rb"[\r\n]end_header[ \t]*(?:\r\n|\n|\r|\Z)")
+"""last line of a header, as Unix, Windows and old Macs end it"""
+_MAX_HEADER = 1 << 24
+"""bytes searched for the end of a header"""
+_BLOCK = 1 << 18
+"""Gaussians read at a time"""
 _POSITION, _OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blue")
-_DC, _SCALE = (tuple(f"{kind}_{axis}" for axis in range(3)) for kind in ("f_dc", "scale"))
-_ROTATION = tuple(f"rot_{axis}" for axis in range(4))
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALE = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FILTERS = ("filter_3D", "filter_3d")
 """standard deviation of Mip-Splatting's 3D filter, world units: of its own training, and of other programs"""
-_ROWS = 1 << 18
-"""Gaussians read at a time"""
-ROUNDED_WRITTEN, MAX_READ_ROUNDING = 0.02, 0.25
-"""of a Gaussian's largest standard deviation, by which float32 may round its place: on writing, else it is written in
-float64, and on reading"""
-_COARSE = ("i1", "u1", "i2", "u2", "f2", "f4")
-"""types of which float32 holds every number"""
+_EXACT_IN_FLOAT32 = ("i1", "u1", "i2", "u2", "f2", "f4")
 _SIZES = {"means": 3, "log_scales": 3, "quaternions": 4}
 _REST_COUNTS = (0, 9, 24, 45)
-_WANTED = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
+_LAYOUT = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what float32 does not hold is infinite, which no reader takes
+def ply_error(path: Path, problem: str, expected: str = "", remedy: str = "Export the file again.") -> InputError:
+    """The error of a .ply that cannot be read."""
+    return InputError(path, problem, expected, remedy)
+
+
+@dataclasses.dataclass
+class Element:
+    """An element of a .ply."""
+
+    name: str
+    count: int
+    fields: list[tuple[str, str]]
+    """(name, NumPy type) of each property; the type of a list is "list"."""
+    lists: dict[str, tuple[str, str]]
+    """Name of a list property -> NumPy types of its length and of its items."""
+
+    @property
+    def fixed(self) -> bool:
+        """Whether all rows have one length: no property is a list."""
+        return not self.lists
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the properties that are not lists."""
+        return tuple(name for name, kind in self.fields if kind != "list")
+
+    def dtype(self, order: str) -> np.dtype:
+        """Type of a row without its lists, in a byte order of NumPy."""
+        return np.dtype([(name, order + kind) for name, kind in self.fields if kind != "list"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Header:
+    """The header of a .ply."""
+
+    form: str
+    """One of ORDERS."""
+    elements: list[Element]
+    comments: tuple[str, ...]
+    start: int
+    """Offset of the first byte after the header."""
+
+    @property
+    def is_compressed(self) -> bool:
+        """Whether the vertices are packed as in SuperSplat's compressed .ply."""
+        return any(name == "packed_position" for element in self.elements for name, _ in element.fields)
+
+
+def _parse_header(path: Path, data: bytes) -> Header:
+    """Parses the header at the start of some bytes."""
+    end = _END.search(data)
+    if not data.startswith(b"ply") or end is None:
+        problem = "it has no .ply header" if data else "the file is empty"
+        raise ply_error(path, problem, "a file that starts with 'ply' and a header")
+    form, elements, comments = "", [], []
+    for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
+        words = line.split()
+        try:
+            if not words:
+                continue
+            if words[0] in ("comment", "obj_info"):
+                comments.append(line.strip().partition(" ")[2].strip())
+            elif words[0] == "format":
+                form = words[1]
+            elif words[0] == "element":
+                elements.append(Element(words[1], int(words[2]), [], {}))
+                if elements[-1].count < 0:
+                    raise ValueError(words[2])
+            elif words[0] == "property" and words[1] == "list":
+                elements[-1].fields.append((words[4], "list"))
+                elements[-1].lists[words[4]] = _TYPES[words[2]], _TYPES[words[3]]
+            elif words[0] == "property":
+                elements[-1].fields.append((words[2], _TYPES[words[1]]))
+            else:
+                raise ValueError(words[0])
+        except (IndexError, KeyError, ValueError) as error:
+            raise ply_error(path, f"the header line {line.strip()!r} is not valid") from error
+    if form not in ORDERS:
+        raise ply_error(path, f"its format is {form!r}", f"one of {', '.join(ORDERS)}")
+    for element in elements:
+        if len({name for name, _ in element.fields}) < len(element.fields):
+            raise ply_error(path, f"its element {element.name} has two properties of one name")
+    return Header(form, elements, tuple(comments), end.end())
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Opens a file for reading."""
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise ply_error(path, describe_error(error), remedy="Check the path.") from error
+
+
+def read_ply_file(path: Path) -> tuple[bytes, Header]:
+    """Reads a whole .ply: all its bytes, and its header. Raises InputError if it is not one."""
+    with _opened(path) as file:
+        data = file.read()
+    return data, _parse_header(path, data)
+
+
+def read_header(path: Path) -> Header:
+    """Reads the header of a .ply and no more. Raises InputError if it is not one."""
+    with _opened(path) as file:
+        data = file.read(1 << 16)
+        while not _END.search(data) and len(data) < _MAX_HEADER and (more := file.read(len(data))):
+            data += more
+        return _parse_header(path, data)
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """Reads the vertices of a .ply.
+
+    Args:
+      path: The file.
+
+    Returns:
+      (N,) structured array of the properties that are not lists.
+
+    Raises:
+      InputError: The file is not a .ply with vertices, or is truncated.
+    """
+    return next(_vertex_blocks(path, read_header(path), sys.maxsize)[1])
+
+
+def _vertex_blocks(path: Path, header: Header, rows: int) -> tuple[Element, Iterator[np.ndarray]]:
+    """Returns the element of the vertices, and the vertices in blocks of `rows` at most, one block at least.
+
+    A binary file without lists before or in its vertices is read block by block.
+    """
+    names = [element.name for element in header.elements]
+    if "vertex" not in names:
+        raise ply_error(path, f"its elements are {', '.join(names) or 'missing'}", "an element vertex")
+    vertex = header.elements[names.index("vertex")]
+    if header.is_compressed:
+        remedy = f"Read it with jsecon.load_gaussians, or run: npx @playcanvas/splat-transform {path.name} plain.ply"
+        raise ply_error(path, "it is compressed (SuperSplat's packed chunks)", remedy=remedy)
+    if not vertex.names:
+        raise ply_error(path, "its element vertex has no properties", "x y z and more")
+    before = header.elements[: names.index("vertex")]
+    if header.form == "ascii" or not all(element.fixed for element in [*before, vertex]):
+        table = _read_irregular(path, before, vertex)
+        return vertex, (table[n : n + rows] for n in range(0, max(vertex.count, 1), rows))
+    order = ORDERS[header.form]
+    offset = header.start + sum(element.count * element.dtype(order).itemsize for element in before)
+    dtype, size = vertex.dtype(order), path.stat().st_size
+    if offset + vertex.count * dtype.itemsize > size:
+        raise _truncated(path, (size - offset) // dtype.itemsize, vertex.count)
+    return vertex, _read_blocks(path, offset, dtype, vertex.count, rows)
+
+
+def _read_blocks(path: Path, offset: int, dtype: np.dtype, count: int, rows: int) -> Iterator[np.ndarray]:
+    """Reads binary rows of one length, block by block."""
+    with _opened(path) as file:
+        file.seek(offset)
+        for first in range(0, max(count, 1), rows):
+            size = min(rows, count - first) * dtype.itemsize
+            data = file.read(size)
+            if len(data) < size:  # truncated after its size was checked
+                raise _truncated(path, first + len(data) // dtype.itemsize, count)
+            yield np.frombuffer(data, dtype)
+
+
+def _read_irregular(path: Path, before: list[Element], vertex: Element) -> np.ndarray:
+    """Reads the vertices of a text file, or of one with lists before or in its vertices."""
+    data, header = read_ply_file(path)
+    if header.form == "ascii":
+        return _parse_text(path, data[header.start :], sum(element.count for element in before), vertex)
+    offset = header.start
+    for element in before:
+        _, offset = _parse_rows(path, data, offset, element, ORDERS[header.form])
+    return _parse_rows(path, data, offset, vertex, ORDERS[header.form])[0]
+
+
+def read_elements(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
+    """Reads all elements of a binary .ply.
+
+    Args:
+      path: The file.
+
+    Returns:
+      Its header, and by element a structured array of the properties that are not lists.
+
+    Raises:
+      InputError: The file is not a binary .ply, or is truncated.
+    """
+    data, header = read_ply_file(path)
+    if header.form == "ascii":
+        raise ply_error(path, "its format is ascii", "a binary .ply")
+    tables, offset = {}, header.start
+    for element in header.elements:
+        tables[element.name], offset = _parse_rows(path, data, offset, element, ORDERS[header.form])
+    return header, tables
+
+
+def _parse_rows(path: Path, data: bytes, offset: int, element: Element, order: str) -> tuple[np.ndarray, int]:
+    """Returns the rows of a binary element without their lists, and the offset of their end."""
+    dtype = element.dtype(order)
+    if element.fixed:
+        end = offset + element.count * dtype.itemsize
+        if end > len(data):
+            raise _truncated(path, (len(data) - offset) // max(dtype.itemsize, 1), element.count, element.name)
+        return np.frombuffer(data, dtype, element.count, offset) if dtype.itemsize else np.empty(0, dtype), end
+    fixed_parts = bytearray()
+    for row in range(element.count):
+        for name, kind in element.fields:
+            if kind != "list":
+                size = np.dtype(kind).itemsize
+                fixed_parts += data[offset : offset + size]
+            else:
+                length, item = (np.dtype(order + part) for part in element.lists[name])
+                if offset + length.itemsize > len(data):
+                    raise _truncated(path, row, element.count, element.name)
+                count = int(np.frombuffer(data, length, 1, offset)[0])
+                if count < 0:
+                    raise ply_error(path, f"a list of its element {element.name} has a length of {count}")
+                size = length.itemsize + count * item.itemsize
+            offset += size
+            if offset > len(data):
+                raise _truncated(path, row, element.count, element.name)
+    return np.frombuffer(bytes(fixed_parts), dtype), offset
+
+
+def _truncated(path: Path, there: int, count: int, name: str = "vertex") -> InputError:
+    """The error of a file that ends before its last row."""
+    rows = "vertices" if name == "vertex" else f"rows of its element {name}"
+    return ply_error(path, f"the file is cut short: it holds {max(there, 0)} of {count} {rows}")
+
+
+def _parse_text(path: Path, body: bytes, skip: int, vertex: Element) -> np.ndarray:
+    """Parses the vertices of a text file, whose first `skip` rows are those of other elements."""
+    lines = [line for line in body.splitlines() if line.strip()][skip : skip + vertex.count]
+    rows = [line.split() for line in lines]
+    try:
+        if not vertex.fixed:
+            rows = [_without_lists(row, vertex) for row in rows]
+        numbers = np.array(rows, np.float64).reshape(len(rows), len(vertex.names))
+    except (ValueError, IndexError) as error:
+        problem = f"a vertex line does not have {len(vertex.names)} numbers, or the file is cut short"
+        raise ply_error(path, problem) from error
+    if len(lines) < vertex.count:
+        raise _truncated(path, len(lines), vertex.count)
+    result = np.empty(vertex.count, vertex.dtype("="))
+    for column, name in enumerate(vertex.names):
+        kind = result.dtype[name]
+        with np.errstate(over="ignore", invalid="ignore"):  # checked below, and infinite numbers by the caller
+            result[name] = numbers[:, column]
+        if kind.kind != "f" and (result[name] != numbers[:, column]).any():
+            raise ply_error(path, f"numbers of {name} do not fit its type {kind.name}")
+    return result
+
+
+def _without_lists(words: list[bytes], element: Element) -> list[bytes]:
+    """The words of a line that are not part of a list."""
+    kept, position = [], 0
+    for _, kind in element.fields:
+        if kind == "list":
+            position += 1 + int(words[position])
+        else:
+            kept.append(words[position])
+            position += 1
+    return kept
+
+
+@np.errstate(over="ignore", invalid="ignore")  # beyond float32: infinite, which every reader refuses
 def _columns(vertices: np.ndarray, names: tuple[str, ...] | list[str], dtype: type = np.float32) -> np.ndarray:
+    """(N, C) some properties of the vertices."""
     fields = vertices.dtype.names or ()
     if len({vertices.dtype[name] for name in fields}) == 1:
         # One type throughout, as in nearly every file: a plain table, read along its rows (twice as fast).
@@ -57,75 +339,87 @@ def load_ply(path: str | Path, *, similarity: Float[Array, "4 4"] | None = None)
     """Reads Gaussians from a .ply in INRIA's layout (graphdeco-inria/gaussian-splatting, gaussian_model.py).
 
     The degree of the spherical harmonics follows from the number of f_rest properties (0, 9, 24, 45; channel-major).
-    Also read, each as the program that wrote it draws it:
+    Variants are read as the program that wrote them draws them:
 
-    - 2D Gaussians: without scale_2, or with -inf there, they are flat.
-    - Mip-Splatting: `filter_3D` is fused into sizes and opacities, as its own create_fused_ply.py does.
-    - Colours red, green, blue in place of f_dc (nerfstudio's --ply-color-mode rgb): whole numbers of 8 or 16 bits, or
-      floats (0..1, or 0..255 where any is above 1).
+    - 2D Gaussians (no scale_2, or -inf there) are flat.
+    - Mip-Splatting's `filter_3D` is fused into sizes and opacities, as by its create_fused_ply.py.
+    - Colours red, green, blue replace f_dc (nerfstudio's --ply-color-mode rgb): whole numbers of 8 or 16 bits, or
+      floats (0..1, or 0..255 if any is above 1).
 
-    Other properties (normals, OpenGaussian's ins_feat, Gaussian Grouping's obj_dc) and other elements are passed over.
-    Text, either order of bytes and any type of number are read. A binary file is read in blocks and never is in memory
-    as a whole beside the arrays, unless it holds lists before its vertices or in them.
+    Other properties and elements are ignored. Binary files are read in blocks.
 
     Args:
-      path: The .ply file.
+      path: The file.
       similarity: (4, 4) float64, see `load_gaussians`.
 
     Returns:
       Its Gaussians, float32; N may be 0.
 
     Raises:
-      InputError: The file is compressed or cut short, a property is missing, a number is NaN or infinite (other than
-        log scales of -inf and opacity logits of -inf and inf, which can be drawn), or a quaternion is zero; or float32
-        does not hold the positions.
+      InputError: The file is compressed or truncated, a property is missing, a number cannot be drawn (NaN, infinite
+        other than log scales of -inf and opacity logits, a zero quaternion), or float32 does not hold the positions.
     """
     path = Path(path)
     return in_float32(path, read_ply(path), similarity)
 
 
-def read_ply(path: Path) -> Gaussians:
-    """What `load_ply` reads, as NumPy arrays. The means are float64 where the file has them finer than float32."""
-    count, names, blocks = vertex_blocks(path, _ROWS)
-    scales = _SCALE[:2] if "scale_2" not in names else _SCALE
-    colours = _RGB if not any(name in names for name in _DC) and all(name in names for name in _RGB) else _DC
+def read_ply(path: Path, header: Header | None = None) -> Gaussians:
+    """Reads Gaussians as `load_ply` does, as NumPy arrays.
+
+    Args:
+      path: The file.
+      header: Its header, if it is already read.
+
+    Returns:
+      Its Gaussians; the means are float64 if the file has them finer than float32.
+
+    Raises:
+      InputError: As in `load_ply`.
+    """
+    vertex, blocks = _vertex_blocks(path, header or read_header(path), _BLOCK)
+    count, names, types = vertex.count, vertex.names, dict(vertex.fields)
+    scales = _SCALE if "scale_2" in names else _SCALE[:2]
+    has_rgb = all(name in names for name in _RGB) and not any(name in names for name in _DC)
+    colours = _RGB if has_rgb else _DC
     if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
-        remedy = "A plain point cloud won't do: export the trained Gaussians as an uncompressed .ply."
-        raise ply_error(path, f"its vertices have no {', '.join(missing)}", _WANTED, remedy)
+        remedy = "A plain point cloud is not enough: export the trained Gaussians as an uncompressed .ply."
+        raise ply_error(path, f"its vertices have no {', '.join(missing)}", _LAYOUT, remedy)
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{index}" for index in range(rest)]
     if rest not in _REST_COUNTS or any(name not in names for name in rest_names):
-        wanted = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
+        expected = "0, 9, 24 or 45 of them, counted from f_rest_0 (spherical harmonics of degree 0 to 3)"
         remedy = "Export the file again, with harmonics of degree 3 or less."
-        raise ply_error(path, f"its vertices have {rest} properties f_rest", wanted, remedy)
+        raise ply_error(path, f"its vertices have {rest} properties f_rest", expected, remedy)
     filters = [name for name in _FILTERS if name in names][:1]
-    types = property_types(path)
-    fine = any(types[name] not in _COARSE for name in _POSITION)
+    exact = all(types[name] in _EXACT_IN_FLOAT32 for name in _POSITION)
     arrays: dict[str, np.ndarray] = {name: np.empty((count, size), np.float32) for name, size in _SIZES.items()}
-    arrays["means"] = np.empty((count, 3), np.float64 if fine else np.float32)
-    arrays |= {"opacity_logits": np.empty(count, np.float32), "sh": np.empty((count, 1 + rest // 3, 3), np.float32)}
-    first, unit = 0, 1.0
+    arrays["means"] = np.empty((count, 3), np.float32 if exact else np.float64)
+    arrays["opacity_logits"] = np.empty(count, np.float32)
+    arrays["sh"] = np.empty((count, 1 + rest // 3, 3), np.float32)
+    first, brightest = 0, 1.0
     for vertices in blocks:
-        own, first = slice(first, first + len(vertices)), first + len(vertices)
-        arrays["means"][own] = _columns(vertices, _POSITION, arrays["means"].dtype.type)
-        arrays["log_scales"][own, 2] = -np.inf
-        arrays["log_scales"][own, : len(scales)] = _columns(vertices, scales)
-        arrays["quaternions"][own] = _columns(vertices, _ROTATION)
-        arrays["opacity_logits"][own] = _columns(vertices, _OPACITY)[:, 0]
-        arrays["sh"][own, 0] = _columns(vertices, colours)
+        rows = slice(first, first + len(vertices))
+        first = rows.stop
+        arrays["means"][rows] = _columns(vertices, _POSITION, arrays["means"].dtype.type)
+        arrays["log_scales"][rows, 2] = -np.inf
+        arrays["log_scales"][rows, : len(scales)] = _columns(vertices, scales)
+        arrays["quaternions"][rows] = _columns(vertices, _ROTATION)
+        arrays["opacity_logits"][rows] = _columns(vertices, _OPACITY)[:, 0]
+        arrays["sh"][rows, 0] = _columns(vertices, colours)
         others = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3)
-        arrays["sh"][own, 1:] = others.transpose(0, 2, 1)
+        arrays["sh"][rows, 1:] = others.transpose(0, 2, 1)
         if filters:
-            _fuse(path, {name: arrays[name][own] for name in arrays}, _columns(vertices, filters)[:, 0])
-        if colours == _RGB:
-            unit = max(unit, _unit(vertices))
-    if colours == _RGB:
-        arrays["sh"][:, 0] = (arrays["sh"][:, 0].astype(np.float64) / unit - 0.5) / SH_DC
+            block = {name: array[rows] for name, array in arrays.items()}
+            _fuse_filter(path, block, _columns(vertices, filters)[:, 0])
+        if has_rgb:
+            brightest = max(brightest, _brightest(vertices))
+    if has_rgb:
+        arrays["sh"][:, 0] = (arrays["sh"][:, 0].astype(np.float64) / brightest - 0.5) / C0
     return drawable_gaussians(path, arrays)
 
 
-def _unit(vertices: np.ndarray) -> float:
-    """The number that stands for the brightest red, green or blue: of these vertices, where they are floats."""
+def _brightest(vertices: np.ndarray) -> float:
+    """The number of the brightest red, green or blue; for floats, it follows from the vertices."""
     kinds = [vertices.dtype[name] for name in _RGB]
     if all(kind.kind == "f" for kind in kinds):
         return 255.0 if max(np.nanmax(vertices[name], initial=0) for name in _RGB) > 1 else 1.0
@@ -133,11 +427,15 @@ def _unit(vertices: np.ndarray) -> float:
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
-def _fuse(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> None:
-    """Widens Gaussians, in place, by a filter of the given standard deviations (M,): sizes become sqrt(s^2 + f^2),
-    opacities shrink by the ratio of the volumes (Mip-Splatting, get_opacity_with_3D_filter)."""
+def _fuse_filter(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> None:
+    """Widens Gaussians, in place, by a filter with standard deviations (M,).
+
+    Sizes become sqrt(s^2 + f^2), opacities shrink by the ratio of the volumes (Mip-Splatting,
+    get_opacity_with_3D_filter).
+    """
     if not (np.isfinite(deviation) & (deviation >= 0)).all():
-        raise ply_error(path, "numbers of filter_3D are negative or not finite", "standard deviations", "Train again.")
+        problem = "numbers of filter_3D are negative or not finite"
+        raise ply_error(path, problem, "standard deviations", "Train again.")
     before = arrays["log_scales"].astype(np.float64)
     after = 0.5 * np.logaddexp(2 * before, 2 * np.log(deviation.astype(np.float64))[:, None])
     shrink = np.exp(np.where(after == before, 0.0, before - after).sum(axis=1))
@@ -147,46 +445,80 @@ def _fuse(path: Path, arrays: dict[str, np.ndarray], deviation: np.ndarray) -> N
 
 
 def drawable_gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
-    """The Gaussians of a file's arrays (NumPy), by their fields. Raises InputError where one of them cannot be drawn:
-    see `unusable_rows`."""
-    _require_usable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
+    """Makes Gaussians of the arrays of a file.
+
+    Args:
+      path: The file, for errors.
+      arrays: NumPy arrays of the fields of `Gaussians`.
+
+    Returns:
+      Gaussians of these arrays.
+
+    Raises:
+      InputError: A Gaussian cannot be drawn (`unusable_rows`).
+    """
+    _require_drawable(path, arrays, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
     return Gaussians(**arrays)
 
 
 def in_float32(path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> Gaussians:
-    """A file's Gaussians (NumPy) on jax's device, carried by `similarity` in float64 first. Raises InputError where
-    float32 then does not hold where they are."""
+    """Puts the Gaussians of a file on jax's device.
+
+    Args:
+      path: The file, for errors.
+      gaussians: NumPy arrays.
+      similarity: (4, 4) transform into another world, applied in float64 first.
+
+    Returns:
+      The Gaussians, float32.
+
+    Raises:
+      InputError: Float32 does not hold the positions.
+    """
     if similarity is not None:
         gaussians = transform_gaussians_float64(gaussians, similarity)
-    rounded = float32_rounding(gaussians)
-    if len(rounded) and np.median(rounded) > MAX_READ_ROUNDING:
+    rounding = float32_rounding(gaussians)
+    if len(rounding) and np.median(rounding) > MAX_READ_ROUNDING:
         place = ", ".join(f"{number:.10g}" for number in np.median(gaussians.means, axis=0))
-        found = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
         remedy = "Give load_gaussians a similarity that brings them near 0, as numpy.linalg.inv(capture.to_source)."
-        raise ply_error(path, found, "coordinates nearer to 0", remedy)
+        problem = f"the Gaussians lie about ({place}), where float32 does not tell them apart"
+        raise ply_error(path, problem, remedy=remedy)
     return jax.tree.map(jnp.asarray, gaussians)
 
 
 def usable_blocks(
     path: str | Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
 ) -> Iterator[tuple[slice, Gaussians]]:
-    """`transform_blocks` of Gaussians that are to be written to a file. Raises ValueError where their shapes
-    disagree, and InputError where `load_gaussians` would refuse them."""
+    """Yields Gaussians in blocks for writing.
+
+    Args:
+      path: The file that is written, for errors.
+      gaussians: N Gaussians; may be memory-mapped.
+      similarity: (4, 4) transform into the world of the file, or None.
+
+    Yields:
+      The rows of a block, and its transformed Gaussians.
+
+    Raises:
+      ValueError: Shapes disagree.
+      InputError: A Gaussian cannot be drawn: `load_gaussians` would refuse the file.
+    """
     check_gaussians(gaussians)
-    for own, part in transform_blocks(gaussians, similarity):
-        columns = {name: getattr(part, name) for name in (*_SIZES, "opacity_logits", "sh")}
-        _require_usable(path, columns, own.start, "Remove these Gaussians first.")
-        yield own, part
+    for rows, block in transform_blocks(gaussians, similarity):
+        columns = {name: getattr(block, name) for name in (*_SIZES, "opacity_logits", "sh")}
+        _require_drawable(path, columns, rows.start, "Remove these Gaussians first.")
+        yield rows, block
 
 
-def _require_usable(path: str | Path, arrays: Mapping[str, np.ndarray], first: int, remedy: str) -> None:
-    """Raises InputError where Gaussians, counted from `first`, cannot be drawn."""
+def _require_drawable(path: str | Path, arrays: Mapping[str, np.ndarray], first: int, remedy: str) -> None:
+    """Raises InputError if a Gaussian, counted from `first`, cannot be drawn."""
     for name, array in arrays.items():
         rows = unusable_rows(name, array)
         if rows.any():
-            what = "are not finite" if name != "quaternions" else "are not finite or zero"
-            found = f"{name} of {rows.sum()} of {len(rows)} Gaussians {what} (the first: {first + rows.argmax()})"
-            raise InputError(path, found, "numbers that can be drawn", remedy)
+            state = "not finite or zero" if name == "quaternions" else "not finite"
+            example = f"(the first: {first + rows.argmax()})"
+            problem = f"{name} of {rows.sum()} of {len(rows)} Gaussians are {state} {example}"
+            raise InputError(path, problem, remedy=remedy)
 
 
 def save_ply(
@@ -198,14 +530,19 @@ def save_ply(
 ) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
-    Written in blocks, so that mapped columns need not fit into memory; `similarity` (4, 4) carries each block into
-    another world (`transform_gaussians_float64`). Positions are written in double precision where float32 would
-    not hold them (in a map projection's coordinates, say), else in float.
+    Float32 Gaussians come back bit by bit from `load_ply`. Positions are written in float64 if float32 would not hold
+    them (coordinates of a map projection). The file is written in blocks: memory-mapped arrays need not fit into
+    memory.
 
-    Float32 Gaussians come back bit by bit from `load_ply`. `rgb` (0..1) replaces the spherical harmonics by one
-    colour a Gaussian, for showing codes or similarities; viewers such as SuperSplat open either. A selection is
-    written by giving its subset. Raises ValueError where shapes disagree, InputError where a Gaussian cannot be drawn
-    (`load_ply` would refuse it) and where the folder cannot be written.
+    Args:
+      path: The file.
+      gaussians: N Gaussians.
+      rgb: (N, 3) in 0..1, one colour a Gaussian instead of its spherical harmonics, to show codes or similarities.
+      similarity: (4, 4) transform into the world of the file.
+
+    Raises:
+      ValueError: Shapes disagree.
+      InputError: A Gaussian cannot be drawn, or the folder cannot be written.
     """
     check_gaussians(gaussians)
     count = gaussians.count
@@ -219,41 +556,50 @@ def save_ply(
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
-        for own, part in usable_blocks(path, gaussians, similarity):
-            colours = part.sh if rgb is None else ((np.asarray(rgb[own], np.float64) - 0.5) / SH_DC)[:, None]
-            rows = _table(part, np.asarray(colours, np.float32), double)
-            file.write(rows.tobytes())  # tofile would not tell a full disk
+        for rows, block in usable_blocks(path, gaussians, similarity):
+            sh = block.sh if rgb is None else ((np.asarray(rgb[rows], np.float64) - 0.5) / C0)[:, None]
+            file.write(_table(block, np.asarray(sh, np.float32), double).tobytes())  # tofile hides a full disk
 
 
 def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
-    """Whether float32 rounds the means, where `similarity` carries them, by more than a reader should see: for more
-    than 1 in 100 by ROUNDED_WRITTEN of their size."""
+    """Whether float32 would round centres, after `similarity`, by more than a reader should see.
+
+    That is by more than MAX_WRITE_ROUNDING of the size of more than 1 in 100 Gaussians.
+    """
     if similarity is None and gaussians.means.dtype != np.float64:
         return False
     bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
-    far = sum(int((float32_rounding(part) > ROUNDED_WRITTEN).sum()) for _, part in transform_blocks(bare, similarity))
+    far = sum(
+        int((float32_rounding(block) > MAX_WRITE_ROUNDING).sum()) for _, block in transform_blocks(bare, similarity)
+    )
     return far > 0.01 * gaussians.count
 
 
-def _table(part: Gaussians, sh: np.ndarray, double: bool) -> np.ndarray:
-    """A row of the file for each Gaussian."""
+def _table(block: Gaussians, sh: np.ndarray, double: bool) -> np.ndarray:
+    """The rows of a file."""
     count = len(sh)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
-    normals, opacity = np.zeros((count, 3)), np.asarray(part.opacity_logits)[:, None]
-    columns = [part.means, normals, sh[:, 0], rest, opacity, part.log_scales, part.quaternions]
+    normals, opacity = np.zeros((count, 3)), np.asarray(block.opacity_logits)[:, None]
+    columns = [block.means, normals, sh[:, 0], rest, opacity, block.log_scales, block.quaternions]
     table = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1).astype("<f4", copy=False)
     if not double:
         return table
     rows = np.empty(count, [("means", "<f8", 3), ("others", "<f4", table.shape[1] - 3)])
-    rows["means"], rows["others"] = part.means, table[:, 3:]
+    rows["means"], rows["others"] = block.means, table[:, 3:]
     return rows
 
 
 def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    """Points (float64) and colours of a plain point cloud (nerfstudio's ply_file_path).
+    """Reads a plain point cloud (nerfstudio's ply_file_path).
 
-    Colours are red green blue in 8 or 16 bits, or in float (0..1, or 0..255 where any is above 1); mid grey where there
-    are none. Raises InputError on a damaged file, or one without x y z.
+    Args:
+      path: A .ply. Colours red green blue have 8 or 16 bits, or are floats (0..1, or 0..255 if any is above 1).
+
+    Returns:
+      (P, 3) float64 points, and (P, 3) uint8 colours, GREY if the file has none.
+
+    Raises:
+      InputError: The file is damaged, or has no x y z.
     """
     path = Path(path)
     vertices = read_vertices(path)
@@ -262,7 +608,7 @@ def load_point_cloud(path: str | Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[
         raise ply_error(path, f"its vertices have no {', '.join(missing)}", "a point cloud with x y z")
     points = _columns(vertices, _POSITION, np.float64)
     if not is_finite_and_bounded(points):
-        raise ply_error(path, "its points have NaN, infinite or absurd coordinates", "finite points")
+        raise ply_error(path, "its points have NaN, infinite or absurd coordinates")
     if not all(name in names for name in _RGB):
         return points, np.full((len(points), 3), GREY, np.uint8)
     colours = np.stack([vertices[name] for name in _RGB], axis=-1)
