@@ -134,7 +134,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
     cameras, told = ring(views, width, height), {}
     labels, gaussians = Labels(cameras), mapped(folder / "scene")
     regions = timed(told, "labels' pixels, s", lambda: main_regions(labels))
-    how = {"folder": folder / "votes", "regions": regions}
+    how = {"folder": folder / "votes", "by_view": True}
     steps, worked = [], []
     votes = timed(
         told,
@@ -152,7 +152,7 @@ def votes_step(folder: Path, views: int, width: int, height: int) -> dict[str, f
         told[name] = float(np.median(np.diff(own))) if len(own) > 1 else np.nan
     told["seen"] = float(np.mean([np.count_nonzero(votes.views[a : a + (1 << 20)]) / len(votes.views[a : a + (1 << 20)])
                                   for a in range(0, len(votes.views), 1 << 20)]))  # fmt: skip
-    votes = timed(told, "overlap of regions, s", lambda: jsecon.with_overlap(votes))
+    votes = timed(told, "votes finished, s", lambda: jsecon.finish_votes_in_blocks(votes, regions))
     table = regions.embeddings[:, :CODE]
     codes = timed(told, "codes, s", lambda: jsecon.codes_in_blocks(votes, table, folder / "codes.npy"))
     field = field_of(gaussians, votes, codes, cameras, regions)
@@ -165,8 +165,8 @@ def query_step(folder: Path, *_: int) -> dict[str, float]:
     told: dict[str, float] = {}
     field = timed(told, "field opened, s", lambda: jsecon.load_field(folder / "field.safetensors", mapped=True))
     texts = texts_near(field.regions)
-    timed(told, "first query, compilation included, s", lambda: jsecon.query_anchored(field, texts[0]).mask)
-    timed(told, "one query, s", lambda: jsecon.query_anchored(field, texts[0]).mask)
+    timed(told, "first query, compilation included, s", lambda: jsecon.query_in_blocks(field, texts[:1]))
+    timed(told, "one query, s", lambda: jsecon.query_in_blocks(field, texts[:1]))
     found = timed(told, "100 queries, s", lambda: jsecon.query_in_blocks(field, texts))
     told["selected by a query, mean"] = float(np.mean([len(own.gaussians) for own in found]))
     return told
@@ -183,6 +183,13 @@ def export_step(folder: Path, *_: int) -> dict[str, float]:
     return told
 
 
+def finished(gaussians, cameras, labels, regions, **how):
+    """Votes in blocks with all that queries read."""
+    return jsecon.finish_votes_in_blocks(
+        jsecon.region_votes_in_blocks(gaussians, cameras, labels, REGIONS, **how), regions
+    )
+
+
 def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, float]:
     """The part in memory and in blocks."""
     whole, told = mapped(folder / "scene"), {}
@@ -191,12 +198,12 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     cameras = ring(views, width, height)
     labels = Labels(cameras)
     regions, images = main_regions(labels), np.stack([labels[t] for t in range(views)])
-    how = {"folder": folder / "part", "regions": regions}
-    blocks = timed(told, "in blocks, s", lambda: jsecon.region_votes_in_blocks(part, cameras, labels, REGIONS, **how))
+    how = {"folder": folder / "part", "by_view": True}
+    blocks = timed(told, "in blocks, s", lambda: finished(part, cameras, labels, regions, **how))
     memory = timed(
         told,
         "in memory, s",
-        lambda: jsecon.with_shown(jsecon.region_votes(part, cameras, images, REGIONS, by_view=True), regions),
+        lambda: jsecon.finish_votes(jsecon.region_votes(part, cameras, images, REGIONS, by_view=True), regions),
     )
     told["part"], told["seen"] = part.count, float((np.asarray(memory.views) > 0).mean())
     for name in ("weights", "shown", "labelled", "total", "peak"):
@@ -206,7 +213,7 @@ def part_step(folder: Path, views: int, width: int, height: int) -> dict[str, fl
     for name in ("regions", "views"):
         told[f"{name}: differ"] = int((np.asarray(getattr(blocks, name)) != np.asarray(getattr(memory, name))).sum())
     codes = np.zeros((part.count, CODE), np.float32)
-    mapped_field = field_of(part, jsecon.with_overlap(blocks), codes, cameras, regions)
+    mapped_field = field_of(part, blocks, codes, cameras, regions)
     held = {own.name: getattr(mapped_field.votes, own.name) for own in dataclasses.fields(Votes)}
     held = {name: np.array(a) if isinstance(a, np.memmap) else a for name, a in held.items()}
     held_field = dataclasses.replace(mapped_field, votes=Votes(**held))
@@ -305,7 +312,7 @@ def query_growth(base: Path, largest: int) -> None:
             none = Gaussians(*(np.zeros((0, *rest), np.float32) for rest in SHAPES.values()))
             field = field_of(none, votes, np.zeros((count, 0), np.float32), cameras, regions)
             for _ in range(2):
-                timed(told, "one", lambda f=field: jsecon.query_anchored(f, texts[0]).mask)
+                timed(told, "one", lambda f=field: jsecon.query_in_blocks(f, texts[:1]))
                 timed(told, "many", lambda f=field: jsecon.query_in_blocks(f, texts))
             rows.append((count, told["one of CPU"], told["many of CPU"]))
             print(f"| {count:,} | {' | '.join(f'{value:.3f}' for value in told.values())} |", flush=True)

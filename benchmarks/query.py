@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from metrics import Metric, interleaved, show
 
-from jsecon.query.anchored import query_anchored
 from jsecon.query.baselines import query_one_step
+from jsecon.query.select import query_anchored
 from jsecon.query.similarity import unit_codes
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 

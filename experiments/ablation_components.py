@@ -23,15 +23,15 @@ COMPONENTS: dict[str, Method] = {
     "the paper's path": paper,
     "membership by votes of all views": asked("all_views", **BY_COSINE),
     "membership by votes of the views that show it": asked("votes", **BY_COSINE),
-    "the region by contrast": asked("votes"),
+    "the region apart from words": asked("votes"),
     "ours, tracks": METHODS["ours, tracks"],
     "ours, consensus, the region by cosine": asked("votes", by="consensus", **BY_COSINE),
     "ours, consensus, without pieces": asked("votes", by="consensus"),
     "ours, consensus": METHODS["ours, consensus"],
 }
 """the rows of Table 4: per-frame masks asked in one step (LangSplat-m) and anchored, then the paper's parts distilled
-by votes, the whole of the paper's path, and ours: the region of the largest contrast and its pieces, by the tracks or
-by consensus"""
+by votes, the whole of the paper's path, and ours: the region apart from unrelated words and its pieces, by the tracks
+or by consensus"""
 PLAN = lerf.beside(lerf.PLAN, "ablation_components", COMPONENTS)
 QUICK = lerf.beside(lerf.QUICK, "ablation_components", COMPONENTS)
 

@@ -16,14 +16,14 @@ QUERIES: dict[str, Method] = {
     "one-step": asked("one_step"),
     "canonical": asked("canonical"),
     "anchored by code": asked("code", **BY_COSINE),
-    "anchored by code, the region by contrast": asked("code"),
+    "anchored by code, the region apart from words": asked("code"),
     "anchored by votes of all views": asked("all_views", **BY_COSINE),
     "anchored by votes": asked("votes", **BY_COSINE),
-    "the region by contrast": asked("votes"),
+    "the region apart from words": asked("votes"),
     "ours, tracks": METHODS["ours, tracks"],
 }
-"""the rows of Table 5, of one field of the tracks with spread codes; the last by votes, the region by contrast, then
-with its pieces"""
+"""the rows of Table 5, of one field of the tracks with spread codes; the last by votes, the region apart from words,
+then with its pieces"""
 PLAN = lerf.beside(lerf.PLAN, "ablation_query", QUERIES)
 QUICK = lerf.beside(lerf.QUICK, "ablation_query", QUERIES)
 

@@ -27,9 +27,9 @@ from jsecon.fit.start import gaussians_from_points
 from jsecon.language.distill import distill_votes
 from jsecon.language.membership import with_shown
 from jsecon.language.votes import region_votes
-from jsecon.query.anchored import query_region
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.render import selection_mask
+from jsecon.query.select import query_region
 from jsecon.types import Camera, Capture, Gaussians, LanguageField, Regions
 
 OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 144: "joke book"}

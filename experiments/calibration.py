@@ -24,8 +24,9 @@ from experiments import lerf, results
 from experiments.cells import append_cell, read_cells
 from experiments.shared_errors import pooled
 from experiments.tables import twins
-from jsecon.query.confidence import OFFSET, SLOPE, answer_confidence
-from jsecon.query.match import QUANTILE, anchor_of, answers, evidence, quantile_among, unrelated_similarities
+from jsecon.query.confidence import OFFSET, SLOPE
+from jsecon.query.match import RULES, reference_similarities, score_text
+from jsecon.query.rules import QUANTILE
 
 BINS = 10
 FITTED_VISION = 100
@@ -88,14 +89,12 @@ def calibration_error(
 
 
 @jax.jit
-def _ask(embeddings, texts, canonical, pixels, words):
-    similar = unrelated_similarities(embeddings, words, canonical, pixels, "apart")
-    weight = evidence(pixels).astype(embeddings.dtype)
+def _ask(embeddings, texts, pixels, words):
+    similar = reference_similarities(embeddings, words, RULES.retrieval)
 
     def ask(text):
-        similarity, known = answers(embeddings, text, canonical, words, pixels, "apart")
-        quantile = quantile_among(jnp.max(jnp.where(known, similarity, -jnp.inf)), text, words, similar)
-        return anchor_of(similarity, known, weight), quantile, answer_confidence(similarity, known, weight, similar)
+        scores = score_text(embeddings, text, pixels, words, similar, RULES)
+        return scores.anchor, scores.quantile, scores.confidence
 
     return jax.vmap(ask)(texts)
 
@@ -111,7 +110,7 @@ def answered(options: Options, scene: str, seed: int, level: str, vision: int) -
     embeddings, pixels = (np.pad(own, ((0, room), (0, 0))) for own in (found.embeddings, found.pixels))
     rows = []
     for texts, objects in ((found.texts, np.arange(len(found.texts))), (found.absent, np.full(len(found.absent), -1))):
-        given = (jnp.asarray(own, jnp.float32) for own in (embeddings, texts, found.canonical, pixels, words))
+        given = (jnp.asarray(own, jnp.float32) for own in (embeddings, texts, pixels, words))
         for region, quantile, confidence, thing in zip(*map(np.asarray, _ask(*given)), objects):
             if quantile >= QUANTILE:
                 right = thing >= 0 and found.objects[region] == thing

@@ -49,11 +49,11 @@ from experiments.words.scenes import (
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import iou
 from jsecon.language.membership import finish_votes
-from jsecon.query.anchored import query_anchored
 from jsecon.query.classes import query_classes
-from jsecon.query.match import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD, evidence
+from jsecon.query.match import evidence
 from jsecon.query.render import ALPHA_THRESHOLD, render_selection
-from jsecon.query.several import query_several
+from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
+from jsecon.query.select import query_anchored, query_several
 from jsecon.types import LanguageField, Regions, Votes
 from jsecon.vision.reference_words import reference_of
 

@@ -32,11 +32,11 @@ from experiments.tables.setting import Setting
 from jsecon.fit.start import gaussians_from_points
 from jsecon.language.votes import region_votes
 from jsecon.process import clear_programs
-from jsecon.query.anchored import found_of, query_anchored
-from jsecon.query.match import CONTRAST_THRESHOLD, RETRIEVAL_THRESHOLD
+from jsecon.query.match import match_regions
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import parts_instead, query_parts
-from jsecon.query.several import query_several
+from jsecon.query.parts import parts_fallback
+from jsecon.query.rules import RETRIEVAL_THRESHOLD, QueryRules
+from jsecon.query.select import query_anchored, query_several
 from jsecon.types import LanguageField
 
 AS_IT_IS = "as it is"
@@ -48,7 +48,7 @@ LEAST = 5
 """points of an object that is judged"""
 QUANTILES = (0.8, 0.9, 0.95, 0.98)
 """of the reference words' similarities with their best regions, above which a text is answered"""
-CONSTANTS = {"contrast": CONTRAST_THRESHOLD, "cosine": RETRIEVAL_THRESHOLD}
+CONSTANTS = {"cosine": RETRIEVAL_THRESHOLD}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +98,9 @@ Row = Callable[[Setting, LanguageField, int], Any]
 
 
 def anchored(change: Callable[[LanguageField], LanguageField] = lambda field: field, **query: Any) -> Row:
-    """A field that is changed, asked with other options `query` of `query_anchored`."""
-    options = {"retrieval_threshold": NO_REFUSAL, **query}
-    return lambda setting, field, k: query_anchored(change(field), jnp.asarray(setting.texts[k]), **options)
+    """A field that is changed, asked by other rules `query`."""
+    rules = QueryRules(**{"retrieval_threshold": NO_REFUSAL, **query})
+    return lambda setting, field, k: query_anchored(change(field), jnp.asarray(setting.texts[k]), rules=rules)
 
 
 def without_evidence(field: LanguageField) -> LanguageField:
@@ -110,20 +110,17 @@ def without_evidence(field: LanguageField) -> LanguageField:
 
 def every_region(setting: Setting, field: LanguageField, k: int) -> Any:
     """All regions that answer."""
-    return query_several(field, jnp.asarray(setting.texts[k])[None], retrieval_threshold=NO_REFUSAL)
-
-
-def answering(setting: Setting, field: LanguageField, k: int) -> Any:
-    """Of them the parts that answer."""
-    field = dataclasses.replace(field, parts=parts_of(setting))
-    return query_parts(field, every_region(setting, field, k), jnp.asarray(setting.texts[k])[None])
+    return query_several(
+        field, jnp.asarray(setting.texts[k])[None], rules=QueryRules(all_of_kind=True, retrieval_threshold=NO_REFUSAL)
+    )
 
 
 def instead(setting: Setting, field: LanguageField, k: int) -> Any:
     """The parts that answer where no region does."""
     text = jnp.asarray(setting.texts[k])
-    found = query_anchored(field, text, retrieval_threshold=NO_REFUSAL)
-    other = parts_instead(dataclasses.replace(field, parts=parts_of(setting)), text, found.score)
+    found = query_anchored(field, text, rules=QueryRules(retrieval_threshold=NO_REFUSAL))
+    rules = QueryRules(retrieval_threshold=NO_REFUSAL)
+    other = parts_fallback(dataclasses.replace(field, parts=parts_of(setting)), text, found.score, rules)
     return found if other is None else other.selection
 
 
@@ -136,12 +133,11 @@ ROWS: dict[str, Row] = {
     "pieces at 0.75 of the way": anchored(piece_threshold=0.75),
     "none alike": anchored(alike_threshold=None),
     "all regions that answer": every_region,
-    "parts that answer": answering,
     "parts where no region answers": instead,
     "refusing by the constant": anchored(retrieval_threshold=None),
     "by the plain cosine, refusing by its constant": anchored(retrieval="cosine", retrieval_threshold=None),
 }
-OF_PARTS = ("parts that answer", "parts where no region answers")
+OF_PARTS = ("parts where no region answers",)
 """rows that are asked of consensus alone"""
 
 
@@ -168,7 +164,8 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
 
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:
     """(Q,) the similarity of each text's best region."""
-    ask = lambda text: found_of(field, text, retrieval=retrieval, retrieval_threshold=NO_REFUSAL).score
+    rules = QueryRules(retrieval=retrieval, retrieval_threshold=NO_REFUSAL)
+    ask = lambda text: match_regions(field, text[None], rules).score
     return np.array([float(ask(jnp.asarray(text))) for text in texts])
 
 

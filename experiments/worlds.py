@@ -31,8 +31,8 @@ under which no answer would be left to be told from another"""
 FRAMES = "kinds", "camouflage"
 """faults of the labels and of the pictures (options of the twins' writer), not of the vision"""
 FAULTS = (*(field.name for field in dataclasses.fields(World)), *FRAMES)
-READ = ("relevancy, threshold", *(f"contrast, threshold{way}" for way in ("", ", all", ", parts")))
-READ += tuple(f"contrast, {kind} silhouette{way}" for kind in ("strict", "lenient") for way in ("", ", parts", SHARP))
+READ = ("relevancy, threshold", *(f"contrast, threshold{way}" for way in ("", ", all")))
+READ += tuple(f"contrast, {kind} silhouette{way}" for kind in ("strict", "lenient") for way in ("", SHARP))
 READ_TRAINED = (*READ, fair.PUBLISHED, "one mask", "cosine, threshold")
 """of methods that train; with any of their own constants ("16 roots", "one mask", 0.98)"""
 LEFT_OUT = "ours, outspoken views", WITH_PARTS

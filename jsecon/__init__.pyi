@@ -15,10 +15,6 @@ from .evaluate.metrics import (
     mean_iou as mean_iou,
 )
 from .language.autoencoder import Autoencoder as Autoencoder, train_autoencoder as train_autoencoder
-from .language.blocks import (
-    codes_in_blocks as codes_in_blocks,
-    region_votes_in_blocks as region_votes_in_blocks,
-)
 from .language.distill import distill_l1 as distill_l1, distill_votes as distill_votes
 from .language.field import check_field as check_field, load_field as load_field, save_field as save_field
 from .language.membership import (
@@ -28,17 +24,28 @@ from .language.membership import (
     with_shown as with_shown,
 )
 from .language.regions import region_embeddings as region_embeddings
-from .language.votes import region_votes as region_votes
+from .language.streaming import (
+    codes_in_blocks as codes_in_blocks,
+    finish_votes_in_blocks as finish_votes_in_blocks,
+    region_votes_in_blocks as region_votes_in_blocks,
+)
+from .language.votes import region_votes as region_votes, scan_region_votes as scan_region_votes
 from .parallel import host_mesh as host_mesh
-from .query.anchored import query_anchored as query_anchored, query_region as query_region
 from .query.baselines import query_canonical as query_canonical, query_one_step as query_one_step
 from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
+from .query.match import RegionMatch as RegionMatch, match_regions as match_regions
 from .query.outliers import remove_outliers as remove_outliers
 from .query.outline import lift as lift
 from .query.pixel import region_at as region_at
 from .query.render import selection_mask as selection_mask
-from .query.several import query_several as query_several
+from .query.rules import QueryRules as QueryRules
+from .query.select import (
+    query_anchored as query_anchored,
+    query_region as query_region,
+    query_several as query_several,
+    select_gaussians as select_gaussians,
+)
 from .query.similarity import unit_codes as unit_codes
 from .splat.capacity import plan_capacity as plan_capacity
 from .splat.plan import plan_view as plan_view, render_plan as render_plan

@@ -13,11 +13,10 @@ from small_field import REGIONS, field_of, make_field, shares, true_regions, uni
 from jsecon.errors import InputError
 from jsecon.language.membership import finish_votes, vote_shares, with_shown
 from jsecon.language.votes import region_votes
-from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.classes import query_classes
-from jsecon.query.match import contrasts
 from jsecon.query.pixel import pixel_weights, region_at, region_shares_at
-from jsecon.query.several import query_several
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import query_anchored, query_region, query_several
 from jsecon.splat.render import render
 from jsecon.types import Regions, Votes
 
@@ -65,7 +64,7 @@ def test_a_region_has_the_same_members_however_it_is_asked_for(made, shown):
             "number": query_region(field, region),
             "pixel": under[region],
             "--all": query_several(field, text[None]),
-            "one": query_several(field, text[None], several=False),
+            "one": query_several(field, text[None], rules=QueryRules()),
             "but not": others,
         }.items():
             np.testing.assert_array_equal(selection.mask, expected, err_msg=way)
@@ -81,7 +80,9 @@ def test_a_text_like_a_region_finds_it_and_its_gaussians(field, region):
     got = query_anchored(field, text)
     assert int(got.region) == region
     cosine = exact_cosine(field.regions.embeddings[[region]], text)[0]
-    assert float(query_anchored(field, text, retrieval="cosine").score) == pytest.approx(cosine, abs=1e-6)
+    assert float(query_anchored(field, text, rules=QueryRules(retrieval="cosine")).score) == pytest.approx(
+        cosine, abs=1e-6
+    )
     share = shares(field, [region])
     np.testing.assert_allclose(got.similarity, share, atol=1e-6)
     np.testing.assert_array_equal(got.mask, share >= 0.5)
@@ -118,12 +119,16 @@ def test_a_region_asked_for_by_its_number_is_the_same(field):
 
 def test_nothing_passes_a_retrieval_threshold_that_no_region_reaches(field):
     text = unit_rows(np.random.default_rng(9), 1, 12)[0]
-    given = field.regions.embeddings, text, field.canonical, field.regions.pixels
-    largest = {"cosine": exact_cosine(*given[:2]).max(), "contrast": float(contrasts(*given)[0].max())}
-    for by, (retrieval, best) in itertools.product(("votes", "code"), largest.items()):
-        ask = functools.partial(query_anchored, field, text, by=by, retrieval=retrieval)
-        assert int(ask(retrieval_threshold=best - 1e-4).region) >= 0
-        nothing = ask(retrieval_threshold=best + 1e-4, similarity_threshold=-1.0)
+    words = unit_rows(np.random.default_rng(10), 30, 12)
+    worded = dataclasses.replace(field, reference=words)
+    directions = {"cosine": text, "apart": text - words.mean(0)}
+    for by, (retrieval, direction) in itertools.product(("votes", "code"), directions.items()):
+        ask = functools.partial(query_anchored, worded, text, by=by)
+        rules = functools.partial(QueryRules, retrieval=retrieval)
+        best = float(ask(rules=rules(retrieval_threshold=-1.0)).score)
+        assert np.abs(exact_cosine(field.regions.embeddings, direction) - best).min() < 1e-6
+        assert int(ask(rules=rules(retrieval_threshold=best - 1e-4)).region) >= 0
+        nothing = ask(rules=rules(retrieval_threshold=best + 1e-4), similarity_threshold=-1.0)
         assert int(nothing.region) == -1
         assert not nothing.mask.any()
         assert float(nothing.score) == pytest.approx(best, abs=1e-6)  # how close it was is still told
@@ -145,13 +150,16 @@ def test_regions_that_are_alike_count_as_one(field):
     pixels = np.array(field.regions.pixels)
     embeddings[4], pixels[4] = embeddings[1], pixels[1]  # of two that are as well known the first is the anchor
     twin = dataclasses.replace(field, regions=Regions(embeddings, pixels))
-    alone, both = query_anchored(twin, embeddings[1], alike_threshold=None), query_anchored(twin, embeddings[1])
+    alone, both = (
+        query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=None)),
+        query_anchored(twin, embeddings[1]),
+    )
     np.testing.assert_allclose(alone.similarity, shares(field, [1]), atol=1e-6)
     np.testing.assert_allclose(both.similarity, shares(field, [1, 4]), atol=1e-6)
     np.testing.assert_allclose(query_region(twin, 4).similarity, shares(field, [4]), atol=1e-6)
-    pointed = query_region(twin, 4, alike_threshold=0.9)
+    pointed = query_region(twin, 4, rules=QueryRules(alike_threshold=0.9, piece_threshold=None))
     np.testing.assert_allclose(pointed.similarity, both.similarity, atol=1e-6)
-    unlike = query_anchored(twin, embeddings[1], alike_threshold=1.5)
+    unlike = query_anchored(twin, embeddings[1], rules=QueryRules(alike_threshold=1.5))
     np.testing.assert_allclose(unlike.similarity, alone.similarity, atol=1e-6)  # the anchor itself always counts
 
 
@@ -200,8 +208,8 @@ def test_a_view_that_lost_the_region_says_nothing_against_it():
     found = query_anchored(known, text)
     assert np.asarray(found.mask).tolist() == [True, False, False]
     np.testing.assert_allclose(found.similarity, [0.8, 0.2, 0], rtol=1e-6)
-    np.testing.assert_allclose(query_several(known, text[None], several=False).similarity, found.similarity)
-    both = query_several(known, jnp.eye(2, 8), several=False)
+    np.testing.assert_allclose(query_several(known, text[None], rules=QueryRules()).similarity, found.similarity)
+    both = query_several(known, jnp.eye(2, 8), rules=QueryRules())
     np.testing.assert_allclose(both.similarity, [0.45, 0.55, 0], rtol=1e-6)  # the views that show either
 
 
@@ -230,7 +238,7 @@ def test_numbers_that_are_not_finite_never_select(field):
 @pytest.mark.parametrize("by", ["votes", "code"])
 def test_broken_texts_and_regions_select_nothing(field, by):
     for text in (np.zeros(12), np.full(12, np.nan), np.r_[np.inf, np.zeros(11)]):
-        got = query_anchored(field, text.astype(np.float32), retrieval_threshold=-1.0, by=by)
+        got = query_anchored(field, text.astype(np.float32), rules=QueryRules(retrieval_threshold=-1.0), by=by)
         assert int(got.region) == -1
         assert not got.mask.any()
         assert float(got.score) == 0
@@ -240,7 +248,7 @@ def test_broken_texts_and_regions_select_nothing(field, by):
     got = query_anchored(
         dataclasses.replace(field, regions=Regions(embeddings, field.regions.pixels)),
         text,
-        retrieval_threshold=-1.0,
+        rules=QueryRules(retrieval_threshold=-1.0),
         by=by,
     )
     assert int(got.region) in (2, 3, 4)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from jsecon.app import ask, cli
-from jsecon.language import field as field_file, membership
+from jsecon.language import columns, field as field_file
 from jsecon.language.field import load_field, save_field, subset_field
-from jsecon.query import pixel
 from jsecon.types import Parts
 from jsecon.vision.colours import ColourEmbedder
 
@@ -21,8 +20,7 @@ def forced(monkeypatch):
     """No room in memory, every column on disk, a handful of blocks."""
     monkeypatch.setenv("JSECON_MEMORY", "1e-9")
     monkeypatch.setattr(field_file, "MAPPED", 0)
-    monkeypatch.setattr(membership, "ROWS", 700)
-    monkeypatch.setattr(pixel, "ROWS", 700)
+    monkeypatch.setattr(columns, "ROWS", 700)
 
 
 def _query(field, out, *more):

@@ -12,23 +12,17 @@ from small_field import make_field
 from test_votes import REGIONS, expected, labels  # noqa: F401
 
 from jsecon.errors import InputError
-from jsecon.language import blocks as module, membership
-from jsecon.language.blocks import codes_in_blocks, region_votes_in_blocks
+from jsecon.language import columns, streaming, votes as votes_module
 from jsecon.language.distill import distill_votes
 from jsecon.language.field import load_field, save_field
-from jsecon.language.membership import with_overlap, with_shown
-from jsecon.language.records import strongest
+from jsecon.language.membership import finish_votes, with_overlap
+from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks, strongest
 from jsecon.language.votes import region_votes
-from jsecon.query.anchored import query_anchored
 from jsecon.query.blocks import query_in_blocks
-from jsecon.splat import bands
+from jsecon.query.select import query_anchored
+from jsecon.splat.render import render_rgb
+from jsecon.splat.visible import padded_size, render_in_blocks, visible_rows
 from jsecon.types import Camera, Gaussians, Regions, Votes
-
-
-@pytest.fixture
-def small_bands(monkeypatch):
-    """Eight splats in a band: the 64 Gaussians of the scene are composited in a dozen of them."""
-    monkeypatch.setattr(bands, "BAND", 8)
 
 
 def ball(count, views, width, height, *, opaque=0.0, seed=0):
@@ -66,7 +60,6 @@ def test_equal_to_votes_in_memory_and_to_the_oracle(
     labels,
     expected,
     tmp_path,
-    small_bands,
     rows,
 ):
     memory = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
@@ -83,24 +76,23 @@ def test_equal_to_votes_in_memory_and_to_the_oracle(
     )
 
 
-def test_few_splats_held_at_once_and_weights_at_the_centre(
+def test_weights_at_the_centre(
     scene,
     cameras,
     labels,
     tmp_path,
-    small_bands,
 ):
     how = {"top": REGIONS, "centre": 0.7}
     memory = region_votes(scene, cameras, labels, REGIONS, **how)
-    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "v", rows=16, most_held=9)
+    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "v", rows=16)
     assert_alike(cast, memory)
     np.testing.assert_array_equal(cast.regions, memory.regions)
 
 
 @pytest.mark.parametrize("opaque", [0.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
-    """40,000, more than a band holds, all visible; opaque, most lie behind what stopped every pixel."""
-    monkeypatch.setattr(bands, "BAND", 4096)
+    """40,000, all visible; opaque, most lie behind what stopped every pixel. Dense blocks hold two regions each."""
+    monkeypatch.setattr(votes_module, "_DENSE_BYTES", 4 * 2 * 40_960)
     scene, cameras = ball(40_000, 3, 160, 120, opaque=opaque)
     labels = blocky(np.random.default_rng(1), 3, 120, 160, 7)
     memory = region_votes(scene, cameras, labels, 7, top=3)
@@ -111,7 +103,7 @@ def test_equal_at_many_gaussians(tmp_path, monkeypatch, opaque):
     np.testing.assert_allclose(cast.cut, memory.cut, rtol=1e-4, atol=1e-3)
 
 
-def test_equal_depths_keep_the_order_of_indices_across_bands(tmp_path, small_bands):
+def test_equal_depths_keep_the_order_of_indices(tmp_path):
     """Thirty Gaussians in one place: each sees what those before it leave."""
     one, cameras = ball(1, 1, 40, 40)
     scene = jax.tree.map(lambda a: np.repeat(a, 30, 0), one)
@@ -124,26 +116,44 @@ def test_equal_depths_keep_the_order_of_indices_across_bands(tmp_path, small_ban
     assert_alike(cast, memory)
 
 
-def test_shown_is_that_of_votes_by_view(scene, cameras, labels, tmp_path, small_bands, monkeypatch):
+def test_finished_votes_are_those_in_memory(scene, cameras, labels, tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     embeddings = rng.normal(size=(REGIONS, 4)).astype(np.float32)
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)
     pixels[:5, 1] = 0  # as if the noise of that view showed but half of them
     regions = Regions(embeddings, pixels)
-    memory = with_shown(region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True), regions)
-    cast = region_votes_in_blocks(
-        scene, cameras, labels, REGIONS, top=4, folder=tmp_path / "v", rows=16, regions=regions
-    )
-    np.testing.assert_array_equal(cast.regions, memory.regions)
-    np.testing.assert_allclose(cast.shown, memory.shown, rtol=1e-5, atol=1e-6)
-    monkeypatch.setattr(membership, "_BLOCK", 24)
+    whole = region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True)
+    memory = finish_votes(whole, regions)
+    monkeypatch.setattr(columns, "ROWS", 24)
     how = {"top": 4, "rows": 16, "by_view": True}
-    kept = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "w")
-    whole = region_votes(scene, cameras, labels, REGIONS, top=4, by_view=True).by_view
-    assert isinstance(kept.by_view, np.memmap)
-    np.testing.assert_allclose(kept.by_view, whole, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(with_shown(kept, regions).shown, memory.shown, rtol=1e-5, atol=1e-6)
+    cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "w")
+    assert isinstance(cast.by_view, np.memmap)
+    np.testing.assert_array_equal(cast.regions, memory.regions)
+    np.testing.assert_allclose(cast.by_view, whole.by_view, rtol=1e-5, atol=1e-5)
+    blocks, one = finish_votes_in_blocks(cast, regions), finish_votes_in_blocks(whole, regions)
+    for finished in (blocks, one):
+        np.testing.assert_allclose(finished.shown, memory.shown, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(finished.overlap, memory.overlap, rtol=1e-5, atol=1e-6)
+
+
+def test_a_view_is_rendered_from_what_it_can_see():
+    scene, cameras = ball(3_000, 3, 60, 40)
+    scene.means[:1500, 0] += 50  # beside every view
+    for t in range(3):
+        ids = visible_rows(scene, cameras[t], rows=700)
+        assert 0 < len(ids) <= 1500
+        assert (ids >= 1500).all()
+        expected = render_rgb(scene, cameras[t]).features
+        np.testing.assert_allclose(render_in_blocks(scene, cameras[t]), expected, atol=1e-5)
+    away = scene.means.copy()
+    away[:, 0] += 500
+    empty = dataclasses.replace(scene, means=away)
+    np.testing.assert_array_equal(render_in_blocks(empty, cameras[0]), 0)
+    sizes = [padded_size(count) for count in range(0, 1_000_000, 999)]
+    assert sizes == sorted(sizes)
+    assert len(set(sizes)) < 64
+    assert all(count <= size <= max(1.13 * count, 4096) for count, size in zip(range(0, 1_000_000, 999), sizes))
 
 
 def test_no_regions_no_gaussians_and_labels_of_nothing(scene, cameras, labels, tmp_path):
@@ -184,8 +194,6 @@ def test_what_does_not_fit_raises(scene, cameras, camera, labels, tmp_path):
         cast(scene, cameras, labels[:2])
     with pytest.raises(ValueError, match="size"):
         cast(scene, cameras, labels[:, 1:])
-    with pytest.raises(ValueError, match=r"regions\.pixels"):
-        cast(scene, cameras, labels, regions=Regions(np.ones((2, 4), np.float32), np.ones((2, 4), np.int32)))
     (tmp_path / "v").mkdir(exist_ok=True)
     (tmp_path / "v" / "mine").touch()
     with pytest.raises(InputError, match="not empty"):
@@ -195,11 +203,11 @@ def test_what_does_not_fit_raises(scene, cameras, camera, labels, tmp_path):
         region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "file" / "v")
 
 
-def test_a_full_disk_is_told_and_the_spool_removed(scene, cameras, labels, tmp_path, monkeypatch):
+def test_a_full_disk_is_told_and_the_scratch_folder_removed(scene, cameras, labels, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module, "append", full)
+    monkeypatch.setattr(streaming.np, "save", full)
     with pytest.raises(InputError, match="No space left"):
         region_votes_in_blocks(scene, cameras, labels, REGIONS, folder=tmp_path / "v")
     assert not list((tmp_path / "v").iterdir())
@@ -225,14 +233,13 @@ def fields(scene, cameras, tmp_path, monkeypatch):
     field = dataclasses.replace(field, votes=with_overlap(field.votes))
     save_field(tmp_path / "a.safetensors", field)
     monkeypatch.setattr(home, "MAPPED", 0)
-    monkeypatch.setattr(membership, "ROWS", 10)
+    monkeypatch.setattr(columns, "ROWS", 10)
     return field, load_field(tmp_path / "a.safetensors", mapped=True)
 
 
 def test_overlap_and_codes_of_mapped_votes(fields, tmp_path):
     field, mapped = fields
     assert isinstance(mapped.votes.regions, np.memmap)
-    np.testing.assert_allclose(with_overlap(mapped.votes).overlap, field.votes.overlap, atol=1e-6)
     for reduce in ("mode", "mean"):
         codes = codes_in_blocks(mapped.votes, field.region_codes, tmp_path / f"{reduce}.npy", reduce)
         assert isinstance(codes, np.memmap)
@@ -248,14 +255,13 @@ def test_queries_of_a_mapped_field_are_those_in_memory(fields, by):
     assert sum(len(own.gaussians) for own in chosen) > 0
     for text, own in zip(texts, chosen):
         memory, blocks = query_anchored(field, text, by=by), query_anchored(mapped, text, by=by)
-        assert isinstance(blocks.mask, np.ndarray)
         np.testing.assert_array_equal(blocks.mask, memory.mask)
         np.testing.assert_array_equal(blocks.similarity, memory.similarity)
         np.testing.assert_array_equal(own.gaussians, np.flatnonzero(memory.mask))
         np.testing.assert_array_equal(own.similarity, np.asarray(memory.similarity)[own.gaussians])
         assert own.region == int(memory.region)
         assert own.score == pytest.approx(float(memory.score), rel=1e-6)
-    with pytest.raises(ValueError, match="query_in_blocks"):
+    with pytest.raises(ValueError, match="match_regions"):
         query_in_blocks(mapped, texts[:, 1:])
     none = dataclasses.replace(mapped, regions=Regions(np.zeros((0, 12), np.float32), np.zeros((0, 4), np.int32)))
     assert [own.region for own in query_in_blocks(none, texts)] == [-1] * len(texts)

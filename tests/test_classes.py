@@ -10,7 +10,7 @@ import pytest
 from small_field import seen_of, unit_rows
 
 from jsecon.query import classes
-from jsecon.query.match import contrasts
+from jsecon.query.rules import QueryRules
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
 from jsecon.vision.protocols import Logits
 
@@ -41,8 +41,8 @@ def made_field(count, *, regions=REGIONS, seed=0):
     )  # fmt: skip
 
 
-def exact(field, similarity, least, clear):
-    """The formula in float64 from (R, Q) similarities and (R,) lengths, one Gaussian after the other; and its share
+def exact(field, similarity, least):
+    """The formula in float64 from (R, Q) similarities, one Gaussian after the other; and its share
     (N, Q) of each class's regions."""
     votes, found, parts = field.votes, [], []
     similarity = np.asarray(similarity, np.float64)
@@ -52,26 +52,24 @@ def exact(field, similarity, least, clear):
         own = [[(float(w), float(s)) for r, w, s in zip(ids, weights, shown) if r >= 0 and speaks[r] and best[r] == q]
                for q in range(similarity.shape[1])]  # fmt: skip
         parts.append([sum(w for w, _ in row) / max(s for _, s in row) if row else 0 for row in own])
-        share = {r: p * float(clear[r]) for r, p in share.items() if speaks[r]} or {
-            r: p * float(clear[r]) for r, p in share.items()
-        }
+        share = {r: p for r, p in share.items() if speaks[r]} or share
         found.append(sum(p * similarity[r] for r, p in share.items()) / sum(share.values()))
     return np.array(found), np.array(parts)
 
 
-@pytest.mark.parametrize(("retrieval", "count"), [("contrast", 600), ("cosine", 60)])
+@pytest.mark.parametrize(("retrieval", "count"), [("apart", 600), ("cosine", 60)])
 def test_equals_the_formula(retrieval, count):
     field, texts = made_field(count), unit_rows(np.random.default_rng(1), 5, SIZE)
     known = field.regions
-    similarity, clear = known.embeddings @ texts.T, np.ones(REGIONS)
-    if retrieval == "contrast":
-        rows, pixels = np.asarray(known.embeddings, np.float64), known.pixels.sum(1)
-        clear = np.linalg.norm(rows - REGIONS / (REGIONS + 1) * pixels @ rows / pixels.sum(), axis=1)
-        similarity = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1)
+    similarity = known.embeddings @ texts.T
+    if retrieval == "apart":
+        field = dataclasses.replace(field, reference=unit_rows(np.random.default_rng(6), 20, SIZE))
+        directions = texts - field.reference.astype(np.float64).mean(0)
+        similarity = known.embeddings @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     least = float(np.sort(similarity.max(1))[2]) - 1e-4  # two regions are none of the classes
-    options = {"retrieval": retrieval, "retrieval_threshold": least}
+    options = {"rules": QueryRules(retrieval=retrieval, retrieval_threshold=least)}
     labels, found = query_classes(field, texts, every=True, **options)
-    expected, part = exact(field, similarity, least, clear)
+    expected, part = exact(field, similarity, least)
     np.testing.assert_allclose(found, expected, atol=2e-6)
     first, second = np.sort(expected, axis=1)[:, -1], np.sort(expected, axis=1)[:, -2]
     clear = first - second > 1e-5
@@ -123,7 +121,7 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     lost = np.array(field.regions.embeddings)
     lost[2] = 0
     known = Regions(lost, field.regions.pixels)
-    ask = {"retrieval": "cosine", "retrieval_threshold": -1.0}
+    ask = {"rules": QueryRules(retrieval="cosine", retrieval_threshold=-1.0)}
     labels, found = query_classes(dataclasses.replace(field, regions=known), texts, **ask)
     ids, weights, shown = (np.array(a) for a in (field.votes.regions, field.votes.weights, field.votes.shown))
     ids[ids == 2] = -1
@@ -133,7 +131,7 @@ def test_regions_and_texts_without_a_direction_are_nobodys():
     np.testing.assert_allclose(found, same, atol=1e-6)
     assert 0.5 < (np.asarray(labels) >= 0).mean() < 1
     opposite = np.concatenate([-lost.sum(0, keepdims=True), np.zeros((1, SIZE), np.float32)]).astype(np.float32)
-    labels, _ = query_classes(field, opposite, retrieval="cosine", every=True)
+    labels, _ = query_classes(field, opposite, rules=QueryRules(retrieval="cosine"), every=True)
     assert not np.asarray(labels).any()  # the worst of texts is nearer than none
     labels, _ = query_classes(field, opposite[1:])
     assert (np.asarray(labels) == -1).all()
@@ -152,35 +150,21 @@ def test_a_region_that_is_none_of_the_classes_speaks_where_no_other_does():
     votes = dataclasses.replace(field.votes, regions=ids, weights=weights, **seen)
     field = dataclasses.replace(field, regions=known, votes=votes)
     texts = np.float32(np.stack([known.embeddings[0], known.embeddings[1] + 0.05 * known.embeddings[2]]))
-    labels, found = query_classes(field, texts, retrieval="cosine", every=True)
+    labels, found = query_classes(field, texts, rules=QueryRules(retrieval="cosine"), every=True)
     np.testing.assert_array_equal(labels, [0, 1, 1])  # the second was seen in the region of no class alone
-    np.testing.assert_array_equal(query_classes(field, texts, retrieval="cosine")[0], [0, -1, 1])
+    np.testing.assert_array_equal(query_classes(field, texts, rules=QueryRules(retrieval="cosine"))[0], [0, -1, 1])
     np.testing.assert_allclose(found[0], [1, 0], atol=1e-6)
     without = dataclasses.replace(field, votes=dataclasses.replace(votes, shown=None))
-    np.testing.assert_array_equal(query_classes(without, texts, retrieval="cosine", every=True)[0], [0, 1, 1])
-
-
-def test_a_surface_like_the_scene_as_a_whole_is_quieter_than_a_thing_on_it():
-    field = made_field(2, regions=3)
-    rows = unit_rows(np.random.default_rng(3), 3, SIZE)
-    rows = np.linalg.qr(rows.T)[0].T.astype(np.float32)  # a table, and two things on it
-    known = Regions(rows, np.int32([[900, 900], [20, 20], [20, 20]]))
-    weights = np.float32([[6, 4, 0], [9.9, 0.1, 0]])  # the foot of a thing, and the table
-    votes = dataclasses.replace(
-        field.votes, regions=np.int32([[0, 1, -1]] * 2), weights=weights, shown=np.float32([[10, 10, 0]] * 2)
+    np.testing.assert_array_equal(
+        query_classes(without, texts, rules=QueryRules(retrieval="cosine"), every=True)[0], [0, 1, 1]
     )
-    field = dataclasses.replace(field, regions=known, votes=votes, canonical=np.zeros((4, SIZE), np.float32))
-    labels, _ = query_classes(field, rows, every=True)
-    np.testing.assert_array_equal(labels, [1, 0])
-    for retrieval in ("contrast", "cosine"):  # who asks for the thing does not get its foot: nor by class
-        np.testing.assert_array_equal(query_classes(field, rows, retrieval=retrieval)[0], [0, 0])
 
 
 def test_a_probability_refuses_classes_as_it_refuses_texts():
     field, texts, rows = made_field(600), unit_rows(np.random.default_rng(1), 5, SIZE), np.arange(REGIONS)
     known = field.regions
     cosines = np.asarray(known.embeddings, np.float64) @ texts.T
-    best = np.stack([contrasts(known.embeddings, t, field.canonical, known.pixels)[0] for t in texts], 1).argmax(1)
+    best = cosines.argmax(1)
     own = np.sort(cosines[rows, best])  # a region is of its best class, or of none
     logits = Logits(40.0, float(np.log(0.01 / 0.99) - 40 * (own[2] + own[3]) / 2))
     there = 1 / (1 + np.exp(-40 * cosines[rows, best] - logits.bias)) >= 0.01
@@ -190,13 +174,13 @@ def test_a_probability_refuses_classes_as_it_refuses_texts():
     for q in range(5):
         inside = (ids >= 0) & np.isin(ids, rows[there & (best == q)])
         part[:, q] = np.where(inside, weights, 0).sum(1) / np.maximum(np.where(inside, shown, 0).max(1), 1e-9)
-    labels, _ = query_classes(field, texts, logits=logits)
+    labels, _ = query_classes(field, texts, rules=QueryRules(logits=logits))
     sure = (np.abs(part - 0.5) > 1e-5).all(1)
     np.testing.assert_array_equal((np.asarray(labels) >= 0)[sure], (part >= 0.5).any(1)[sure])
     assert 0.1 < (np.asarray(labels) < 0).mean() < 0.9
-    assert (np.asarray(query_classes(field, texts, logits=Logits(40.0, -1000.0))[0]) == -1).all()
-    every, _ = query_classes(field, texts, logits=logits, retrieval_threshold=0.0)
-    np.testing.assert_array_equal(every, query_classes(field, texts, retrieval_threshold=-2.0)[0])
+    assert (np.asarray(query_classes(field, texts, rules=QueryRules(logits=Logits(40.0, -1000.0)))[0]) == -1).all()
+    every, _ = query_classes(field, texts, rules=QueryRules(logits=logits, retrieval_threshold=0.0))
+    np.testing.assert_array_equal(every, query_classes(field, texts, rules=QueryRules(retrieval_threshold=-2.0))[0])
 
 
 def test_refuses_what_it_cannot_ask():
@@ -204,5 +188,5 @@ def test_refuses_what_it_cannot_ask():
     for wrong in (texts[:, :5], texts[:0]):
         with pytest.raises(ValueError, match="query_classes"):
             query_classes(field, wrong)
-    with pytest.raises(ValueError, match="contrast"):
-        query_classes(field, texts, retrieval="nearest")
+    with pytest.raises(ValueError, match="apart"):
+        query_classes(field, texts, rules=QueryRules(retrieval="nearest"))

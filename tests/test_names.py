@@ -18,8 +18,8 @@ from jsecon.data.gaussians.ply import load_ply
 from jsecon.errors import InputError
 from jsecon.files import path_within
 from jsecon.language.field import load_field, save_field
-from jsecon.query.anchored import query_region
-from jsecon.query.several import parts_of_question
+from jsecon.query.composite import parse_query
+from jsecon.query.select import query_region
 from jsecon.vision.colours import ColourEmbedder
 
 HOSTILE = ("/../../evil", "..", "C:\\evil", "a/b", "a\0b", "x" * 4000, "nul", "frame 1", "Frame_1", "frame_1")
@@ -148,7 +148,7 @@ def test_a_capture_that_names_images_outside_its_folder_is_refused(tmp_path, roo
     ],
 )
 def test_quotes_protect_and_are_removed(question, wanted, unwanted):
-    assert parts_of_question(question) == (wanted, unwanted)
+    assert parse_query(question) == (wanted, unwanted)
 
 
 def test_a_lone_quoted_text_is_embedded_without_its_quotes(field, word):

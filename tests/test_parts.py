@@ -5,13 +5,14 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from small_field import field_of, make_field, unit_rows
+from small_field import field_of, unit_rows
 
 from jsecon.app.ask import ask_each, ask_text
 from jsecon.language import field as field_file
 from jsecon.language.field import load_field, save_field
-from jsecon.query.anchored import query_anchored
-from jsecon.query.parts import HELD, THING, answering_parts, part_nearness, parts_instead, query_parts
+from jsecon.query.parts import MIN_REGION_RATIO, PART_THRESHOLD, best_cluster, part_scores, parts_fallback
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import query_anchored
 from jsecon.types import Parts, Regions, Votes
 from jsecon.vision.protocols import Logits
 
@@ -23,71 +24,52 @@ def made_parts(seed=0, count=200, parts=30, dim=16):
     return Parts(rng.integers(-1, parts, count).astype(np.int32), units, rng.random(parts).astype(np.float32))
 
 
-def nearness_in_numpy(parts, text, canonical):
-    units, weight = parts.embeddings.astype(np.float64), parts.weight.astype(np.float64)
+def scores_in_numpy(parts, text, words):
+    units = parts.embeddings.astype(np.float64)
     known = units.any(1)
-    cone = canonical.astype(np.float64).mean(0)
-    cone /= np.linalg.norm(cone)
-    across = text / np.linalg.norm(text)
-    across = across - (across @ cone) * cone
-    mean = known.sum() / (known.sum() + 1) * (weight[known, None] * units[known]).sum(0) / weight[known].sum()
-    apart = units - mean
-    cosine = apart @ across / np.maximum(np.linalg.norm(apart, axis=1) * np.linalg.norm(across), 1e-30)
+    direction = text / np.linalg.norm(text) - words.astype(np.float64).mean(0)
+    cosine = units @ direction / np.maximum(np.linalg.norm(direction), 1e-30)
     middle, best = np.median(cosine[known]), cosine[known].max()
-    near = np.where(known, (cosine - middle) / (best - middle), 0)
-    return np.where(parts.part >= 0, near[np.maximum(parts.part, 0)], 0)
+    scores = np.where(known, (cosine - middle) / (best - middle), 0)
+    return np.where(parts.part >= 0, scores[np.maximum(parts.part, 0)], 0)
 
 
-def test_nearness_is_the_stated_one_compiled_and_over_many_texts():
+def test_part_scores_are_the_stated_ones_compiled_and_over_many_texts():
     parts = made_parts()
     rng = np.random.default_rng(1)
-    texts, canonical = unit_rows(rng, 3, 16), unit_rows(rng, 4, 16)
-    many = jax.vmap(part_nearness, (None, 0, None))(parts, texts, canonical)
+    texts, words = unit_rows(rng, 3, 16), unit_rows(rng, 4, 16)
+    many = jax.vmap(part_scores, (None, 0, None))(parts, texts, words)
     for text, row in zip(texts, many):
-        expected = nearness_in_numpy(parts, text.astype(np.float64), canonical)
+        expected = scores_in_numpy(parts, text.astype(np.float64), words)
         np.testing.assert_allclose(row, expected, atol=1e-4)
-        np.testing.assert_allclose(part_nearness(parts, text, canonical), row, atol=1e-5)
+        np.testing.assert_allclose(part_scores(parts, text, words), row, atol=1e-5)
     assert float(np.max(many)) == pytest.approx(1)
+    plain = part_scores(parts, texts[0], None)
+    np.testing.assert_allclose(plain, scores_in_numpy(parts, texts[0], np.zeros((1, 16))), atol=1e-4)
 
 
 def test_parts_that_are_all_equally_near_answer_nothing():
     parts = Parts(np.zeros(4, np.int32), np.ones((1, 3), np.float32) / 3**0.5, np.ones(1, np.float32))
-    near = part_nearness(parts, np.array([1, 0, 0], np.float32), np.zeros((0, 3), np.float32))
-    np.testing.assert_array_equal(near, np.zeros(4))
+    np.testing.assert_array_equal(part_scores(parts, np.array([1, 0, 0], np.float32), None), np.zeros(4))
 
 
 def test_a_scene_whose_parts_lie_in_no_mask():
     bare = Parts(np.zeros(5, np.int32), np.zeros((1, 2), np.float32), np.zeros(1, np.float32))
-    near = part_nearness(bare, np.ones(2, np.float32), np.zeros((0, 2), np.float32))
-    np.testing.assert_array_equal(near, np.zeros(5))
+    np.testing.assert_array_equal(part_scores(bare, np.ones(2, np.float32), None), np.zeros(5))
 
 
-def test_a_neighbour_of_the_same_region_is_left_out_and_a_second_thing_stays():
-    """Four blobs of one selection: the thing (near 1), its neighbour (0.6), a second one of the kind (0.8), and what
-    touches the thing without answering (0.2)."""
-    rng = np.random.default_rng(0)
-    centres = np.array([[0, 0, 0], [3, 0, 0], [9, 0, 0], [0.3, 0, 0]])
-    means = np.concatenate([c + 0.1 * rng.normal(size=(200, 3)) for c in centres]).astype(np.float32)
-    nearness = np.repeat([1.0, 0.6, 0.8, 0.2], 200).astype(np.float32)
-    kept = answering_parts(np.ones(800, bool), nearness, means)
-    share = kept.reshape(4, 200).mean(1)
-    assert share[0] > 0.95
-    assert share[2] > 0.95
-    np.testing.assert_array_equal(share[[1, 3]], 0)
-
-
-def test_the_nearest_cluster_stays_even_where_none_is_near_and_specks_do_not_rule():
+def test_the_best_cluster_stays_and_specks_do_not_rule():
     rng = np.random.default_rng(0)
     means = np.concatenate([c + 0.1 * rng.normal(size=(n, 3)) for c, n in ((0, 300), (5, 200), (9, 15))])
-    nearness = np.repeat([0.6, 0.55, 0.7], [300, 200, 15])
-    kept = answering_parts(np.ones(515, bool), nearness, means)
+    scores = np.repeat([0.6, 0.55, 0.5], [300, 200, 15])
+    kept = best_cluster(np.ones(515, bool), scores, means)
     assert kept[:300].mean() > 0.95
-    assert not kept[300:500].any()
-    assert not answering_parts(np.zeros(515, bool), nearness, means).any()
+    assert not kept[300:].any()
+    assert not best_cluster(np.zeros(515, bool), scores, means).any()
     few = np.arange(515) < 5
-    np.testing.assert_array_equal(answering_parts(few, nearness, means), few)
+    np.testing.assert_array_equal(best_cluster(few, scores, means), few)
     means[0] = np.nan
-    assert not answering_parts(np.ones(515, bool), nearness, means)[0]
+    assert not best_cluster(np.ones(515, bool), scores, means)[0]
 
 
 class Embedder:
@@ -96,27 +78,6 @@ class Embedder:
 
     def embed_text(self, texts):
         return np.stack([self.rows[text] for text in texts])
-
-
-def test_all_that_answers_leaves_out_parts_that_do_not(scene, cameras):
-    """Of the Gaussians of a region, half lie in a part that looks like another region."""
-    field, _ = make_field(scene, cameras)
-    rows = np.asarray(field.regions.embeddings)
-    embedder = Embedder({"it": rows[0], "other": rows[1]})
-    before = ask_text(field, embedder, "it", several=True, outliers=False)
-    members = np.flatnonzero(before.mask)
-    half = members[np.asarray(field.gaussians.means)[members, 0] > np.median(field.gaussians.means[members, 0])]
-    part = np.full(scene.count, 1, np.int32)
-    part[members], part[half] = 0, 2
-    parts = Parts(part, rows[[0, 1, 2]], np.ones(3, np.float32))
-    with_parts = dataclasses.replace(field, parts=parts)
-    after = ask_text(with_parts, embedder, "it", several=True, outliers=False)
-    assert after.mask.any()
-    assert not after.mask[half].any()
-    assert (np.asarray(after.selection.similarity)[half] <= 0.25).all()
-    np.testing.assert_array_equal(ask_text(with_parts, embedder, "it", outliers=False).mask, before.mask)
-    with pytest.raises(ValueError, match="--parts"):
-        query_parts(field, before.selection, rows[:1])
 
 
 @pytest.fixture(scope="module")
@@ -157,54 +118,51 @@ def across(directions):
 
 
 def pooled_in_numpy(field, mask, text):
-    """The contrast of the Gaussians of `mask`, by the rule of `parts_instead` written out."""
+    """The cosine of the Gaussians of `mask`, by the rule of `parts_fallback` written out."""
     parts, total = field.parts, np.zeros(len(text))
     for p in range(len(parts.weight)):
         own = parts.part == p
         total += parts.weight[p] * (mask & own).sum() / own.sum() * parts.embeddings[p].astype(np.float64)
-    rows = np.concatenate([parts.embeddings, (total / np.linalg.norm(total))[None]]).astype(np.float64)
-    mean = len(rows) / (len(rows) + 1) * (parts.weight[:, None] * rows[:-1]).sum(0) / parts.weight.sum()
-    apart = rows[-1] - mean
-    return apart @ text / np.linalg.norm(apart) / np.linalg.norm(text)
+    return total @ text / np.linalg.norm(total) / np.linalg.norm(text)
 
 
 def test_the_parts_answer_what_no_region_holds(unheld):
     field, directions, thing = unheld
     text, score = directions[4], query_anchored(field, directions[4]).score
-    found = parts_instead(field, text, score)
+    found = parts_fallback(field, text, score)
     selection = found.selection
     np.testing.assert_array_equal(selection.mask, thing == 4)
     assert int(selection.region) == -1
-    assert found.there is None
+    assert found.presence_prob is None
     expected = pooled_in_numpy(field, thing == 4, text.astype(np.float64))
     assert float(selection.score) == pytest.approx(expected, abs=1e-5)
-    near = np.asarray(part_nearness(field.parts, text, field.canonical))
-    on_scale = np.interp(near, [0, THING, 1], [0, 0.5, 1])
+    near = np.asarray(part_scores(field.parts, text, None))
+    on_scale = np.interp(near, [0, PART_THRESHOLD, 1], [0, 0.5, 1])
     np.testing.assert_allclose(selection.similarity, on_scale, atol=1e-6)
     assert on_scale[thing != 4].max() < 0.5
-    assert parts_instead(field, text, HELD * expected + 1e-4) is None  # a region that good holds it
-    assert parts_instead(field, text, HELD * expected - 1e-4) is not None
+    assert parts_fallback(field, text, MIN_REGION_RATIO * expected + 1e-4) is None  # a region that good holds it
+    assert parts_fallback(field, text, MIN_REGION_RATIO * expected - 1e-4) is not None
 
 
 def test_they_are_silent_where_a_region_answers_or_nothing_does(unheld):
     field, directions, _ = unheld
     for text in directions[:4]:
-        assert parts_instead(field, text, query_anchored(field, text).score) is None
-    assert parts_instead(field, across(directions)[1], 0.0) is None
+        assert parts_fallback(field, text, query_anchored(field, text).score) is None
+    assert parts_fallback(field, across(directions)[1], 0.0) is None
     never = dataclasses.replace(field, parts=dataclasses.replace(field.parts, part=np.full(200, -1, np.int32)))
-    assert parts_instead(never, directions[4], 0.0) is None
+    assert parts_fallback(never, directions[4], 0.0) is None
     with pytest.raises(ValueError, match="--parts"):
-        parts_instead(dataclasses.replace(field, parts=None), directions[4], 0.0)
+        parts_fallback(dataclasses.replace(field, parts=None), directions[4], 0.0)
 
 
 def test_a_higher_threshold_takes_fewer_and_a_probability_decides_where_there_is_one(unheld):
     field, directions, thing = unheld
     text = directions[4]
-    strict = parts_instead(field, text, 0.0, similarity_threshold=0.999)
+    strict = parts_fallback(field, text, 0.0, similarity_threshold=0.999)
     assert 0 < np.asarray(strict.selection.mask).sum() < (thing == 4).sum()  # the nearer of its two parts
     likely, unlikely = Logits(20.0, -10.0), Logits(20.0, -40.0)
-    assert parts_instead(field, text, 0.0, logits=likely).there > 0.9
-    assert parts_instead(field, text, 0.0, logits=unlikely) is None
+    assert parts_fallback(field, text, 0.0, QueryRules(logits=likely)).presence_prob > 0.9
+    assert parts_fallback(field, text, 0.0, QueryRules(logits=unlikely)) is None
 
 
 def test_a_text_that_no_region_answers_is_answered_by_parts_in_memory_and_in_blocks(unheld, tmp_path, monkeypatch):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from small_field import make_field, shares
 
-from jsecon.query.anchored import query_anchored, query_region
 from jsecon.query.match import is_piece
-from jsecon.query.several import query_several
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import query_anchored, query_region, query_several
 from jsecon.types import Regions
 
 
@@ -24,7 +24,7 @@ def test_a_piece_is_near_the_text_and_shares_gaussians_with_what_was_chosen():
         best, middle = similarity[known].max(), np.median(similarity[known])
         near = known & (similarity >= middle + 0.5 * (best - middle)) & (best > middle)
         wanted = near & (overlap[chosen].max(0) >= 0.7)
-        got = is_piece(similarity, known, chosen, overlap, nearness=0.5, least=0.7)
+        got = is_piece(similarity, known, chosen, overlap, threshold=0.5, min_overlap=0.7)
         np.testing.assert_array_equal(got, wanted)
     nothing = np.zeros(9, bool)
     assert not np.asarray(is_piece(similarity, nothing, chosen, overlap)).any()
@@ -49,21 +49,21 @@ def with_other(field, overlap, **changes):
     return dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=overlap), **changes)
 
 
-@pytest.mark.parametrize("retrieval", ["cosine", "contrast"])
+@pytest.mark.parametrize("retrieval", ["cosine", "apart"])
 def test_a_text_finds_a_thing_with_its_pieces_but_no_other_of_its_kind(broken, retrieval):
     text = broken.regions.embeddings[0]
-    found = query_anchored(broken, text, retrieval=retrieval)
+    found = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval))
     np.testing.assert_allclose(found.similarity, shares(broken, [0, 1]), atol=1e-6)
     np.testing.assert_array_equal(found.mask, shares(broken, [0, 1]) >= 0.5)
     assert int(found.region) == 0
-    alone = query_anchored(broken, text, retrieval=retrieval, piece_threshold=None)
+    alone = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, piece_threshold=None))
     np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)
     for other in (with_other(broken, np.eye(5, dtype=np.float32)), with_other(broken, None)):  # apart; not known
-        got = query_anchored(other, text, retrieval=retrieval)
+        got = query_anchored(other, text, rules=QueryRules(retrieval=retrieval))
         np.testing.assert_array_equal(got.similarity, alone.similarity)
     by_code = [query_anchored(field, text, by="code").mask for field in (broken, other)]
     np.testing.assert_array_equal(*by_code)
-    none = query_anchored(broken, text, retrieval=retrieval, retrieval_threshold=2.0)
+    none = query_anchored(broken, text, rules=QueryRules(retrieval=retrieval, retrieval_threshold=2.0))
     assert int(none.region) == -1
     assert not np.asarray(none.mask).any()
 
@@ -72,13 +72,13 @@ def test_several_regions_take_their_pieces_with_them(broken):
     text = broken.regions.embeddings[:1]
     apart = with_other(broken, np.eye(5, dtype=np.float32))
     for field, options, regions in (
-        (broken, {"several": False}, [0, 1]),
-        (apart, {"several": False}, [0]),
+        (broken, {"all_of_kind": False}, [0, 1]),
+        (apart, {"all_of_kind": False}, [0]),
         (apart, {"kind_threshold": 0.8}, [0, 1]),
         (broken, {"kind_threshold": 0.99}, [0, 1]),
         (apart, {"kind_threshold": 0.99}, [0]),
     ):
-        found = query_several(field, text, **options)
+        found = query_several(field, text, rules=QueryRules(**{"all_of_kind": True} | options))
         np.testing.assert_allclose(found.similarity, shares(field, regions), atol=1e-6, err_msg=str(options))
 
 
@@ -91,15 +91,19 @@ def test_texts_by_vmap_are_the_loop(broken):
 def test_a_region_takes_its_pieces_with_it_where_that_is_asked_for(broken):
     """As a text would whose embedding is the region's own."""
     for nearness, regions in ((None, [0]), (1.0, [0]), (0.5, [0, 1])):
-        found = query_region(broken, 0, piece_threshold=nearness)
+        found = query_region(broken, 0, rules=QueryRules(piece_threshold=nearness, alike_threshold=None))
         np.testing.assert_allclose(found.similarity, shares(broken, regions), atol=1e-6)
         assert int(found.region) == 0
     unknown = with_other(broken, None)
-    np.testing.assert_allclose(query_region(unknown, 0, piece_threshold=0.5).similarity, shares(broken, [0]), atol=1e-6)
-    assert int(query_region(broken, 99, piece_threshold=0.5).region) == -1
+    np.testing.assert_allclose(
+        query_region(unknown, 0, rules=QueryRules(piece_threshold=0.5, alike_threshold=None)).similarity,
+        shares(broken, [0]),
+        atol=1e-6,
+    )
+    assert int(query_region(broken, 99, rules=QueryRules(piece_threshold=0.5, alike_threshold=None)).region) == -1
 
 
 def test_several_regions_leave_their_pieces_where_that_is_asked_for(broken):
     text = broken.regions.embeddings[:1]
-    alone = query_several(broken, text, several=False, piece_threshold=1.0)
+    alone = query_several(broken, text, rules=QueryRules(piece_threshold=1.0))
     np.testing.assert_allclose(alone.similarity, shares(broken, [0]), atol=1e-6)

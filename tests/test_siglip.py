@@ -21,9 +21,9 @@ from jsecon.networks.clip import ClipEmbedder, find_clip, read_preprocessing
 from jsecon.networks.tokenizer import TextRules, TextTokenizer
 from jsecon.pipeline import networks
 from jsecon.pipeline.models import inspect_models
-from jsecon.query.anchored import query_anchored
-from jsecon.query.match import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, best_presence, contrasts, presence
-from jsecon.query.several import query_several
+from jsecon.query.match import best_presence, presence
+from jsecon.query.rules import PRESENCE_THRESHOLD, RETRIEVAL_THRESHOLD, QueryRules
+from jsecon.query.select import query_anchored, query_several
 from jsecon.vision.protocols import Embedder, Logits
 
 LAYOUTS = ("immich", "transformers.js")
@@ -172,7 +172,7 @@ def test_scale_and_bias_are_read_in_every_layout(folders, layout):
 def test_a_folder_without_them_says_so_and_has_no_probability(tmp_path):
     folder = write_siglip(tmp_path / "model", "immich", logits=False)
     assert ClipEmbedder(folder).logits is None
-    assert "refused by its contrast" in _told(folder)
+    assert "refused by its cosine" in _told(folder)
     assert "logits.json" in _told(folder)
 
 
@@ -192,7 +192,7 @@ def _told(folder) -> str:
     return use.summary
 
 
-# The probability in place of the contrast's threshold
+# The probability in place of the cosine's threshold
 
 
 class Told:
@@ -211,7 +211,7 @@ def field(scene, cameras):
     return make_field(scene, cameras)[0]
 
 
-def test_a_text_is_refused_by_its_probability_and_not_by_its_contrast(field):
+def test_a_text_is_refused_by_its_probability_and_not_by_its_cosine(field):
     embeddings = np.asarray(field.regions.embeddings)
     text = embeddings[2] / np.linalg.norm(embeddings[2])
     plain = query_anchored(field, text)
@@ -221,19 +221,18 @@ def test_a_text_is_refused_by_its_probability_and_not_by_its_contrast(field):
         for shift, there in ((0.1, True), (-0.1, False)):
             given = None if least == PRESENCE_THRESHOLD else least
             logits = Logits(50.0, edge + shift)
-            found = query_anchored(field, text, logits=logits, retrieval_threshold=given)
-            several = query_several(field, text[None], logits=logits, retrieval_threshold=given, several=False)
+            found = query_anchored(field, text, rules=QueryRules(logits=logits, retrieval_threshold=given))
+            several = query_several(field, text[None], rules=QueryRules(logits=logits, retrieval_threshold=given))
             for selection in (found, several):
                 np.testing.assert_array_equal(selection.mask, plain.mask if there else False)
                 assert int(selection.region) == (int(plain.region) if there else -1)
-            assert float(found.score) == float(plain.score)  # the contrast still ranks
-    given = field.regions.embeddings, field.canonical, field.regions.pixels
+            assert float(found.score) == float(plain.score)  # the cosine still ranks
     texts = unit_rows(np.random.default_rng(0), 500, 12)
-    best = [float(contrasts(given[0], text, *given[1:])[0].max()) for text in texts]
+    best = (texts @ (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).T).max(1)
     weak = texts[int(np.argmin(best))]
-    assert min(best) < CONTRAST_THRESHOLD
+    assert min(best) < RETRIEVAL_THRESHOLD
     assert int(query_anchored(field, weak).region) == -1
-    assert int(query_anchored(field, weak, logits=Logits(50.0, 60.0)).region) >= 0
+    assert int(query_anchored(field, weak, rules=QueryRules(logits=Logits(50.0, 60.0))).region) >= 0
 
 
 def test_presence_is_the_sigmoid_of_the_cosine_also_under_jit_and_vmap(field):
@@ -247,8 +246,10 @@ def test_presence_is_the_sigmoid_of_the_cosine_also_under_jit_and_vmap(field):
     given = embeddings.astype(np.float32), texts.astype(np.float32)
     found = jax.jit(jax.vmap(lambda text: presence(given[0], text, Logits(7.0, -2.0))))(given[1])
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    many = jax.vmap(lambda text: query_anchored(field, text, logits=Logits(50.0, -10.0)).region)(given[1])
-    each = [query_anchored(field, text, logits=Logits(50.0, -10.0)).region for text in given[1]]
+    many = jax.vmap(lambda text: query_anchored(field, text, rules=QueryRules(logits=Logits(50.0, -10.0))).region)(
+        given[1]
+    )
+    each = [query_anchored(field, text, rules=QueryRules(logits=Logits(50.0, -10.0))).region for text in given[1]]
     np.testing.assert_array_equal(many, each)
     assert best_presence(field.regions, given[1], np.asarray(-1), None) is None
 

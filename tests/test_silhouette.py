@@ -15,9 +15,9 @@ from jsecon.query.silhouette import (
     WEIGHTS,
     Footprints,
     ascend,
+    choose_views,
     fit_silhouette,
     footprints,
-    views_of,
 )
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.walk import to_tiles
@@ -50,7 +50,7 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
     gaussians, cameras, share = world
     before = share >= 0.5
     after = np.asarray(fit_silhouette(gaussians, cameras, share))
-    views = views_of(gaussians, cameras, before)
+    views = choose_views(gaussians, cameras, before)
     assert expected(gaussians, views, share, after) > expected(gaussians, views, share, before) + 0.005
     assert not after[share <= 0.1].any()
 
@@ -59,7 +59,7 @@ def test_what_is_rendered_fits_better_than_what_the_threshold_takes(world):
 def test_each_weighting_fits_best_what_it_weighs(world):
     gaussians, cameras, share = world
     before = share >= 0.5
-    views = views_of(gaussians, cameras, before)
+    views = choose_views(gaussians, cameras, before)
     fit = lambda weights: np.asarray(fit_silhouette(gaussians, cameras, share, weights=weights))
     found = {weights: fit(weights) for weights in SILHOUETTE_WEIGHTS.values()}
     for weights in SILHOUETTE_WEIGHTS.values():
@@ -72,7 +72,7 @@ def test_footprints_add_up_to_what_a_rendering_absorbs(world):
     gaussians, cameras, share = world
     chosen = share >= 0.5
     open_to = np.flatnonzero((share > 0.3) & (share < 0.9))
-    views = views_of(gaussians, cameras, chosen)
+    views = choose_views(gaussians, cameras, chosen)
     found = footprints(gaussians, views, share, open_to, chosen)
     level = np.array(found.base)
     for c in np.flatnonzero(chosen[open_to]):

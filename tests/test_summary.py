@@ -8,7 +8,7 @@ from small_field import make_field
 from jsecon.app.ask import Answer
 from jsecon.app.outputs import write_answers
 from jsecon.pipeline.progress import Listener
-from jsecon.query.anchored import query_region
+from jsecon.query.select import query_region
 
 
 class Told(Listener):

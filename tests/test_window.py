@@ -23,11 +23,11 @@ from jsecon.fit.photometric import l1, psnr
 from jsecon.language.codes import Rotation, Spread
 from jsecon.language.distill import distill_votes
 from jsecon.language.membership import share_of, with_overlap, with_shown
-from jsecon.query.anchored import query_anchored
 from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.classes import query_classes
-from jsecon.query.match import contrasts
-from jsecon.query.several import query_several
+from jsecon.query.match import region_similarities
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import query_anchored, query_several
 from jsecon.query.similarity import similarities, unit_codes
 from jsecon.splat.project import project
 from jsecon.splat.sh import colours_from_sh
@@ -109,7 +109,7 @@ def share(field, regions):
 def test_anchored(field):
     asked = np.array([0, 3])
     texts = field.regions.embeddings[asked]
-    ask = {"retrieval": "cosine", "alike_threshold": None, "piece_threshold": None}
+    ask = {"rules": QueryRules(retrieval="cosine", alike_threshold=None, piece_threshold=None)}
     by_votes = compiled(lambda text, field: query_anchored(field, text, **ask).similarity, texts, field)
     by_code = compiled(lambda text, field: query_anchored(field, text, by="code", **ask).similarity, texts, field)
     for n, region in enumerate(asked):
@@ -120,7 +120,7 @@ def test_anchored(field):
 @pytest.mark.long
 def test_several(field):
     sets = field.regions.embeddings[np.array([[0, 3], [1, 2]])]
-    ask = {"retrieval": "cosine", "several": False, "kind_threshold": 2.0}
+    ask = {"rules": QueryRules(retrieval="cosine")}
     found = compiled(lambda texts, field: query_several(field, texts, **ask).similarity, sets, field)
     for n, regions in enumerate(([0, 3], [1, 2])):
         np.testing.assert_allclose(found[n], share(field, regions), atol=1e-6)
@@ -129,7 +129,8 @@ def test_several(field):
 @pytest.mark.long
 def test_classes_of_all(field, count):
     sets = unit_rows(np.random.default_rng(2), 10, of_classes.SIZE).reshape(2, 5, -1)
-    ask = {"retrieval": "cosine", "retrieval_threshold": -1.0, "standardise": False, "every": True}
+    rules = QueryRules(retrieval="cosine", retrieval_threshold=-1.0)
+    ask = {"rules": rules, "standardise": False, "every": True}
     labels, found = compiled(lambda texts, field: query_classes(field, texts, **ask), sets, field)
     rows = np.unique(np.linspace(0, count - 1, 2_000).astype(int))
     few = dataclasses.replace(
@@ -137,7 +138,7 @@ def test_classes_of_all(field, count):
     )
     for n, texts in enumerate(sets):
         similarity = np.asarray(field.regions.embeddings, np.float64) @ texts.T
-        expected, _ = of_classes.exact(few, similarity, -1.0, np.ones(REGIONS))
+        expected, _ = of_classes.exact(few, similarity, -1.0)
         np.testing.assert_allclose(found[n][rows], expected, atol=2e-6)
         ordered = np.sort(expected, axis=1)
         clear = ordered[:, -1] - ordered[:, -2] > 1e-5
@@ -145,15 +146,14 @@ def test_classes_of_all(field, count):
 
 
 @pytest.mark.long
-def test_contrasts_of_many_regions(count):
+def test_similarities_of_many_regions(count):
     rng = np.random.default_rng(3)
-    embeddings, texts, phrases = (unit_rows(rng, n, of_retrieval.SIZE) for n in (count, 3, 4))
-    pixels = rng.integers(0, 900, (count, 2))
-    ask = lambda text, *given: contrasts(given[0], text, *given[1:])
-    found, known = compiled(ask, texts, embeddings, phrases, pixels)
+    embeddings, texts, words = (unit_rows(rng, n, of_retrieval.SIZE) for n in (count, 3, 4))
+    ask = lambda text, embeddings, words: region_similarities(embeddings, text, words, "apart")
+    found, known = compiled(ask, texts, embeddings, words)
     assert np.asarray(known).all()
     for n, text in enumerate(texts):
-        np.testing.assert_allclose(found[n], of_retrieval.exact(embeddings, text, phrases, pixels), atol=5e-6)
+        np.testing.assert_allclose(found[n], of_retrieval.exact(embeddings, text, words), atol=5e-6)
 
 
 @pytest.mark.parametrize("shown", [True, pytest.param(False, marks=pytest.mark.long)])

@@ -18,13 +18,12 @@ from jsecon.language.distill import distill_l1, distill_votes
 from jsecon.language.membership import finish_votes, membership_probability
 from jsecon.language.regions import scene_parts
 from jsecon.language.votes import region_votes
-from jsecon.query.anchored import query_anchored
 from jsecon.query.baselines import query_canonical, query_one_step
 from jsecon.query.classes import query_classes
-from jsecon.query.match import PIECE_THRESHOLD
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import parts_instead, query_parts
-from jsecon.query.several import query_several
+from jsecon.query.parts import parts_fallback
+from jsecon.query.rules import PIECE_THRESHOLD, QueryRules
+from jsecon.query.select import query_anchored, query_several
 from jsecon.types import LanguageField, Parts, Regions, Selection, Votes
 
 BY_COSINE = {"retrieval": "cosine"}
@@ -139,7 +138,7 @@ def ask_field(
     field: LanguageField,
     way: str,
     *,
-    retrieval: str = "contrast",
+    retrieval: str = "apart",
     clean: bool = True,
     threshold: float | None = None,
     pieces: bool = False,
@@ -147,20 +146,20 @@ def ask_field(
     retrieval_threshold: float | None = None,
 ) -> Answers:
     """Queries of a field: `way` is votes, all_views (votes, but every view that sees a Gaussian counts), code,
-    probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that answer)
-    and parts (of them the parts that do). `clean` drops outliers, `pieces` joins the regions that are pieces of what
-    the text found; `instead`: by votes, parts answer where no region does (`parts_instead`)."""
+    probability (of the votes; all anchored, by `retrieval`), one_step or canonical; or all (of all regions that
+    answer). `clean` drops outliers, `pieces` joins the regions that are pieces of what the text found; `instead`: by
+    votes, parts answer where no region does (`parts_fallback`)."""
     means = np.asarray(setting.evidence.gaussians.means)
     field = of_all_views(field) if way == "all_views" else field
     phrases = jnp.asarray(field.canonical)
-    nearness = PIECE_THRESHOLD if pieces else None
+    rules = QueryRules(retrieval=retrieval, retrieval_threshold=retrieval_threshold)
+    rules = rules if pieces else dataclasses.replace(rules, piece_threshold=None)
 
     def ask(k: int) -> Selection:
         text = jnp.asarray(setting.texts[k])
-        if way in ("all", "parts"):
-            found = query_several(field, text[None], retrieval=retrieval, retrieval_threshold=retrieval_threshold)
-            if way == "parts":
-                return query_parts(dataclasses.replace(field, parts=parts_of(setting)), found, text[None])
+        if way == "all":
+            every = dataclasses.replace(rules, all_of_kind=True, piece_threshold=PIECE_THRESHOLD)
+            found = query_several(field, text[None], rules=every)
             return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, found.mask, keep="all")))
         if way == "one_step":
             found = query_one_step(
@@ -170,29 +169,29 @@ def ask_field(
             code, canonical = encode(field.autoencoder, text), encode(field.autoencoder, phrases)
             found = query_canonical(field.codes, code, canonical, 0.5 if threshold is None else threshold)
         elif way == "probability":
-            found = query_anchored(field, text, retrieval=retrieval, piece_threshold=nearness)
+            found = query_anchored(field, text, rules=dataclasses.replace(rules, retrieval_threshold=None))
             probability = membership_probability(found.similarity, field.votes)
             inside = (found.region >= 0) & (probability >= (0.5 if threshold is None else threshold))
             found = dataclasses.replace(found, mask=inside)
         else:
             by = "votes" if way == "all_views" else way
-            options = {"retrieval": retrieval, "similarity_threshold": threshold, "piece_threshold": nearness}
-            options["retrieval_threshold"] = retrieval_threshold
-            found = query_anchored(field, text, by=by, **options)
+            found = query_anchored(field, text, rules=rules, by=by, similarity_threshold=threshold)
             whole = dataclasses.replace(field, parts=parts_of(setting)) if instead else field
-            if instead and (other := parts_instead(whole, text, found.score)) is not None:
+            if instead and (other := parts_fallback(whole, text, found.score, rules)) is not None:
                 found = other.selection
         mask = np.asarray(found.mask)
         return dataclasses.replace(found, mask=jnp.asarray(remove_outliers(means, mask))) if clean else found
 
-    if way not in ("votes", "all", "parts"):
+    if way not in ("votes", "all"):
         return by_selection(setting, ask, field.codes)
     texts = jnp.asarray(setting.texts)
-    classes = lambda: np.asarray(query_classes(field, texts, retrieval=retrieval, standardise=False, every=True)[0])
+    classes = lambda: np.asarray(
+        query_classes(field, texts, rules=QueryRules(retrieval=retrieval), standardise=False, every=True)[0]
+    )
     return Answers(ask, classes, features=field.codes)
 
 
-def asked(way: str, *, retrieval: str = "contrast", clean: bool = True, pieces: bool = False, **options) -> Method:
+def asked(way: str, *, retrieval: str = "apart", clean: bool = True, pieces: bool = False, **options) -> Method:
     """The row that asks `field_of(setting, **options)` as `ask_field` describes."""
     return lambda setting, steps: ask_field(
         setting, field_of(setting, **options), way, retrieval=retrieval, clean=clean, pieces=pieces

@@ -32,8 +32,8 @@ from jsecon.types import Selection
 
 NO_REFUSAL = -1.0
 """below every similarity"""
-WAYS = {"votes": "", "all": ", all", "parts": ", parts"}
-"""of asking jsecon's regions: the one that answers best with its pieces, all that answer, of them the parts that do"""
+WAYS = {"votes": "", "all": ", all"}
+"""of asking jsecon's regions: the one that answers best with its pieces, all that answer"""
 OURS = {"ours, tracks": "tracks", "ours, outspoken views": "outspoken", "ours, consensus": "consensus"}
 WITH_PARTS = "ours, with parts"
 """those of consensus; where no region answers a text, the parts that do"""
@@ -219,8 +219,7 @@ def rows_of(points: bool) -> dict[str, Method]:
                     if association == "consensus" or "agreement" not in options:
                         found[f"{name}: {rule}, {chooser}{told}"] = own(association, rule, chooser, **options)
                 if association == "consensus" and rule != "cosine" and not points:
-                    for way in ("all", "parts"):
-                        found[f"{name}: {rule}, {chooser}{WAYS[way]}"] = own(association, rule, chooser, way=way)
+                    found[f"{name}: {rule}, {chooser}{WAYS['all']}"] = own(association, rule, chooser, way="all")
                     for told, options in EVENED.items():
                         found[f"{name}: {rule}, {chooser}{told}"] = own(association, rule, chooser, **options)
                     for told, options in {"": {}, **EVENED}.items():

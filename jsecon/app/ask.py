@@ -21,18 +21,20 @@ from jaxtyping import Bool
 from jsecon.data.images import read_pixels
 from jsecon.data.masks import resize_nearest
 from jsecon.errors import InputError, require
+from jsecon.language.columns import is_mapped
 from jsecon.language.field import subset_field
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.process import MEMORY, memory_budget
-from jsecon.query.anchored import RegionMatch, found_of, found_region, select_gaussians
 from jsecon.query.blocks import SparseSelection, select_in_blocks
-from jsecon.query.match import PIECE_THRESHOLD, QUANTILE, best_presence
+from jsecon.query.composite import parse_query
+from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, match_region, match_regions
 from jsecon.query.outliers import split_outliers
 from jsecon.query.outline import box_mask, lift
-from jsecon.query.parts import InParts, parts_instead, query_parts
+from jsecon.query.parts import PartsAnswer, parts_fallback
 from jsecon.query.pixel import region_at
-from jsecon.query.several import found_of_several, parts_of_question
+from jsecon.query.rules import PIECE_THRESHOLD, QUANTILE, QueryRules
+from jsecon.query.select import select_gaussians
 from jsecon.query.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette
 from jsecon.types import LanguageField, Selection
 
@@ -97,10 +99,8 @@ class _Match(NamedTuple):
     keep: str = "supported"
     """clusters to keep of the selection (`split_outliers`)"""
     presence: float | None = None
-    parts: InParts | None = None
+    parts: PartsAnswer | None = None
     """answer in place of the regions"""
-    texts: Any = None
-    """embeddings of several texts or matches, by which a field with parts trims the selection"""
 
 
 def quantile_message(quantile: float) -> str:
@@ -139,8 +139,8 @@ def ask_text(
     Raises:
       InputError: The embedder has no words for the text, or several regions are selected by codes.
     """
-    options = {"several": several, "piece_threshold": piece_threshold, "quantile": quantile}
-    match = _match_text(field, embedder, text, by=by, threshold=threshold, **options)
+    rules = QueryRules(quantile=quantile, piece_threshold=piece_threshold, all_of_kind=several)
+    match = _match_text(field, embedder, text, rules, by=by, threshold=threshold)
     return _select(field, match, by, threshold, outliers)
 
 
@@ -195,7 +195,8 @@ def ask_region(
       The answer.
     """
     alike = ALIKE_THRESHOLD if several else None
-    regions = found_region(field, region, alike_threshold=alike, piece_threshold=piece_threshold)
+    rules = dataclasses.replace(ONE_REGION, alike_threshold=alike, piece_threshold=piece_threshold)
+    regions = match_region(field, region, rules)
     name = f"region {region}"
     skipped = {"text encoder": "the region is the query"}
     match = _Match(name, regions, skipped, key=name, keep="all" if several else "supported")
@@ -240,39 +241,31 @@ def _match_text(
     field: LanguageField,
     embedder: Any,
     text: str,
+    rules: QueryRules,
     *,
     by: str,
     threshold: float | None,
-    several: bool,
-    quantile: float,
-    piece_threshold: float = PIECE_THRESHOLD,
 ) -> _Match:
     """Finds the regions that match a text, or the parts that answer in place of them."""
     require(by in METHODS, "by", by, f"one of {METHODS}", "votes is the default.")
     field = with_phrases(field, embedder)
-    included, excluded = parts_of_question(text)
+    included, excluded = parse_query(text)
     # Of an embedder trained to tell whether a text is true of an image; the cosines of all others only rank.
-    logits = getattr(embedder, "logits", None)
-    rules: dict[str, Any] = {"piece_threshold": piece_threshold, "logits": logits, "quantile": quantile}
-    if several or excluded or len(included) > 1:
-        if by == "code":
-            problem = "codes cannot select several regions"
-            raise InputError(f"query {text!r}", problem, remedy="Ask by votes or silhouette, or for one thing.")
-        embedded = jax.device_put(embedder.embed_text(included + excluded))
-        texts = embedded[: len(included)]
-        regions = found_of_several(field, texts, embedded[len(included) :], several=several, **rules)
-        presence = best_presence(field.regions, texts, regions.region, logits)
-        trim = texts if several and field.parts is not None else None
-        return _Match(text, regions, {}, keep="all", presence=presence, texts=trim)
-    texts = jax.device_put(embedder.embed_text(included))
-    regions = found_of(field, texts[0], **rules)
-    presence = best_presence(field.regions, texts, regions.region, logits)
+    rules = dataclasses.replace(rules, logits=getattr(embedder, "logits", None))
+    several = rules.all_of_kind or len(included + excluded) > 1
+    if several and by == "code":
+        problem = "codes cannot select several regions"
+        raise InputError(f"query {text!r}", problem, remedy="Ask by votes or silhouette, or for one thing.")
+    embedded = jax.device_put(embedder.embed_text(included + excluded))
+    texts = embedded[: len(included)]
+    regions = match_regions(field, texts, rules, excluded=embedded[len(included) :])
+    presence = best_presence(field.regions, texts, regions.region, rules.logits)
+    if several:
+        return _Match(text, regions, {}, keep="all", presence=presence)
     if field.parts is not None and by != "code":
-        unrefused = found_of(field, texts[0], quantile=0.0, retrieval="contrast")  # as parts are measured
-        rules = {"similarity_threshold": threshold, "logits": logits, "quantile": quantile}
-        parts = parts_instead(field, texts[0], unrefused.score, **rules)
+        parts = parts_fallback(field, texts[0], regions.score, rules, similarity_threshold=threshold)
         if parts is not None:
-            return _Match(text, regions, PARTS_ANSWER, presence=parts.there, parts=parts)
+            return _Match(text, regions, PARTS_ANSWER, presence=parts.presence_prob, parts=parts)
     return _Match(text, regions, {}, presence=presence)
 
 
@@ -284,7 +277,7 @@ def _match_pixel(field: LanguageField, frame: int | str, x: int, y: int) -> _Mat
         remedy = "Choose another pixel or frame: report.html of the run shows the regions."
         raise InputError(f"frame {field.names[index]}", f"no region lies under column {x}, row {y}", remedy=remedy)
     name = f"at {field.names[index]} {x} {y}"
-    return _Match(name, found_region(field, region), POINTED, key=name)
+    return _Match(name, match_region(field, region), POINTED, key=name)
 
 
 def _select(field: LanguageField, match: _Match, by: str, threshold: float | None, outliers: bool) -> Answer:
@@ -293,16 +286,15 @@ def _select(field: LanguageField, match: _Match, by: str, threshold: float | Non
     if match.parts is not None:
         selection = match.parts.selection
     else:
-        selection = select_gaussians(field, match.regions, threshold, by="code" if by == "code" else "votes")
+        by_region = "code" if by == "code" else "votes"
+        selection = select_gaussians(field, match.regions, by_region, similarity_threshold=threshold)
     return _finish(field, match, selection, by, threshold, outliers)
 
 
 def _finish(
     field: LanguageField, match: _Match, selection: Selection, by: str, threshold: float | None, outliers: bool
 ) -> Answer:
-    """Trims a selection by parts, silhouette and outliers."""
-    if match.texts is not None:
-        selection = query_parts(field, selection, match.texts)
+    """Trims a selection by silhouette and outliers."""
     if by == "silhouette":
         scene = field.gaussians, field.cameras, selection.similarity
         least = SHARE_THRESHOLD if threshold is None else threshold
@@ -480,17 +472,17 @@ def ask_each(
     Returns:
       The answers, and the errors of the other queries. Answers of a mapped field hold the rows of what they select.
     """
-    options: dict[str, Any] = {"by": by, "threshold": threshold, "several": several, "quantile": quantile}
+    rules = QueryRules(quantile=quantile, all_of_kind=several)
+    match_text = functools.partial(_match_text, field, embedder, rules=rules, by=by, threshold=threshold)
     queries: list[Callable[[], _Match]] = [
-        *(functools.partial(_match_text, field, embedder, text, **options) for text in texts),
+        *(functools.partial(match_text, text) for text in texts),
         *(functools.partial(_match_pixel, field, *pixel) for pixel in pixels),
     ]
     matches, errors = collect(queries)
-    if not isinstance(field.votes.regions, np.memmap):
+    if not is_mapped(field.votes):
         return [_select(field, match, by, threshold, outliers) for match in matches], errors
-    selections = select_in_blocks(field, [match.regions for match in matches], threshold, by=by)
-    canonical = with_phrases(field, embedder).canonical if texts else field.canonical
-    field = dataclasses.replace(field, canonical=canonical)
+    regions = [match.regions for match in matches]
+    selections = select_in_blocks(field, regions, by, similarity_threshold=threshold)
     pairs = zip(matches, selections)
     return [_select_rows(field, match, selection, by, outliers) for match, selection in pairs], errors
 
@@ -522,7 +514,7 @@ def _select_rows(field: LanguageField, match: _Match, sparse: SparseSelection, b
     rows[:count] = sparse.gaussians
     similarity[:count] = sparse.similarity
     best = np.asarray(sparse.region, np.int32), np.asarray(sparse.score, np.float32)
-    selection = Selection(np.arange(size) < count, similarity, *best, np.asarray(quantile))
+    selection = Selection(np.arange(size) < count, similarity, *best, np.asarray(quantile), match.regions.confidence)
     answer = _finish(subset_field(field, rows), match, selection, by, None, outliers)
     return dataclasses.replace(answer, rows=rows)
 

@@ -17,7 +17,7 @@ from jsecon.files import write_text
 from jsecon.language.codes import encode
 from jsecon.pipeline.progress import Listener
 from jsecon.query.baselines import query_canonical, query_one_step
-from jsecon.query.several import parts_of_question
+from jsecon.query.composite import parse_query
 from jsecon.types import LanguageField, Selection
 
 Evaluation: TypeAlias = dict[str, tuple[list[Row], dict[str, Any]]]
@@ -90,7 +90,7 @@ def select_by_code(field: LanguageField, embedder: Any, text: str, kind: str) ->
     Raises:
       InputError: The embedder has no words for the text.
     """
-    texts, _ = parts_of_question(text)
+    texts = parse_query(text).included
     code = encode(field.autoencoder, jax.device_put(embedder.embed_text(texts[:1])[0]))
     if kind == "one_step":
         return query_one_step(field.codes, code, ONE_STEP_THRESHOLD)

@@ -22,8 +22,9 @@ from jsecon.app.ask import Answer, quantile_message
 from jsecon.app.locate import decimals, rounded, selected_centers
 from jsecon.data.gaussians.files import save_gaussians
 from jsecon.files import atomic_write, write_text
+from jsecon.language.columns import vote_blocks
 from jsecon.language.field import subset_field
-from jsecon.language.membership import SHARE_THRESHOLD, probability_inside, vote_blocks, vote_shares
+from jsecon.language.membership import SHARE_THRESHOLD, probability_inside, vote_shares
 from jsecon.pipeline.progress import Listener
 from jsecon.query.render import selection_mask
 from jsecon.splat.transform import transform_gaussians_float64

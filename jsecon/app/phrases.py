@@ -16,8 +16,8 @@ from jsecon.errors import InputError
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.networks.sam3 import IMAGE_SIDE, PhraseMasks, Sam3
 from jsecon.pipeline.sources import locate_sources
-from jsecon.query.anchored import query_region
 from jsecon.query.outline import lift
+from jsecon.query.select import query_region
 from jsecon.types import LanguageField
 
 Frames = Mapping[int, np.ndarray]

@@ -9,9 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.splat.banded import render_in_blocks
-from jsecon.splat.bands import block_bounds
 from jsecon.splat.render import render, render_rgb
+from jsecon.splat.visible import render_in_blocks
 from jsecon.types import Array, Camera, Gaussians, LanguageField
 
 SELECTED = (255, 64, 160)
@@ -182,14 +181,14 @@ class Renderer:
 
     def __init__(self, gaussians: Gaussians, cameras: Camera, *, in_blocks: bool = False):
         self._gaussians = gaussians if in_blocks else jax.device_put(gaussians)
-        self._bounds = block_bounds(gaussians) if in_blocks else None
+        self._in_blocks = in_blocks
         self._cameras = jax.tree.map(np.asarray, cameras)  # whose items need no compilation
         self.photo = functools.cache(self._photo)
 
     def _photo(self, view: int) -> UInt8[np.ndarray, "h w 3"]:
         """Renders a view in the scene's colours."""
-        if self._bounds is not None:
-            return _to_bytes(render_in_blocks(self._gaussians, self._cameras[view], bounds=self._bounds))
+        if self._in_blocks:
+            return _to_bytes(render_in_blocks(self._gaussians, self._cameras[view]))
         return _to_bytes(render_rgb(self._gaussians, self._cameras[view]).features)
 
     def colours(self, view: int, rgb: Float[Array, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -24,7 +24,7 @@ MIN_STEPS = 1_000
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Autoencoder:
-    """Parameters of one scene's autoencoder. The layers' sizes are read off the arrays, so there is nothing else."""
+    """Parameters of one scene's autoencoder. The layers' sizes follow from the arrays."""
 
     encoder: Any
     """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
@@ -65,23 +65,32 @@ def train_autoencoder(
     cosine_weight: float = 0.001,
     progress: Callable[[int, int], None] | None = None,
 ) -> Autoencoder:
-    """Trains LangSplat's autoencoder (minghanqin/LangSplat, autoencoder/) on the regions' embeddings; the same key
-    gives the same parameters.
+    """Trains LangSplat's autoencoder (minghanqin/LangSplat, autoencoder/) on the regions' embeddings.
 
-    embeddings: (R, E), R >= 1, brought to unit length first; zero rows (never embedded) are left out.
-    epochs: passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
-    batch: largest batch. The regions are dealt into batches of like size, so that no batch is a remnant of one or two,
-        from which batch normalisation would learn nothing.
-    The parameters returned are the best, by the loss in evaluation mode, of the last twentieth of the epochs.
-    Raises ValueError for no usable row, numbers that are not finite, or options out of range.
+    Args:
+      embeddings: (R, E), R >= 1, of any length; zero rows (never embedded) are left out.
+      latent: Numbers of a code.
+      key: The same key gives the same parameters.
+      epochs: Passes over the regions; None takes LangSplat's 100, or as many as make 1,000 steps.
+      batch: Largest batch. Batches have like sizes: batch normalisation cannot learn from a remnant of one or two.
+      learning_rate: Of Adam.
+      cosine_weight: Weight of the cosine term of the loss.
+      progress: Called as progress(done, total) between stretches of epochs.
+
+    Returns:
+      The best parameters, by the loss in evaluation mode, of the last twentieth of the epochs.
+
+    Raises:
+      ValueError: No usable row, numbers that are not finite, or options out of range.
     """
     require(latent >= 1, "train_autoencoder", f"latent={latent}", "at least 1", "3 is LangSplat's.")
-    positive, found = batch >= 1 and (epochs is None or epochs >= 1), f"batch={batch}, epochs={epochs}"
-    require(positive, "train_autoencoder", found, "both at least 1", "Leave epochs out to have it chosen.")
+    positive, options = batch >= 1 and (epochs is None or epochs >= 1), f"batch={batch}, epochs={epochs}"
+    require(positive, "train_autoencoder", options, "both at least 1", "Leave epochs out to have it chosen.")
     rows = np.asarray(embeddings)
     require_finite("train_autoencoder", rows)
-    rows, found = rows[np.any(rows != 0, axis=1)], f"{len(rows)} rows, all zero or none"
-    require(len(rows) >= 1, "train_autoencoder", found, "at least one embedding", "Embed the regions first.")
+    count = f"{len(rows)} rows, all zero"
+    rows = rows[np.any(rows != 0, axis=1)]
+    require(len(rows) >= 1, "train_autoencoder", count, "at least one embedding", "Embed the regions first.")
     units = normalize(jnp.asarray(rows))
     count, dim = units.shape
     batches = -(-count // batch)
@@ -99,7 +108,7 @@ def train_autoencoder(
             jax.block_until_ready(carry)
             progress(stop, total)
     _, vector, stats = carry[1]
-    vector = vector if is_traced(vector) else np.asarray(vector)  # whose slices compile nothing
+    vector = vector if is_traced(vector) else np.asarray(vector)  # NumPy's slices need no compilation
     params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
     return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
 

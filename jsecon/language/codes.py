@@ -19,21 +19,21 @@ from jsecon.numerics import FULL_PRECISION, cosine_matrix, normalize
 from jsecon.types import Array, Key
 
 MAX_COSINE_LOSS = 1e-4
-"""a rotation counts as lossless when no cosine between two regions moves by more than this"""
+"""Largest change of a cosine between two regions for which a rotation counts as lossless."""
 CODE_THRESHOLD = 0.9
-"""on the cosine of codes: from it on a query takes one for the other. Codes distilled from one region lie within a few
-degrees (0.9 is 26)"""
+"""Cosine of two codes from which a query takes one for the other. Codes distilled from one region lie within a few
+degrees (0.9 is 26)."""
 DISTINCT_COSINE = 0.95
-"""of two regions' embeddings: below it their codes are to be kept apart"""
+"""Cosine of two regions' embeddings below which their codes must stay apart."""
 LATENTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
-"""sizes of code that "auto" tries"""
+"""Sizes of code that "auto" tries."""
 SHARPNESS = 40.0
-"""of the softmax over regions with which `Spread` places a text among their codes"""
+"""Factor of the softmax over regions with which `Spread` places a text among their codes."""
 SPREAD_STEPS = 400
-"""of Adam, in `spread_codes`"""
+"""Steps of Adam in `spread_codes`."""
 
 Coder = Any
-"""Autoencoder, Rotation, Spread, or None: whatever `encode` below takes"""
+"""Autoencoder, Rotation, Spread, or None."""
 
 
 @jax.tree_util.register_dataclass
@@ -80,9 +80,9 @@ def _among(x: Array, keys: Array, values: Array) -> Array:
     similarity = jnp.where(known[None], SHARPNESS * cosine_matrix(rows, keys), -jnp.inf)
     share = jax.nn.softmax(similarity, axis=-1)
     share = jnp.where(jnp.any(known), share, 0.0)
-    found = normalize(jnp.matmul(share, values, precision=FULL_PRECISION))
-    found = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), found, 0.0)
-    return found.reshape(*x.shape[:-1], values.shape[-1])
+    units = normalize(jnp.matmul(share, values, precision=FULL_PRECISION))
+    units = jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), units, 0.0)
+    return units.reshape(*x.shape[:-1], values.shape[-1])
 
 
 def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:
@@ -93,16 +93,24 @@ def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "
 def region_codes(
     embeddings: Float[Array, "r e"], *, latent: int | str, key: Key, **training: Any
 ) -> tuple[Float[Array, "r d"], Coder, str]:
-    """The cheapest code of at most `latent` numbers per region that keeps the regions' cosines, and why that one.
+    """Chooses the cheapest code of at most `latent` numbers per region that keeps the regions' cosines. Host code.
 
-    embeddings: (R, E); a zero row (never embedded) gets a zero code. `training` goes to `train_autoencoder`.
-    Returns (codes (R, d) of unit length, coder, reason), d = min(latent, E):
-    E <= latent: the unit embeddings, coder None; regions whose span has at most `latent` dimensions: coordinates in it,
-    a `Rotation`, no cosine moved by more than 1e-4; else the codes of an `Autoencoder` trained on them.
-    latent="auto": the smallest of `LATENTS`, and of a `Rotation` and `Spread` codes the first, that keeps every pair of
-    distinct regions (embeddings' cosine below `DISTINCT_COSINE`) apart at a query's threshold (codes' cosine below
-    `CODE_THRESHOLD`); None where no code shorter than the embeddings does.
-    Raises ValueError for numbers that are not finite.
+    With E <= latent it is the unit embeddings (coder None); for regions whose span has at most `latent` dimensions a
+    `Rotation` into it; otherwise the codes of an `Autoencoder` trained on them. With "auto" it is the smallest of
+    LATENTS, first as a `Rotation` and then as `Spread` codes, that keeps every pair of distinct regions (cosine of
+    embeddings below DISTINCT_COSINE) apart for queries (cosine of codes below CODE_THRESHOLD), or else None.
+
+    Args:
+      embeddings: (R, E); a zero row (never embedded) gets a zero code.
+      latent: Largest number of numbers, or "auto".
+      key: For the autoencoder.
+      training: Options of `train_autoencoder`.
+
+    Returns:
+      Unit codes (R, d), the coder, and a sentence that says why.
+
+    Raises:
+      ValueError: Numbers are not finite, or `latent` is out of range.
     """
     known = latent == "auto" or (isinstance(latent, int) and latent >= 1)
     require(known, "region_codes", f"latent={latent!r}", "at least 1, or 'auto'", "3 is LangSplat's.")
@@ -131,8 +139,8 @@ def _smallest_codes(units: Array) -> tuple[Array, Coder, str]:
         for kind, make in (("a rotation", _rotated), ("spread codes", _spread_out)):
             codes, coder = make(units, latent)
             if not confused_pairs(units, codes):
-                told = f"{kind} of {latent} numbers: all {distinct} pairs of {count} regions stay apart"
-                return codes, coder, f"left out: {told} (cosine below {CODE_THRESHOLD:g})"
+                reason = f"{kind} of {latent} numbers: all {distinct} pairs of {count} regions stay apart"
+                return codes, coder, f"left out: {reason} (cosine below {CODE_THRESHOLD:g})"
     return units, None, f"left out: no code shorter than {dim} numbers keeps all {distinct} pairs of regions apart"
 
 
@@ -172,11 +180,18 @@ def principal_rotation(units: Float[Array, "r e"], latent: int) -> Rotation:
 
 
 def spread_codes(units: Float[Array, "r e"], latent: int, *, separation: float = CODE_THRESHOLD) -> Float[Array, "r d"]:
-    """Unit codes (R, d) whose cosines are those of the regions (R, E) as far as that leaves distinct ones apart.
+    """Places a unit code (R, d) for each region so that cosines are kept and distinct regions stay apart. Host code.
 
-    From the principal directions, by Adam on: the mean squared error of the cosines, centred (what all regions have in
-    common tells none from another), and the squares by which distinct pairs exceed `separation` and alike ones fall
-    short of it. Deterministic. A zero row keeps a zero code.
+    Adam starts at the principal directions and minimises the mean squared error of the centred cosines, and the squares
+    by which distinct pairs exceed the separation and alike ones fall short of it.
+
+    Args:
+      units: (R, E) unit embeddings; a zero row gets a zero code.
+      latent: d.
+      separation: Cosine below which codes of distinct regions stay.
+
+    Returns:
+      The codes, the same in every run.
     """
     exact = np.asarray(units, np.float64)
     known = np.any(exact != 0, axis=1)
@@ -186,12 +201,12 @@ def spread_codes(units: Float[Array, "r e"], latent: int, *, separation: float =
     left, sizes, _ = np.linalg.svd(centred, full_matrices=False)
     kept = min(latent, len(sizes))
     start[:, :kept] = (left * sizes)[:, :kept]
-    # Equal rows, and rows of fewer directions than numbers, part by a little that depends on nothing but their place.
+    # Equal rows, and rows of fewer directions than numbers, part by a little noise that only depends on their place.
     start += 1e-3 * np.random.default_rng(0).standard_normal(start.shape)
     distinct = distinct_pairs(units)
     alike = ~distinct & known[:, None] & known[None]
-    given = jnp.asarray(start, units.dtype), jnp.asarray(target, units.dtype)
-    codes = _spread(*given, jnp.asarray(distinct), jnp.asarray(alike), separation)
+    start, target = jnp.asarray(start, units.dtype), jnp.asarray(target, units.dtype)
+    codes = _spread(start, target, jnp.asarray(distinct), jnp.asarray(alike), separation)
     return jnp.where(jnp.asarray(known)[:, None], codes, 0.0)
 
 

@@ -31,8 +31,8 @@ _ROWS = 8192
 _TIE = 1e-5
 """relative weight below which two halves of a median count as equal: float32 sums of K weights are no surer"""
 MIN_LABELLED = 0.5
-"""share of a Gaussian's weight: below, what no region holds has the majority. With masks of a few objects and nothing
-else, the walls around them would otherwise carry the objects' codes (demo, one-step mIoU 0.24)"""
+"""Smallest labelled share of a Gaussian's weight. With masks of a few objects alone, the walls around them would
+otherwise carry the objects' codes (demo, one-step mIoU 0.24)."""
 
 
 def distill_votes(
@@ -42,14 +42,22 @@ def distill_votes(
     *,
     min_labelled: float | Float[Array, ""] = MIN_LABELLED,
 ) -> Float[Array, "n d"]:
-    """Unit codes (N, d) of the Gaussians from their strongest votes and the (R, d) codes of the regions.
+    """Computes the codes of Gaussians from their strongest votes and the codes of the regions. Pure.
 
-    reduce: "mean", the weighted mean, which minimises the weighted squared (and, brought to unit length, the cosine)
-    error; "median", the weighted median of each number of the code, which minimises the rendered L1 of a Gaussian taken
-    alone, and where a whole interval does takes what is closest to the mode; "mode", the code of the strongest region.
-    Unknown, a zero code, are Gaussians without votes, with votes that are not finite, those of which at least half of
-    the votes' weight is for regions that have no code themselves (zero rows), and those of which less than
-    `min_labelled` of all weight lies on labelled pixels (0 keeps them). Raises ValueError on shapes that disagree.
+    Args:
+      votes: Of N Gaussians.
+      region_codes: (R, d).
+      reduce: "mode", the code of the strongest region. "mean", the weighted mean, which minimises the weighted squared
+        error. "median", the weighted median of each number, which minimises the rendered L1 of a Gaussian taken alone;
+        if a whole interval does, the value closest to the mode.
+      min_labelled: Smallest share of a Gaussian's weight on labelled pixels; 0 keeps all.
+
+    Returns:
+      (N, d) unit codes. A zero code (unknown) has a Gaussian without votes, with votes that are not finite, with at
+      least half of its weight on regions without a code, or with too little labelled weight.
+
+    Raises:
+      ValueError: Shapes disagree, or the reduction is unknown.
     """
     require_one_of("reduce", reduce, _REDUCTIONS, "'mode' is the default.")
     expected = votes.num_regions, "d"
@@ -91,10 +99,10 @@ def _median(values: Array, weight: Array) -> Array:
     # pairs vectorises, where a sort along an axis of 8 does not.
     half = 0.5 * jnp.sum(weight) * (1 + _TIE)
     low, high = jnp.full(values.shape[1:], jnp.inf, values.dtype), jnp.full(values.shape[1:], -jnp.inf, values.dtype)
-    for value, own in zip(values, weight, strict=True):
+    for value, value_weight in zip(values, weight, strict=True):
         below = jnp.sum(jnp.where(values < value, weight[:, None], 0.0), axis=0)
         above = jnp.sum(jnp.where(values > value, weight[:, None], 0.0), axis=0)
-        optimal = (below <= half) & (above <= half) & (own > 0)
+        optimal = (below <= half) & (above <= half) & (value_weight > 0)
         low, high = jnp.where(optimal, jnp.minimum(low, value), low), jnp.where(optimal, jnp.maximum(high, value), high)
     return jnp.clip(_mode(values, weight), low, high)
 
@@ -136,24 +144,35 @@ def distill_l1(
 
     One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
     numbers of |F m - G m|: F the rendering of f / (|f| + 1e-9) without background or renormalisation, G the code of the
-    pixel's region, m = 1 on labelled pixels, so that unlabelled ones count in the denominator alone. G is gathered from
-    the labels, (T, H, W) with -1 = none, and the (R, d) region codes when its view comes up. The geometry stays as it
-    is.
+    pixel's region, m = 1 on labelled pixels, so unlabelled ones count in the denominator alone. The geometry is fixed.
 
-    init: "zero" is LangSplat's, and a trap: the gradient through f / (|f| + 1e-9) at zero is 1e9 times too large,
-    Adam's second moment remembers it for about 15,000 steps, and until then a Gaussian's code hardly moves from the
-    corner of the cube that its first step took it to. "random" (length 0.01) or codes to start from,
-    (N, d) such as those of `distill_votes`, escape it. Gaussians that no labelled pixel sees get a zero code, or keep
-    the one given.
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region. Inside a trace ids of R and more
+        count as -1.
+      region_codes: (R, d).
+      steps: Number of steps.
+      key: Of the order of views and of random codes.
+      init: "zero" is LangSplat's, and a trap: the gradient through f / (|f| + 1e-9) at zero is 1e9 times too large,
+        Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves from the corner of
+        the cube that its first step took it to. "random" (length 0.01) or (N, d) codes, such as those of
+        `distill_votes`, escape it.
+      learning_rate: Of Adam.
+      capacity: As for `render`.
+      progress: Called as progress(done, total) between stretches of steps.
 
-    Returns the unit codes (N, d) (zero where still zero) and the loss before each step, NaN where the view overflowed
-    its capacity (as for `render`: outside a trace only a given one can). Raises ValueError on shapes that disagree, on
-    labels that are no integers and, outside a trace, on such a NaN and on labels of R and more; inside one these count
-    as -1.
+    Returns:
+      Unit codes (N, d), zero for Gaussians that no labelled pixel sees and that started at zero or random; and the loss
+      before each step, NaN for views that overflowed the capacity.
+
+    Raises:
+      ValueError: Shapes disagree, or labels are no integers; outside a trace also for such a NaN and for labels of R
+        and more.
     """
-    given = gaussians, cameras, labels, region_codes
+    inputs = gaussians, cameras, labels, region_codes
     require_labels(labels, len(region_codes))
-    start = start_distillation(*given, steps=steps, key=key, init=init)
+    start = start_distillation(*inputs, steps=steps, key=key, init=init)
     stretch = steps if progress is None else max(1, -(-steps // 100))
     state, plans = start, plan_views(gaussians, cameras, capacity=capacity)
     if plans is None and capacity is None and not is_traced((gaussians, cameras)):
@@ -161,16 +180,16 @@ def distill_l1(
     for begin in range(0, steps, stretch):
         stop = min(begin + stretch, steps)
         state = continue_distillation(
-            state, *given, until=stop, learning_rate=learning_rate, capacity=capacity, plans=plans
+            state, *inputs, until=stop, learning_rate=learning_rate, capacity=capacity, plans=plans
         )
         if progress is not None:
             jax.block_until_ready(state.step)
             progress(stop, steps)
     if not is_traced(state.history):
-        found = f"capacity={capacity}, too small for a view, or NaN"
+        problem = f"capacity={capacity}, too small for a view, or NaN"
         expected = "every view within the capacity, finite Gaussians and codes"
         remedy = "Leave capacity out, and check the Gaussians with jsecon.numerics.finite."
-        require(not bool(jnp.isnan(state.history).any()), "distill_l1", found, expected, remedy)
+        require(not bool(jnp.isnan(state.history).any()), "distill_l1", problem, expected, remedy)
     codes = normalize(state.features)
     if isinstance(init, str) and init == "random":
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
@@ -192,8 +211,9 @@ def start_distillation(
     views, count, size = labels.shape[0], gaussians.count, region_codes.shape[1]
     expected = (*cameras.world_to_camera.shape[:-2], cameras.height, cameras.width)
     require_shape("labels", labels, expected, "Pass the labels and the cameras of the same views at the same size.")
-    some, found = min(views, steps, len(region_codes)) > 0, f"{views} views, {steps} steps, {len(region_codes)} regions"
-    require(some, "distill_l1", found, "at least one of each", "There is nothing to distil.")
+    sizes = f"{views} views, {steps} steps, {len(region_codes)} regions"
+    some = min(views, steps, len(region_codes)) > 0
+    require(some, "distill_l1", sizes, "at least one of each", "Give what is to be distilled.")
     order_key, init_key = jax.random.split(key)
     dtype = region_codes.dtype
     if isinstance(init, str):

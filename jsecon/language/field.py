@@ -31,7 +31,7 @@ from jsecon.files import (
 )
 from jsecon.language.autoencoder import Autoencoder
 from jsecon.language.codes import Rotation, Spread
-from jsecon.language.membership import votes_of_rows
+from jsecon.language.columns import votes_of_rows
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Camera, Gaussians, LanguageField, Parts, Regions, Votes
@@ -59,7 +59,7 @@ _LETTERS = {
     "w": ("reference", 0),
     "b": ("gaussians.sh", 1),
 }
-"""where a field's sizes are read off: array and axis"""
+"""Array and axis of each of a field's sizes."""
 _SHAPES = {
     ("n", 3): "gaussians.means gaussians.log_scales",
     ("n", 4): "gaussians.quaternions",
@@ -82,11 +82,15 @@ _OPTIONAL = ("votes.shown", "votes.overlap", "parts.part", "parts.embeddings", "
 
 
 def save_field(path: str | os.PathLike, field: LanguageField) -> None:
-    """Writes `field` to `path`, whole or not at all. Equal fields give equal bytes.
+    """Writes a field to a file, atomically. Equal fields give equal bytes.
 
-    Raises ValueError for what `load_field` would refuse: arrays whose shapes disagree, that are not plain numbers, or
-    that hold NaN or infinity. Log scales of -inf (flat Gaussians) and opacity logits of -inf and inf are kept: they can
-    be drawn. Raises InputError where the folder cannot be written.
+    Args:
+      path: The file.
+      field: The field. Log scales of -inf (flat Gaussians) and opacity logits of -inf and inf are allowed.
+
+    Raises:
+      ValueError: `load_field` would refuse the field: shapes disagree, or numbers are NaN or infinite.
+      InputError: The folder cannot be written.
     """
     problem, arrays = _disagreement(field) or _oddity(field), {}
     require(problem is None, "save_field", problem, "what load_field reads", "Build the field from one run.")
@@ -96,23 +100,29 @@ def save_field(path: str | os.PathLike, field: LanguageField) -> None:
 
 
 def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageField:
-    """Reads what `save_field` wrote. Arrays come back on JAX's device, those wider than its number types as NumPy.
+    """Reads what `save_field` wrote.
 
-    `mapped`: columns above 1 MiB stay on disk, as memory maps (NumPy), so that a field larger than memory opens at
-    once. Their sizes are checked then; their checksums and numbers are not, as that would read them: `check_field`
-    does. Raises InputError for a file that is missing, not a field, cut short, damaged, of a later version, or
-    inconsistent.
+    Args:
+      path: The file.
+      mapped: Whether columns above 1 MiB stay on disk, as memory maps, so that a field larger than memory opens at
+        once. Their sizes are checked; their checksums and numbers only by `check_field`, which reads them.
+
+    Returns:
+      The field. Its arrays are on JAX's device, those wider than its number types NumPy's.
+
+    Raises:
+      InputError: The file is missing, not a field, cut short, damaged, of a later version, or inconsistent.
     """
     return _read(Path(path), MAPPED if mapped else sys.maxsize, checked=not mapped)
 
 
 def subset_field(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
-    """The field of some of its Gaussians (M,), their columns NumPy's; of mapped ones no others are read."""
+    """The field of some of its Gaussians (M,), with NumPy columns; of mapped columns only their rows are read."""
     take = lambda a: np.asarray(a)[rows]
     parts = None if field.parts is None else dataclasses.replace(field.parts, part=take(field.parts.part))
-    own = {"gaussians": jax.tree.map(take, field.gaussians), "codes": take(field.codes), "parts": parts}
+    gaussians = jax.tree.map(take, field.gaussians)
     votes = dataclasses.replace(votes_of_rows(field.votes, rows), overlap=field.votes.overlap)
-    return dataclasses.replace(field, votes=votes, **own)
+    return dataclasses.replace(field, gaussians=gaussians, votes=votes, codes=take(field.codes), parts=parts)
 
 
 class Provenance(str):
@@ -122,7 +132,14 @@ class Provenance(str):
 
 
 def check_field(path: str | os.PathLike) -> None:
-    """Raises InputError where `load_field` would: reads the whole file, checksums and numbers, a piece at a time."""
+    """Reads a whole field file, checksums and numbers, a piece at a time.
+
+    Args:
+      path: The file.
+
+    Raises:
+      InputError: As for `load_field`.
+    """
     _read(Path(path), MAPPED, checked=True)
 
 
@@ -148,8 +165,8 @@ def _read(path: Path, mapped: int, checked: bool) -> LanguageField:
     except ForeignFileError as error:
         raise InputError(path, str(error), "a field file", _REMEDY) from error
     except READ_ERRORS as error:
-        found = f"the field file is damaged ({describe_error(error)})"
-        raise InputError(path, found, "a whole one", changed) from error
+        problem = f"the field file is damaged ({describe_error(error)})"
+        raise InputError(path, problem, "a whole one", changed) from error
     if problem is not None:
         raise InputError(path, problem, "arrays of one N, R, d, E and T", _REMEDY)
     provenance = Provenance(field.provenance)
@@ -161,7 +178,7 @@ def _known(node: Any) -> Any:
     """A description of a tree without what a later version may have added: fields of our records that they lack."""
     if not isinstance(node, dict) or node.get("record") not in _RECORDS:
         return node
-    names = {own.name for own in dataclasses.fields(_RECORDS[node["record"]])}
+    names = {part.name for part in dataclasses.fields(_RECORDS[node["record"]])}
     return node | {"fields": {name: _known(part) for name, part in node["fields"].items() if name in names}}
 
 
@@ -173,8 +190,9 @@ def _on_device(leaf: object) -> object:
 
 
 def _array(field: LanguageField, name: str) -> Any:
-    """An array by its dotted name; None where the field has none, or not the record that holds it."""
-    return functools.reduce(lambda part, own: None if part is None else getattr(part, own), name.split("."), field)
+    """An array by its dotted name; None if the field lacks it, or the record around it."""
+    step = lambda part, name: None if part is None else getattr(part, name)
+    return functools.reduce(step, name.split("."), field)
 
 
 def _disagreement(field: LanguageField) -> str | None:
@@ -203,12 +221,12 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
             continue
         name, column = jax.tree_util.keystr(place).lstrip("."), np.atleast_1d(np.asarray(leaf))
         for numbers in (column[first : first + _ROWS] for first in range(0, len(column), _ROWS)):
-            own = name.removeprefix("gaussians.")
-            wrong = unusable_rows(own, numbers) if own != name else ~np.isfinite(numbers)
+            column_name = name.removeprefix("gaussians.")
+            wrong = unusable_rows(column_name, numbers) if column_name != name else ~np.isfinite(numbers)
             if wrong.any():
-                return f"{name} with numbers that are not finite{' or zero' if own == 'quaternions' else ''}"
+                return f"{name} with numbers that are not finite{' or zero' if column_name == 'quaternions' else ''}"
             if name in sizes and not (numbers.dtype.kind == "i" and ((numbers >= -1) & (numbers < sizes[name])).all()):
-                return f"{name} with numbers of none of {sizes[name]}"
+                return f"{name} with numbers beyond {sizes[name]}"
     if field.gaussians.sh.shape[1] not in COEFFICIENT_COUNTS:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     texts = (*field.names, field.embedder, field.provenance)

@@ -14,13 +14,13 @@ from jsecon.parallel import map_over_processes
 from jsecon.types import Array, Parts, Regions
 
 ALIKE_THRESHOLD = 0.9
-"""on the cosine of what sets two regions apart from the scene (`mean_residuals`): above it they are one thing seen
+"""Cosine of what sets two regions apart from the mean region (`mean_residuals`), from which they are one object seen
 twice, such as a track that broke. Over all pairs of simulated CLIP (medium and high noise, errors that views share) and
 of colours, all that it joins are one object. On real words (ConSE, replica_apartment_0) it joins 0.008 of the pairs, of
-which 0.36 are of one class, where a cosine of 0.95 of the embeddings themselves joins 0.027, of which 0.25 are"""
+which 0.36 are of one class; a cosine of 0.95 of the embeddings themselves joins 0.027, of which 0.25 are."""
 
 Embed = Callable[[int, np.ndarray], np.ndarray]
-"""(frame's index, masks (M, H, W) bool) -> (M, E) unit, zero where there is nothing to embed"""
+"""(frame's index, masks (M, H, W) bool) -> (M, E) unit embeddings, zero where there is no image to embed"""
 
 
 def region_embeddings(
@@ -32,30 +32,50 @@ def region_embeddings(
     num_regions: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Regions:
-    """Embeddings of the regions of a labelled sequence.
+    """Embeds the regions of a labelled sequence: the mean over the views, scaled to unit length. Host code.
 
-    frames (T, H, W, 3) uint8; labels (T, H, W) integers, -1 = none; `embed` is Embedder.embed_regions: (H, W, 3) and
-    masks (M, H, W) -> (M, E) unit. phi_bar_r = sum_t omega_t phi_rt with omega_t = pixels of r in t / pixels of r in
-    all views ("pixels"), or 1 / number of views of r ("uniform"); then scaled to unit length, since only cosines are
-    used afterwards. A view whose embedding is zero (nothing to embed) does not count; a region without any view is
-    zero.
+        phi_r = sum_t omega_t phi_rt,  omega_t = pixels of r in t / pixels of r in all views
 
-    Returns Regions with R = `num_regions`, or the largest label + 1. Raises ValueError for shapes that disagree, a
-    label beyond R, or an unknown weighting.
+    Args:
+      frames: (T, H, W, 3) uint8.
+      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
+      embed: `Embedder.embed_regions`: (H, W, 3) and masks (M, H, W) -> (M, E) unit embeddings.
+      weighting: "pixels" as above (the paper), or "uniform": omega_t = 1 / number of views of r.
+      num_regions: R; None takes the largest label + 1.
+      progress: Called as progress(done, total) while frames finish.
+
+    Returns:
+      Regions. A view whose embedding is zero does not count; a region without any view has a zero embedding.
+
+    Raises:
+      ValueError: Shapes disagree, a label is out of range, or the weighting is unknown.
     """
-    require_shape("labels", labels, frames.shape[:3], "Give one label image per frame, of the frame's own size.")
+    require_shape("labels", labels, frames.shape[:3], "Give one label image per frame, of the frame's size.")
     of_frame = lambda t, masks: embed(frames[t], masks)
-    return pooled(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
+    return pool_embeddings(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
 
 
 def embeddings_of_masks(
-    labels: Int[np.ndarray, "t h w"], masks: Int[np.ndarray, "_ _ _"], embeddings: Float[np.ndarray, "m e"], **how: Any
+    labels: Int[np.ndarray, "t h w"],
+    masks: Int[np.ndarray, "_ _ _"],
+    embeddings: Float[np.ndarray, "m e"],
+    **options: Any,
 ) -> Regions:
-    """Embeddings of the regions of a labelled sequence, from those that masks of its frames have already.
+    """Embeds the regions of a labelled sequence from masks of its frames that have embeddings. Host code.
 
-    labels (T, H, W) integers, -1 = none; masks (T, H, W) rows of `embeddings` (M, E), -1 = none. In each view a region
-    has the mean of the embeddings under its pixels, scaled to unit length; where it lies on no mask it does not count.
-    Else as `region_embeddings`, whose keywords `how` holds.
+    In each view a region has the mean of the embeddings under its pixels, scaled to unit length.
+
+    Args:
+      labels: (T, H, W) integer region ids, -1 where a pixel belongs to no region.
+      masks: (T, H, W) rows of `embeddings`, -1 where there is no mask.
+      embeddings: (M, E) of the masks.
+      options: Other options of `region_embeddings`.
+
+    Returns:
+      Regions. Views in which a region lies on no mask do not count.
+
+    Raises:
+      ValueError: As for `region_embeddings`.
     """
     require_shape("masks", masks, labels.shape, "Give one image of rows per frame, of the labels' size.")
 
@@ -63,13 +83,14 @@ def embeddings_of_masks(
         known = masks[t] >= 0
         rows, place = np.unique(masks[t][known], return_inverse=True)
         inside = [np.bincount(place[region[known]], minlength=len(rows)) for region in regions]
-        found = np.asarray(inside, np.float64).reshape(len(regions), len(rows)) @ embeddings[rows].astype(np.float64)
-        return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
+        pixels = np.asarray(inside, np.float64).reshape(len(regions), len(rows))
+        sums = pixels @ embeddings[rows].astype(np.float64)
+        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
 
-    return pooled(labels, under, **how)
+    return pool_embeddings(labels, under, **options)
 
 
-def pooled(
+def pool_embeddings(
     labels: Shaped[np.ndarray, "t h w"],
     embed: Embed,
     *,
@@ -77,41 +98,50 @@ def pooled(
     num_regions: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Regions:
-    """`region_embeddings` with what embeds the masks of the t-th frame given as a function of t. Over several processes
-    (`jax.distributed`) the frames are dealt out."""
+    """`region_embeddings` for an `embed` that takes a frame's index. Several processes (`jax.distributed`) share the
+    frames."""
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
     count = int(labels.max(initial=-1)) + 1 if num_regions is None else num_regions
     require_labels(labels, count)
     areas = [np.bincount(image[image >= 0].reshape(-1), minlength=count)[:count] for image in labels]
     pixels = np.stack(areas, axis=1).astype(np.int32) if len(areas) else np.zeros((count, 0), np.int32)
 
-    def rows(own: Sequence[int]) -> Iterator[np.ndarray | None]:
-        for t in own:
+    def embed_frames(frames: Sequence[int]) -> Iterator[np.ndarray | None]:
+        for t in frames:
             seen = np.flatnonzero(pixels[:, t])
             yield np.asarray(embed(t, labels[t][None] == seen[:, None, None]), np.float64) if len(seen) else None
 
     total: np.ndarray | None = None
-    for t, found in enumerate(map_over_processes(len(labels), rows, progress)):
-        if found is not None:
+    for t, rows in enumerate(map_over_processes(len(labels), embed_frames, progress)):
+        if rows is not None:
             seen = np.flatnonzero(pixels[:, t])
-            require_shape("embed", found, (len(seen), "E"), "An embedder returns one row per mask.")
-            total = np.zeros((count, found.shape[1])) if total is None else total
+            require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
+            total = np.zeros((count, rows.shape[1])) if total is None else total
             weight = pixels[seen, t].astype(np.float64) if weighting == "pixels" else np.ones(len(seen))
-            total[seen] += weight[:, None] * found
-    if total is None:  # nothing is labelled: the embedder alone knows E
+            total[seen] += weight[:, None] * rows
+    if total is None:  # without a label the embedder alone knows E
         total = np.zeros((count, np.asarray(embed(0, np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    unit = np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0)
-    return Regions(embeddings=unit.astype(np.float32), pixels=pixels)
+    return Regions(embeddings=_unit_rows(total), pixels=pixels)
+
+
+def _unit_rows(rows: np.ndarray) -> np.ndarray:
+    """Rows scaled to unit length, float32; zero rows stay zero."""
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.where(length > 0, rows / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
 
 
 def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"], Bool[Array, " r"]]:
-    """What sets each of R regions apart from the others (R, E), and which regions have an embedding (R,); 0 elsewhere.
+    """What sets each of R regions apart from the others. Pure.
 
         e_r - n / (n + 1) mean_q e_q
 
-    with unit embeddings e of the n regions that have one. The factor keeps a region from being all that it is measured
-    against: a single region keeps its own direction. Pure.
+    with unit embeddings e of the n regions that have one. The factor lets a single region keep its own direction.
+
+    Args:
+      embeddings: (R, E), of any length.
+
+    Returns:
+      The residuals (R, E), 0 for regions without an embedding; and which regions have one (R,).
     """
     units = normalize(embeddings)
     known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
@@ -121,21 +151,25 @@ def mean_residuals(embeddings: Float[Array, "r e"]) -> tuple[Float[Array, "r e"]
 
 
 def scene_parts(part: Int[np.ndarray, " n"], cast: Any, embeddings: Float[np.ndarray, "m e"]) -> Parts:
-    """Parts of a scene from the part (N,) of each Gaussian, 0 .. P-1, -1 = none, the weight (N, M) that each casts on
-    each mask (a sparse matrix), and the masks' embeddings (M, E).
+    """Embeds the parts of a scene: of each the mean over masks, weighted by what its Gaussians cast on them. Host code.
 
-        e_p = unit(sum_m w_pm phi_m),  w_pm the weight of all Gaussians of p on m
+    Args:
+      part: (N,) part of each Gaussian, 0 .. P-1, -1 for no part.
+      cast: (N, M) sparse matrix, the weight of each Gaussian on each mask.
+      embeddings: (M, E) of the masks.
 
-    A part that lies in no mask has a zero embedding. Raises ValueError where sizes disagree.
+    Returns:
+      The parts. A part that lies in no mask has a zero embedding.
+
+    Raises:
+      ValueError: Sizes disagree.
     """
     fit = cast.shape == (len(part), len(embeddings))
-    found, expected = f"cast {cast.shape}", f"({len(part)} Gaussians, {len(embeddings)} masks)"
-    require(fit, "scene_parts", found, expected, "Give a row for each Gaussian and a column for each mask.")
-    own = np.flatnonzero(part >= 0)
+    shapes, expected = f"cast {cast.shape}", f"({len(part)} Gaussians, {len(embeddings)} masks)"
+    require(fit, "scene_parts", shapes, expected, "Give a row for each Gaussian and a column for each mask.")
+    members = np.flatnonzero(part >= 0)
     count = int(part.max(initial=-1)) + 1
-    gather = sparse.csr_matrix((np.ones(len(own), np.float32), (part[own], own)), shape=(count, len(part)))
+    gather = sparse.csr_matrix((np.ones(len(members), np.float32), (part[members], members)), shape=(count, len(part)))
     weight = gather @ cast
     total = np.asarray(weight @ np.asarray(embeddings, np.float32), np.float32).reshape(count, embeddings.shape[1])
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    units = np.where(length > 0, total / np.where(length > 0, length, 1.0), 0.0).astype(np.float32)
-    return Parts(part.astype(np.int32), units, np.asarray(weight.sum(1), np.float32).reshape(count))
+    return Parts(part.astype(np.int32), _unit_rows(total), np.asarray(weight.sum(1), np.float32).reshape(count))

@@ -6,7 +6,6 @@ targets take only R values. The N x R votes therefore hold all that distillation
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -52,24 +51,22 @@ def region_votes(
     With the geometry frozen, a rendering is linear in the features of the Gaussians. So one pass over the views holds
     what any later choice of embedding or code needs.
 
-    Outside a trace the views are spread over jax's local devices, and over processes that all make the same call
-    (`jax.distributed`). The result has the same bits on any number of devices. Inside a trace the views are scanned
-    on one device.
+    Host code: the views are spread over jax's local devices, and over processes that all make the same call
+    (`jax.distributed`). The result has the same bits on any number of devices. Called inside a trace it is
+    `scan_region_votes`.
 
     Args:
       gaussians: Scene of N Gaussians.
       cameras: Batch of T cameras.
-      labels: (T, H, W) integers below `num_regions`; -1 where a pixel belongs to no region. Inside a trace, where
-        values cannot be checked, a label of `num_regions` and more counts as -1.
+      labels: (T, H, W) integers below `num_regions`; -1 where a pixel belongs to no region.
       num_regions: R.
       top: Number of strongest regions that each Gaussian keeps; `Votes.cut` counts the rest.
       by_view: Whether to keep each view's total too (`Votes.by_view`, 4 T N bytes), as `with_shown` needs it.
       centre: In [0, 1]. A weight away from the pixel that holds the Gaussian's centre counts 1 - `centre`: at 1 a
         Gaussian is what its centre is, at 0 what its whole footprint is.
-      capacity: As for `render`, but overflow is looked at once, when all views are done. Where there is any, outside
-        a trace and without a capacity given, all votes are cast again with enough.
+      capacity: As for `render`. Without it, votes of views that overflow are cast again with enough.
       near: Near plane, world units.
-      progress: Called as progress(done, total) while views finish, outside a trace.
+      progress: Called as progress(done, total) while views finish.
 
     Returns:
       Votes of the N Gaussians. `overflow` is 0 if they are exact.
@@ -77,60 +74,148 @@ def region_votes(
     Raises:
       ValueError: Shapes disagree, or labels are no integers or too large.
     """
+    if is_traced((gaussians, cameras, labels)):
+        options = {"top": top, "by_view": by_view, "centre": centre, "capacity": capacity, "near": near}
+        return scan_region_votes(gaussians, cameras, labels, num_regions, **options)
+    _require_views(cameras, labels, num_regions)
+    blocks = region_blocks(gaussians.count, num_regions)
+    kept, labelled, totals, state = _none_kept(np, gaussians), None, None, {}
+    for b, block in enumerate(blocks):
+        report = None
+        if progress is not None:
+            report = lambda done, total, b=b: progress(b * total + done, len(blocks) * total)
+        options = {"by_view": by_view, "centre": centre, "near": near, "progress": report}
+        state, totals, size = dense_votes(gaussians, cameras, labels, block, capacity=capacity, **options)
+        capacity = size if capacity is None and size > _default_capacity(gaussians, cameras) else capacity
+        kept, weight = _keep_strongest(kept, state.pop("votes"), block.start, min(top, max(num_regions, 1)))
+        labelled = weight if labelled is None else labelled + weight
+    return _as_votes(kept, labelled, state, totals if by_view else None, num_regions)
+
+
+def scan_region_votes(
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Shaped[Array, "t h w"],
+    num_regions: int,
+    *,
+    top: int = 8,
+    by_view: bool = False,
+    centre: float = 0.0,
+    capacity: int | None = None,
+    near: float = NEAR,
+) -> Votes:
+    """`region_votes` as a pure function: it scans the views on one device, under jit and vmap.
+
+    Labels cannot be checked there: a label of `num_regions` and more counts as -1. Pairs that overflow the capacity are
+    left out and counted in `overflow`.
+
+    Args:
+      gaussians: As for `region_votes`, like all that follow.
+      cameras: Batch of T cameras.
+      labels: (T, H, W) integers.
+      num_regions: R.
+      top: Regions that each Gaussian keeps.
+      by_view: Whether to keep each view's total.
+      centre: In [0, 1].
+      capacity: As for `render`.
+      near: Near plane, world units.
+
+    Returns:
+      Votes of the N Gaussians.
+
+    Raises:
+      ValueError: Shapes disagree, or labels are no integers.
+    """
+    _require_views(cameras, labels, num_regions)
+    static = _default_capacity(gaussians, cameras) if capacity is None else capacity, near, by_view, centre
+    kept, labelled, totals, state = _none_kept(jnp, gaussians), None, None, {}
+    for block in region_blocks(gaussians.count, num_regions):
+        common = _without_colour(gaussians), np.array([block.start, min(block.stop, num_regions)], np.int32)
+
+        def one_view(state, view, common=common):
+            return _add_view(state, common, _plan_view(common, view, *static), *static)
+
+        start = _empty(jnp, gaussians.count, len(block), gaussians.means.dtype)
+        state, totals = lax.scan(one_view, start, (cameras, labels))
+        kept, weight = _keep_strongest(kept, state.pop("votes"), block.start, min(top, max(num_regions, 1)))
+        labelled = weight if labelled is None else labelled + weight
+    return _as_votes(kept, labelled, state, totals if by_view else None, num_regions)
+
+
+def dense_votes(
+    gaussians: Gaussians,
+    cameras: Camera,
+    labels: Shaped[Array, "t h w"],
+    regions: range,
+    *,
+    by_view: bool = False,
+    centre: float = 0.0,
+    capacity: int | None = None,
+    near: float = NEAR,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, Array], Array | None, int]:
+    """The votes of a block of regions, all of them: {"votes" (N, len(regions)), "total", "peak", "views" (N,),
+    "overflow"}, the total of each view (T, N) with `by_view`, and the capacity that was used. Host code.
+
+    `regions` are consecutive ids; other options as for `region_votes`.
+    """
+    size = _default_capacity(gaussians, cameras) if capacity is None else capacity
+    common = _without_colour(gaussians), np.array([regions.start, regions.stop], np.int32)
+    start = _empty(np, gaussians.count, len(regions), gaussians.means.dtype)
+    while True:
+        static = size, near, by_view, centre
+        state, totals = accumulate_over_views(
+            _add_view, start, _merge, common, (cameras, labels), prepare=_plan_view, static=static, progress=progress
+        )
+        missing = np.asarray(state["missing"])
+        if capacity is not None or not missing:
+            return state, totals, size
+        size = enough_capacity(size, missing[None])
+
+
+def region_blocks(count: int, regions: int) -> list[range]:
+    """Blocks of region ids, of one length, whose dense (N, block) votes fit into _DENSE_BYTES; at least one."""
+    size = _block_size(count, regions)
+    return [range(first, first + size) for first in range(0, max(regions, 1), size)]
+
+
+def _block_size(count: int, regions: int) -> int:
+    return max(1, min(max(regions, 1), _DENSE_BYTES // max(4 * count, 1)))
+
+
+def _require_views(cameras: Camera, labels: Array, num_regions: int) -> None:
+    """Raises ValueError for labels that are not of these cameras and regions."""
     poses = cameras.world_to_camera
     require_shape("cameras.world_to_camera", poses, ("T", 4, 4), "Add a leading axis to all arrays of a single camera.")
     expected = len(poses), cameras.height, cameras.width
     require_shape("labels", labels, expected, "Give one label image per view, of the camera's size.")
     require(num_regions >= 0, "num_regions", num_regions, ">= 0", "Count the regions.")
-    traced = is_traced((gaussians, cameras, labels))
     require_labels(labels, num_regions)
-    count = gaussians.means.shape[0]
-    size = default_capacity(count, cameras.width, cameras.height) if capacity is None else capacity
-    block = _regions_at_once(count, num_regions)
-    blocks = math.ceil(max(num_regions, 1) / block)
-    static = size, near, by_view, centre
-    xp = jnp if traced else np  # NumPy compiles nothing
-    bare = dataclasses.replace(gaussians, sh=np.zeros((count, 1, 3), gaussians.means.dtype))  # colour has no part in it
-    totals: Any = None
-    labelled: Any = None
-    kept = (np.full((count, 0), -1, np.int32), np.zeros((count, 0), gaussians.means.dtype))
-    for b in range(blocks):
-        start = _empty(xp, count, block, gaussians.means.dtype)
-        common = bare, np.array([b * block, min((b + 1) * block, num_regions)], np.int32)
-        if traced:
-
-            def one_view(state, view, common=common):
-                return _add_view(state, common, _plan_view(common, view, *static), *static)
-
-            state, totals = lax.scan(one_view, start, (cameras, labels))
-        else:
-            report = None if progress is None else (lambda done, total, b=b: progress(b * total + done, blocks * total))
-            state, totals = accumulate_over_views(
-                _add_view, start, _merge, common, (cameras, labels), prepare=_plan_view, static=static, progress=report
-            )
-            if capacity is None and (missing := np.asarray(state["missing"])):
-                again = functools.partial(region_votes, top=top, by_view=by_view, centre=centre, near=near)
-                again = functools.partial(again, progress=progress)
-                return again(gaussians, cameras, labels, num_regions, capacity=enough_capacity(size, missing[None]))
-        votes = state.pop("votes")
-        kept, own = _keep_strongest(kept, votes, b * block, min(top, max(num_regions, 1)))
-        del votes
-        labelled = own if labelled is None else labelled + own
-    seen = totals if by_view else None
-    return Votes(
-        kept[0], kept[1], labelled, state["total"], state["peak"], state["views"], state["overflow"], num_regions, seen
-    )
 
 
-def _regions_at_once(count: int, regions: int) -> int:
-    """Of the dense N x R block that is accumulated at once."""
-    return max(1, min(max(regions, 1), _DENSE_BYTES // max(4 * count, 1)))
+def _default_capacity(gaussians: Gaussians, cameras: Camera) -> int:
+    return default_capacity(gaussians.count, cameras.width, cameras.height)
+
+
+def _without_colour(gaussians: Gaussians) -> Gaussians:
+    """Colour has no part in the votes."""
+    return dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 1, 3), gaussians.means.dtype))
+
+
+def _none_kept(xp: Any, gaussians: Gaussians) -> tuple[Array, Array]:
+    """Region ids and weights (N, 0) before any block; of NumPy on the host, which compiles nothing."""
+    return xp.full((gaussians.count, 0), -1, np.int32), xp.zeros((gaussians.count, 0), gaussians.means.dtype)
+
+
+def _as_votes(kept: tuple[Array, Array], labelled: Any, state: Any, by_view: Any, num_regions: int) -> Votes:
+    total, peak, views, overflow = (state[name] for name in ("total", "peak", "views", "overflow"))
+    return Votes(kept[0], kept[1], labelled, total, peak, views, overflow, num_regions, by_view)
 
 
 def votes_memory(count: int, views: int, regions: int) -> int:
-    """What `region_votes` with `by_view` takes in memory beside what it is given, about: the views' totals, a copy of
-    the Gaussians with one band of colour, and the dense block of each lane that is worked on and of their sum."""
-    dense = 4 * count * _regions_at_once(count, regions)
+    """About how many bytes `region_votes` with `by_view` takes beside its inputs: the views' totals, a copy of the
+    Gaussians with one band of colour, and a dense block for each lane that is worked on and for their sum."""
+    dense = 4 * count * _block_size(count, regions)
     return (4 * views + _BARE_BYTES) * count + (concurrent_lanes(views, dense) + 1) * dense
 
 

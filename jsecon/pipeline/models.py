@@ -107,7 +107,7 @@ def _sigmoid(embedder: ClipEmbedder) -> str:
     """How the probability of a text follows from its cosine, or what to do without it."""
     logits, where = embedder.logits, embedder.files.logits
     if logits is None or where is None:
-        return f"no scale and bias, so that a text is refused by its contrast. {LOGITS_REMEDY}"
+        return f"no scale and bias, so that a text is refused by its cosine. {LOGITS_REMEDY}"
     return f"how likely a text is there: sigmoid({logits.scale:.4f} cosine {logits.bias:+.4f}), from {where.name}"
 
 

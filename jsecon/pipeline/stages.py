@@ -38,11 +38,11 @@ from jsecon.fit.refine import refine_capture
 from jsecon.fit.schedule import Schedule, default_max_gaussians
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.autoencoder import Autoencoder
-from jsecon.language.blocks import codes_in_blocks, region_votes_in_blocks
 from jsecon.language.codes import region_codes
+from jsecon.language.columns import is_mapped
 from jsecon.language.distill import distill_votes
-from jsecon.language.membership import finish_votes
 from jsecon.language.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
+from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks
 from jsecon.language.votes import region_votes, votes_memory
 from jsecon.pipeline.bare_stages import planned_views, scene_itself
 from jsecon.pipeline.options import Options, is_bare_scene
@@ -641,7 +641,7 @@ def distil(context: RunContext) -> Stage:
 
 def _distil(stage: StageInput) -> StageResult:
     (table, _), cast, reduce = stage.results.codes, stage.results.votes, stage.context.options.reduce
-    if isinstance(cast.regions, np.memmap):
+    if is_mapped(cast):
         return StageResult(codes_in_blocks(cast, table, stage.checkpoint.folder / "codes.npy", reduce))
     return StageResult(distill_votes(cast, table, reduce=reduce))
 
@@ -655,7 +655,7 @@ def field_of(results: Results, embedder: Embedder, provenance: str) -> LanguageF
     return LanguageField(
         gaussians=results.gaussians,
         codes=results.distil,
-        votes=finish_votes(results.votes, embedded),
+        votes=finish_votes_in_blocks(results.votes, embedded),
         regions=Regions(embedded.embeddings, pixels),
         region_codes=table,
         autoencoder=coder,

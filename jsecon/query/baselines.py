@@ -14,12 +14,19 @@ TEMPERATURE = 10.0
 
 
 def query_one_step(codes: Codes, text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
-    """The Gaussians whose code has a cosine of at least `threshold` with the text's code.
+    """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code.
 
-    codes (N, d), text_code (d,), any length. A zero code (unknown) or one that is not finite has similarity 0 and is
-    never selected; nothing is for a text code that is zero or not finite. `unit_codes(codes)` in place of the codes,
-    made once, spares many queries the lengths. Selection.score is the best similarity, 0 where nothing is known. Raises
-    ValueError on shapes that disagree.
+    Args:
+      codes: (N, d) of any length, or `unit_codes(codes)`, made once for many queries. A zero code (unknown) or one that
+        is not finite has similarity 0 and is never selected.
+      text_code: (d,) of any length.
+      threshold: On the cosine.
+
+    Returns:
+      The selection; `score` is the best similarity. Pure.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
     require_shape("query_one_step", text_code, (codes.shape[1],), "Encode the text with the field's coder.")
     return _one_step(as_codes(codes), jnp.asarray(text_code), threshold)
@@ -33,18 +40,27 @@ def _one_step(codes: Array | UnitCodes, text_code: Array, threshold: Number) -> 
 def query_canonical(
     features: Codes, text: Float[Array, " d_text"], canonical: Float[Array, "c d_canonical"], threshold: Number
 ) -> Selection:
-    """The Gaussians whose relevancy to the text is at least `threshold`.
+    """Selects the Gaussians whose relevancy to the text is at least `threshold`.
 
-    features (N, d), text (d,) and canonical phrases (C, d), C >= 1, in one space: embeddings, or codes of the same
-    coder. Relevancy is the least, over the phrases c, of softmax(10 [cos(f, text), cos(f, c)])[0] (Kerr et al. 2023,
-    LERF), in (0, 1); above 0.5 the text is closer than every phrase. Unknown features (zero, or not
-    finite) have relevancy 0 and are never selected. Phrases that are zero or not finite make every relevancy unknown.
-    Raises ValueError on shapes that disagree.
+    The relevancy is the smallest, over the phrases c, of softmax(10 [cos(f, text), cos(f, c)])[0] (Kerr et al. 2023,
+    LERF), in (0, 1); above 0.5 the text is closer than every phrase.
+
+    Args:
+      features: (N, d) embeddings, or codes; zero or non-finite ones have relevancy 0 and are never selected.
+      text: (d,) in the same space.
+      canonical: (C, d) phrases in the same space, C >= 1.
+      threshold: On the relevancy.
+
+    Returns:
+      The selection; `score` is the best relevancy. Pure.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
     size = features.shape[1]
     fit = text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1
-    found, expected = f"text {text.shape}, canonical {canonical.shape}", f"({size},) and (C >= 1, {size})"
-    require(fit, "query_canonical", found, expected, "Embed or encode text and canonical phrases as the features are.")
+    shapes, expected = f"text {text.shape}, canonical {canonical.shape}", f"({size},) and (C >= 1, {size})"
+    require(fit, "query_canonical", shapes, expected, "Embed or encode text and canonical phrases as the features are.")
     return _canonical(as_codes(features), jnp.asarray(text), jnp.asarray(canonical), threshold)
 
 
@@ -54,18 +70,18 @@ def _canonical(features: Codes, text: Array, canonical: Array, threshold: Number
 
 
 def relevancies(features: Codes, text: Float[Array, " d"], canonical: Float[Array, "c d"]) -> tuple[Array, Array]:
-    """LERF's relevancy (N,), and where it means something (N,); 0 elsewhere."""
+    """LERF's relevancy (N,), and where it is known (N,); 0 elsewhere."""
     positive, known = similarities(features, text)
     # One phrase at a time: the sums stay multiply-and-sum, and no (N, C) array of products is made.
     negative, known_too = jax.lax.map(lambda phrase: similarities(features, phrase), canonical)
     known = known & jnp.all(known_too, axis=0)
-    # The softmax of two is a sigmoid of their difference, and its least is against the closest phrase.
+    # The softmax of two is a sigmoid of their difference, and it is smallest against the closest phrase.
     share = jax.nn.sigmoid(TEMPERATURE * (positive - jnp.max(negative, axis=0)))
     return jnp.where(known, share, 0.0), known
 
 
 def _selection(similarity: Array, known: Array, threshold: Number) -> Selection:
-    """Those known whose similarity is at least the threshold; the score is the best of all, 0 where none is known."""
-    mask, nothing = known & (similarity >= threshold), jnp.asarray(-1, jnp.int32)
+    """The known Gaussians whose similarity reaches the threshold; the score is the best of all, or 0."""
+    mask, no_region = known & (similarity >= threshold), jnp.asarray(-1, jnp.int32)
     best = jnp.where(jnp.any(known), jnp.max(jnp.where(known, similarity, -jnp.inf), initial=-jnp.inf), 0.0)
-    return Selection(mask, similarity, nothing, best)
+    return Selection(mask, similarity, no_region, best)

@@ -1,73 +1,98 @@
-"""Many questions to a field larger than memory: its columns are read once, and a selection is a list of Gaussians."""
+"""Queries of a field larger than memory: its columns are read once, and an answer is a list of Gaussians. Host code."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.errors import require_one_of, require_shape
-from jsecon.language.regions import ALIKE_THRESHOLD
-from jsecon.query.anchored import THRESHOLDS, RegionMatch, found_of, select_by_block
-from jsecon.query.match import PIECE_THRESHOLD, QUANTILE, RETRIEVALS
+from jsecon.errors import require_one_of
+from jsecon.language.columns import row_slices, votes_of_rows
+from jsecon.query.match import RULES, RegionMatch, match_regions
+from jsecon.query.rules import QueryRules
+from jsecon.query.select import THRESHOLDS, select_by_code, select_by_share
 from jsecon.query.similarity import Number
 from jsecon.types import Array, LanguageField
-from jsecon.vision.protocols import Logits
 
 
 class SparseSelection(NamedTuple):
-    """The answer to one query: `Selection` without a number for each Gaussian."""
+    """The answer to one query: `Selection` without a number for every Gaussian."""
 
     gaussians: Int[np.ndarray, " m"]
     """(M,) int64 the selected ones, ascending: `np.flatnonzero(selection.mask)`."""
     similarity: Float[np.ndarray, " m"]
-    """(M,) theirs."""
+    """(M,) of the selected ones."""
     region: int
-    """as in `Selection`."""
+    """As in `Selection`."""
     score: float
-    """as in `Selection`."""
+    """As in `Selection`."""
 
 
 def query_in_blocks(
     field: LanguageField,
     text_embeddings: Float[Array, "q e"],
     *,
-    quantile: Number = QUANTILE,
-    retrieval_threshold: Number | None = None,
-    similarity_threshold: Number | None = None,
+    rules: QueryRules = RULES,
     by: str = "votes",
-    retrieval: str = RETRIEVALS[0],
-    alike_threshold: Number | None = ALIKE_THRESHOLD,
-    piece_threshold: Number | None = PIECE_THRESHOLD,
-    logits: Logits | None = None,
+    similarity_threshold: Number | None = None,
 ) -> list[SparseSelection]:
-    """`query_anchored` of Q texts, (Q, E), in one pass over the columns of a field (`load_field(path, mapped=True)`).
+    """Answers Q texts as `query_anchored` does, to the bit, in one pass over the columns of a field.
 
-    The same Gaussians with the same similarities, to the bit. Memory: a block of columns, and what is selected (12
-    bytes each). Host code. Options and errors as for `query_anchored`.
+    Memory: one block of columns, and 12 bytes for each selected Gaussian.
+
+    Args:
+      field: From `load_field(path, mapped=True)`.
+      text_embeddings: One row per text.
+      rules: How texts match regions.
+      by: How Gaussians are chosen (`select_gaussians`).
+      similarity_threshold: On their similarity; None takes the default of `by`.
+
+    Returns:
+      One answer per text.
+
+    Raises:
+      ValueError: The embeddings have another size, or `by` is unknown.
     """
-    require_shape(
-        "query_in_blocks", text_embeddings, ("Q", field.regions.embeddings.shape[1]), "Give a row for a text."
-    )
-    require_one_of("query_in_blocks", by, THRESHOLDS, "'votes' is the default.")
-    how = {"quantile": quantile, "retrieval_threshold": retrieval_threshold, "retrieval": retrieval}
-    how |= {"alike_threshold": alike_threshold, "piece_threshold": piece_threshold, "logits": logits}
-    found = [found_of(field, jnp.asarray(text), **how) for text in text_embeddings]
-    return select_in_blocks(field, found, similarity_threshold, by=by)
+    matches = [match_regions(field, jnp.asarray(text)[None], rules) for text in text_embeddings]
+    return select_in_blocks(field, matches, by, similarity_threshold=similarity_threshold)
 
 
 def select_in_blocks(
-    field: LanguageField, found: Sequence[RegionMatch], threshold: Number | None = None, *, by: str = "votes"
+    field: LanguageField,
+    matches: Sequence[RegionMatch],
+    by: str = "votes",
+    *,
+    similarity_threshold: Number | None = None,
 ) -> list[SparseSelection]:
-    """`members` of what each of several questions found, in one pass over the columns."""
-    empty = np.zeros(0, np.int64), np.zeros(0, np.float32)
-    parts: list[list[tuple[np.ndarray, np.ndarray]]] = [[empty] for _ in found]
-    first = 0
-    for selections in select_by_block(field, found, threshold, by=by) if field.regions.count and found else ():
-        for own, selection in zip(parts, selections):
+    """`select_gaussians` of several matches in one pass over the columns of a field.
+
+    Args:
+      field: From `load_field(path, mapped=True)`.
+      matches: From `match_regions`.
+      by: How Gaussians are chosen.
+      similarity_threshold: On their similarity; None takes the default of `by`.
+
+    Returns:
+      One answer per match.
+
+    Raises:
+      ValueError: `by` is unknown.
+    """
+    require_one_of("select_in_blocks", by, THRESHOLDS, "'votes' is the default.")
+    threshold = THRESHOLDS[by] if similarity_threshold is None else similarity_threshold
+    table = jnp.asarray(field.region_codes)
+    columns = [[(np.zeros(0, np.int64), np.zeros(0, np.float32))] for _ in matches]
+    for rows in row_slices(field.votes, len(field.votes.views)) if field.regions.count and matches else ():
+        votes = jax.tree.map(jnp.asarray, votes_of_rows(field.votes, rows))
+        codes = jnp.asarray(field.codes[rows]) if by == "code" else None
+        for column, match in zip(columns, matches):
+            if codes is None:
+                selection = select_by_share(votes, match, threshold)
+            else:
+                selection = select_by_code(codes, table, votes.views, match, threshold)
             places = np.flatnonzero(np.asarray(selection.mask))
-            own.append((places + first, np.asarray(selection.similarity)[places]))
-        first += len(selections[0].mask)
-    joined = [[np.concatenate(column) for column in zip(*own)] for own in parts]
-    return [SparseSelection(own[0], own[1], int(each.region), float(each.score)) for own, each in zip(joined, found)]
+            column.append((places + rows.start, np.asarray(selection.similarity)[places]))
+    joined = [[np.concatenate(part) for part in zip(*column)] for column in columns]
+    return [SparseSelection(*rows, int(match.region), float(match.score)) for rows, match in zip(joined, matches)]

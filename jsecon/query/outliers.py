@@ -1,11 +1,10 @@
-"""Selected Gaussians that stand apart from the rest: scikit-learn's DBSCAN on their centres (the paper's last step).
+"""Selected Gaussians that lie apart from the rest: scikit-learn's DBSCAN on their centres (the paper's last step).
 
-Host code. DBSCAN lists all neighbours of every point. Where thousands of splats lie within eps of each other those
-lists are quadratic in time and memory, so that a large selection is clustered by voxels: one point for each, with the
+Host code. DBSCAN lists all neighbours of every point. Where thousands of splats lie within eps of each other, those
+lists are quadratic in time and memory. A large selection is therefore clustered by voxels: one point for each, with the
 number of its splats as sample weight.
 """
 
-import hashlib
 from typing import NamedTuple
 
 import numpy as np
@@ -16,44 +15,32 @@ from jsecon.errors import require, require_one_of, require_shape
 from jsecon.types import Array
 
 EPS_SPACINGS = 6.0
-"""eps in units of the selection's own point spacing, the median distance to the third neighbour: wide enough to cross
-the gaps that weakly textured parts leave between splats, far below the distance between objects"""
+"""DBSCAN's eps in point spacings of the selection (median distance to the third neighbour). It crosses the gaps that
+weakly textured parts leave between splats, and is far below the distance between objects."""
 MIN_SAMPLES = 10
-"""neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings"""
+"""Neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings."""
 MIN_CLUSTER_SUPPORT = 0.1
-"""of the weight of the heaviest cluster: a cluster with so much of it is a piece of the thing, not an outlier"""
+"""Share of the heaviest cluster's weight from which a cluster is a piece of the object, not an outlier."""
 KEEP = ("largest", "supported", "all")
-"""which clusters stay: the one with most Gaussians (the paper), those that the views support, or every one"""
+"""Which clusters stay: the one with most Gaussians (the paper), those that the views support, or every one."""
 _EXACT_POINTS = 5_000
-"""up to so many points are clustered one by one: their lists of neighbours have at most 25 million entries"""
+"""Up to so many points are clustered one by one: their lists of neighbours have at most 25 million entries."""
 _VOXELS_PER_EPS = 3.0
-"""edges of a voxel in eps. A splat lies about half an edge from the mean of its voxel, so that a gap is told from a
-connection to about a third of eps. 4 takes three times as long for a million splats"""
-_REMEMBERED = 256
-"""selections, of a byte a selected Gaussian: texts in other words often select the same"""
+"""Voxels along eps. A splat lies about half a voxel from the mean of its voxel, so gaps are measured to about a third
+of eps. 4 takes three times as long for a million splats."""
 
 
 class OutlierResult(NamedTuple):
     """A selection without its outliers, and what became of its clusters."""
 
     mask: Bool[np.ndarray, " n"]
-    """the Gaussians that stay."""
+    """The Gaussians that stay."""
     skipped: str
-    """why DBSCAN was not needed; "" where it was."""
+    """Why DBSCAN was not needed; empty if it was."""
     clusters_kept: int
+    """Clusters that stay."""
     clusters_dropped: int
-
-
-class _Kept(NamedTuple):
-    """`OutlierResult` of M selected points."""
-
-    inside: Bool[np.ndarray, " m"]
-    skipped: str
-    kept: int
-    dropped: int
-
-
-_known: dict[bytes, _Kept] = {}
+    """Clusters that were dropped."""
 
 
 def remove_outliers(
@@ -65,20 +52,19 @@ def remove_outliers(
     keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
 ) -> Bool[np.ndarray, " n"]:
-    """The selection `mask` without the Gaussians that stand apart, by DBSCAN on their centres.
+    """Removes the selected Gaussians that lie apart, by DBSCAN on their centres.
 
-    DBSCAN tells clusters from noise. Noise is dropped, and the clusters that `keep` does not name. These selections
-    are returned as they came, less centres that are not finite: one of fewer than `min_samples` points, one that is a
-    single component (no gap of eps anywhere), and one in which DBSCAN finds no cluster, as there is nothing for
-    outliers to lie outside of. Host code: it cannot be traced.
+    Noise is dropped, and so are the clusters that `keep` does not name. Three kinds of selections come back as they
+    are, except for centres that are not finite: fewer than `min_samples` points, a single component (no gap of eps
+    anywhere), and points in which DBSCAN finds no cluster. Host code: it cannot be traced.
 
     Args:
       means: Centres, world units.
-      mask: The selected ones.
+      mask: The selected Gaussians.
       eps: Radius, world units; None takes `default_eps` of the selection, which follows its scale.
       min_samples: Points within eps, itself included, that make a core point.
       keep: "largest" keeps the cluster with most Gaussians (the paper). "supported" keeps each cluster that has at
-        least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask may show one thing in several pieces. "all"
+        least MIN_CLUSTER_SUPPORT of the weight of the heaviest: a mask may show one object in several pieces. "all"
         keeps every cluster.
       weight: With keep="supported", how much the views' masks show of each Gaussian, such as share * votes.total, in
         pixels; None counts each as 1.
@@ -101,11 +87,11 @@ def split_outliers(
     keep: str = "largest",
     weight: Float[Array, " n"] | None = None,
 ) -> OutlierResult:
-    """`remove_outliers`, with how many clusters it kept and dropped."""
+    """`remove_outliers`, with how many clusters it kept and dropped; arguments and errors are the same."""
     require_one_of("remove_outliers", keep, KEEP, "Use 'all' to keep several objects.")
-    positive, found = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
+    positive, options = min_samples >= 1 and (eps is None or eps > 0), f"eps={eps}, min_samples={min_samples}"
     remedy = "Leave eps out to have it follow the selection's spacing."
-    require(positive, "remove_outliers", found, "eps > 0 and min_samples >= 1", remedy)
+    require(positive, "remove_outliers", options, "eps > 0 and min_samples >= 1", remedy)
     if weight is not None:
         require_shape("weight", weight, (len(means),), "Give one weight per Gaussian.")
     mask = np.array(mask, bool)
@@ -116,36 +102,23 @@ def split_outliers(
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < min_samples:
         return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
-    own = np.ones(len(chosen)) if weight is None or keep != "supported" else np.asarray(weight, np.float64)[chosen]
-    key = hashlib.blake2b(f"{eps} {min_samples} {keep}".encode() + points.tobytes() + own.tobytes()).digest()
-    if key not in _known:
-        found = _kept_of(points, default_eps(points) if eps is None else eps, min_samples, keep, own)
-        if len(_known) >= _REMEMBERED:
-            _known.clear()
-        _known[key] = found
-    inside, skipped, kept, dropped = _known[key]
-    mask[chosen[~inside]] = False
-    return OutlierResult(mask, skipped, kept, dropped)
-
-
-def _kept_of(points: np.ndarray, eps: float, min_samples: int, keep: str, weight: np.ndarray) -> _Kept:
-    """Which of the points (M, 3) stay."""
-    whole = np.ones(len(points), bool)
+    eps = default_eps(points) if eps is None else eps
     labels = dbscan(points, eps, min_samples)
     if (labels == 0).all() or one_component(points, eps):
-        return _Kept(whole, "the selection is one component", 1, 0)
+        return OutlierResult(mask, "the selection is one component", 1, 0)
     if labels.max() < 0:
-        return _Kept(whole, "", 0, 0)
+        return OutlierResult(mask, "", 0, 0)
     clustered = labels >= 0
     sizes = np.bincount(labels[clustered])
+    stays = np.ones(len(sizes), bool)
     if keep == "largest":
         stays = np.arange(len(sizes)) == sizes.argmax()
     elif keep == "supported":
-        support = np.bincount(labels[clustered], np.nan_to_num(weight[clustered], posinf=0.0))
+        support = np.ones(len(chosen)) if weight is None else np.asarray(weight, np.float64)[chosen]
+        support = np.bincount(labels[clustered], np.nan_to_num(support[clustered], posinf=0.0))
         stays = support >= MIN_CLUSTER_SUPPORT * support.max()
-    else:
-        stays = np.ones(len(sizes), bool)
-    return _Kept(clustered & stays[labels], "", int(stays.sum()), int((~stays).sum()))
+    mask[chosen[~(clustered & stays[labels])]] = False
+    return OutlierResult(mask, "", int(stays.sum()), int((~stays).sum()))
 
 
 def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) -> float:

@@ -1,7 +1,7 @@
-"""What somebody outlined in one frame or several, as Gaussians: a mask or a box in place of a text.
+"""An outline in one frame or several, as Gaussians: a mask or a box in place of a text. Host code.
 
-Gaussians that the frames see are told by the outline itself, through their rendering weights; those that they do not,
-the far side of a mug, by the field's regions, which all views made.
+The rendering weights of the outline decide on the Gaussians that the frames see. The field's regions, which all views
+made, decide on the others, such as the far side of a mug.
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ from jsecon.language.votes import region_votes
 from jsecon.types import LanguageField, Selection
 
 OUTSIDE, INSIDE, UNKNOWN = 0, 1, 2
-"""what a pixel of an outline says: of a box only the outside is known"""
+"""Values of an outline's pixels; a box only knows its outside."""
 PRIOR_PX = 4.0
-"""weight, px, that the regions' word has against what the outline says of a Gaussian"""
+"""Weight of the regions against that of the outline, px."""
 
 
 def lift(
@@ -29,18 +29,28 @@ def lift(
     *,
     threshold: float = SHARE_THRESHOLD,
 ) -> Selection:
-    """The Gaussians of one thing that is outlined in K frames of a field.
+    """Selects the Gaussians of one object that is outlined in K frames of a field.
 
-    masks (K, H, W): bool, or integers of OUTSIDE, INSIDE and UNKNOWN; frames: the index or name of each, also of one
-    held out. With a_n and b_n the weight of Gaussian n on pixels inside and outside of them (`region_votes`), and p_n
-    its share of the regions that lie in the masks by at least half of what the frames see of them, the share is
+    With a_n and b_n the weight of Gaussian n on pixels inside and outside of the masks (`region_votes`), and p_n its
+    share of the regions that lie in the masks by at least half of what the frames see of them, its share is
 
         (a_n + PRIOR_PX p_n) / (a_n + b_n + PRIOR_PX)
 
-    and Gaussians of at least `threshold` are selected. Where the field has no region there, the outline alone decides.
-    Selection.region is the region that lies in the masks with the most of its weight, or -1; score its part inside.
-    Host code around compiled parts. Raises InputError for a frame that the field does not have and for masks with
-    nothing inside, ValueError for masks of another size.
+    If no region lies there, the outline alone decides.
+
+    Args:
+      field: The field.
+      masks: (K, H, W) bool, or integers of OUTSIDE, INSIDE and UNKNOWN.
+      frames: Index or name of each frame; held-out frames count too.
+      threshold: On the share.
+
+    Returns:
+      The selection. `region` is the region that lies in the masks with most of its weight, or -1; `score` its part
+      inside.
+
+    Raises:
+      InputError: The field does not have a frame, or the masks have no pixel inside.
+      ValueError: The masks have another size.
     """
     index = [_frame(field, frame) for frame in frames]
     size = field.cameras.height, field.cameras.width
@@ -63,19 +73,32 @@ def lift(
     if not chosen.any():
         share = np.where(inside + outside > 0, inside / np.maximum(inside + outside, 1e-9), 0.0)
     best = int(within.argmax()) if len(within) else -1
-    found = best if best >= 0 and chosen[best] else -1
+    region = best if best >= 0 and chosen[best] else -1
     score = float(within[best]) if best >= 0 else 0.0
-    sound = np.isfinite(share)
-    mask = sound & (share >= threshold)
-    similarity = np.where(sound, share, 0.0).astype(np.float32)
+    finite = np.isfinite(share)
+    mask = finite & (share >= threshold)
+    similarity = np.where(finite, share, 0.0).astype(np.float32)
     return Selection(
-        jnp.asarray(mask), jnp.asarray(similarity), jnp.asarray(found, jnp.int32), jnp.asarray(score, jnp.float32)
+        jnp.asarray(mask), jnp.asarray(similarity), jnp.asarray(region, jnp.int32), jnp.asarray(score, jnp.float32)
     )
 
 
 def box_mask(field: LanguageField, x0: int, y0: int, x1: int, y1: int) -> Int[np.ndarray, "h w"]:
-    """(H, W) OUTSIDE and UNKNOWN of a box, columns x0 to x1 and rows y0 to y1, both ends within. Raises InputError for
-    a box without a pixel of the frame."""
+    """Makes the mask of a box for `lift`.
+
+    Args:
+      field: The field, of whose frames the size is taken.
+      x0: First column.
+      y0: First row.
+      x1: Last column.
+      y1: Last row.
+
+    Returns:
+      (H, W) OUTSIDE, and UNKNOWN within the box.
+
+    Raises:
+      InputError: The box has no pixel of the frame.
+    """
     mask = np.full((field.cameras.height, field.cameras.width), OUTSIDE, np.int32)
     mask[max(y0, 0) : max(y1 + 1, 0), max(x0, 0) : max(x1 + 1, 0)] = UNKNOWN
     if not mask.any():

@@ -1,4 +1,4 @@
-"""Which region lies under a pixel of a frame: the votes of the Gaussians that make up that pixel, by their weights."""
+"""The region under a pixel: the votes of the Gaussians that make up the pixel, by their weights. Host code."""
 
 import jax
 import jax.numpy as jnp
@@ -6,31 +6,37 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.language.membership import ROWS, vote_shares, votes_of_rows
+from jsecon.language.columns import row_slices, votes_of_rows
+from jsecon.language.membership import vote_shares
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from jsecon.splat.project import project
 from jsecon.types import Array, Camera, Gaussians, LanguageField
 
 MIN_SHARE = 0.05
-"""a region that makes up less of a pixel than this is no answer to what lies there: the pixel is background"""
+"""Smallest part of a pixel that a region must make up; the pixel is background otherwise."""
 
 
 def pixel_weights(
     gaussians: Gaussians, camera: Camera, x: int, y: int
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Ids (M,) front to back and weights alpha T (M,) of the Gaussians that make up pixel (column x, row y) of a view.
+    """Composites one pixel, without tiles: O(N), where a render would have to carry every region as a channel.
 
-    By the definition of the image (jsecon.splat.render), without tiles: O(N) for one pixel, where a render is O(N) too
-    and would have to carry every region as a channel. Host code; columns that are mapped are read in blocks.
+    Args:
+      gaussians: Scene of N Gaussians; its columns may be memory-mapped.
+      camera: The view.
+      x: Column of the pixel.
+      y: Row of the pixel.
+
+    Returns:
+      Ids (M,), front to back, and weights alpha T (M,) of the Gaussians that make up the pixel.
     """
-    mapped = any(isinstance(column, np.memmap) for column in jax.tree.leaves(gaussians))
-    rows, found = ROWS if mapped else max(gaussians.count, 1), []
-    for first in range(0, gaussians.count, rows):
-        block = jax.tree.map(lambda a, own=slice(first, first + rows): jnp.asarray(a[own]), gaussians)
+    columns = [np.zeros((3, 0))]
+    for rows in row_slices(gaussians, gaussians.count):
+        block = jax.tree.map(lambda a, rows=rows: jnp.asarray(a[rows]), gaussians)
         alpha, depths = (np.asarray(a) for a in _alphas(block, camera, x + 0.5, y + 0.5))
-        own = np.flatnonzero(alpha)
-        found.append((own + first, alpha[own], depths[own]))
-    ids, alpha, depths = (np.concatenate(column) for column in zip(*found)) if found else np.zeros((3, 0))
+        hit = np.flatnonzero(alpha)
+        columns.append((hit + rows.start, alpha[hit], depths[hit]))
+    ids, alpha, depths = (np.concatenate(column) for column in zip(*columns))
     order = np.argsort(depths, kind="stable")  # ties in depth keep index order
     ids, alpha = ids[order].astype(np.int64), alpha[order]
     after = np.cumprod(1.0 - alpha.astype(np.float64))
@@ -50,12 +56,19 @@ def _alphas(gaussians: Gaussians, camera: Camera, x: Array | float, y: Array | f
 
 
 def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[np.ndarray, " r"]:
-    """(R,) how much of pixel (column x, row y) of frame `frame` each region makes up: the rendered shares p_nr,
+    """How much of a pixel each region makes up: sum_n w_n p_nr, w the weights alpha T and p the shares of votes.
 
-        sum_n w_n p_nr
+    Args:
+      field: Field of R regions.
+      frame: Index of the frame.
+      x: Column of the pixel.
+      y: Row of the pixel.
 
-    with w the weights alpha T of the Gaussians there. Each is at most the pixel's alpha.
-    Raises InputError for a frame or a pixel that the field does not have.
+    Returns:
+      (R,), each at most the pixel's alpha.
+
+    Raises:
+      InputError: The field does not have the frame or the pixel.
     """
     frames, width, height = field.cameras.world_to_camera.shape[0], field.cameras.width, field.cameras.height
     if not 0 <= frame < frames:
@@ -68,7 +81,7 @@ def region_shares_at(field: LanguageField, frame: int, x: int, y: int) -> Float[
 
 
 def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
-    """`region_shares_at` for a camera that is none of the field's."""
+    """`region_shares_at` for any camera."""
     ids, weights = pixel_weights(field.gaussians, camera, x, y)
     shares = np.zeros(field.regions.count)
     if not len(ids):
@@ -81,9 +94,20 @@ def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> 
 
 
 def region_at(field: LanguageField, frame: int, x: int, y: int, *, min_share: float = MIN_SHARE) -> int:
-    """The region that makes up most of pixel (column x, row y) of frame `frame`; -1 where none makes up `min_share`.
+    """Finds the region that makes up most of a pixel.
 
-    See `region_shares_at`, also for what it raises.
+    Args:
+      field: The field.
+      frame: Index of the frame.
+      x: Column of the pixel.
+      y: Row of the pixel.
+      min_share: Smallest part of the pixel that it must make up.
+
+    Returns:
+      The region, or -1 for background.
+
+    Raises:
+      InputError: The field does not have the frame or the pixel.
     """
     shares = region_shares_at(field, frame, x, y)
     return int(shares.argmax()) if shares.size and shares.max() >= min_share else -1

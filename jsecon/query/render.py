@@ -11,11 +11,11 @@ from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
 ALPHA_THRESHOLD = 0.7
-"""OpenGaussian's silhouette (render_lerf_by_text.py); VALA's is 10/255, which rewards faint selections"""
+"""Alpha of OpenGaussian's silhouette (render_lerf_by_text.py)."""
 VALA_THRESHOLD = 10 / 255
-"""VALA's silhouette threshold: lenient, to be reported beside 0.7 and never mixed with it"""
+"""Alpha of VALA's silhouette: lenient, it rewards faint selections; reported beside 0.7."""
 HIDDEN_LOGIT = -30.0
-"""an opacity of 1e-13, far below 1/255: culled in projection, with every number finite"""
+"""Opacity logit of hidden Gaussians: an opacity of 1e-13 is culled in projection, and every number stays finite."""
 
 
 def selection_mask(
@@ -26,10 +26,22 @@ def selection_mask(
     threshold: float = ALPHA_THRESHOLD,
     capacity: int | None = None,
 ) -> Bool[Array, "h w"]:
-    """(H, W) bool: where the rendering of the selected Gaussians alone, all others deleted, has alpha > threshold.
+    """Renders the selected Gaussians alone and thresholds their alpha. Pure.
 
-    Occlusion by what is not selected is not taken into account: that is the protocol. capacity as for `render`; inside
-    a trace `render_selection` tells what overflowed it.
+    Occlusion by Gaussians that are not selected does not count: that is the protocol.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      camera: The view.
+      mask: (N,) the selected ones.
+      threshold: On alpha.
+      capacity: As for `render`; inside a trace `render_selection` returns the overflow.
+
+    Returns:
+      (H, W) bool.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
     return _rendered(gaussians, camera, mask, None, capacity).alpha > threshold
 
@@ -42,9 +54,20 @@ def render_selection(
     *,
     capacity: int | None = None,
 ) -> Rendering:
-    """Renders the selected Gaussians alone: alpha, and features (H, W, 1) = sum alpha T similarity (ones by default).
+    """Renders the selected Gaussians alone. The others become transparent, so selections share one program. Pure.
 
-    Those not selected become transparent instead of being cut out, so that every selection shares one compilation.
+    Args:
+      gaussians: Scene of N Gaussians.
+      camera: The view.
+      mask: (N,) the selected ones.
+      similarity: (N,) feature of each; ones by default.
+      capacity: As for `render`.
+
+    Returns:
+      The rendering; features (H, W, 1) are sum alpha T similarity.
+
+    Raises:
+      ValueError: Shapes disagree.
     """
     rendering = _rendered(gaussians, camera, mask, similarity, capacity)
     return dataclasses.replace(rendering, features=rendering.features[..., :1])

@@ -1,8 +1,8 @@
-"""Which Gaussians to take so that, rendered alone, they cover what the views say is the thing, and nothing else.
+"""The Gaussians whose silhouette fits an object best. Host code around compiled parts.
 
-A Gaussian's share (`jsecon.language.membership`) says what it is part of; a silhouette is made by many. A splat that is
-half the thing's is needed in a hole of it and spills at its rim: here each is taken or left by what the outline of the
-whole gains, in expectation, over the views.
+A Gaussian's share (`jsecon.language.membership`) says how much of it belongs to the object; many Gaussians make a
+silhouette. A splat that is half the object's fills a hole of it, and spills over at its rim. Here each one is taken or
+left by what the outline gains, in expectation, over the views.
 """
 
 import functools
@@ -25,17 +25,21 @@ from jsecon.splat.walk import pixel_alphas, to_tiles
 from jsecon.types import Array, Camera, Gaussians
 
 SILHOUETTE_WEIGHTS = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}
-"""weights of the expected IoU at ALPHA_THRESHOLD, of what is opaque, and at VALA_THRESHOLD, of all that is there"""
+"""Weights of the expected IoU at ALPHA_THRESHOLD, of what is opaque, and at VALA_THRESHOLD, of all that is visible."""
 WEIGHTS = SILHOUETTE_WEIGHTS["silhouette"]
+"""The default."""
 MIN_CANDIDATE_SHARE = 0.1
-"""of a Gaussian that may be taken"""
+"""Share above which a Gaussian may be taken."""
 SWEEPS = 3
-VIEWS, LONG_SIDE = 12, 192
-"""views that are looked at, and their size, px, at most"""
-MOST = 8192
-"""Gaussians that are decided on, at most: those nearest to the threshold; the others stay with their side of it"""
+"""Passes over the candidates."""
+VIEWS = 12
+"""Views that are rendered, at most."""
+LONG_SIDE = 192
+"""Largest side of a rendered view, px."""
+MAX_CANDIDATES = 8192
+"""Gaussians that are decided on, at most: those whose shares are nearest to the threshold."""
 _BLOCK = 16
-"""(tile, Gaussian) pairs at a time"""
+"""(tile, Gaussian) pairs at a time."""
 
 
 class Footprints(NamedTuple):
@@ -51,11 +55,11 @@ class Footprints(NamedTuple):
     starts: Array
     """(C + 1,) int32 where each Gaussian's pairs begin."""
     inside: Float[Array, "tiles 64"]
-    """expected part of the pixel that is the thing's; 0 beyond the image."""
+    """Expected part of the pixel that is the object's; 0 beyond the image."""
     outside: Float[Array, "tiles 64"]
     """1 - inside; 0 beyond the image."""
     base: Float[Array, "tiles 64"]
-    """what Gaussians absorb that are taken for certain."""
+    """What Gaussians absorb that are certainly taken."""
 
 
 def fit_silhouette(
@@ -66,39 +70,49 @@ def fit_silhouette(
     threshold: float = SHARE_THRESHOLD,
     weights: tuple[float, float] = WEIGHTS,
 ) -> Bool[Array, " n"]:
-    """(N,) bool: the Gaussians whose silhouette should fit best what `share` (N,), in [0, 1], says is the thing.
+    """Chooses the Gaussians whose silhouette, rendered alone, fits best what their shares say is the object.
 
-    With pi_v(p) = min(sum_i w_ip s_i, 1) the part of a pixel that is the thing's, composited from the shares s
-    through the whole scene, and alpha_S(p) what the Gaussians S let nothing through of, rendered alone, it ascends
+    With pi_v(p) = min(sum_i w_ip s_i, 1) the part of a pixel that is the object's, composited from the shares s through
+    the whole scene, and alpha_S(p) the opacity of the Gaussians S rendered alone, it ascends
 
         mean_v (a E_v(0.7) + b E_v(10 / 255)),  E_v(t) = sum_p pi c / (sum_p pi + sum_p (1 - pi) c),  c = 1[alpha_S > t]
 
-    with `weights` (a, b); (0, 1) is for who must not touch a thing, (1, 0) for its solid core. E is the expected IoU
-    but for the order of mean and ratio. From {s >= `threshold`}, Gaussians with s > MIN_CANDIDATE_SHARE are taken or
-    left out one by one, lowest share first, wherever that raises it, SWEEPS times. `cameras` are a batch of views of
-    the scene, of which VIEWS that see the thing are looked at, at LONG_SIDE px at most, in float32. Host code around
-    compiled parts; not differentiable. Raises ValueError on a share of another length.
+    E is the expected IoU up to the order of mean and ratio. From {s >= `threshold`}, Gaussians with a share above
+    MIN_CANDIDATE_SHARE are taken or left one by one, lowest share first, wherever that raises it, SWEEPS times.
+
+    Args:
+      gaussians: Scene of N Gaussians.
+      cameras: Batch of views; VIEWS that see the object are rendered, LONG_SIDE px at most, in float32.
+      share: (N,) in [0, 1].
+      threshold: On the share, to start from.
+      weights: (a, b). (0, 1) for an outline that must not touch other objects, (1, 0) for the solid core.
+
+    Returns:
+      (N,) bool. Not differentiable.
+
+    Raises:
+      ValueError: The share has another length.
     """
     require_shape("fit_silhouette", share, (gaussians.count,), "Give one share per Gaussian.")
     share = np.asarray(share, np.float32)
     chosen = share >= threshold
-    open_to = np.flatnonzero(share > MIN_CANDIDATE_SHARE)
-    if not chosen.any() or not len(open_to):
+    candidates = np.flatnonzero(share > MIN_CANDIDATE_SHARE)
+    if not chosen.any() or not len(candidates):
         return jnp.asarray(chosen)
-    open_to = open_to[np.argsort(np.abs(share[open_to] - threshold), kind="stable")[:MOST]]
-    open_to = open_to[np.argsort(share[open_to], kind="stable")]
-    views = views_of(gaussians, cameras, chosen)
-    found = footprints(gaussians, views, share, open_to, chosen)
-    taken = np.zeros(len(found.starts) - 1, bool)
-    taken[: len(open_to)] = chosen[open_to]
-    ascended = np.asarray(ascend(found, jnp.asarray(taken), len(views.fx), len(open_to), jnp.asarray(weights)))
+    candidates = candidates[np.argsort(np.abs(share[candidates] - threshold), kind="stable")[:MAX_CANDIDATES]]
+    candidates = candidates[np.argsort(share[candidates], kind="stable")]
+    views = choose_views(gaussians, cameras, chosen)
+    prints = footprints(gaussians, views, share, candidates, chosen)
+    taken = np.zeros(len(prints.starts) - 1, bool)
+    taken[: len(candidates)] = chosen[candidates]
+    ascended = np.asarray(ascend(prints, jnp.asarray(taken), len(views.fx), len(candidates), jnp.asarray(weights)))
     chosen = chosen.copy()
-    chosen[open_to] = ascended[: len(open_to)]
+    chosen[candidates] = ascended[: len(candidates)]
     return jnp.asarray(chosen)
 
 
-def views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camera:
-    """VIEWS cameras, evenly among those into whose image most of the chosen Gaussians' centres fall, at LONG_SIDE."""
+def choose_views(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camera:
+    """Up to VIEWS cameras, evenly among those whose images hold the most centres of the chosen Gaussians."""
     means = np.asarray(gaussians.means)[chosen]
     poses = np.asarray(cameras.world_to_camera)
     local = np.einsum("tij,nj->tni", poses[:, :3, :3], means) + poses[:, None, :3, 3]
@@ -114,16 +128,16 @@ def views_of(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> Camer
 
 
 def footprints(
-    gaussians: Gaussians, views: Camera, share: np.ndarray, open_to: np.ndarray, chosen: np.ndarray
+    gaussians: Gaussians, views: Camera, share: np.ndarray, candidates: np.ndarray, chosen: np.ndarray
 ) -> Footprints:
-    """What the Gaussians `open_to` (C,) absorb in `views`, padded so that texts share their programs; `chosen` (N,) of
-    the others are taken for certain."""
+    """What the Gaussians `candidates` (C,) absorb in `views`, padded so that texts share their programs. Of the others
+    the `chosen` ones (N,) are certainly taken."""
     # One precision for all: jax.enable_x64 holds in its own thread alone, and views are planned in several.
     gaussians, views = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (gaussians, views))
-    rows = _padded(len(open_to))
+    rows = _padded(len(candidates))
     certain = chosen.copy()
-    certain[open_to] = False
-    own = _rows(gaussians, open_to, rows)
+    certain[candidates] = False
+    part = _rows(gaussians, candidates, rows)
     rest = np.flatnonzero(certain)
     rest_of = _rows(gaussians, rest, _padded(len(rest))) if len(rest) else None
     shares = jnp.broadcast_to(jnp.asarray(share)[:, None], (len(share), 3))
@@ -131,7 +145,7 @@ def footprints(
     def seen_from(t: int) -> tuple[np.ndarray, ...]:
         camera = views[t]
         image = jnp.clip(render_plan(plan_view(gaussians, camera), shares).features[..., 0], 0.0, 1.0)
-        tile = plan_view(own, camera)
+        tile = plan_view(part, camera)
         edge, number = tile.lists.tile, len(tile.lists.lengths)
         lengths, starts = np.asarray(tile.lists.lengths), np.asarray(tile.lists.starts)
         of_tile = np.repeat(np.arange(number), lengths)
@@ -141,13 +155,13 @@ def footprints(
         pairs = (np.pad(a, (0, size - len(a))) for a in (ids, of_tile))
         absorbed = np.asarray(_absorbed(tile.splats, *pairs, -(-views.width // edge), edge))[: len(ids)]
         seen = absorbed.max(1, initial=0) > 0
-        there = np.asarray(to_tiles(jnp.ones_like(image), edge))[:-1]
+        in_image = np.asarray(to_tiles(jnp.ones_like(image), edge))[:-1]
         expected = np.asarray(to_tiles(image, edge))[:-1]
         certainly = np.zeros_like(expected)
         if rest_of is not None:
             alpha = render_plan(plan_view(rest_of, camera), jnp.zeros((rest_of.count, 1), jnp.float32)).alpha
             certainly = np.asarray(to_tiles(-jnp.log(jnp.maximum(1 - alpha, 1e-6)), edge))[:-1]
-        return absorbed[seen], of_tile[seen] + t * number, ids[seen], expected, there - expected, certainly
+        return absorbed[seen], of_tile[seen] + t * number, ids[seen], expected, in_image - expected, certainly
 
     with ThreadPoolExecutor(cores()) as pool:  # a view's lists are sorted on one core
         values, tiles, owners, inside, outside, base = zip(*pool.map(seen_from, range(len(views.fx))), strict=True)
@@ -187,7 +201,7 @@ def _absorbed(splats: Array, ids: Array, tiles: Array, across: int, edge: int) -
 
 @functools.partial(jax.jit, static_argnums=2)
 def ascend(
-    found: Footprints,
+    prints: Footprints,
     taken: Bool[Array, " c"],
     views: int,
     count: int | Array,
@@ -195,31 +209,33 @@ def ascend(
 ) -> Bool[Array, " c"]:
     """Which of C Gaussians are taken after SWEEPS sweeps over the first `count` from `taken` (C,), see
     `fit_silhouette`. Pure."""
-    found = jax.tree.map(jnp.asarray, found)
-    levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], found.absorbed.dtype)
+    prints = jax.tree.map(jnp.asarray, prints)
+    levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], prints.absorbed.dtype)
     worth = jnp.asarray(weights, levels.dtype)
-    per_view = (found.inside.shape[0] - 1) // views
+    per_view = (prints.inside.shape[0] - 1) // views
     by_view = lambda image: image[:-1].reshape(views, -1).sum(1)
-    whole = by_view(found.inside)
+    whole = by_view(prints.inside)
 
     def place(c, first):
         pair = first + lax.iota(jnp.int32, _BLOCK)
-        own = pair < found.starts[c + 1]
-        values = jnp.where(own[:, None], lax.dynamic_slice_in_dim(found.absorbed, first, _BLOCK), 0.0)
-        return jnp.where(own, lax.dynamic_slice_in_dim(found.tiles, first, _BLOCK), found.inside.shape[0] - 1), values
+        inside = pair < prints.starts[c + 1]
+        values = jnp.where(inside[:, None], lax.dynamic_slice_in_dim(prints.absorbed, first, _BLOCK), 0.0)
+        return jnp.where(
+            inside, lax.dynamic_slice_in_dim(prints.tiles, first, _BLOCK), prints.inside.shape[0] - 1
+        ), values
 
     def blocks(c, step, carry):
         onward = lambda state: (state[0] + _BLOCK, step(*place(c, state[0]), state[1]))
-        return lax.while_loop(lambda state: state[0] < found.starts[c + 1], onward, (found.starts[c], carry))[1]
+        return lax.while_loop(lambda state: state[0] < prints.starts[c + 1], onward, (prints.starts[c], carry))[1]
 
     def add_up(c, level):
-        given = jnp.where(taken[c], 1.0, 0.0).astype(level.dtype)
-        return blocks(c, lambda tiles, values, level: level.at[tiles].add(given * values), level)
+        weight = jnp.where(taken[c], 1.0, 0.0).astype(level.dtype)
+        return blocks(c, lambda tiles, values, level: level.at[tiles].add(weight * values), level)
 
-    level = lax.fori_loop(0, taken.shape[0], add_up, found.base)
+    level = lax.fori_loop(0, taken.shape[0], add_up, prints.base)
     covered = [level > threshold for threshold in levels]
-    hit = jnp.stack([by_view(jnp.where(c, found.inside, 0.0)) for c in covered])  # (2, V)
-    spilt = jnp.stack([by_view(jnp.where(c, found.outside, 0.0)) for c in covered])
+    hit = jnp.stack([by_view(jnp.where(c, prints.inside, 0.0)) for c in covered])  # (2, V)
+    spilt = jnp.stack([by_view(jnp.where(c, prints.outside, 0.0)) for c in covered])
     worth_of = lambda hit, spilt: (worth[:, None] * hit / jnp.maximum(whole + spilt, 1e-6)).sum()
 
     def flip(k, state):
@@ -231,7 +247,7 @@ def ascend(
             hit, spilt = carry
             before = level[tiles]
             after, view = before + sign * values, jnp.minimum(tiles // per_view, views - 1)
-            inside, outside = found.inside[tiles], found.outside[tiles]
+            inside, outside = prints.inside[tiles], prints.outside[tiles]
             for n in range(2):
                 moved = (after > levels[n]).astype(level.dtype) - (before > levels[n]).astype(level.dtype)
                 hit = hit.at[n, view].add((moved * inside).sum(1))

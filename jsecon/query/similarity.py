@@ -11,18 +11,18 @@ from jsecon.numerics import FULL_PRECISION, normalize, safe_scale
 from jsecon.types import Array, Leaf
 
 NARROW = 32
-"""codes of at most so many numbers are compared column by column"""
+"""Codes of at most so many numbers are compared column by column."""
 Number = float | int | Array
-"""a threshold: a Python number, or () under a trace"""
+"""A threshold: a Python number, or () under a trace."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class UnitCodes:
-    """What `unit_codes` makes, and every query takes in place of codes."""
+    """Codes of unit length, as `unit_codes` makes them; queries take them in place of codes."""
 
     rows: Leaf
-    """(N, d) of unit length; zero where unknown."""
+    """(N, d) of unit length; zero if unknown."""
     known: Leaf
     """(N,) bool: the code was finite and not zero."""
 
@@ -32,15 +32,20 @@ class UnitCodes:
 
 
 Codes = Float[Array, "n d"] | UnitCodes
-"""(N, d) as they come, or brought to unit length once by `unit_codes`"""
+"""(N, d) of any length, or scaled to unit length by `unit_codes`."""
 
 
 @jax.jit
 def unit_codes(codes: Float[Array, "n d"]) -> UnitCodes:
-    """Codes (N, d) of any length as units, with what is zero or not finite marked as unknown.
+    """Scales codes to unit length, once for many queries. Pure.
 
-    A field keeps its Gaussians and is asked many times: the lengths of 1 million codes of 512 numbers cost more than
-    the query itself.
+    The lengths of 1 million codes of 512 numbers cost more than the query itself.
+
+    Args:
+      codes: (N, d) of any length.
+
+    Returns:
+      The unit codes; zero codes and codes that are not finite are unknown.
     """
     units = normalize(codes)
     known = jnp.all(jnp.isfinite(units), axis=-1) & jnp.any(units != 0, axis=-1)
@@ -48,20 +53,20 @@ def unit_codes(codes: Float[Array, "n d"]) -> UnitCodes:
 
 
 def as_codes(codes: Array | UnitCodes) -> Array | UnitCodes:
-    """jax's arrays of what a caller gave."""
+    """Codes as jax's arrays."""
     return codes if isinstance(codes, UnitCodes) else jnp.asarray(codes)
 
 
 def similarities(codes: Codes, code: Float[Array, " d"]) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Cosines (N,) of rows with one code, and where they mean something: both finite and not zero; 0 elsewhere."""
+    """Cosines (N,) of rows with one code, and which are known: both finite and not zero; 0 elsewhere."""
     unit = normalize(code)
-    sound = jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
+    usable = jnp.all(jnp.isfinite(unit)) & jnp.any(unit != 0)
     if isinstance(codes, UnitCodes):
-        known = codes.known & sound
+        known = codes.known & usable
         return jnp.where(known, _product(codes.rows, unit), 0.0), known
     narrow = codes.shape[1] <= NARROW
     largest, dots, squares = (_by_column if narrow else _by_row)(codes, unit)
-    known = (largest > 0) & jnp.isfinite(largest) & sound
+    known = (largest > 0) & jnp.isfinite(largest) & usable
     return jnp.where(known, dots / jnp.sqrt(jnp.where(known, squares, 1.0)), 0.0), known
 
 

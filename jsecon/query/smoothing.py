@@ -1,7 +1,6 @@
-"""Similarities evened out over neighbours in space: what one Gaussian's votes say by chance its neighbours do not.
+"""Similarities smoothed over neighbours in space, so that chance differences of the votes even out.
 
-VALA's readout does so with the relevancy of each Gaussian (experiments/rivals/lifting.py); here it is done with the
-share that a region has of each.
+VALA's readout smooths the relevancy of each Gaussian (experiments/rivals/lifting.py); here it is the share of a region.
 """
 
 import jax
@@ -14,26 +13,42 @@ from jsecon.errors import require
 from jsecon.types import Array
 
 NEIGHBOURS = 10
+"""Nearest Gaussians that are averaged."""
 
 
 def nearest_neighbours(means: Float[Array, "n 3"], *, count: int = NEIGHBOURS) -> Int[np.ndarray, "n k"]:
-    """(N, K) int32 the `count` Gaussians whose centres (N, 3) are nearest to each, itself left out; K = N - 1 where
-    there are fewer. Centres that are not finite are nobody's neighbours, and have themselves as theirs. Host code."""
-    require(count >= 1, "nearest", count, "at least 1", "10 is the default.")
+    """Finds the Gaussians whose centres are nearest to each. Host code.
+
+    Args:
+      means: (N, 3) centres.
+      count: Neighbours of each.
+
+    Returns:
+      (N, K) int32 ids without the Gaussian itself; K = N - 1 if there are fewer. A centre that is not finite is not a
+      neighbour, and has itself as its neighbours.
+
+    Raises:
+      ValueError: `count` is below 1.
+    """
+    require(count >= 1, "nearest_neighbours", count, "at least 1", "10 is the default.")
     means = np.asarray(means, np.float64)
-    sound = np.flatnonzero(np.isfinite(means).all(1))
-    found = np.repeat(np.arange(len(means), dtype=np.int32)[:, None], min(count, max(len(means) - 1, 1)), axis=1)
-    if len(sound) > 1:
-        points = means[sound]
-        ways = min(found.shape[1], len(sound) - 1)
-        near = np.asarray(KDTree(points).query(points, k=ways + 1, workers=-1)[1])
-        own = near == np.arange(len(points))[:, None]
-        own[~own.any(1), -1] = True  # of many in one place the farthest goes in its stead
-        found[sound, :ways] = sound[near[~own].reshape(len(points), ways)]
-    return found
+    finite = np.flatnonzero(np.isfinite(means).all(1))
+    ids = np.repeat(np.arange(len(means), dtype=np.int32)[:, None], min(count, max(len(means) - 1, 1)), axis=1)
+    if len(finite) > 1:
+        points = means[finite]
+        kept = min(ids.shape[1], len(finite) - 1)
+        near = np.asarray(KDTree(points).query(points, k=kept + 1, workers=-1)[1])
+        itself = near == np.arange(len(points))[:, None]
+        itself[~itself.any(1), -1] = True  # of many in one place the farthest goes in its stead
+        ids[finite, :kept] = finite[near[~itself].reshape(len(points), kept)]
+    return ids
 
 
 @jax.jit
 def smooth_over_neighbours(similarity: Float[Array, " n"], near: Int[Array, "n k"]) -> Float[Array, " n"]:
-    """(N,) the mean of each Gaussian's similarity and its neighbours' mean, `near` (N, K) as of `nearest`. Pure."""
+    """Averages each Gaussian's similarity (N,) with the mean of its `nearest_neighbours` (N, K). Pure.
+
+    Returns:
+      (N,) half the similarity and half the neighbours' mean.
+    """
     return 0.5 * (similarity + jnp.mean(similarity[near], axis=1))

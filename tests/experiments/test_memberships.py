@@ -7,7 +7,7 @@ import pytest
 from small_field import make_field, shares
 
 from experiments.tables.ours import of_all_views
-from jsecon.query.anchored import query_anchored
+from jsecon.query.select import query_anchored
 from jsecon.types import Regions
 
 

@@ -13,7 +13,7 @@ from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_we
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError
 from jsecon.query.baselines import relevancies
-from jsecon.query.match import answers
+from jsecon.query.match import region_similarities
 from jsecon.vision.protocols import CANONICAL, Embedder
 
 SIDE = 8
@@ -214,7 +214,7 @@ def test_scores_of_all_texts_are_those_of_the_library():
     assert all((table[:, 2] == -np.inf).all() for table in found.values())
     known = np.arange(6) != 2
     for q, text in enumerate(texts):
-        apart = np.asarray(answers(regions, text, canonical, words, pixels, "apart")[0])
+        apart = np.asarray(region_similarities(regions, text, words, "apart")[0])
         relevancy = np.asarray(relevancies(regions, text, canonical)[0])
         np.testing.assert_allclose(found["apart"][q, known], apart[known], atol=1e-5)
         np.testing.assert_allclose(found["relevancy"][q, known], relevancy[known], atol=1e-5)

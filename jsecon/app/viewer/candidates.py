@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, UInt8
 from jsecon.app.ask import with_phrases
 from jsecon.app.outputs import main_regions
 from jsecon.app.pictures import Renderer
-from jsecon.query.match import RETRIEVALS, answers, evidence, scene_residuals, words_of
+from jsecon.language.regions import mean_residuals
+from jsecon.query.composite import parse_query
+from jsecon.query.match import ROUNDING, RULES, evidence, reference_words, region_similarities
 from jsecon.query.pixel import MIN_SHARE, region_shares_seen
 from jsecon.query.render import HIDDEN_LOGIT
-from jsecon.query.several import ROUNDING, parts_of_question
 from jsecon.query.similarity import similarities
 from jsecon.types import Camera, LanguageField
 
@@ -61,16 +62,14 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     pixels = jnp.asarray(field.regions.pixels)
     if isinstance(query, str):
         field = with_phrases(field, embedder)
-        words, retrieval = words_of(field, RETRIEVALS[0])
-        included, excluded = parts_of_question(query)
-        canonical = jnp.asarray(field.canonical)
+        included, excluded = parse_query(query)
         texts = jnp.asarray(embedder.embed_text(included + excluded))
-        matches = [_answers(table, text, canonical, words, pixels, retrieval) for text in texts]
+        matches = [_similarities(table, text, reference_words(field), RULES.retrieval) for text in texts]
         scores = np.stack([score for score, _ in matches])
         score = scores[: len(included)].max(0)
         known = matches[0][1] & (score > scores[len(included) :].max(0, initial=-np.inf) + ROUNDING)
     else:
-        score, known = (np.array(a) for a in _region_similarity(table, pixels, min(query, field.regions.count - 1)))
+        score, known = (np.array(a) for a in _region_similarity(table, min(query, field.regions.count - 1)))
         known[query : query + 1] = False
     weighted = np.where(known, np.where(score > 0, score * np.asarray(_evidence(pixels)), score), -np.inf)
     order = [r for r in np.argsort(-weighted, kind="stable")[:count] if known[r]]
@@ -78,14 +77,14 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     return [Candidate(int(r), float(score[r]), int(frames[r])) for r in order]
 
 
-_answers = jax.jit(answers, static_argnames="retrieval")
+_similarities = jax.jit(region_similarities, static_argnames="retrieval")
 _evidence = jax.jit(evidence)
 
 
 @jax.jit
-def _region_similarity(embeddings, pixels, region):
-    """Returns cosines of all regions with one, by what sets them apart from the scene, and where they are known."""
-    residuals, known = scene_residuals(embeddings, pixels)
+def _region_similarity(embeddings, region):
+    """Returns cosines of all regions with one, by what sets them apart from the mean, and where they are known."""
+    residuals, known = mean_residuals(embeddings)
     cosines, measured = similarities(residuals, residuals[region])
     return jnp.where(measured, cosines, 0.0), known & measured
 

@@ -15,7 +15,7 @@ from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import COLOURINGS, ViewState, answer_colours
 from jsecon.errors import InputError
 from jsecon.language.membership import probability_inside
-from jsecon.query.match import CONTRAST_THRESHOLD, PRESENCE_THRESHOLD, QUANTILE
+from jsecon.query.rules import PRESENCE_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
 from jsecon.types import LanguageField
 
 THUMBNAIL = 88
@@ -242,7 +242,7 @@ def _refusal(answer: Answer) -> str:
         return f"{quantile_message(answer.quantile)}, and {100 * QUANTILE:.0f} % are required"
     if answer.presence is not None:
         return f"the probability that it is there is {answer.presence:.2g}, and {PRESENCE_THRESHOLD} is required"
-    return f"the best score is {float(answer.selection.score):.2f}, and {CONTRAST_THRESHOLD} is required"
+    return f"the best score is {float(answer.selection.score):.2f}, and {RETRIEVAL_THRESHOLD} is required"
 
 
 def candidate_grid(

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from jsecon.errors import InputError, describe_error
 from jsecon.language.membership import SHARE_THRESHOLD
-from jsecon.query.match import PIECE_THRESHOLD
+from jsecon.query.rules import PIECE_THRESHOLD
 
 Colouring: TypeAlias = Literal["photo", "code", "region", "score"]
 COLOURINGS: tuple[Colouring, ...] = get_args(Colouring)

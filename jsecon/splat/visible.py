@@ -1,0 +1,100 @@
+"""Views of a scene that need not fit into memory. Host code.
+
+The geometry of one Gaussian takes 44 bytes. The columns are read block by block, and only the Gaussians that a view can
+see are kept: what is rendered of them equals what is rendered of all.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jsecon.numerics import NEAR
+from jsecon.splat.project import check_shapes, project
+from jsecon.splat.render import render
+from jsecon.splat.sh import colours_from_sh
+from jsecon.types import Array, Camera, Gaussians
+
+ROWS = 1 << 18
+"""Gaussians of a block."""
+_HIDDEN_LOGIT = -np.inf
+"""Opacity logit of the rows that fill a size up."""
+
+
+def visible_rows(
+    gaussians: Gaussians, camera: Camera, *, near: float = NEAR, rows: int = ROWS
+) -> Int[np.ndarray, " m"]:
+    """Finds the Gaussians that a view can see.
+
+    Args:
+      gaussians: Scene of N Gaussians; its columns may be memory-mapped.
+      camera: The view.
+      near: Near plane, world units.
+      rows: Gaussians that are read at once.
+
+    Returns:
+      (M,) int64 ids, ascending.
+
+    Raises:
+      ValueError: Shapes disagree.
+    """
+    check_shapes(gaussians, camera)
+    geometry = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
+    ids = [np.zeros(0, np.int64)]
+    for first in range(0, gaussians.count, rows):
+        block = jax.tree.map(lambda a, first=first: np.asarray(a[first : first + rows], np.float32), geometry)
+        ids.append(first + np.flatnonzero(np.asarray(_is_visible(block, camera, near))))
+    return np.concatenate(ids)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _is_visible(gaussians: Gaussians, camera: Camera, near: float) -> Array:
+    return project(gaussians, camera, near=near).visible
+
+
+def padded_size(count: int) -> int:
+    """`count` rounded up to an eighth of a power of two, at least 4,096: views share compiled programs."""
+    step = max(4096, 1 << max(count.bit_length() - 4, 0))
+    return max(-(-count // step), 1) * step
+
+
+def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussians:
+    """The Gaussians `ids` (M,) without colour, then transparent ones up to `padded_size`. NumPy, float32."""
+    fill = padded_size(len(ids)) - len(ids)
+    bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
+    rows = lambda a: np.concatenate([np.asarray(a[ids], np.float32), np.zeros((fill, *a.shape[1:]), np.float32)])
+    part = jax.tree.map(rows, bare)
+    part.opacity_logits[len(ids) :] = _HIDDEN_LOGIT
+    return part
+
+
+def render_in_blocks(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Float[np.ndarray, "h w 3"]:
+    """Renders the features of `render_rgb` of N Gaussians whose columns may be memory-mapped.
+
+    Args:
+      gaussians: The scene. Its numbers must be finite.
+      camera: The view.
+      near: Near plane, world units.
+
+    Returns:
+      The image.
+
+    Raises:
+      ValueError: Shapes disagree.
+    """
+    camera = jax.tree.map(np.asarray, camera)
+    ids = visible_rows(gaussians, camera, near=near)
+    colours = np.zeros((padded_size(len(ids)), 3), np.float32)
+    for first in range(0, len(ids), ROWS):
+        rows = ids[first : first + ROWS]
+        part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
+        colours[first : first + len(rows)] = _colours(part, camera)
+    if not len(ids):
+        return np.zeros((camera.height, camera.width, 3), np.float32)
+    return np.asarray(render(geometry_of_rows(gaussians, ids), camera, jnp.asarray(colours), near=near).features)
+
+
+_colours = jax.jit(colours_from_sh)
