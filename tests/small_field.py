@@ -11,6 +11,7 @@ from jsecon.language.votes import region_votes
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render
 from jsecon.types import Camera, Gaussians, LanguageField, Regions, Votes
+from jsecon.vision.colours import ColourEmbedder
 
 REGIONS = 5
 
@@ -53,6 +54,9 @@ def _make_field(scene, cameras, dim, latent):
     labels = labels_of(scene, cameras, true_regions(scene))
     votes = region_votes(scene, cameras, jnp.asarray(labels), REGIONS, top=3)
     embeddings = unit_rows(rng, REGIONS, dim)
+    if dim == ColourEmbedder().dim:  # regions that texts of colours name
+        embeddings += ColourEmbedder().embed_text(["red", "green", "blue", "orange", "pink"])
+        embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     embeddings.flags.writeable = False  # several tests share it
     table, coder, _ = region_codes(jnp.asarray(embeddings), latent=latent, key=jax.random.key(0))
     pixels = np.stack([(labels == r).sum((1, 2)) for r in range(REGIONS)]).astype(np.int32)

@@ -50,7 +50,9 @@ def assert_alike(blocks, memory, *, pixels=0):
         assert np.linalg.norm(own - other) <= 1e-6 * np.linalg.norm(other) + 0.01 * np.sqrt(pixels)
         np.testing.assert_allclose(own, other, rtol=3e-6, atol=1e-6 + 0.01 * (pixels > 0))
     # A single pixel's weight hangs on the last bit of a splat's place, which each program rounds its own way.
-    np.testing.assert_allclose(blocks.peak, memory.peak, rtol=2e-4, atol=1e-5)
+    apart = ~np.isclose(blocks.peak, memory.peak, rtol=2e-4, atol=1e-5)
+    assert apart.sum() <= pixels
+    np.testing.assert_allclose(blocks.peak, memory.peak, atol=0.011)
 
 
 @pytest.mark.parametrize("rows", [5, *(pytest.param(rows, marks=pytest.mark.long) for rows in (64, 1 << 18))])

@@ -6,7 +6,7 @@ A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact whe
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -90,9 +90,18 @@ def encode(coder: Coder, embeddings: Float[Array, "*batch e"]) -> Float[Array, "
     return normalize(jnp.asarray(embeddings)) if coder is None else coder.encode(embeddings)
 
 
-def region_codes(
-    embeddings: Float[Array, "r e"], *, latent: int | str, key: Key, **training: Any
-) -> tuple[Float[Array, "r d"], Coder, str]:
+class RegionCodes(NamedTuple):
+    """Codes of the regions."""
+
+    codes: Float[Array, "r d"]
+    """(R, d) of unit length; zero for a region that was never embedded."""
+    coder: Coder
+    """What encodes texts in the same way."""
+    reason: str
+    """A sentence that says why this code."""
+
+
+def region_codes(embeddings: Float[Array, "r e"], *, latent: int | str, key: Key, **training: Any) -> RegionCodes:
     """Chooses the cheapest code of at most `latent` numbers per region that keeps the regions' cosines. Host code.
 
     With E <= latent it is the unit embeddings (coder None); for regions whose span has at most `latent` dimensions a
@@ -107,7 +116,7 @@ def region_codes(
       training: Options of `train_autoencoder`.
 
     Returns:
-      Unit codes (R, d), the coder, and a sentence that says why.
+      The codes.
 
     Raises:
       ValueError: Numbers are not finite, or `latent` is out of range.
@@ -121,18 +130,20 @@ def region_codes(
     assert isinstance(latent, int)
     count, dim = units.shape
     if dim <= latent:
-        return units, None, f"left out: the embeddings have {dim} numbers, no more than the {latent} of a code"
+        return RegionCodes(
+            units, None, f"left out: the embeddings have {dim} numbers, no more than the {latent} of a code"
+        )
     codes, rotation = _rotated(units, latent)
     exact, coded = np.asarray(units, np.float64), np.asarray(codes, np.float64)
     loss = float(np.abs(coded @ coded.T - exact @ exact.T).max(initial=0.0))
     if loss <= MAX_COSINE_LOSS:
-        return codes, rotation, f"left out: {count} regions fit in {latent} dimensions without loss"
+        return RegionCodes(codes, rotation, f"left out: {count} regions fit in {latent} dimensions without loss")
     coder = train_autoencoder(units, latent=latent, key=key, **training)
     why = f"run: a rotation into {latent} dimensions would move cosines by up to {loss:.2f}"
-    return coder.encode(units), coder, why
+    return RegionCodes(coder.encode(units), coder, why)
 
 
-def _smallest_codes(units: Array) -> tuple[Array, Coder, str]:
+def _smallest_codes(units: Array) -> RegionCodes:
     count, dim = units.shape
     distinct = int(distinct_pairs(units).sum()) // 2
     for latent in (size for size in LATENTS if size < dim):
@@ -140,8 +151,9 @@ def _smallest_codes(units: Array) -> tuple[Array, Coder, str]:
             codes, coder = make(units, latent)
             if not confused_pairs(units, codes):
                 reason = f"{kind} of {latent} numbers: all {distinct} pairs of {count} regions stay apart"
-                return codes, coder, f"left out: {reason} (cosine below {CODE_THRESHOLD:g})"
-    return units, None, f"left out: no code shorter than {dim} numbers keeps all {distinct} pairs of regions apart"
+                return RegionCodes(codes, coder, f"left out: {reason} (cosine below {CODE_THRESHOLD:g})")
+    reason = f"left out: no code shorter than {dim} numbers keeps all {distinct} pairs of regions apart"
+    return RegionCodes(units, None, reason)
 
 
 def _rotated(units: Array, latent: int) -> tuple[Array, Rotation]:

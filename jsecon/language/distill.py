@@ -7,7 +7,7 @@ casts on each Gaussian) hold what a closed form needs. `distill_l1` is the paper
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -127,6 +127,15 @@ class DistillState:
     """() int32 steps taken."""
 
 
+class Distillation(NamedTuple):
+    """What `distill_l1` trains."""
+
+    codes: Float[Array, "n d"]
+    """(N, d) of unit length; zero for Gaussians that no labelled pixel sees and that started at zero or random."""
+    losses: Float[Array, " steps"]
+    """(steps,) before each step; NaN for a view that overflowed the capacity."""
+
+
 def distill_l1(
     gaussians: Gaussians,
     cameras: Camera,
@@ -139,7 +148,7 @@ def distill_l1(
     learning_rate: float = 0.0025,
     capacity: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Float[Array, "n d"], Float[Array, " steps"]]:
+) -> Distillation:
     """The paper's distillation (as LangSplat's, train.py): Adam on the L1 between rendered and target codes.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
@@ -163,8 +172,7 @@ def distill_l1(
       progress: Called as progress(done, total) between stretches of steps.
 
     Returns:
-      Unit codes (N, d), zero for Gaussians that no labelled pixel sees and that started at zero or random; and the loss
-      before each step, NaN for views that overflowed the capacity.
+      The codes and the losses.
 
     Raises:
       ValueError: Shapes disagree, or labels are no integers; outside a trace also for such a NaN and for labels of R
@@ -194,7 +202,7 @@ def distill_l1(
     if isinstance(init, str) and init == "random":
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
         codes = jnp.where(jnp.any(state.features != start.features, axis=1, keepdims=True), codes, 0.0)
-    return codes, state.history
+    return Distillation(codes, state.history)
 
 
 def start_distillation(

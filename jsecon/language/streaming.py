@@ -116,9 +116,13 @@ def finish_votes_in_blocks(votes: Votes, regions: Regions) -> Votes:
     shows = views_that_show(regions)
     sums = jnp.zeros((regions.count, regions.count), jnp.float32)
     shown = [np.zeros((0, votes.regions.shape[1]), np.float32)]
-    require(votes.by_view is not None, "finish_votes", "votes without by_view", "by_view (T, N)", "Cast them with it.")
+    by_view = votes.by_view
+    if by_view is None:
+        raise ValueError(
+            "finish_votes_in_blocks: got votes without by_view, expected by_view (T, N). Cast them with it."
+        )
     for rows in row_slices(votes, len(votes.views)):
-        block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(votes.by_view[:, rows]))
+        block = dataclasses.replace(votes_of_rows(votes, rows), by_view=np.asarray(by_view[:, rows]))
         block = add_shown(block, shows)
         sums += overlap_sums(jnp.asarray(block.regions), vote_shares(block), regions.count)
         shown.append(np.asarray(block.shown))
@@ -227,7 +231,7 @@ def _sum_block(scratch: Path, views: int, rows: slice, regions: int, top: int, b
     return sums
 
 
-def strongest(votes: sparse.csr_array, top: int) -> tuple[np.ndarray, np.ndarray]:
+def strongest(votes: Any, top: int) -> tuple[np.ndarray, np.ndarray]:
     """The ids (N, top) int32 of the largest weights of each row of a sparse matrix (N, R), largest first as float32,
     equal ones by id, -1 where a row has fewer; and the weights (N, top) float32."""
     lengths, weights = np.diff(votes.indptr), votes.data.astype(np.float32)

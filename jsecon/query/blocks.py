@@ -94,5 +94,8 @@ def select_in_blocks(
                 selection = select_by_code(codes, table, votes.views, match, threshold)
             places = np.flatnonzero(np.asarray(selection.mask))
             column.append((places + rows.start, np.asarray(selection.similarity)[places]))
-    joined = [[np.concatenate(part) for part in zip(*column)] for column in columns]
-    return [SparseSelection(*rows, int(match.region), float(match.score)) for rows, match in zip(joined, matches)]
+    answers = []
+    for column, match in zip(columns, matches):
+        gaussians, similarity = (np.concatenate(part) for part in zip(*column))
+        answers.append(SparseSelection(gaussians, similarity, int(match.region), float(match.score)))
+    return answers

@@ -4,6 +4,7 @@ A text finds one region, the best; a list of classes divides the scene among the
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,15 @@ from jsecon.query.rules import QueryRules
 from jsecon.types import Array, LanguageField
 
 
+class Classes(NamedTuple):
+    """The class of each of N Gaussians."""
+
+    labels: Int[Array, " n"]
+    """Index of the class; -1 for a Gaussian without one."""
+    similarity: Float[Array, "n q"]
+    """How far it matches each of Q texts; 0 without votes on a region that has an embedding."""
+
+
 def query_classes(
     field: LanguageField,
     texts: Float[Array, "q e"],
@@ -31,7 +41,7 @@ def query_classes(
     rules: QueryRules = RULES,
     standardise: bool = True,
     every: bool = False,
-) -> tuple[Int[Array, " n"], Float[Array, "n q"]]:
+) -> Classes:
     """Divides the Gaussians among a list of classes, however many objects each class has.
 
         sum_r p_nr s_rq / sum_r p_nr
@@ -53,8 +63,7 @@ def query_classes(
         regions of the class must have a share of at least 0.5 in it, as for a query by votes.
 
     Returns:
-      (N,) index of each Gaussian's class, -1 if it has none; and (N, Q) how far it matches each text, 0 for Gaussians
-      without votes on a region that has an embedding. Pure: jit it or vmap it over sets of texts.
+      The classes. Pure: jit it or vmap it over sets of texts.
 
     Raises:
       ValueError: Texts of another size, or no text.
@@ -65,13 +74,13 @@ def query_classes(
     require(fit, "query_classes", f"texts {texts.shape}", f"(Q >= 1, {size})", remedy)
     if field.regions.count == 0:
         count, dtype = field.codes.shape[0], jnp.asarray(field.regions.embeddings).dtype
-        return jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype)
+        return Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
     arrays = field.regions.embeddings, texts, field.regions.pixels, field.votes
     return _classes(*jax.tree.map(jnp.asarray, arrays), reference_words(field), rules, standardise, every)
 
 
 @functools.partial(jax.jit, static_argnames=("standardise", "every"))
-def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, standardise: bool, every: bool):
+def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, standardise: bool, every: bool) -> Classes:
     compare = lambda text: region_similarities(embeddings, text, reference, rules.retrieval)
     similarity, known = jax.vmap(compare)(texts)  # (Q, R) both
     valid = jnp.any(known, axis=1)  # a text without a direction is no region's class
@@ -85,8 +94,8 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
         accepted = below >= rules.quantile * jnp.sum(jnp.isfinite(scores), axis=0)
     else:
         judged = plain
-        if rules.logits is not None:
-            judged = jax.vmap(lambda text: presence(embeddings, text, rules.logits), out_axes=1)(texts)
+        if (logits := rules.logits) is not None:
+            judged = jax.vmap(lambda text: presence(embeddings, text, logits), out_axes=1)(texts)
         accepted = of_best(judged) >= fixed_threshold(rules)
     accepted &= known & jnp.any(valid)
     count = votes.regions.shape[0]
@@ -105,7 +114,7 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
         jnp.where(weight > 0, weight, weight_of_all),
         jnp.where((weight > 0)[:, None], total, total_of_all),
     )
-    finite = (votes.views > 0) & (weight > 0) & jnp.isfinite(weight) & jnp.any(valid)
+    finite = (votes.views > 0) & (weight > 0) & jnp.isfinite(weight_of_all) & jnp.any(valid)
     mean = jnp.where(finite[:, None], total / jnp.where(finite, weight, 1.0)[:, None], 0.0)
     possible = finite[:, None] & valid
     if not every:
@@ -113,7 +122,7 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
         share = jax.vmap(lambda chosen: share_of(votes, chosen).share, out_axes=1)(of_class)
         possible &= share >= SHARE_THRESHOLD
     label = jnp.argmax(jnp.where(possible, mean, -jnp.inf), axis=1)
-    return jnp.where(jnp.any(possible, axis=1), label, -1).astype(jnp.int32), mean
+    return Classes(jnp.where(jnp.any(possible, axis=1), label, -1).astype(jnp.int32), mean)
 
 
 def _standardised(table: Array, known: Array, pixels: Array) -> Array:

@@ -145,7 +145,7 @@ def _match(embeddings, pixels, overlap, queries, excluded, reference, rules: Que
     nearest = jnp.max(jnp.where(known, of_anchor(scores.similarity), -jnp.inf))
     nearest = jnp.where(jnp.any(known), nearest, 0.0)
     return RegionMatch(
-        chosen,
+        jnp.asarray(chosen),
         jnp.where(matches, best, -1).astype(jnp.int32),
         jnp.where(matches, closeness[best], nearest),
         jnp.nanmax(jnp.where(known, scores.quantile, jnp.nan)),

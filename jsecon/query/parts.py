@@ -108,13 +108,13 @@ def parts_fallback(
     require(field.parts is not None, "parts_fallback", "a field without parts", "its parts", "Run with --parts.")
     parts, text = cast(Parts, field.parts), jnp.asarray(text)
     reference = reference_words(field)
-    scales = np.array([0.0, PART_THRESHOLD, 1.0]), np.array([0.0, SHARE_THRESHOLD, 1.0])
+    from_scores, to_similarity = np.array([0.0, PART_THRESHOLD, 1.0]), np.array([0.0, SHARE_THRESHOLD, 1.0])
     scores = np.asarray(_part_scores(parts, text, reference, retrieval=rules.retrieval))
     least = PART_THRESHOLD
     if similarity_threshold is not None:
-        least = float(np.interp(similarity_threshold, *scales[::-1]))
+        least = float(np.interp(similarity_threshold, to_similarity, from_scores))
     mask = best_cluster(scores >= least, scores, field.gaussians.means)
-    similarity = np.interp(scores, *scales).astype(np.float32)
+    similarity = np.interp(scores, from_scores, to_similarity).astype(np.float32)
     similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, REJECTED_SIMILARITY))
     part = np.asarray(parts.part)
     count = lambda rows: np.bincount(rows[rows >= 0], minlength=len(parts.weight)).astype(np.float32)

@@ -1,5 +1,7 @@
 """The region under a pixel: the votes of the Gaussians that make up the pixel, by their weights. Host code."""
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,9 +18,16 @@ MIN_SHARE = 0.05
 """Smallest part of a pixel that a region must make up; the pixel is background otherwise."""
 
 
-def pixel_weights(
-    gaussians: Gaussians, camera: Camera, x: int, y: int
-) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+class PixelWeights(NamedTuple):
+    """The M Gaussians that make up a pixel, front to back."""
+
+    ids: Int[np.ndarray, " m"]
+    """Which Gaussians they are."""
+    weights: Float[np.ndarray, " m"]
+    """Their weights alpha T."""
+
+
+def pixel_weights(gaussians: Gaussians, camera: Camera, x: int, y: int) -> PixelWeights:
     """Composites one pixel, without tiles: O(N), where a render would have to carry every region as a channel.
 
     Args:
@@ -28,9 +37,9 @@ def pixel_weights(
       y: Row of the pixel.
 
     Returns:
-      Ids (M,), front to back, and weights alpha T (M,) of the Gaussians that make up the pixel.
+      The Gaussians that make up the pixel.
     """
-    columns = [np.zeros((3, 0))]
+    columns: list[Any] = [np.zeros((3, 0))]
     for rows in row_slices(gaussians, gaussians.count):
         block = jax.tree.map(lambda a, rows=rows: jnp.asarray(a[rows]), gaussians)
         alpha, depths = (np.asarray(a) for a in _alphas(block, camera, x + 0.5, y + 0.5))
@@ -42,7 +51,7 @@ def pixel_weights(
     after = np.cumprod(1.0 - alpha.astype(np.float64))
     seen = after > MIN_TRANSMITTANCE
     before = np.concatenate([[1.0], after])[: seen.sum()]
-    return ids[seen], alpha[seen] * before
+    return PixelWeights(ids[seen], alpha[seen] * before)
 
 
 @jax.jit

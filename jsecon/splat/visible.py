@@ -62,13 +62,13 @@ def padded_size(count: int) -> int:
 
 
 def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussians:
-    """The Gaussians `ids` (M,) without colour, then transparent ones up to `padded_size`. NumPy, float32."""
-    fill = padded_size(len(ids)) - len(ids)
+    """The Gaussians `ids` (M,) in black, then transparent ones up to `padded_size`. NumPy, float32."""
+    size = padded_size(len(ids))
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
-    rows = lambda a: np.concatenate([np.asarray(a[ids], np.float32), np.zeros((fill, *a.shape[1:]), np.float32)])
-    part = jax.tree.map(rows, bare)
+    fill = lambda a: np.zeros((size - len(ids), *a.shape[1:]), np.float32)
+    part = jax.tree.map(lambda a: np.concatenate([np.asarray(a[ids], np.float32), fill(a)]), bare)
     part.opacity_logits[len(ids) :] = _HIDDEN_LOGIT
-    return part
+    return dataclasses.replace(part, sh=np.zeros((size, 1, 3), np.float32))
 
 
 def render_in_blocks(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Float[np.ndarray, "h w 3"]:
