@@ -98,7 +98,7 @@ def test_blocks_of_any_size_give_the_same_bytes_in_another_world(tmp_path, monke
     codes |= {"regions": np.arange(600) % 7 - 1}
     files = [tmp_path / f"{name}.{ending}" for name in ("whole", "blocks")]
     save_gaussians(files[0], given, **codes, similarity=turn)
-    monkeypatch.setattr(transform, "ROWS", 77)
+    monkeypatch.setattr(transform, "BLOCK_ROWS", 77)
     save_gaussians(files[1], given, **codes, similarity=turn)
     assert files[0].read_bytes() == files[1].read_bytes()
     found, expected = load_gaussians(files[1]), transform.transform_gaussians(given, turn)

@@ -107,7 +107,7 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
         (["red", "--images", "x"], "--images: it needs --phrases"),
         (["red", "--looks", "3"], "--looks: it needs --phrases"),
         (["red", "--phrases", "nowhere"], "no such folder, expected SAM 3's graphs"),
-        (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: nothing there"),
+        (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: there is no such file or folder"),
     ],
 )
 def test_phrases_that_cannot_be_asked(room_run, model, tmp_path, capsys, options, says):

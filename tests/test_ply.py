@@ -291,7 +291,7 @@ def test_blocks_of_rows_and_another_world(tmp_path, monkeypatch):
     turn[:3, 3] = 1, 2, 3
     save_ply(tmp_path / "whole.ply", scene)
     save_ply(tmp_path / "rgb.ply", scene, rgb=np.linspace(0, 1, 120).reshape(40, 3))
-    monkeypatch.setattr(transform, "ROWS", 7)
+    monkeypatch.setattr(transform, "BLOCK_ROWS", 7)
     monkeypatch.setattr(ply, "_BLOCK", 9)
     save_ply(tmp_path / "blocks.ply", scene)
     save_ply(tmp_path / "rgb_blocks.ply", scene, rgb=np.linspace(0, 1, 120).reshape(40, 3))
