@@ -50,7 +50,7 @@ from jsecon.errors import InputError
 from jsecon.evaluate.metrics import iou
 from jsecon.language.membership import finish_votes
 from jsecon.query.classes import query_classes
-from jsecon.query.match import evidence
+from jsecon.query.match import evidence, match_regions
 from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.query.rules import KIND_THRESHOLD, QUANTILE, RETRIEVAL_THRESHOLD
 from jsecon.query.select import query_anchored, query_several
@@ -364,11 +364,10 @@ def refusal(case: Case, embedder: Conse) -> dict[str, Any]:
     each answer with whether its region has the name."""
     scene = case.scene
     absent = absent_names(embedder.texts, scene.name, scene.names)
-    field = jax.tree.map(jnp.asarray, case.field)
     found: dict[str, Any] = {"asked": [len(scene.texts), len(absent)]}
     quantiles, answers = [], []
     for names, wanted in ((scene.texts, scene.asked), (absent, np.full(len(absent), -1))):
-        told = [query_anchored(field, jnp.asarray(text)) for text in embedder.embed_text(list(names))]
+        told = [match_regions(case.field, jnp.asarray(text)[None]) for text in embedder.embed_text(list(names))]
         quantiles.append(np.array([float(answer.quantile) for answer in told]))
         answers.append([int(answer.region) for answer in told])
         found.setdefault("confidence", []).append(

@@ -27,6 +27,7 @@ from experiments.tables.readings import CHOOSERS, RULES, SHARP, SHARPENED, as_sh
 from experiments.tables.setting import Setting
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.query.outliers import remove_outliers
+from jsecon.query.rules import RETRIEVALS
 from jsecon.query.smoothing import nearest_neighbours, smooth_over_neighbours
 from jsecon.types import Selection
 
@@ -213,7 +214,7 @@ def rows_of(points: bool) -> dict[str, Method]:
             for rule, chooser in every + (() if points else SHARPENED):
                 found[f"{name}: {way}{rule}, {chooser}"] = reading((name, way), features, rule, chooser)
     for name, association in OURS.items():
-        for rule in ("cosine", "contrast", "apart"):
+        for rule in RETRIEVALS:
             for chooser in choosers:
                 for told, options in CENTRES.items() if points and rule != "cosine" else (("", {}),):
                     if association == "consensus" or "agreement" not in options:
@@ -241,7 +242,7 @@ def rows_of(points: bool) -> dict[str, Method]:
             )
     found["the paper's path: as published"] = METHODS["the paper's path"]
     for threshold in CODE_THRESHOLDS:
-        for rule in ("cosine", "contrast"):
+        for rule in RETRIEVALS:
             for chooser in ("threshold", *ascents):
                 found[f"the paper's path: {rule}, {chooser} {threshold:g}"] = _paper_row(rule, threshold, chooser)
     return found

@@ -105,7 +105,7 @@ def test_the_interval_is_of_pairs():
 @pytest.mark.long
 def test_a_cell_holds_the_texts_that_its_figure_is_made_of(folder):  # noqa: F811
     rows = rows_of(points=False)
-    few = ("VALA: contrast, lenient silhouette, sharp", "ours, tracks: contrast, silhouette")
+    few = ("VALA: contrast, lenient silhouette, sharp", "ours, tracks: apart, silhouette")
     plan = with_gaussians(small(lerf.QUICK, folder, "readings", methods=few), "perfect")
     plan = dataclasses.replace(plan, level="perfect")
     cells = fill.fill(plan, rows, tell=lambda _: None)
