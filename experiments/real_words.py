@@ -431,6 +431,9 @@ def main(options: Options = Options(), tell: Callable[[str], None] = print) -> d
             figures = kept(own, functools.partial(measured, *given))
             if figures is None:
                 continue
+            error, curve = calibration(figures["refusal"])
+            figures["refusal"] = {k: v for k, v in figures["refusal"].items() if k != "confidence"}
+            figures["refusal"] |= {"calibration error": error, "reliability": curve}
             figures["alone"] = {}
             for method in RIVALS if variant in ALONE else ():
                 ious = kept(f"{own}, {method}", functools.partial(measured_alone, *given, method))
@@ -513,7 +516,7 @@ def tables(metrics: dict, told: list[str], score: dict) -> list[str]:
     rows = []
     for k, figures in cases.items():
         own = figures["refusal"]
-        rows.append((k, own["asked"][1], *(own[key] for key in ("auc", "kept", "refused")), calibration(own)[0]))
+        rows.append((k, own["asked"][1], *(own[key] for key in ("auc", "kept", "refused", "calibration error"))))
     text.append(
         f"Present and absent names by `query_anchored`, which answers above the quantile {QUANTILE}; the calibration "
         "error of its confidence, both kinds weighing the same in all."
