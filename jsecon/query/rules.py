@@ -16,7 +16,7 @@ QUANTILE = 0.82
 """Smallest share of unrelated words (`LanguageField.reference`) that must match the scene less than the text does. It
 is the least that refuses 0.8 of the absent texts with simulated CLIP at medium noise. Refused of these, and kept of the
 others: there 0.81 and 0.95, with errors that views share 0.78 and 0.49; on real words (ConSE, 15 classes of
-replica_apartment_0) 0.96 and 0.93, with jsecon's own masks 0.95 and 0.73."""
+replica_apartment_0) 0.95 and 0.93, with jsecon's own masks 0.94 and 0.73."""
 RETRIEVAL_THRESHOLD = 0.2
 """Smallest cosine of the best region, for fields without unrelated words. The paper has such a threshold and does not
 state it. In CLIP ViT-B/16 an image has a cosine of 0.25 to 0.35 with a text that fits and 0.1 to 0.2 with another."""
