@@ -15,6 +15,7 @@ from jsecon.language.field import save_field
 from jsecon.language.membership import finish_votes
 from jsecon.types import Camera, Gaussians, Regions, Votes
 from jsecon.vision.colours import PALETTE, ColourEmbedder
+from jsecon.vision.reference_words import reference_of
 
 FRIDGE, WALL, SOFA = 0, 1, 2
 COLOURS = ColourEmbedder()
@@ -153,8 +154,9 @@ def asked_of(embeddings, pixels, text):
     ones = np.ones(count, np.float32)
     votes = Votes(own, ones[:, None], ones, ones, ones, ones.astype(np.int32), np.int32(0), count)
     field = field_of(votes, Regions(embeddings, np.repeat(pixels[:, None], 10, 1)))
-    field = dataclasses.replace(field, canonical=COLOURS.canonical)
-    found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]))
+    field = dataclasses.replace(field, canonical=COLOURS.canonical, reference=reference_of(COLOURS))
+    rules = jsecon.QueryRules(quantile=0.0)  # all colours but one are there, so most other words match as well
+    found = jsecon.query_anchored(field, jnp.asarray(COLOURS.embed_text([text])[0]), rules=rules)
     return int(found.region), float(found.score)
 
 

@@ -31,7 +31,7 @@ def test_an_answer_is_told_with_how_many_and_how_sure(field):
 
 def test_what_has_no_answer_is_told_and_why(field):
     nothing = ask_region(field, 99)
-    assert "no match: the best score is 0.00, and 0.12" in messages(field, ViewState(("x",)), [nothing])
+    assert "no match: the best score is 0.00, and 0.2" in messages(field, ViewState(("x",)), [nothing])
     none_left = ask_region(field, 1, threshold=1.1)
     assert "no Gaussian reaches the threshold 0.50" in messages(field, ViewState((1,)), [none_left])
     with pytest.raises(InputError) as error:

@@ -59,19 +59,21 @@ def candidates(field: LanguageField, embedder: Any, query: str | int, count: int
     if field.regions.count == 0:
         return []
     table = jnp.asarray(field.regions.embeddings)
-    pixels = jnp.asarray(field.regions.pixels)
+    weight = np.asarray(_evidence(jnp.asarray(field.regions.pixels)))
     if isinstance(query, str):
         field = with_phrases(field, embedder)
+        reference = reference_words(field)
+        weight = np.ones_like(weight) if reference is None else weight  # the plain cosine ranks without evidence
         included, excluded = parse_query(query)
         texts = jnp.asarray(embedder.embed_text(included + excluded))
-        matches = [_similarities(table, text, reference_words(field), RULES.retrieval) for text in texts]
+        matches = [_similarities(table, text, reference, RULES.retrieval) for text in texts]
         scores = np.stack([score for score, _ in matches])
         score = scores[: len(included)].max(0)
         known = matches[0][1] & (score > scores[len(included) :].max(0, initial=-np.inf) + ROUNDING)
     else:
         score, known = (np.array(a) for a in _region_similarity(table, min(query, field.regions.count - 1)))
         known[query : query + 1] = False
-    weighted = np.where(known, np.where(score > 0, score * np.asarray(_evidence(pixels)), score), -np.inf)
+    weighted = np.where(known, np.where(score > 0, score * weight, score), -np.inf)
     order = [r for r in np.argsort(-weighted, kind="stable")[:count] if known[r]]
     frames = np.asarray(field.regions.pixels).argmax(1)
     return [Candidate(int(r), float(score[r]), int(frames[r])) for r in order]
