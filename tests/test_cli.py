@@ -83,6 +83,7 @@ def test_query_writes_a_ply_a_json_and_masks_for_each_text(room_run, tmp_path, c
         answer = json.loads((tmp_path / f"{slug}.json").read_text())
         assert answer["query"] == name
         assert answer["by"] == by
+        assert 0 <= answer["confidence"] <= 1
         assert repr(name) in told
         if by != "code":
             assert 0 < answer["count"] < answer["gaussians"]

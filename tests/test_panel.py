@@ -24,8 +24,8 @@ def field(scene, cameras):
 def test_an_answer_is_told_with_how_many_and_how_sure(field):
     answer = ask_region(field, 1)
     text = messages(field, ViewState((1,)), [answer])
-    assert f"<b>region 1</b>: {answer.mask.sum()} Gaussians, confidence" in text
-    assert 50 <= int(re.search(r"confidence (\d+) %", text).group(1)) <= 100
+    assert f"<b>region 1</b>: {answer.mask.sum()} Gaussians, membership" in text
+    assert 50 <= int(re.search(r"membership (\d+) %", text).group(1)) <= 100
     assert "score" not in text  # of what was pointed at: it is no similarity
 
 

@@ -3,7 +3,7 @@
 A text passes these modules on the way to its .ply; splat/ renders for them.
 
     ask     app/ask, language/field, vision/colours, query/match, query/select, language/membership, query/outliers
-    write   app/outputs, splat/transform, data/gaussian_files
+    write   app/outputs, splat/transform, data/gaussians/files
 """
 
 import dataclasses
@@ -82,6 +82,12 @@ class Answer:
         """Share of unrelated words that are less similar to the scene than the text; None if it is unknown."""
         share = self.selection.quantile
         return None if share is None or np.isnan(share) else round(float(share), 4)
+
+    @property
+    def confidence(self) -> float | None:
+        """Estimated probability that the answer shows what the text names; None if it is unknown."""
+        confidence = self.selection.confidence
+        return None if confidence is None or np.isnan(confidence) else round(float(confidence), 4)
 
     @property
     def dropped(self) -> int:

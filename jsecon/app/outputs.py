@@ -162,6 +162,7 @@ def _record(field: LanguageField, answer: Answer) -> dict[str, Any]:
         "count": len(means),
         "score": round(float(answer.selection.score), 6),
         "quantile": answer.quantile,
+        "confidence": answer.confidence,
         "region": region if region >= 0 else None,
         "probability": probability or None,
         "outliers": {

@@ -203,7 +203,7 @@ def _swatch(place: int) -> str:
 
 
 def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | InputError]) -> str:
-    """Describes the answers as HTML: how many Gaussians with which confidence, or why no Gaussian is selected.
+    """Describes the answers as HTML: how many Gaussians with which mean membership, or why no Gaussian is selected.
 
     Args:
       field: The field.
@@ -231,7 +231,7 @@ def messages(field: LanguageField, state: ViewState, answers: Sequence[Answer | 
                 parts.append("parts in place of a region")
             else:
                 inside = probability_inside(answer.selection.similarity, field.votes, answer.mask).mean()
-                parts.append(f"confidence {100 * inside:.0f} %")
+                parts.append(f"membership {100 * inside:.0f} %")
             lines.append(f'<div style="margin:0 .8em .4em;font-size:.85em">{head}: {", ".join(parts)}</div>')
     return "".join(lines)
 
