@@ -74,7 +74,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
 
 @pytest.mark.parametrize(
     "more",
-    [("--by", "silhouette"), ("--box", "#1", 2, 2, 9, 9), ("--phrases", "sam3")],
+    [("--by", "silhouette"), ("--box", "#1", 2, 2, 9, 9), ("--phrases", ".")],
 )
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run

@@ -62,5 +62,5 @@ def test_it_is_in_the_world_of_the_capture(answer):
 
 def test_what_selects_nothing_has_no_place(answer):
     field, asked, *_ = answer
-    with pytest.raises(InputError, match="nothing selected"):
+    with pytest.raises(InputError, match="no Gaussian is selected"):
         locate_answer(field, dataclasses.replace(asked, mask=np.zeros(64, bool)))
