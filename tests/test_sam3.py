@@ -115,7 +115,7 @@ def test_phrases_that_cannot_be_asked(folders, frame):
 
 def test_folders_that_lack_something(folder, tmp_path):
     write_sam(tmp_path / "sam")
-    for other, told in ((tmp_path / "nowhere", "no such folder"), (tmp_path / "sam", "sam_vit_b_decoder.onnx")):
+    for other, told in ((tmp_path / "nowhere", "no such folder"), (tmp_path / "sam", "no .onnx file")):
         with pytest.raises(InputError, match=rf"{told}.*expected SAM 3's graphs, one \*image_encoder.onnx"):
             find_sam3(other)
     (folder / "tokenizer.json").rename(folder / "vocabulary.json")

@@ -188,7 +188,7 @@ class SamGraphs:
         height, width = frame.shape[:2]
         scale = self.side / max(height, width)
         size = (self.side, self.side) if self.stretched else (int(height * scale + 0.5), int(width * scale + 0.5))
-        image = np.asarray(Image.fromarray(frame).resize(size[::-1], Image.Resampling.BILINEAR), np.float32)
+        image = np.asarray(Image.fromarray(frame).resize((size[1], size[0]), Image.Resampling.BILINEAR), np.float32)
         square = np.zeros((self.side, self.side, 3), np.float32)
         square[: size[0], : size[1]] = (image - self._mean) / self._std
         features = self._encoder.run({"pixel_values": square.transpose(2, 0, 1)[None]}, self._links)

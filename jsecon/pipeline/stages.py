@@ -344,8 +344,8 @@ def masklets(context: RunContext) -> Stage:
         by = "through the Gaussians" if options.tracker is None else f"by the SAM 2 of {options.tracker.name}"
         how += f", followed {by}"
         key_options |= context.key_options("iou_threshold")
-    key_options["association"] = options.associated_by
-    key_options["tracker"] = None if networks.tracker is None else networks.tracker.name
+    tracker = None if networks.tracker is None else networks.tracker.name
+    key_options = {**key_options, "association": options.associated_by, "tracker": tracker}
     return Stage(
         "masklets",
         how,
@@ -362,7 +362,8 @@ def _read_masklets(stage: StageInput) -> StageResult:
     assert options.masks is not None
     names = [capture.names[t] for t in training_frames(capture)]
     layout = _mask_layout(options, capture)
-    loaded = load_labels(options.masks, names, capture.frames.shape[1:3], **layout, progress=stage.progress)
+    size = int(capture.frames.shape[1]), int(capture.frames.shape[2])
+    loaded = load_labels(options.masks, names, size, **layout, progress=stage.progress)
     _require_regions(loaded.labels, str(options.masks))
     return StageResult(loaded.labels, notes=(f"{len(loaded.ids)} regions in the masks", *loaded.notes))
 
