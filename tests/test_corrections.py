@@ -283,6 +283,7 @@ def test_a_frame_ten_times_as_bright_or_dark_leaves_finite_numbers(capture, trut
     assert all(np.isfinite(leaf).all() for leaf in (losses, *jax.tree.leaves(found)))
 
 
+@pytest.mark.long
 def test_depth_that_is_not_known_teaches_nothing(capture, truth):
     unknown = dataclasses.replace(capture, depths=np.full_like(capture.depths, np.nan))
     zero = dataclasses.replace(capture, depths=np.zeros_like(capture.depths))

@@ -35,6 +35,7 @@ def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera, chan
     np.testing.assert_array_equal(one.alpha, two.alpha)
 
 
+@pytest.mark.long
 def test_votes_are_the_twins_weights(scene, cameras):
     labels = np.random.default_rng(5).integers(-1, 11, (4, 5, 6)).repeat(8, 1).repeat(8, 2).astype(np.int32)
     votes = region_votes(scene, cameras, labels, 11, top=11)
