@@ -313,7 +313,7 @@ class Models(Verb):
       names: Names, addresses (hub:owner/name or hub:owner/name@revision), and for check also folders.
       role: What the models are for. By default every role that a name has.
       precision: Precision of the graphs. By default it is the one that jsecon uses.
-      yes: Fetches without asking.
+      yes: Fetches the models without asking first.
     """
 
     action: Positional[Literal["list", "get", "check", "remove"]]
