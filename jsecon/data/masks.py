@@ -212,13 +212,12 @@ def find_masks(
     others = []
     for path, folders in _list_files(folder):
         suffix = next((suffix for suffix in suffixes if path.name.lower().endswith(suffix)), None)
-        match = None if suffix is None else frame_names.match(path, folders, suffix)
-        if match is not None:
-            matched[suffix].append(match)
-        elif suffix is not None:
-            unmatched[suffix].append((path, folders))
-        else:
+        if suffix is None:
             others.append((path, folders))
+        elif (match := frame_names.match(path, folders, suffix)) is not None:
+            matched[suffix].append(match)
+        else:
+            unmatched[suffix].append((path, folders))
     if not matched and numbered:
         for suffix, pairs in unmatched.items():
             stems = [(path.name[: -len(suffix)], path, folders) for path, folders in pairs]

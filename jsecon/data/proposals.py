@@ -179,8 +179,9 @@ def load_proposals(
         kinds = find_masks(folder, every, SUFFIXES, is_black_and_white, files=files, numbered=order is not None)
         kinds = sorted(kinds, key=lambda kind: SUFFIXES.index(kind.suffix))
         by_name = {name: kind for kind in reversed(kinds) for name in names if kind.path(name) is not None}
+        frames = {name: _frame_size(files.get(name), size) for name in by_name}
         available = {
-            name: lambda name=name, kind=kind: _read_files(kind, name, level, _frame_size(files.get(name), size))
+            name: lambda name=name, kind=kind: _read_files(kind, name, level, frames[name])
             for name, kind in by_name.items()
         }
         notes = [note for kind in kinds for note in kind.notes]
