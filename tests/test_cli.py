@@ -402,9 +402,9 @@ def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_pa
         (["--at", "#99", 3, 3], "a place, #0 to #"),
         (["--mask", "#0", "a.png", "#1"], "FRAME PNG, in pairs"),
         (["--mask", "#0", "nowhere.png"], "No such file"),
-        (["--box", "#0", 3, 3, "x", 9], "whole numbers"),
+        (["--box", "#0", 3, 3, "x", 9], "--box does not take '#0 3 3 x 9'"),
         (["--box", "#0", 500, 3, 600, 9], "pixels of a frame of 160x120"),
-        ([], "nothing to find"),
+        ([], "there is no query"),
     ],
 )
 def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):

@@ -150,8 +150,9 @@ def _sentence(box: str, prog: str) -> str:
             parts[-1] += f" {row.strip()}"
     message, *more = filter(None, parts)
     message = message.strip().replace(f"Missing from {prog}:", "Missing:")
-    if (value := re.match(r"Error parsing (\S+):.*'([^']*)'", message)) is not None:
-        message = f"{value[1]} does not take {value[2]!r}"
+    if (values := re.match(r"Error parsing (\S+):.*?(\['.*?'\]|'[^']*')", message)) is not None:
+        words = " ".join(re.findall("'([^']*)'", values[2]))
+        message = f"{values[1]} does not take {words!r}"
     more = [part.strip() for part in more if part.startswith((" Perhaps", " Unrecognized"))]
     return ". ".join([message.rstrip("."), *more])
 
