@@ -302,6 +302,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert seen["region"] is not None
     assert unseen["region"] is None
     assert f"more similar than {int(100 * seen['quantile'])} % of unrelated words" in out
+    assert f"confidence {int(100 * seen['confidence'])} %" in out
     assert "earlier version" not in out
     assert asked("new.npz", "--quantile", "0")[0][1]["region"] is not None
     beyond = ["query", str(tmp_path / "new.npz"), "seen", "--out", str(tmp_path), "--quantile", "1.5"]
@@ -311,6 +312,7 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     save_field(tmp_path / "old.npz", dataclasses.replace(field, reference=None))
     (seen, unseen), out = asked("old.npz")
     assert seen["quantile"] is unseen["quantile"] is None
+    assert seen["confidence"] is unseen["confidence"] is None
     assert out.count("earlier version") == 1
     cosine = query_anchored(dataclasses.replace(field, reference=None), rows["seen"])
     assert seen["score"] == pytest.approx(float(cosine.score), abs=1e-5)

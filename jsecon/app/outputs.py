@@ -230,6 +230,8 @@ def _line(record: Mapping[str, Any]) -> str:
     parts = [f"{record['count']} of {record['gaussians']} Gaussians", f"score {record['score']:.3f}"]
     if record["quantile"] is not None:
         parts.append(quantile_message(record["quantile"]))
+    if record["confidence"] is not None and record["region"] is not None:
+        parts.append(f"confidence {int(100 * record['confidence'])} %")
     if record["region"] is not None:
         parts.append(f"region {record['region']}")
     elif "regions" in record["skipped"]:
