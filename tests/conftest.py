@@ -17,6 +17,8 @@ import compiling
 
 os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 {compiling.ENVIRONMENT}")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # as the command line sets them
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 # All workers and subprocesses of a run share one folder of compiled programs. xdist's workers inherit it.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

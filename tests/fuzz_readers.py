@@ -558,6 +558,10 @@ def kept(folder: Path) -> Iterator[Case]:
         def __call__(self, frame, index):
             return np.stack([mask, ~mask, mask])
 
+        def check(self): ...
+
+        def close(self): ...
+
     stored = StoredSegmenter(Fixed(), folder / "masks")  # pyright: ignore[reportArgumentType]
     stored(frame, 0)
 

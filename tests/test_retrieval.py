@@ -294,9 +294,9 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
         told = [json.loads((tmp_path / f"{text}.json").read_text()) for text in ("seen", "unseen")]
         return told, capsys.readouterr().out
 
-    save_field(tmp_path / "new.npz", dataclasses.replace(field, reference=field.reference.astype(np.float16)))
-    assert np.asarray(load_field(tmp_path / "new.npz").reference).dtype == np.float16
-    (seen, unseen), out = asked("new.npz")
+    save_field(tmp_path / "new.safetensors", dataclasses.replace(field, reference=field.reference.astype(np.float16)))
+    assert np.asarray(load_field(tmp_path / "new.safetensors").reference).dtype == np.float16
+    (seen, unseen), out = asked("new.safetensors")
     assert seen["quantile"] == pytest.approx(max(shares), abs=0.02)  # of words in float16
     assert unseen["quantile"] == pytest.approx(min(shares), abs=0.02)
     assert seen["region"] is not None
@@ -304,13 +304,13 @@ def test_the_command_line_says_the_quantile_and_what_an_old_field_lacks(worded, 
     assert f"more similar than {int(100 * seen['quantile'])} % of unrelated words" in out
     assert f"confidence {int(100 * seen['confidence'])} %" in out
     assert "earlier version" not in out
-    assert asked("new.npz", "--quantile", "0")[0][1]["region"] is not None
-    beyond = ["query", str(tmp_path / "new.npz"), "seen", "--out", str(tmp_path), "--quantile", "1.5"]
+    assert asked("new.safetensors", "--quantile", "0")[0][1]["region"] is not None
+    beyond = ["query", str(tmp_path / "new.safetensors"), "seen", "--out", str(tmp_path), "--quantile", "1.5"]
     assert cli.main(beyond) == 2
     assert "--quantile" in capsys.readouterr().err
 
-    save_field(tmp_path / "old.npz", dataclasses.replace(field, reference=None))
-    (seen, unseen), out = asked("old.npz")
+    save_field(tmp_path / "old.safetensors", dataclasses.replace(field, reference=None))
+    (seen, unseen), out = asked("old.safetensors")
     assert seen["quantile"] is unseen["quantile"] is None
     assert seen["confidence"] is unseen["confidence"] is None
     assert out.count("earlier version") == 1

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from experiments import (
-    ablation_components,
-    ablation_query,
     lerf,
     ovs3d,
     replica,
@@ -76,7 +74,7 @@ def test_table_1_and_its_resumption(folder, monkeypatch):
     file.write_text(first + last[: len(last) // 2])  # as a process leaves it that is killed within the line
     calls, measure = [], fill.measure
     monkeypatch.setattr(fill, "measure", lambda *a: calls.append(1) or measure(*a))
-    with pytest.warns(UserWarning, match="cut"):
+    with pytest.warns(UserWarning, match="incomplete last line"):
         lerf.main(plan)
     assert len(calls) == 1  # the lost cell alone was computed again
     again, _ = read(folder, "lerf")
@@ -192,11 +190,10 @@ def test_the_noise_table_says_at_which_levels_ours_does_not_lead(tmp_path):
     assert "leads" not in layout.noise(cells, plan)
 
 
-@pytest.mark.parametrize(
-    "table", [lerf, ovs3d, replica, ablation_components, ablation_query, threshold_sweep], ids=lambda m: m.__name__
-)
+@pytest.mark.parametrize("table", [lerf, ovs3d, replica, threshold_sweep], ids=lambda m: m.__name__)
 def test_the_committed_table_is_what_the_committed_cells_give(table, tmp_path, monkeypatch):
-    """Each cell of the plan is found by its key, and nothing is computed."""
+    """Each cell of the plan is found by its key, and nothing is computed. The ablations' cells are of the
+    contrast, which their methods no longer ask by."""
     monkeypatch.setattr(fill, "prepare", lambda *a, **k: pytest.fail(f"no cell of {a[1:]}"))
     home = Path(table.PLAN.out)
     cells = table.PLAN.cells or str(home / "cells.jsonl")
