@@ -12,6 +12,7 @@ from jsecon.networks.hub import (
     LAYOUTS,
     PREFIX,
     RECOMMENDED,
+    Download,
     HubModel,
     NoSuchFilesError,
     Precision,
@@ -72,15 +73,19 @@ def folders_of_models(
     Raises:
       InputError: A model cannot be fetched, or the user declines.
     """
-    folders = {}
+    folders: dict[Role, Path] = {}
+    missing: dict[Role, HubModel] = {}
     for role, model in models.items():
-        folders[role] = model if isinstance(model, Path) else None if fresh else cached_folder(model)
-    missing = {role: model for role, model in models.items() if folders[role] is None and isinstance(model, HubModel)}
+        folder = model if isinstance(model, Path) else None if fresh else cached_folder(model)
+        if folder is not None:
+            folders[role] = folder
+        elif isinstance(model, HubModel):
+            missing[role] = model
     if not missing:
         return folders
     with console.progress("hub"):
-        downloads = {role: plan_download(model) for role, model in missing.items()}
-    for download in downloads.values():
+        downloads: list[tuple[Role, Download]] = [(role, plan_download(model)) for role, model in missing.items()]
+    for _, download in downloads:
         console.note(f"fetching {download}")
     if not yes:
         commands = "; ".join(get_command(model) for model in missing.values())
@@ -89,7 +94,9 @@ def folders_of_models(
             raise InputError(where, "not on this machine", "", f"Fetch with: {commands}. Or add --yes.")
         if input("Fetch now? [y/N] ").strip().lower() not in ("y", "yes"):
             raise InputError(where, "not fetched", "", f"To fetch later: {commands}.")
-    return folders | {role: fetch(download) for role, download in downloads.items()}
+    for role, download in downloads:
+        folders[role] = fetch(download)
+    return folders
 
 
 def list_models(console: Console) -> dict[str, Any]:
@@ -178,14 +185,19 @@ def cached_model(name: str) -> Path:
 def _models_of(name: str, role: Role | None, precision: Precision | None) -> list[HubModel]:
     """Returns the models of a name, one for each of its roles."""
     if name.startswith(PREFIX):
-        roles = [role or _role_of_repository(name)]
+        roles: list[Role] = [role or _role_of_repository(name)]
     else:
         roles = [row.role for row in catalogue() if row.name == name and role in (None, row.role)]
         if not roles:
             known = ", ".join(dict.fromkeys(row.name for row in catalogue() if role in (None, row.role)))
             raise InputError(name, "no known model", "", f"Known names: {known}. Or give hub:owner/name.")
     models = [parse_model(name, each, precision) for each in roles]
-    return [model for model in models if isinstance(model, HubModel)]
+    on_hub = [model for model in models if isinstance(model, HubModel)]
+    if len(on_hub) < len(models):
+        raise InputError(
+            name, "a folder of this name lies here", "", "Run this in another folder, or name hub:owner/name."
+        )
+    return on_hub
 
 
 def _role_of_repository(address: str) -> Role:

@@ -71,7 +71,10 @@ def locate_sources(field: LanguageField, beside: Path | None = None) -> Sources:
     if None in entries or not all(isinstance(hint, str) for hint in hints):
         remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy)
-    precision = next((name for name in SUFFIXES if name == options.get("precision")), None)
+    precision: Precision | None = None
+    for name_of_precision in SUFFIXES:
+        if options.get("precision") == name_of_precision:
+            precision = name_of_precision
     model, capture = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture"))
     return Sources(name or None, model, capture, models.get("embedder"), precision)
 

@@ -142,7 +142,7 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
 def _ground_normal(points: np.ndarray) -> tuple[np.ndarray, bool, str]:
     """Returns the normal of the ground, whether it is trusted, and on what evidence."""
     low, high = np.quantile(points, [TRIM, 1 - TRIM], axis=0)
-    tolerance = PLANE_TOLERANCE * np.linalg.norm(high - low)
+    tolerance = PLANE_TOLERANCE * float(np.linalg.norm(high - low))
     normals, offsets, shares = _planes(points, tolerance)
     order = np.argsort(-shares)
     distinct: list[int] = []

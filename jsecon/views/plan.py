@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jsecon.errors import InputError, require
 from jsecon.language.votes import region_votes
@@ -149,7 +149,7 @@ def free_places(points: Float[np.ndarray, "p 3"], frame: SceneFrame) -> Float[np
     ticks = np.linspace(-0.9, 0.9, GRID)
     grid = np.stack(np.meshgrid(ticks, ticks, np.linspace(*HEIGHTS, 5), indexing="ij"), axis=-1).reshape(-1, 3)
     world = frame.to_world(grid)
-    distance = cKDTree(points).query(world)[0]
+    distance = KDTree(points).query(world)[0]
     free = np.flatnonzero(distance >= FREE_DISTANCE * frame.diagonal)
     if not len(free):
         return np.zeros((0, 3))
