@@ -214,6 +214,18 @@ def test_a_folder_stays_a_folder(tmp_path):
     assert hub.parse_model(str(tmp_path), "tracker") == tmp_path
 
 
+@pytest.mark.parametrize("constants", ["constants.json", "onnx/constants.json", None])
+def test_a_tracker_needs_its_constants_in_either_place(constants):
+    parts = ("vision_encoder", "mask_decoder", "memory_attention", "memory_encoder", "pointer_tpos")
+    paths = [f"onnx/{part}.onnx" for part in parts]
+    model = hub.HubModel("tracker", "square-zero-labs/sam2.1-tiny-video-onnx")
+    if constants is None:
+        with pytest.raises(InputError, match=r"constants\.json"):
+            hub.choose_files(model, paths)
+    else:
+        assert set(hub.choose_files(model, [*paths, constants])) == {*paths, constants}
+
+
 def test_external_data_comes_with_its_graph():
     paths = [*NEEDED, "onnx/vision_encoder.onnx_data", "onnx/vision_encoder.onnx_data_1", "onnx/other.onnx_data"]
     assert set(hub.choose_files(slimsam(), paths)) == set(paths) - {"onnx/other.onnx_data"}

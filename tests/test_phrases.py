@@ -106,7 +106,7 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
         (["red", "--phrases", "MODEL", "--all", "--by", "code"], "--by --all"),
         (["red", "--images", "x"], "--images: it needs --phrases"),
         (["red", "--looks", "3"], "--looks: it needs --phrases"),
-        (["red", "--phrases", "nowhere"], "nowhere: no folder"),
+        (["red", "--phrases", "nowhere"], "no such folder"),
         (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: there is no such file or folder"),
     ],
 )

@@ -35,7 +35,7 @@ def with_models(options: T, console: Console, *, yes: bool) -> T:
     """Replaces the names of models in options by the folders of their files, fetching what is missing.
 
     Args:
-      options: A dataclass with attributes named like roles (embedder, segmenter, tracker, phrases) that hold a name, an
+      options: A dataclass with attributes named like roles (embedder, segmenter, tracker) that hold a name, an
         address or a folder; and perhaps `models` and `precision`.
       console: Where to say and ask.
       yes: Fetch without asking.

@@ -183,8 +183,8 @@ class Query(FieldVerb):
         similarity lies at least 0.75 of the way from the median region to the best one (by votes or silhouette).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
-      phrases: SAM 3 model (the name sam3, hub:owner/name, or a folder), which masks the objects that each text names in
-        some frames of the capture. A text then selects what lies in the masks in most of the frames that see it.
+      phrases: Folder of a SAM 3 model (.onnx), which masks the objects that each text names in some frames of the
+        capture. A text then selects what lies in the masks in most of the frames that see it.
       images: With --phrases, the capture whose frames are used. By default it is where the run had it.
       looks: With --phrases, number of frames, evenly spaced. More frames take longer.
       views: Number of masks to write for each query.

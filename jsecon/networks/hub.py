@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from jsecon.errors import InputError, describe_error
 
-Role = Literal["embedder", "segmenter", "tracker", "phrases"]
+Role = Literal["embedder", "segmenter", "tracker"]
 
 Precision = Literal["fp32", "fp16", "int8"]
 """numbers that a graph computes with"""
@@ -59,6 +59,10 @@ class FileSet:
 
 
 _TEXTS = ("config.json", "tokenizer_config.json")
+_TRACKER = tuple(
+    f"onnx/{part}.onnx"
+    for part in ("vision_encoder", "mask_decoder", "memory_attention", "memory_encoder", "pointer_tpos")
+)
 LAYOUTS: Mapping[Role, tuple[FileSet, ...]] = {
     "embedder": (
         FileSet(
@@ -76,21 +80,7 @@ LAYOUTS: Mapping[Role, tuple[FileSet, ...]] = {
             ("preprocessor_config.json", "config.json"),
         ),
     ),
-    "tracker": (
-        FileSet(
-            tuple(
-                f"onnx/{part}.onnx"
-                for part in ("vision_encoder", "mask_decoder", "memory_attention", "memory_encoder", "pointer_tpos")
-            ),
-            ("constants.json", "onnx/constants.json"),
-        ),
-    ),
-    "phrases": (
-        FileSet(
-            ("sam3/sam3_image_encoder.onnx", "sam3/sam3_language_encoder.onnx", "sam3/sam3_decoder.onnx"),
-            ("sam3/tokenizer.json",),
-        ),
-    ),
+    "tracker": (FileSet((*_TRACKER, "constants.json")), FileSet((*_TRACKER, "onnx/constants.json"))),
 }
 """role -> the layouts that its public exports have. A graph's external data (`.onnx_data`) comes with the graph."""
 
