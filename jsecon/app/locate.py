@@ -7,16 +7,13 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from jsecon.app.ask import Answer, ask_text
 from jsecon.errors import InputError
 from jsecon.language.membership import probability_inside
+from jsecon.query.object_shapes import gaussian_spreads, object_shapes
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import LanguageField
-
-BOX_TAIL = 0.02
-"""share of the Gaussians at each end of an axis that a box leaves out as strays"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,21 +102,15 @@ def locate_answer(field: LanguageField, answer: Answer) -> Place:
     plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
     selected = transform_gaussians_float64(jax.tree.map(lambda a: np.asarray(a)[mask], plain), field.to_source)
     points = selected_centers(field, mask)
-    offsets = points - points.mean(0)
-    axes = np.linalg.eigh(offsets.T @ offsets)[1][:, ::-1]
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    rotations = Rotation.from_quat(np.asarray(selected.quaternions, np.float64), scalar_first=True).as_matrix()
-    shapes = rotations * np.exp(np.asarray(selected.log_scales, np.float64))[:, None, :]
-    low, high = _box_ends(points, shapes, np.eye(3))
-    oriented_low, oriented_high = _box_ends(points, shapes, axes)
+    shape = object_shapes(points, np.zeros(len(points), int), spreads=gaussian_spreads(selected))[0]
     return Place(
         name=answer.query,
         centroid=points.mean(0),
-        center=axes @ (0.5 * (oriented_low + oriented_high)),
-        axes=axes,
-        extent=oriented_high - oriented_low,
-        low=low,
-        high=high,
+        center=shape.center,
+        axes=shape.axes,
+        extent=2 * shape.half_size,
+        low=shape.low,
+        high=shape.high,
         points=points,
         score=float(answer.selection.score),
         probability=float(probability_inside(answer.selection.similarity, field.votes, answer.mask).mean()),
@@ -140,15 +131,3 @@ def decimals(size: float, part: float) -> int:
 def rounded(values: np.ndarray, size: float) -> list[float]:
     """Rounds coordinates of a thing to a millionth of its size, and at least to six decimals."""
     return np.round(np.asarray(values, np.float64), max(6, decimals(size, 1e-6))).tolist()
-
-
-def _box_ends(
-    points: Float[np.ndarray, "n 3"], shapes: Float[np.ndarray, "n 3 3"], axes: Float[np.ndarray, "3 3"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends (3,) of the Gaussians along each column of `axes`, to one standard deviation, without strays.
-
-    The columns of `shapes` are the axes of each Gaussian, as long as its standard deviations.
-    """
-    reach = np.linalg.norm(axes.T @ shapes, axis=2)
-    along = points @ axes
-    return np.quantile(along - reach, BOX_TAIL, axis=0), np.quantile(along + reach, 1 - BOX_TAIL, axis=0)

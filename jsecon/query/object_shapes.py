@@ -1,0 +1,184 @@
+"""Where objects are and how large they are: the boxes and points that catalogues, relations and measures read.
+
+This module has the one definition of a box. Along an axis it ends where all but BOX_TAIL of the Gaussians end, each to
+one standard deviation. Host code.
+"""
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from jsecon.errors import require, require_shape
+from jsecon.types import Array, Camera, Gaussians, record
+
+BOX_TAIL = 0.02
+"""share of the Gaussians at each end of an axis that a box leaves out as strays"""
+POINTS = 256
+"""points of each object"""
+YAW_STEPS = 18
+"""directions, evenly spaced over a right angle, that an upright box tries"""
+YAW_POINTS = 400
+"""points of an object that these directions are tried on"""
+PARALLEL = 0.01
+"""share of the cameras' x axes off their common line up to which they do not tell the up axis"""
+
+
+@record
+class ObjectShapes:
+    """K objects in one world and its unit. A pytree of float64 NumPy arrays.
+
+    Subtract a common origin before the coordinates become float32: those of a map projection lose their last metres.
+    """
+
+    center: Array
+    """(K, 3) middle of the oriented box."""
+    axes: Array
+    """(K, 3, 3) unit columns, right-handed: axes of the box. With an up axis the third is that axis, and the first is
+    the longer of the two horizontal ones. Without one they are the principal axes of the points, the longest first."""
+    half_size: Array
+    """(K, 3) half of the length of the oriented box along each of its axes."""
+    low: Array
+    """(K, 3) lower corner of the box along the axes of the world."""
+    high: Array
+    """(K, 3) upper corner of that box."""
+    points: Array
+    """(K, P, 3) centres of Gaussians in the oriented box, spread evenly over them, for distances between surfaces. An
+    object with fewer than P repeats them."""
+    count: Array
+    """(K,) int number of Gaussians."""
+
+    def __getitem__(self, index) -> "ObjectShapes":
+        """The objects at `index`."""
+        return jax.tree.map(lambda column: column[index], self)
+
+    def __len__(self) -> int:
+        """K."""
+        return self.center.shape[0]
+
+
+def object_shapes(
+    means: Float[Array, "n 3"],
+    labels: Int[Array, " n"],
+    up: Float[Array, " 3"] | None = None,
+    *,
+    spreads: Float[Array, "n 3 3"] | None = None,
+    points: int = POINTS,
+) -> ObjectShapes:
+    """Measures objects.
+
+    Args:
+      means: Centres of N Gaussians.
+      labels: Object of each Gaussian, 0 .. K-1, or -1 for none. Every object has a Gaussian.
+      up: Up axis; boxes stand upright along it, turned so that their footprint is smallest. None takes the principal
+        axes of each object.
+      spreads: `gaussian_spreads` of the Gaussians; None takes them as points.
+      points: P, the number of points of each object.
+
+    Returns:
+      The shapes, in the world of the means. Equal inputs give equal bits.
+
+    Raises:
+      ValueError: Shapes disagree, an object has no Gaussian, or `up` has no direction.
+    """
+    means = np.asarray(means, np.float64)
+    labels = np.asarray(labels)
+    require_shape("labels", labels, (len(means),), "Give one label per Gaussian.")
+    count = np.bincount(labels[labels >= 0])
+    remedy = "Number the objects without gaps."
+    require(bool((count > 0).all()), "object_shapes", f"no Gaussian of {np.flatnonzero(count == 0)}", "one", remedy)
+    if up is not None:
+        up = np.asarray(up, np.float64)
+        require(bool(np.linalg.norm(up) > 0), "object_shapes", f"up {up}", "a direction", "For example 0 0 1.")
+        up = up / np.linalg.norm(up)
+    order = np.argsort(labels, kind="stable")[np.sum(labels < 0) :]
+    shapes = []
+    for rows in np.split(order, np.cumsum(count)[:-1]) if len(count) else ():
+        own = np.zeros((len(rows), 3, 3)) if spreads is None else np.asarray(spreads, np.float64)[rows]
+        shapes.append(_measure(means[rows], own, up, points))
+    if not shapes:
+        sizes = ((3,), (3, 3), (3,), (3,), (3,), (points, 3))
+        return ObjectShapes(*(np.zeros((0, *size)) for size in sizes), count)
+    return ObjectShapes(*map(np.stack, zip(*shapes)), count)
+
+
+def _measure(points: np.ndarray, spreads: np.ndarray, up: np.ndarray | None, count: int) -> tuple[np.ndarray, ...]:
+    """Returns the fields of `ObjectShapes` of one object, without its count."""
+    axes = _principal_axes(points) if up is None else _upright_axes(points, spreads, up)
+    ends = np.stack(_box_ends(points, spreads, axes))
+    low, high = _box_ends(points, spreads, np.eye(3))
+    along = points @ axes
+    inside = ((along >= ends[0]) & (along <= ends[1])).all(1)
+    kept = points[inside] if inside.any() else points
+    return axes @ ends.mean(0), axes, (ends[1] - ends[0]) / 2, low, high, _spaced_points(kept, count)
+
+
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    """Returns the right-handed principal axes (3, 3) of points (M, 3) as columns, the longest first."""
+    offsets = points - points.mean(0)
+    axes = np.linalg.eigh(offsets.T @ offsets)[1][:, ::-1]
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
+def _upright_axes(points: np.ndarray, spreads: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Returns the axes of the upright box with the smallest footprint as columns, the longer horizontal one first."""
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    yaw = 0.5 * np.pi * np.arange(YAW_STEPS) / YAW_STEPS
+    turned = np.concatenate([np.cos(yaw)[:, None] * first + np.sin(yaw)[:, None] * second,
+                             np.cos(yaw)[:, None] * second - np.sin(yaw)[:, None] * first])  # fmt: skip
+    step = -(-len(points) // YAW_POINTS)
+    low, high = _box_ends(points[::step], spreads[::step], turned.T)
+    sides = (high - low).reshape(2, YAW_STEPS)
+    best = int(np.argmin(sides[0] * sides[1]))
+    long, short = turned[best], turned[best + YAW_STEPS]
+    if sides[1, best] > sides[0, best]:
+        long, short = short, -long
+    return np.stack([long, short, up], axis=1)
+
+
+def _box_ends(points: np.ndarray, spreads: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends (A,) of the Gaussians along each of A columns of `axes`, to one standard deviation, without
+    strays."""
+    reach = np.linalg.norm(axes.T @ spreads, axis=2)
+    along = points @ axes
+    return np.quantile(along - reach, BOX_TAIL, axis=0), np.quantile(along + reach, 1 - BOX_TAIL, axis=0)
+
+
+def _spaced_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Returns `count` of the points, evenly spaced along a curve through all of them (Morton order)."""
+    low, high = points.min(0), points.max(0)
+    cell = ((points - low) / max((high - low).max(), 1e-300) * 1023).astype(np.int64)
+    code = sum(((cell >> bit) & 1) @ np.array([4, 2, 1]) << 3 * bit for bit in range(10))
+    order = np.argsort(code, kind="stable")
+    return points[order[(np.arange(count) * len(points)) // count]]
+
+
+def gaussian_spreads(gaussians: Gaussians) -> Float[np.ndarray, "n 3 3"]:
+    """Returns the axes of Gaussians as columns, each as long as its standard deviation, world units, float64."""
+    rotations = Rotation.from_quat(np.asarray(gaussians.quaternions, np.float64), scalar_first=True).as_matrix()
+    return rotations * np.exp(np.asarray(gaussians.log_scales, np.float64))[:, None, :]
+
+
+def scene_up(cameras: Camera) -> Float[np.ndarray, " 3"]:
+    """Finds the up axis of a scene from its cameras, which people and planners hold level.
+
+    It is the direction that is most nearly perpendicular to the x axes of all cameras, on the side of their upper
+    edges. If all cameras have nearly the same x axis, it is the mean direction of their upper edges.
+
+    Args:
+      cameras: T cameras, T >= 1.
+
+    Returns:
+      (3,) float64 unit vector, world.
+    """
+    pose = np.asarray(cameras.world_to_camera, np.float64)
+    right = pose[:, 0, :3]
+    mean_up = -pose[:, 1, :3].mean(0)
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    up = vectors[:, 0] * (np.sign(vectors[:, 0] @ mean_up) or 1.0)
+    if values[1] < PARALLEL and np.linalg.norm(mean_up) > 0:
+        up = mean_up
+    return up / np.linalg.norm(up)

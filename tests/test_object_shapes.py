@@ -1,0 +1,64 @@
+"""Boxes and points of objects: known bricks, turned and shifted far away, with strays; and the up axis of cameras."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jsecon.query.object_shapes import object_shapes, scene_up
+from jsecon.types import Camera
+
+SIZE = np.array([0.5, 0.3, 0.2])
+
+
+def brick(turn, shift, count=4000):
+    """Points in a brick, and two strays far above it."""
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3)) * SIZE
+    return turn.apply(np.concatenate([points, [[0, 0, 9.0], [0, 0, 9.1]]])) + shift
+
+
+@pytest.mark.parametrize("shift", [0.0, 5e6])
+def test_an_upright_box_is_that_of_a_brick_that_was_turned_about_the_up_axis(shift):
+    turn = Rotation.from_euler("z", 40, degrees=True)
+    means = np.concatenate([brick(turn, shift), brick(turn, shift + 2.0), np.full((5, 3), np.nan)])
+    labels = np.concatenate([np.zeros(4002, int), np.ones(4002, int), np.full(5, -1)])
+    shapes = object_shapes(means, labels, [0, 0, 2.0])
+    assert len(shapes) == 2
+    assert shapes.count.tolist() == [4002, 4002]
+    np.testing.assert_allclose(shapes.center - shift, [[0, 0, 0], [2, 2, 2]], atol=0.02)
+    np.testing.assert_allclose(2 * shapes.half_size, [SIZE, SIZE], rtol=0.08)
+    np.testing.assert_allclose(shapes.axes[:, :, 2], [[0, 0, 1]] * 2)
+    assert np.abs(shapes.axes[:, :, 0] @ turn.apply([1, 0, 0])).min() > 0.99
+    np.testing.assert_allclose(np.linalg.det(shapes.axes), 1)
+    local = (shapes.points[0] - shapes.center[0]) @ shapes.axes[0]
+    assert (np.abs(local) <= shapes.half_size[0] + 1e-6).all()
+    assert (np.ptp(local, axis=0) > 0.8 * SIZE).all()
+
+
+def test_without_an_up_axis_the_box_follows_the_points():
+    turn = Rotation.from_euler("zyx", [40, 25, 10], degrees=True)
+    shapes = object_shapes(brick(turn, 0.0)[:-2], np.zeros(4000, int))
+    np.testing.assert_allclose(2 * shapes.half_size[0], SIZE, rtol=0.08)
+    assert np.abs(np.diagonal(shapes.axes[0].T @ turn.as_matrix())).min() > 0.99
+
+
+def test_spreads_make_boxes_larger_and_few_points_are_repeated():
+    points = np.array([[0.0, 0, 0], [1, 0, 0]])
+    spreads = np.broadcast_to(0.1 * np.eye(3), (2, 3, 3))
+    shapes = object_shapes(points, np.zeros(2, int), [0, 0, 1], spreads=spreads, points=8)
+    np.testing.assert_allclose(shapes.half_size[0], [0.6, 0.1, 0.1], atol=0.02)
+    assert shapes.points.shape == (1, 8, 3)
+    assert {tuple(point) for point in shapes.points[0]} == {(0, 0, 0), (1, 0, 0)}
+    assert len(object_shapes(points, np.full(2, -1))) == 0
+    with pytest.raises(ValueError, match="no Gaussian"):
+        object_shapes(points, np.array([0, 2]))
+
+
+def test_up_is_across_the_x_axes_of_cameras_that_look_down():
+    yaw = np.linspace(0, 100, 7)
+    turns = Rotation.from_euler("ZX", np.stack([yaw, np.full(7, -120.0)], axis=1), degrees=True)  # 30 degrees down
+    for chosen in (slice(None), slice(1)):
+        pose = np.tile(np.eye(4), (7, 1, 1))
+        pose[:, :3, :3] = turns.inv().as_matrix()
+        ones = np.ones(7)
+        up = scene_up(Camera(pose, ones, ones, ones, ones, 4, 4)[chosen])
+        assert up[2] > (0.999 if chosen == slice(None) else 0.8)
