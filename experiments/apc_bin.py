@@ -8,7 +8,6 @@ compared with the masks there. The masks are projections of object models, so th
 """
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 from experiments import results
 from experiments.datasets.depth_points import confirmed_depths
@@ -40,7 +40,7 @@ OBJECTS = {48: "chenille stems", 114: "bunny book", 132: "kleenex tissue box", 1
 class Options:
     """What the experiment can vary."""
 
-    capture: str = str(results.CAPTURES / "apc_bin" / "scene-0000")
+    capture: tyro.conf.Positional[str] = str(results.CAPTURES / "apc_bin" / "scene-0000")
     held_out_every: int = 3
     """Every `held_out_every`-th frame is held out, starting with the second."""
     nearest_m: float = 0.2
@@ -221,4 +221,4 @@ def main(options: Options = Options()) -> dict:
 
 
 if __name__ == "__main__":
-    main(dataclasses.replace(Options(), **({"capture": sys.argv[1]} if len(sys.argv) > 1 else {})))
+    main(tyro.cli(Options, description=__doc__))

@@ -10,7 +10,6 @@ pairwise cosine 0.74).
 """
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from scipy.spatial.transform import Rotation
 
 from experiments import results
@@ -46,7 +46,7 @@ PALETTE = np.array([int(h, 16) for h in _HEX.split()])
 class Options:
     """What the experiment can vary."""
 
-    capture: str = str(results.CAPTURES / "replica_apartment_0")
+    capture: tyro.conf.Positional[str] = str(results.CAPTURES / "replica_apartment_0")
     text_vectors: str = str(results.CAPTURES.parent / "text" / "clip_vitb32_lvis.npy")
     voting_every: int = 2
     """The masks of every `voting_every`-th view vote."""
@@ -213,4 +213,4 @@ def main(options: Options = Options()) -> dict:
 
 
 if __name__ == "__main__":
-    main(dataclasses.replace(Options(), **({"capture": sys.argv[1]} if len(sys.argv) > 1 else {})))
+    main(tyro.cli(Options, description=__doc__))

@@ -66,11 +66,12 @@ def object_alone():
     return scene_of(balls())
 
 
-def moved(gaussians, seed):
-    """The scene turned, scaled and shifted at random; and the similarity."""
+def moved(gaussians, seed, scale=None):
+    """The scene turned, scaled (by default at random) and shifted at random; and the similarity."""
     rng = np.random.default_rng(seed)
     similarity = np.eye(4)
-    similarity[:3, :3] = Rotation.random(random_state=seed).as_matrix() * np.exp(rng.uniform(-2, 2))
+    factor = np.exp(rng.uniform(-2, 2))
+    similarity[:3, :3] = Rotation.random(random_state=seed).as_matrix() * (scale or factor)
     similarity[:3, 3] = rng.normal(size=3) * 20
     return transform_gaussians_float64(gaussians, similarity), similarity
 
@@ -171,8 +172,53 @@ def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):
     assert json.loads(next(out.glob("*.json")).read_text())["count"] == len(selected)
 
 
-def test_a_scene_of_gaussians_takes_no_other_gaussians(room, tmp_path, capsys):
-    scene = tmp_path / "scene.ply"
-    jsecon.save_ply(scene, room)
-    assert main(["run", str(scene), "--gaussians", str(scene), "--out", str(tmp_path / "field")]) == 2
-    assert "--gaussians" in capsys.readouterr().err
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+def test_given_cameras_take_the_place_of_planned_views(object_alone, tmp_path, kind):
+    """In the world of the scene's file, which is moved and 200 times larger; no image is needed."""
+    there, similarity = moved(object_alone, 3, scale=200.0)
+    jsecon.save_ply(tmp_path / "scene.ply", there)
+    planned = plan_views(object_alone, views=4, width=160, height=120).cameras
+    poses = np.array(planned.world_to_camera, np.float64) @ np.linalg.inv(similarity)
+    poses[:, :3] /= np.linalg.norm(poses[:, :1, :3], axis=2, keepdims=True)
+    lens = {"w": 160, "h": 120, "fl_x": float(planned.fx[0]), "fl_y": float(planned.fy[0])}
+    if kind == "transforms":
+        cameras = tmp_path / "transforms.json"
+        matrices = np.linalg.inv(poses) @ np.diag([1, -1, -1, 1])
+        frames = [{"file_path": f"a{k}.png", "transform_matrix": pose.tolist()} for k, pose in enumerate(matrices)]
+        cameras.write_text(json.dumps(lens | {"frames": frames}))
+    else:
+        cameras = tmp_path / "sparse"
+        cameras.mkdir()
+        (cameras / "cameras.txt").write_text(f"1 PINHOLE 160 120 {lens['fl_x']} {lens['fl_y']} 80 60\n")
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+        rows = [(k + 1, *quaternions[k], *poses[k, :3, 3], 1, f"a{k}.png") for k in range(4)]
+        (cameras / "images.txt").write_text("".join(" ".join(map(str, row)) + "\n\n" for row in rows))
+    out = tmp_path / "field"
+    assert main(["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(out)]) == 0
+    field = jsecon.load_field(out / "field.safetensors")
+    assert field.frames == ("a0.png", "a1.png", "a2.png", "a3.png")
+    mine = jsecon.render_rgb(field.gaussians, field.cameras[1]).alpha
+    assert np.abs(mine - jsecon.render_rgb(object_alone, planned[1]).alpha).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    "option", [["--gaussians", "scene.ply"], ["--frames", "5"], ["--holdout", "4"], ["--downscale", "2"]]
+)
+def test_options_of_photographs_are_refused_for_a_scene_alone(room, tmp_path, capsys, monkeypatch, option):
+    monkeypatch.chdir(tmp_path)
+    jsecon.save_ply("scene.ply", room)
+    assert main(["run", "scene.ply", *option, "--out", "field"]) == 2
+    assert option[0] in capsys.readouterr().err
+    assert not (tmp_path / "field").exists()
+
+
+def test_poses_that_look_elsewhere_are_refused(object_alone, tmp_path, capsys):
+    jsecon.save_ply(tmp_path / "scene.ply", object_alone)
+    pose = np.eye(4)
+    pose[:3, 3] = 1000
+    frames = [{"file_path": f"{k}.png", "transform_matrix": pose.tolist()} for k in range(2)]
+    cameras = tmp_path / "poses.json"
+    cameras.write_text(json.dumps({"w": 80, "h": 60, "fl_x": 60, "frames": frames}))
+    asked = ["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(tmp_path / "field")]
+    assert main(asked) == 2
+    assert "poses.json" in capsys.readouterr().err

@@ -127,6 +127,28 @@ def read_nerfstudio(file: Path) -> PosedImages:
     return PosedImages(images, file, *points, to_source=to_source, notes=tuple(notes))
 
 
+def read_poses(file: Path) -> list[tuple[str, Lens, np.ndarray]]:
+    """Reads the cameras of a transforms.json whose images are not needed.
+
+    Args:
+      file: The transforms.json.
+
+    Returns:
+      (name, lens, (4, 4) world_to_camera) of each frame, in the order of the file.
+
+    Raises:
+      InputError: The file is damaged or lacks a key, or a lens has no size.
+    """
+    scene, poses = _Transforms(file), []
+    for index, entry in enumerate(scene.get(scene.content, "frames", "the file", list)):
+        if not isinstance(entry, dict):
+            raise scene.error(f"frame {index} is not an object", "frames with transform_matrix")
+        name = str(entry.get("file_path", f"frame {index}"))
+        pose = scene.matrix(entry, "transform_matrix", f"frame {index} ({name})")
+        poses.append((name, _lens(scene, entry, name, None), invert_pose(pose * [1, -1, -1, 1], file, name)))
+    return poses
+
+
 def trained_to_source(file: Path) -> Float[np.ndarray, "4 4"]:
     """Reads where the world that nerfstudio trained and exported Gaussians in lies in the source's world.
 
@@ -169,7 +191,7 @@ def _full_name(name: str, image: Path) -> str:
     return name if name.lower().endswith(image.suffix.lower()) else name + image.suffix
 
 
-def _lens(scene: _Transforms, entry: dict[str, Any], name: str, image: Path) -> Lens:
+def _lens(scene: _Transforms, entry: dict[str, Any], name: str, image: Path | None) -> Lens:
     """The lens of a frame: its keys take precedence over those of the file."""
     keys = {**scene.content, **entry}
     model = str(keys.get("camera_model", "OPENCV")).upper()
@@ -181,6 +203,8 @@ def _lens(scene: _Transforms, entry: dict[str, Any], name: str, image: Path) -> 
         raise scene.error(problem, "a perspective or an OpenCV fisheye lens", "Undistort the images first.")
     is_fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     if keys.get("w") is None or keys.get("h") is None:
+        if image is None:
+            raise scene.error(f"{name} has no size", "w and h, in the file or the frame")
         width, height = image_header(image).closest_to_centre(keys.get("cx"), keys.get("cy"))
     else:
         width, height = (round(scene.number(keys, key, 0.0)) for key in ("w", "h"))

@@ -1,25 +1,59 @@
 """The stages of a scene that comes without photographs: its views are planned and rendered, its Gaussians are read."""
 
+import dataclasses
+
 import numpy as np
 
+from jsecon.data.coordinates import transform_poses
+from jsecon.data.poses import load_poses
 from jsecon.errors import InputError
+from jsecon.pipeline.options import Options
 from jsecon.pipeline.results import RunContext, Stage, StageInput, StageResult
-from jsecon.pipeline.scene_files import read_scene
-from jsecon.views.capture import into_world, render_capture, world_of_scene
+from jsecon.pipeline.scene_files import check_overlap, read_scene
+from jsecon.types import Quality
+from jsecon.views.capture import capture_from_cameras, into_world, render_capture, world_of_scene
+
+OF_PHOTOGRAPHS = ("downscale", "frames", "holdout", "refine", "drop_frames")
+"""options that only photographs have a use for"""
+OF_BARE_SCENES = ("views", "up", "cameras")
+"""options that only a scene without photographs has a use for"""
+
+
+def require_options_apply(options: Options, *, bare: bool) -> None:
+    """Checks that no option is set that the input has no use for.
+
+    Args:
+      options: Options of the run.
+      bare: Whether the input is a scene without photographs.
+
+    Raises:
+      InputError: One is.
+    """
+    defaults = {field.name: field.default for field in dataclasses.fields(options)}
+    for name in OF_PHOTOGRAPHS if bare else OF_BARE_SCENES:
+        if getattr(options, name) != defaults[name]:
+            kind = "a scene without photographs" if bare else "a capture, which has its own views"
+            remedy = (
+                "Leave it out; --views sets the number of views." if bare else "Leave it out; --frames sets the most."
+            )
+            raise InputError(f"--{name.replace('_', '-')}", f"{options.capture.name} is {kind}", remedy=remedy)
+    if bare and options.gaussians is not None:
+        problem = f"{options.capture.name} is a scene of Gaussians itself"
+        raise InputError("--gaussians", problem, "", "Leave out --gaussians, or give the folder of the photographs.")
 
 
 def planned_views(context: RunContext) -> Stage:
-    """Plans the stage "load" of a bare scene: virtual views planned from its Gaussians, and rendered as its frames.
-
-    Raises:
-      InputError: The options name another file of Gaussians.
-    """
+    """Plans the stage "load" of a bare scene: virtual views, or given cameras, rendered as its frames."""
     options = context.options
-    if options.gaussians is not None:
-        problem = f"{options.capture.name} is a scene of Gaussians itself"
-        raise InputError("--gaussians", problem, "", "Leave out --gaussians, or give the folder of the photographs.")
-    how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
     skipped = {"photographs": "the scene comes without any"}
+    if options.cameras is not None:
+        how = f"the scene rendered from the poses of {options.cameras.name}"
+        poses = options.cameras
+        files = lambda: [poses, options.capture]
+        key_options = context.key_options("long_side")
+        skipped["planned views"] = f"the poses are given ({poses.name})"
+        return Stage("load", how, _render_poses, key_options=key_options, files=files, skipped=skipped)
+    how = f"{options.views} virtual views, planned from the Gaussians of {options.capture.name}"
     key_options = context.key_options("views", "up", "long_side")
     return Stage("load", how, _render_views, key_options=key_options, files=options.capture, skipped=skipped)
 
@@ -28,7 +62,7 @@ def _render_views(stage: StageInput) -> StageResult:
     options = stage.context.options
     source, _ = read_scene(options.capture)
     to_source = world_of_scene(source)
-    capture, _ = render_capture(
+    capture = render_capture(
         into_world(source, to_source),
         to_source,
         views=options.views,
@@ -38,6 +72,19 @@ def _render_views(stage: StageInput) -> StageResult:
         progress=stage.progress,
     )
     return StageResult(capture, notes=capture.notes)
+
+
+def _render_poses(stage: StageInput) -> StageResult:
+    options = stage.context.options
+    assert options.cameras is not None
+    source, _ = read_scene(options.capture)
+    to_source = world_of_scene(source)
+    cameras, names = load_poses(options.cameras, long_side=options.long_side)
+    poses = transform_poses(np.asarray(cameras.world_to_camera), np.linalg.inv(to_source)).astype(np.float32)
+    cameras = dataclasses.replace(cameras, world_to_camera=poses)
+    scene = into_world(source, to_source)
+    check_overlap(scene, cameras, str(options.cameras))
+    return StageResult(capture_from_cameras(scene, cameras, names, to_source))
 
 
 def scene_itself(context: RunContext) -> Stage:
@@ -50,3 +97,9 @@ def scene_itself(context: RunContext) -> Stage:
 def _read_scene(stage: StageInput) -> StageResult:
     source, notes = read_scene(stage.context.options.capture)
     return StageResult(into_world(source, np.asarray(stage.results.load.to_source, np.float64)), notes=notes)
+
+
+def no_photographs() -> Stage:
+    """Plans the stage "held_out" of a bare scene, whose frames are its own renders: the quality of no frame."""
+    none = lambda stage: StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
+    return Stage("held_out", "no photograph to compare with", none)

@@ -91,10 +91,13 @@ class BareOptions:
     Attributes:
       views: Number of virtual views that are planned and rendered, at least 2.
       up: Up axis of the scene, three numbers. By default it is the normal of the largest plane, the ground.
+      cameras: Renders the scene from these poses instead of planned ones: a COLMAP model, or a transforms.json. Their
+        images are not needed.
     """
 
     views: Option[int] = 24
     up: Option[tuple[float, float, float] | None] = None
+    cameras: Option[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,7 +44,7 @@ from jsecon.language.distill import distill_votes
 from jsecon.language.regions import Embed, embeddings_of_masks, region_embeddings, scene_parts
 from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks
 from jsecon.language.votes import region_votes, votes_memory
-from jsecon.pipeline.bare_stages import planned_views, scene_itself
+from jsecon.pipeline.bare_stages import no_photographs, planned_views, require_options_apply, scene_itself
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Progress
 from jsecon.pipeline.results import (
@@ -83,7 +83,9 @@ Refinement = Literal["none", "poses", "exposure", "both", "auto"]
 
 def capture_stages(context: RunContext) -> list[Stage]:
     """Plans the capture, and before it the poses if there are photographs or a video without poses."""
-    if context.load is None and is_bare_scene(context.options.capture):
+    bare = _is_bare(context)
+    require_options_apply(context.options, bare=bare)
+    if bare:
         return [planned_views(context)]
     if context.load is not None or not _is_unposed(context.options.capture):
         return [load(context)]
@@ -95,6 +97,11 @@ def capture_stages(context: RunContext) -> list[Stage]:
     # The stage computes from the posed capture, whatever the context of the run says.
     compute = lambda stage_input: plan.compute(stage_input._replace(context=posed))
     return [stage, dataclasses.replace(plan, compute=compute, after=("poses",), files=None)]
+
+
+def _is_bare(context: RunContext) -> bool:
+    """Whether a run's input is a scene without photographs."""
+    return context.load is None and is_bare_scene(context.options.capture)
 
 
 def _is_unposed(capture: Path) -> bool:
@@ -232,7 +239,7 @@ def _fit_steps(options: Options, capture: Capture) -> float:
 
 def gaussians(context: RunContext) -> Stage:
     """Plans the scene's Gaussians: of a file, brought into the capture's world, or fitted to the training frames."""
-    if context.load is None and is_bare_scene(context.options.capture):
+    if _is_bare(context):
         return scene_itself(context)
     options, path = context.options, context.options.gaussians
     if path is not None:
@@ -290,6 +297,8 @@ def _fit_gaussians(stage: StageInput) -> StageResult:
 
 def held_out(context: RunContext) -> Stage:
     """Plans PSNR and SSIM of the held-out frames."""
+    if _is_bare(context):
+        return no_photographs()
     how = "PSNR and SSIM of the rendered colours"
     return Stage("held_out", how, _measure, after=("load", "gaussians"), distributed=True)
 

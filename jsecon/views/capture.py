@@ -10,9 +10,9 @@ import numpy as np
 from jsecon.splat.render import render_rgb
 from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians_float64
-from jsecon.types import Capture, Gaussians
+from jsecon.types import Camera, Capture, Gaussians
 from jsecon.views.frame import scene_frame, surface_points
-from jsecon.views.plan import PlannedViews, plan_views
+from jsecon.views.plan import plan_views
 
 ORDINARY = (3.0, 30.0)
 """diagonal of a scene that keeps its units: a table to a flat, in metres"""
@@ -54,7 +54,7 @@ def render_capture(
     height: int = 300,
     up: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[Capture, PlannedViews]:
+) -> Capture:
     """Plans views of a bare scene and renders them as the frames of a capture.
 
     Args:
@@ -67,31 +67,48 @@ def render_capture(
       progress: Called as progress(done, total).
 
     Returns:
-      The capture, no frame of it held out, and the planned views.
+      The capture, no frame of it held out.
 
     Raises:
       InputError: The scene cannot be judged.
     """
     planned = plan_views(gaussians, views=views, width=width, height=height, up=up, progress=progress)
+    names = tuple(f"view_{index:03d}" for index in range(len(planned.cameras)))
+    return capture_from_cameras(gaussians, planned.cameras, names, to_source, notes=(f"{planned.describe()}.",))
+
+
+def capture_from_cameras(
+    gaussians: Gaussians, cameras: Camera, names: tuple[str, ...], to_source: np.ndarray, *, notes: tuple[str, ...] = ()
+) -> Capture:
+    """Renders a bare scene as the frames of a capture.
+
+    Args:
+      gaussians: Scene of N Gaussians, in the capture's world.
+      cameras: Batch of T cameras, in the capture's world.
+      names: T names of the frames.
+      to_source: (4, 4) similarity from that world to the file's.
+      notes: What the user should know, a sentence each.
+
+    Returns:
+      The capture, no frame of it held out.
+    """
     scene = jax.tree.map(jnp.asarray, gaussians)
-    background = _background(scene, planned)
-    frames = np.empty((len(planned.cameras), height, width, 3), np.uint8)
-    for frame, camera in zip(frames, planned.cameras):
+    background = _background(scene, cameras[0])
+    frames = np.empty((len(cameras), cameras.height, cameras.width, 3), np.uint8)
+    for frame, camera in zip(frames, cameras):
         image = np.asarray(render_rgb(scene, camera, background=background).features)
         frame[:] = np.round(255 * np.clip(image, 0, 1))
-    count = len(frames)
-    capture = Capture(
+    return Capture(
         frames=frames,
-        cameras=planned.cameras,
+        cameras=cameras,
         points=np.zeros((0, 3), np.float32),
         point_colors=np.zeros((0, 3), np.uint8),
-        held_out=np.zeros(count, bool),
+        held_out=np.zeros(len(frames), bool),
         depths=None,
         to_source=to_source,
-        names=tuple(f"view_{index:03d}" for index in range(count)),
-        notes=(f"{planned.describe()}.",),
+        names=names,
+        notes=notes,
     )
-    return capture, planned
 
 
 def into_world(gaussians: Gaussians, to_source: np.ndarray) -> Gaussians:
@@ -108,9 +125,9 @@ def into_world(gaussians: Gaussians, to_source: np.ndarray) -> Gaussians:
     return dataclasses.replace(moved, means=np.asarray(moved.means, np.float32))
 
 
-def _background(gaussians: Gaussians, planned: PlannedViews) -> np.ndarray:
+def _background(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """(3,) the grey that is farthest from the scene's colours: a black object would vanish before black."""
-    colours = np.clip(np.asarray(colours_from_sh(gaussians, planned.cameras[0])), 0, 1)
+    colours = np.clip(np.asarray(colours_from_sh(gaussians, camera)), 0, 1)
     opacity = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits, np.float64)))
     colours = colours[opacity >= 0.5] if (opacity >= 0.5).any() else colours
     distances = [float(np.quantile(np.abs(colours - grey).max(1), 0.05)) for grey in BACKGROUNDS]

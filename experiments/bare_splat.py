@@ -1,0 +1,134 @@
+"""A bare splat against the same scene with its photographs.
+
+    python -m experiments.bare_splat [--seeds 1 2 3 4 5] [--demos FOLDER] [--views 24] [--out FOLDER]
+    python -m experiments.bare_splat --field FIELD [--out FOLDER]       (a field of `jsecon run` on a capture)
+
+Each made-up room comes from `jsecon demo --seed S`, kept in DEMOS/demoS. Its fitted Gaussians are written to a .ply,
+turned, scaled by 0.01 to 100 and shifted at random, and `jsecon run scene.ply` makes a field without photographs.
+
+- label mIoU: for each true object (the demo's field of exact masks), the best IoU of its Gaussians with those of one
+  region; a Gaussian belongs to its strongest region if that has half of its weight. The ratio is bare / photographs.
+- selection IoU: of the Gaussians of the regions that match a true object best in both fields.
+- matched: share of the regions of the field with photographs (of at least 50 Gaussians) that a region of the bare
+  field matches by an IoU of at least 0.5.
+"""
+
+import argparse
+import dataclasses
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import jsecon
+from experiments import results
+
+SMALLEST = 50
+"""Gaussians of a region that is matched"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What is compared."""
+
+    seeds: tuple[int, ...] = (1, 2, 3, 4, 5)
+    demos: str = "jsecon-demos"
+    field: str = ""
+    views: int = 24
+    out: str = str(results.HOME / "results" / "bare_splat")
+
+
+def strongest_regions(field: jsecon.LanguageField) -> np.ndarray:
+    """(N,) the region that has at least half of each Gaussian's weight, else -1."""
+    votes = field.votes
+    regions, weights = np.asarray(votes.regions)[:, 0], np.asarray(votes.weights)[:, 0]
+    return np.where(weights >= 0.5 * np.asarray(votes.total), regions, -1)
+
+
+def best_match(labels: np.ndarray, members: np.ndarray) -> tuple[float, int]:
+    """The region of `labels` (N,) with the largest IoU with a set of Gaussians (N,), and that IoU."""
+    ids, shared = np.unique(labels[members & (labels >= 0)], return_counts=True)
+    if not len(ids):
+        return 0.0, -1
+    sizes = np.array([(labels == region).sum() for region in ids])
+    overlaps = shared / (sizes + members.sum() - shared)
+    return float(overlaps.max()), int(ids[overlaps.argmax()])
+
+
+def compare(photographs: np.ndarray, bare: np.ndarray, truth: np.ndarray | None) -> dict[str, float]:
+    """The figures of one scene, from the strongest regions of its Gaussians (N,) in each field."""
+    ids = [k for k in np.unique(photographs[photographs >= 0]) if (photographs == k).sum() >= SMALLEST]
+    figures = {"matched": float(np.mean([best_match(bare, photographs == k)[0] >= 0.5 for k in ids]))}
+    if truth is None:
+        return figures
+    rows = []
+    for k in np.unique(truth[truth >= 0]):
+        members = truth == k
+        with_photographs, region = best_match(photographs, members)
+        without, other = best_match(bare, members)
+        a, b = photographs == region, bare == other
+        rows.append((with_photographs, without, (a & b).sum() / max((a | b).sum(), 1)))
+    mean = np.mean(rows, axis=0)
+    figures |= {"photographs": float(mean[0]), "bare": float(mean[1]), "ratio": float(mean[1] / mean[0])}
+    return figures | {"selection_iou": float(mean[2])}
+
+
+def bare_field(field: jsecon.LanguageField, seed: int, folder: Path, views: int) -> tuple[jsecon.LanguageField, float]:
+    """The field of the same Gaussians without photographs, in a world of their own, and the seconds of its run."""
+    rng = np.random.default_rng(seed)
+    world = np.eye(4)
+    world[:3, :3] = Rotation.random(random_state=seed).as_matrix() * 10 ** rng.uniform(-2, 2)
+    world[:3, 3] = rng.normal(size=3) * 20
+    folder.mkdir(parents=True, exist_ok=True)
+    jsecon.save_ply(folder / "scene.ply", field.gaussians, similarity=world)
+    began = time.perf_counter()
+    command = [sys.executable, "-m", "jsecon", "run", "scene.ply", "--out", "field", "--views", str(views)]
+    with (folder / "run.log").open("w") as log:
+        subprocess.run(command, cwd=folder, check=True, stdout=log, stderr=subprocess.STDOUT)
+    return jsecon.load_field(folder / "field" / "field.safetensors"), time.perf_counter() - began
+
+
+def main(options: Options) -> dict[str, dict]:
+    """Runs and compares, and writes the table."""
+    found: dict[str, dict] = {}
+    scenes: list[tuple[str, int, Path, Path | None]] = []
+    if options.field:
+        scenes.append((Path(options.field).parent.name, 0, Path(options.field), None))
+    else:
+        for seed in options.seeds:
+            demo = Path(options.demos) / f"demo{seed}"
+            if not (demo / "metrics.json").exists():
+                command = [sys.executable, "-m", "jsecon", "demo", "--seed", str(seed), "--out", str(demo)]
+                subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+            scenes.append((f"room {seed}", seed, demo / "field.safetensors", demo / "true_masks" / "field.safetensors"))
+    for name, seed, path, true_path in scenes:
+        field = jsecon.load_field(path)
+        bare, seconds = bare_field(field, seed, Path(options.out) / "runs" / name.replace(" ", "_"), options.views)
+        truth = None if true_path is None else strongest_regions(jsecon.load_field(true_path))
+        figures = compare(strongest_regions(field), strongest_regions(bare), truth)
+        seen = float((np.asarray(bare.votes.views) > 0).mean())
+        found[name] = figures | {"seen": seen, "seconds": seconds, "gaussians": field.gaussians.count}
+        print(name, json.dumps(found[name]), flush=True)
+    keys = list(next(iter(found.values())))
+    rows = [(name, *(figures[key] for key in keys)) for name, figures in found.items()]
+    rows.append(("mean", *(float(np.mean([figures[key] for figures in found.values()])) for key in keys)))
+    table = results.table(("scene", *keys), rows)
+    print(table)
+    results.save(Path(options.out), options, found, table)
+    return found
+
+
+if __name__ == "__main__":
+    defaults = Options()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(defaults.seeds))
+    parser.add_argument("--demos", default=defaults.demos)
+    parser.add_argument("--field", default=defaults.field)
+    parser.add_argument("--views", type=int, default=defaults.views)
+    parser.add_argument("--out", default=defaults.out)
+    arguments = parser.parse_args()
+    main(Options(tuple(arguments.seeds), arguments.demos, arguments.field, arguments.views, arguments.out))
