@@ -23,7 +23,10 @@ def measure(device, gaussians, camera, features, capacity: int, repeats: int) ->
     """Image, gradients, and ms of each call on `device`."""
     gaussians, camera, features = jax.device_put((gaussians, camera, features), device)
     forward = jax.jit(lambda g, f: jsecon.render(g, camera, f, capacity=capacity).features)
-    loss = lambda g, f: (forward(g, f) ** 2).sum()
+
+    def loss(g, f):
+        return (forward(g, f) ** 2).sum()
+
     plan = jsecon.plan_view(gaussians, camera, capacity=capacity)
     planned = jax.jit(lambda f: jsecon.render_plan(plan, f).features)
     wide = jnp.tile(features, (1, 11))[:, :32]

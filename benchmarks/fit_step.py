@@ -47,7 +47,10 @@ def main() -> None:
     gaussians = pad_with_free_rows(jax.tree.map(np.asarray, gaussians), padded_row_count(gaussians.count))
     mesh = host_mesh()
     options: dict[str, Any] = {} if mesh is None else {"compiler_options": MESH_OPTIONS}
-    put = lambda tree: jax.device_put(tree, None if mesh is None else NamedSharding(mesh, PartitionSpec()))
+
+    def put(tree):
+        return jax.device_put(tree, None if mesh is None else NamedSharding(mesh, PartitionSpec()))
+
     cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras)
     camera, frame = put((cameras[4], capture.frames[4]))
     strips = 1 if mesh is None else mesh.size

@@ -262,7 +262,10 @@ def cast(base: Path, count: int, views: int, width: int, height: int) -> dict[st
         write_landscape(folder, count)
     for given in (1, views):
         cameras, out = ring(given, width, height), base / "votes"
-        call = lambda c=cameras, o=out: jsecon.region_votes_in_blocks(mapped(folder), c, Labels(c), REGIONS, folder=o)
+
+        def call(c=cameras, o=out):
+            return jsecon.region_votes_in_blocks(mapped(folder), c, Labels(c), REGIONS, folder=o)
+
         timed(told, "s", call)
         shutil.rmtree(out)
     return told

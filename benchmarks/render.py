@@ -53,11 +53,17 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, repeats: int) -> li
         if devices in [key.split(", ")[-1] for key in calls]:
             continue
         jit = functools.partial(jax.jit, compiler_options=None if spread is None else MESH_OPTIONS)
-        rendered = lambda g, f, m=spread: jsecon.render(g, camera, f, capacity=capacity, mesh=m).features
+
+        def rendered(g, f, m=spread):
+            return jsecon.render(g, camera, f, capacity=capacity, mesh=m).features
+
         forward, loss = jit(rendered), lambda g, f, rendered=rendered: (rendered(g, f) ** 2).sum()
         plan = plan_view(gaussians, camera, capacity=capacity, mesh=spread)
         planned = jit(lambda plan, f: render_plan(plan, f).features)
-        planned_loss = lambda f, plan: (render_plan(plan, f).features ** 2).sum()
+
+        def planned_loss(f, plan):
+            return (render_plan(plan, f).features ** 2).sum()
+
         alone = jit(lambda plan, f, m=spread: composite(plan.splats, f, plan.lists, camera.width, camera.height, m))
         by_all, by_features = jit(jax.grad(loss, argnums=(0, 1))), jit(jax.grad(planned_loss))
         calls |= {
@@ -141,7 +147,10 @@ def nearby(camera: Camera, count: int) -> Camera:
     """A batch of `count` cameras, each a little further to the side."""
     poses = np.tile(np.asarray(camera.world_to_camera), (count, 1, 1))
     poses[:, 0, 3] += 0.02 * np.arange(count)
-    repeat = lambda a: jnp.tile(jnp.asarray(a), count)
+
+    def repeat(a):
+        return jnp.tile(jnp.asarray(a), count)
+
     return Camera(
         jnp.asarray(poses), *(repeat(a) for a in (camera.fx, camera.fy, camera.cx, camera.cy)), camera.width,
         camera.height,

@@ -41,7 +41,10 @@ def one(count: int, width: int, height: int, channels: int, repeats: int) -> dic
     capacity = jsecon.plan_capacity(gaussians, camera, margin=1.0)
     start = time.perf_counter()
     mesh = host_mesh()
-    draw = lambda g, f: jsecon.render(g, camera, f, capacity=capacity, mesh=mesh)
+
+    def draw(g, f):
+        return jsecon.render(g, camera, f, capacity=capacity, mesh=mesh)
+
     options = None if mesh is None else MESH_OPTIONS
     render = jax.jit(draw, compiler_options=options).lower(gaussians, features).compile()
     compile_s = time.perf_counter() - start

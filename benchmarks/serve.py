@@ -42,7 +42,10 @@ def copied(field: LanguageField, copies: int) -> LanguageField:
     means = np.asarray(field.gaussians.means)
     apart = 1.5 * np.ptp(np.quantile(means, (0.02, 0.98), axis=0)[:, 0])
     count = len(means)
-    tile = lambda a: np.concatenate([np.asarray(a)] * copies) if np.shape(a)[:1] == (count,) else a
+
+    def tile(a):
+        return np.concatenate([np.asarray(a)] * copies) if np.shape(a)[:1] == (count,) else a
+
     gaussians, votes = jax.tree.map(tile, field.gaussians), jax.tree.map(tile, field.votes)
     shift = np.repeat(np.arange(copies), count)[:, None] * np.float32([apart, 0, 0])
     gaussians = dataclasses.replace(gaussians, means=(np.asarray(gaussians.means) + shift).astype(np.float32))

@@ -37,7 +37,10 @@ def calls() -> tuple[str, dict[str, Callable], Callable[[], float]]:
     features = {d: jnp.asarray(rng.normal(size=(gaussians.count, d)), jnp.float32) for d in (3, 32)}
     capacity = jsecon.plan_capacity(gaussians, camera, margin=1.0)
     gaussians, camera = jax.tree.map(jnp.asarray, (gaussians, camera))
-    rendered = lambda g, f: jsecon.render(g, camera, f, capacity=capacity).features
+
+    def rendered(g, f):
+        return jsecon.render(g, camera, f, capacity=capacity).features
+
     plan = plan_view(gaussians, camera, capacity=capacity)
     forward, planned = jax.jit(rendered), jax.jit(lambda plan, f: render_plan(plan, f).features)
     by_features = jax.jit(jax.grad(lambda f, plan: (render_plan(plan, f).features ** 2).sum()))

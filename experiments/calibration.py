@@ -82,7 +82,10 @@ def calibration_error(
     place = np.clip((confidence * BINS).astype(int), 0, BINS - 1)
     curve = []
     for own in (place == k for k in range(BINS) if (place == k).any()):
-        mean = lambda values, own=own: float(np.average(values[own], weights=weight[own]))
+
+        def mean(values, own=own):
+            return float(np.average(values[own], weights=weight[own]))
+
         curve.append(Bin(mean(confidence), mean(right), float(weight[own].sum())))
     error = sum(bin.weight * abs(bin.confidence - bin.right) for bin in curve) / max(weight.sum(), 1e-12)
     return float(error), curve

@@ -58,7 +58,10 @@ def views_of_regions(setting: Setting) -> list[tuple[np.ndarray, np.ndarray]]:
 def spread(regions: list[tuple[np.ndarray, np.ndarray]], seed: int) -> tuple[float, float]:
     """Mean 1 - cosine to the mean of half of the views: of a view of the other half, and of the mean of that half."""
     draw, single, half = np.random.default_rng(seed), [], []
-    mean = lambda rows, weights: unit((weights[:, None] * rows).sum(0, keepdims=True))[0]
+
+    def mean(rows, weights):
+        return unit((weights[:, None] * rows).sum(0, keepdims=True))[0]
+
     for rows, weights in regions:
         order = draw.permutation(len(rows))
         a, b = order[: len(rows) // 2], order[len(rows) // 2 :]

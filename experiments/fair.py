@@ -126,8 +126,13 @@ def report(name: str, level: str, cells: list[dict], asked: Asked) -> tuple[str,
     best = taken(name, asked) or chosen(here, asked.choosing, figures)
     ours_is = mine_of(cells)
     held = [cell for cell in cells if cell["seed"] in asked.seeds]
-    of = lambda row: [cell for cell in held if cell["method"] == row]
-    mean = lambda own, figure: by_scene(own, figure, lambda values: float(np.mean(values)))
+
+    def of(row):
+        return [cell for cell in held if cell["method"] == row]
+
+    def mean(own, figure):
+        return by_scene(own, figure, lambda values: float(np.mean(values)))
+
     rows, told = [], {}
     for method, by_figure in best.items():
         row, settings = [method], 0
@@ -206,7 +211,10 @@ def cells_of(name: str, level: str, asked: Asked, processes: int) -> list[dict]:
 
     def filled(rows: list[str], seeds: tuple[int, ...]) -> list[dict]:
         plan = plan_of(name, level, asked, processes, seeds, rows)
-        tell = lambda line: print(line, flush=True)
+
+        def tell(line):
+            return print(line, flush=True)
+
         with contextlib.suppress(SystemExit):  # of a helper: what others are at is waited for below
             fill(plan, methods, tell=tell)
         return fill(dataclasses.replace(plan, processes=1), methods, tell=tell)

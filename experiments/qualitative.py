@@ -80,7 +80,10 @@ def seen(setting: Setting) -> Seen:
     camera = setting.evidence.cameras[t]
     true = {text: shown(setting.evidence.gaussians, camera, own) for text, own in at_points.items() if own.any()}
     labelled = np.asarray(bench.point_classes) >= 0  # the others are nobody's in Table 3
-    by_class = lambda answers, k: (answers.classes() == k) & labelled
+
+    def by_class(answers, k):
+        return (answers.classes() == k) & labelled
+
     return Seen(setting.names[t], camera, setting.frames[t], largest(true), by_class, at_points)
 
 

@@ -483,7 +483,10 @@ def tables(metrics: dict, told: list[str], score: dict) -> list[str]:
         return _mean(found) if found else ""
 
     scenes = list(metrics["crops"][0]["scenes"]) if metrics["crops"] else []
-    quality = lambda own: f"{own['words']:.3f} / {own['first']:.2f}"
+
+    def quality(own):
+        return f"{own['words']:.3f} / {own['first']:.2f}"
+
     rows = [(*row["crop"].values(), *(quality(row["scenes"][s]) for s in scenes)) for row in metrics["crops"]]
     text = [
         "Crops of outlined things: share of all words less similar than the own name / own name first in the scene."
@@ -538,8 +541,13 @@ def calibration(refused: dict[str, Any]) -> tuple[float, list[Bin]]:
 def acceptance(metrics: dict) -> list[str]:
     """What the library must reach, a line each, as far as it is measured."""
     (rule, variant), cases, lines = metrics["best_rule"], metrics["cases"], []
-    lifted = lambda k: float(np.mean(next(row for row in metrics["parts"][k] if row["part"] == "lifting")["T2"]))
-    real = lambda k: float(np.mean(cases[f"{k}, {variant}"]["points"]["T2"][rule]))
+
+    def lifted(k):
+        return float(np.mean(next(row for row in metrics["parts"][k] if row["part"] == "lifting")["T2"]))
+
+    def real(k):
+        return float(np.mean(cases[f"{k}, {variant}"]["points"]["T2"][rule]))
+
     if GIVEN_FLAT in metrics["parts"]:
         lines.append(f"(a) {GIVEN_FLAT} masks, true names, T2: {lifted(GIVEN_FLAT):.3f} (0.75)")
     if f"{GIVEN_FLAT}, {variant}" in cases:

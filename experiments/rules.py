@@ -165,7 +165,10 @@ def measure(data: twins.Data, scene: str, seed: int, level: str) -> dict:
 def best_scores(field: LanguageField, texts: np.ndarray, retrieval: str) -> np.ndarray:
     """(Q,) the similarity of each text's best region."""
     rules = QueryRules(retrieval=retrieval, retrieval_threshold=NO_REFUSAL)
-    ask = lambda text: match_regions(field, text[None], rules).score
+
+    def ask(text):
+        return match_regions(field, text[None], rules).score
+
     return np.array([float(ask(jnp.asarray(text))) for text in texts])
 
 
@@ -188,9 +191,10 @@ def refusal(setting: Setting, field: LanguageField) -> dict[str, float]:
 def report(found: dict[tuple, dict], level: str) -> tuple[str, dict]:
     """Markdown tables of one level, and its figures."""
     here = {where: told for where, told in found.items() if where[2] == level}
-    by_text = lambda by, row: {
-        (*where, text): value for where, told in here.items() for text, value in told[by][row].items()
-    }
+
+    def by_text(by, row):
+        return {(*where, text): value for where, told in here.items() for text, value in told[by][row].items()}
+
     kept, rows = {}, []
     for by in ("consensus", "tracks"):
         for row in next(iter(here.values()))[by]:

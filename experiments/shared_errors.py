@@ -185,7 +185,10 @@ def main(options: Options = Options()) -> dict:
 
 def report(told: dict[float, list[dict[str, float]]], options: Options) -> dict:
     """Writes the table of the figures of each strength; returns their means."""
-    mean = lambda each: {name: float(np.nanmean([figures[name] for figures in each])) for name in REAL}
+
+    def mean(each):
+        return {name: float(np.nanmean([figures[name] for figures in each])) for name in REAL}
+
     means = {strength: mean(each) for strength, each in told.items()}
     header = ("measured", *(f"strength {strength:g}" for strength in means), "a real embedder")
     table = results.table(header, [(name, *(m[name] for m in means.values()), REAL[name]) for name in REAL])

@@ -16,14 +16,18 @@ UNREAD = 141
 
 
 class Output:
-    """A text stream that may fail, as where its reader goes away: what is written from then on is dropped, so that
-    files are still written. `failure` is the first error."""
+    """A text stream that may fail, for example where its reader goes away.
+
+    What is written after a failure is dropped, so that files are still written. `failure` is the first error.
+    """
 
     def __init__(self, stream: Any):
+        """Wraps `stream`."""
         self._stream = stream
         self.failure: OSError | None = None
 
     def __getattr__(self, name: str) -> Any:
+        """Returns an attribute of the stream."""
         return getattr(self._stream, name)
 
     def isatty(self) -> bool:

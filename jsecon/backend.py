@@ -52,7 +52,10 @@ def check_backend(*, strict: bool = False) -> BackendReport:
     texts, rows = rng.normal(size=(2, 3)), rng.normal(size=(_ROWS, 3))
     unit_rows, unit_texts = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in (rows, texts))
     expected = (unit_rows @ unit_texts.T).max(1)
-    error = lambda values: float(np.abs(np.asarray(values, np.float64) - expected).max())
+
+    def error(values):
+        return float(np.abs(np.asarray(values, np.float64) - expected).max())
+
     f, t = jnp.asarray(rows, jnp.float32), jnp.asarray(texts, jnp.float32)
     ours = [
         jax.jit(lambda f, t: cosine_matrix(f, t).max(1))(f, t),

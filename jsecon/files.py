@@ -148,7 +148,7 @@ def list_files(root: Path, *, exclude: Path | None = None) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Writes a text (UTF-8) atomically; bytes of file names that are no UTF-8 become \\udcxx."""
+    r"""Writes a text (UTF-8) atomically; bytes of file names that are no UTF-8 become \\udcxx."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 

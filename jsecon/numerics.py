@@ -63,7 +63,7 @@ def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
 
 
 def normalize(x: Array, axis: int = -1) -> Array:
-    """x / |x| over `axis`; zero (with zero gradient) where x is zero, NaN where x is not finite."""
+    """X / |x| over `axis`; zero (with zero gradient) where x is zero, NaN where x is not finite."""
     x = jnp.asarray(x)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True, initial=0.0))
     usable = (largest > 0) & jnp.isfinite(largest)
@@ -75,8 +75,11 @@ def normalize(x: Array, axis: int = -1) -> Array:
 
 @jax.custom_jvp
 def sigmoid(x: Array) -> Array:
-    """1 / (1 + exp(-x)), with a derivative right to the last digits where it is nearly 1: as s(x) s(-x), for 1 - s(x)
-    cancels (jax.nn.sigmoid's is off by 5e-4 at x = 10, and 0 from 17 on, in float32)."""
+    """Computes 1 / (1 + exp(-x)) with a derivative that is right to the last digits where it is nearly 1.
+
+    The derivative is s(x) s(-x), because 1 - s(x) cancels: jax.nn.sigmoid's is off by 5e-4 at x = 10, and 0 from 17 on,
+    in float32.
+    """
     return jax.nn.sigmoid(x)
 
 
@@ -102,8 +105,10 @@ def all_finite(*arrays: Array) -> Array:
 
 
 def is_traced(tree: Any = ()) -> bool:
-    """Returns whether a leaf of `tree` is being traced (jit, grad, vmap), or all that is computed now is: inside a jit
-    also arrays that its function closes over."""
+    """Returns whether a leaf of `tree` is being traced (jit, grad, vmap).
+
+    Inside a jit all that is computed is traced, also arrays that its function closes over.
+    """
     return any(isinstance(leaf, Tracer) for leaf in [*jax.tree.leaves(tree), jnp.zeros(())])
 
 

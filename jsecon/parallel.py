@@ -91,7 +91,10 @@ def map_rows(local: Callable, rows: Any, common: Any, mesh: Mesh | None) -> Any:
     if mesh is None:
         return local(rows, common)
     count = jax.tree.leaves(rows)[0].shape[0]
-    pad = lambda a: jnp.pad(a, [(0, -count % mesh.size)] + [(0, 0)] * (a.ndim - 1))
+
+    def pad(a):
+        return jnp.pad(a, [(0, -count % mesh.size)] + [(0, 0)] * (a.ndim - 1))
+
     out = map_over_devices(lambda _, rows, common: local(rows, common), jax.tree.map(pad, rows), common, mesh)
     return jax.tree.map(lambda a: a[:count], out)
 
@@ -232,7 +235,10 @@ def _advance_lanes(states: Any, wave: tuple[Array, Any], common: Any, step: Call
 
     def local(_, dealt, common):
         state, (is_view, view) = jax.tree.map(lambda a: a[0], dealt)
-        take_step = lambda: step(state, common, view, *static)
+
+        def take_step():
+            return step(state, common, view, *static)
+
         if mesh.size == 1:  # without a view there is no wave
             result = take_step()
         else:

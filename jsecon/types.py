@@ -1,5 +1,6 @@
-"""The pytrees that flow through the pipeline: frozen dataclasses of arrays, one line per field (shape, unit, range,
-frame).
+"""The pytrees that flow through the pipeline.
+
+They are frozen dataclasses of arrays, one line per field (shape, unit, range, frame).
 
 Conventions, fixed here once: OpenCV camera axes (x right, y down, z forward); `world_to_camera` matrices; quaternions
 wxyz, normalised on use; pixel (row i, column j) is sampled at (x, y) = (j + 0.5, i + 0.5) and u = fx x/z + cx; metres
@@ -68,6 +69,7 @@ class Gaussians:
 
     @property
     def count(self) -> int:
+        """Number of records along the first axis."""
         return self.means.shape[0]
 
 
@@ -232,6 +234,7 @@ class Regions:
 
     @property
     def count(self) -> int:
+        """Number of records along the first axis."""
         return self.embeddings.shape[0]
 
 

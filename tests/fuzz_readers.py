@@ -360,7 +360,9 @@ def langsplat(folder: Path) -> Iterator[Case]:
         _finite(masks.embeddings)
         assert -1 <= masks.labels.min() <= masks.labels.max() < max(len(masks.frame), 1)
 
-    read = lambda: (load_features(folder, ["a", "b"], (12, 16)), embedding_size(folder))
+    def read():
+        return (load_features(folder, ["a", "b"], (12, 16)), embedding_size(folder))
+
     yield Case(sorted(folder.iterdir()), read, whole)
 
 
@@ -433,10 +435,13 @@ def labels(folder: Path) -> Iterator[Case]:
 def _field(coder: Any = None) -> LanguageField:
     rng = np.random.default_rng(0)
     n, r, e, d, t, k, p = 12, 3, 8, 4, 2, 2, 2
-    unit = lambda *shape: (lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True))(rng.normal(size=shape)).astype(
-        np.float32
-    )
-    positive = lambda *shape: rng.random(shape).astype(np.float32)
+
+    def unit(*shape):
+        return (lambda x: x / np.linalg.norm(x, axis=-1, keepdims=True))(rng.normal(size=shape)).astype(np.float32)
+
+    def positive(*shape):
+        return rng.random(shape).astype(np.float32)
+
     votes = Votes(
         rng.integers(-1, r, (n, k)).astype(np.int32),
         positive(n, k),
@@ -470,7 +475,10 @@ def _field(coder: Any = None) -> LanguageField:
 
 def _coder() -> Autoencoder:
     """Layers of the true layout: 8 -> 4 -> 4, and back."""
-    dense = lambda a, b: {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
+
+    def dense(a, b):
+        return {"kernel": np.full((a, b), 0.1, np.float32), "bias": np.zeros(b, np.float32)}
+
     norm = {"scale": np.ones(4, np.float32), "bias": np.zeros(4, np.float32)}
     stats = {"mean": np.zeros(4, np.float32), "var": np.ones(4, np.float32)}
     encoder = {

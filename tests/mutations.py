@@ -246,7 +246,10 @@ def of_graph(rng, data: bytes) -> bytes:
     model = onnx.load_from_string(data)
     graph = model.graph
     for _ in range(rng.choice([1, 1, 2])):
-        pick = lambda items: items[int(rng.integers(len(items)))] if len(items) else None
+
+        def pick(items):
+            return items[int(rng.integers(len(items)))] if len(items) else None
+
         node, weight, value = pick(graph.node), pick(graph.initializer), pick([*graph.input, *graph.output])
         size = int([0, -1, 1, 2, 7, 2**31, 2**62, 2**63 - 1][rng.integers(8)])
         match rng.integers(11):

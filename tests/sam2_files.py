@@ -34,7 +34,9 @@ class Sketch:
         return name
 
     def save(self, path: Path, inputs: dict, outputs: dict) -> None:
-        kind = lambda name: "int32" if name in ("input_labels",) else "float32"
+        def kind(name):
+            return "int32" if name in ("input_labels",) else "float32"
+
         typed = [{name: (kind(name), list(shape)) for name, shape in side.items()} for side in (inputs, outputs)]
         write_graph(path, self.nodes, *typed, self.weights)
 

@@ -45,7 +45,10 @@ def products(jaxpr):
 def test_no_product_of_matrices_is_left_to_the_device(scene, cameras):
     """A GPU keeps 10 bits of a factor that nobody asks it to keep whole."""
     rows, coder = jnp.ones((9, 40)), Rotation(jnp.ones((40, 5)))
-    image = lambda g, c, f: (jsecon.render(g, c[0], f, capacity=4096).features ** 2).sum()
+
+    def image(g, c, f):
+        return (jsecon.render(g, c[0], f, capacity=4096).features ** 2).sum()
+
     programs = {
         "cosines": lambda *_: cosine_matrix(rows, rows),
         "similarities": lambda *_: similarities(unit_codes(rows), rows[0])[0],

@@ -189,7 +189,9 @@ def test_labels_are_read_one_at_a_time_and_progress_counts(scene, cameras, label
 
 
 def test_what_does_not_fit_raises(scene, cameras, camera, labels, tmp_path):
-    cast = lambda *given, **how: region_votes_in_blocks(*given, REGIONS, folder=tmp_path / "v", **how)
+    def cast(*given, **how):
+        return region_votes_in_blocks(*given, REGIONS, folder=tmp_path / "v", **how)
+
     with pytest.raises(ValueError, match="leading axis"):
         cast(scene, camera, labels)
     with pytest.raises(ValueError, match="one per view"):

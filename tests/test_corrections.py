@@ -131,18 +131,27 @@ def test_gradients_through_the_whole_step_are_central_differences(capture, truth
     has its own test.)"""
     rng = np.random.default_rng(2)
     views = TrainingViews(dataclasses.replace(capture, held_out=np.arange(VIEWS) != 1))
-    double = lambda a: jnp.asarray(a, jnp.float64) if np.asarray(a).dtype == np.float32 else jnp.asarray(a)
+
+    def double(a):
+        return jnp.asarray(a, jnp.float64) if np.asarray(a).dtype == np.float32 else jnp.asarray(a)
+
     view = jax.tree.map(double, views[0])
     scene = jax.tree.map(lambda a: double(a) + 0.02 * rng.normal(size=a.shape), truth)
     own = Corrections(double(0.02 * rng.normal(size=6)), np.eye(3, 4) + 0.05 * rng.normal(size=(3, 4)))
     nothing, extent = jnp.zeros((40, 1)), jnp.float64(1.7)
-    loss = lambda scene, own: view_loss(scene, nothing, own, view, extent, 4096)[0]
+
+    def loss(scene, own):
+        return view_loss(scene, nothing, own, view, extent, 4096)[0]
+
     both = jax.jit(jax.value_and_grad(loss, (0, 1)))
     gradient = both(scene, own)[1]
     leaves, tree = jax.tree.flatten((scene, own))
     for n, (leaf, slope) in enumerate(zip(leaves, jax.tree.leaves(gradient), strict=True)):
         direction = rng.normal(size=leaf.shape)
-        moved = lambda h: both(*tree.unflatten([*leaves[:n], leaf + h * direction, *leaves[n + 1 :]]))[0]  # noqa: B023
+
+        def moved(h):
+            return both(*tree.unflatten([*leaves[:n], leaf + h * direction, *leaves[n + 1 :]]))[0]  # noqa: B023
+
         by = [float(moved(h) - moved(-h)) / (2 * h) for h in (1e-6, 3e-7)]
         exact = float((slope * direction).sum())
         assert min(abs(value - exact) for value in by) <= 1e-5 * abs(exact), (n, by, exact)

@@ -195,7 +195,10 @@ def test_the_votes_are_the_weights_on_the_errors(capture, start):
     view = np.array([0, 1, 3, 4])[view_order(KEY, 4, 0, 1)[0]]
     camera, target = capture.cameras[view], capture.frames[view] / np.float32(255)
     error = np.abs(np.asarray(render_rgb(start, camera).features) - target).mean(-1)
-    one = lambda features: jnp.sum(render(start, camera, features).features[..., 0] * error)
+
+    def one(features):
+        return jnp.sum(render(start, camera, features).features[..., 0] * error)
+
     expected = jax.grad(one)(jnp.ones((start.count, 1)))[:, 0]
     np.testing.assert_allclose(states[0].votes[: start.count], expected, rtol=1e-3, atol=1e-4)
 

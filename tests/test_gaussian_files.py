@@ -59,7 +59,10 @@ def psnr(a: Gaussians, b: Gaussians) -> float:
 def compare(found: Gaussians, given: dict, steps: tuple) -> None:
     """Each number within half a step, and a little of float32."""
     place, size, alpha, colour, rest, turn = steps
-    near = lambda a, b, step: np.testing.assert_allclose(a, b, rtol=0, atol=0.51 * step + 2e-6)
+
+    def near(a, b, step):
+        return np.testing.assert_allclose(a, b, rtol=0, atol=0.51 * step + 2e-6)
+
     near(found.means, given["means"], place)
     near(found.log_scales, given["log_scales"], size)
     near(opacity({"opacity_logits": np.asarray(found.opacity_logits)}), opacity(given), alpha)

@@ -52,7 +52,10 @@ def test_halves_have_the_mean_and_covariance_of_the_whole():
 def test_halves_give_the_centre_the_alpha_it_had():
     whole = scene()
     one, other = split_in_two(whole)
-    alpha = lambda g: 1 / (1 + np.exp(-g.opacity_logits))
+
+    def alpha(g):
+        return 1 / (1 + np.exp(-g.opacity_logits))
+
     near = np.exp(-((0.6 / 0.8) ** 2) / 2)
     at_centre = 1 - (1 - near * alpha(one)) * (1 - near * alpha(other))
     free = alpha(one) < alpha(whole) - 1e-6  # where it would have to be more opaque than the whole, it is as opaque

@@ -124,7 +124,9 @@ def test_the_point_is_the_maximum_of_the_similarity(scene, views, labelled):
 
 
 def test_both_thresholds_from_one_rendering(scene, views, labelled):
-    select = lambda query: selection(members(scene)[query])
+    def select(query):
+        return selection(members(scene)[query])
+
     both = evaluate_at_thresholds(scene, views, labelled[:1], select)
     assert list(both) == [0.7, VALA_THRESHOLD]
     for threshold, (rows, told) in both.items():

@@ -38,8 +38,13 @@ print(*map(int, state), "|", *map(int, outs), "|", *rows(count))
 
 def summed(count: int, progress=None):
     """(sum, number) of 0, 10, 20, ... and the views doubled."""
-    step = lambda state, factor, view: (state + jnp.stack([view, 1]), factor * view)
-    merge = lambda a, b: a + b
+
+    def step(state, factor, view):
+        return (state + jnp.stack([view, 1]), factor * view)
+
+    def merge(a, b):
+        return a + b
+
     views = 10 * jnp.arange(count)
     return accumulate_over_views(step, jnp.zeros(2, int), merge, jnp.int32(2), views, progress=progress)
 
@@ -61,7 +66,10 @@ def test_a_parcel_holds_trees_of_arrays_and_plain_values():
 
 def test_views_are_added_up_in_lanes_that_are_joined_in_their_order():
     values = np.asarray(np.random.default_rng(0).normal(size=101) * 10.0 ** np.arange(-50, 51).clip(-6, 6), np.float32)
-    step = lambda state, _, view: (state + view, None)
+
+    def step(state, _, view):
+        return (state + view, None)
+
     got, _ = accumulate_over_views(step, np.float32(0), lambda a, b: a + b, np.float32(0), values)
     lanes = np.zeros(LANES, np.float32)
     for t, value in enumerate(values):

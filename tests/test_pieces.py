@@ -84,7 +84,10 @@ def test_several_regions_take_their_pieces_with_them(broken):
 
 def test_texts_by_vmap_are_the_loop(broken):
     texts = jnp.asarray(broken.regions.embeddings)
-    ask = lambda text: query_anchored(broken, text).similarity
+
+    def ask(text):
+        return query_anchored(broken, text).similarity
+
     np.testing.assert_allclose(jax.jit(jax.vmap(ask))(texts), np.stack([ask(t) for t in texts]), rtol=1e-6)
 
 

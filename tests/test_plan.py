@@ -26,7 +26,9 @@ def test_a_planned_render_is_a_render(scene, camera, channels):
     np.testing.assert_allclose(got.features, expected.features + left, atol=2e-6 * channels)
     np.testing.assert_allclose(got.alpha, expected.alpha, atol=1e-6)
 
-    loss = lambda features, draw: (draw(features).features ** 2).sum()
+    def loss(features, draw):
+        return (draw(features).features ** 2).sum()
+
     by_plan = jax.jit(jax.grad(lambda f: loss(f, lambda f: render_plan(plan, f))))(features)
     whole = jax.jit(jax.grad(lambda f: loss(f, lambda f: render(scene, camera, f))))(features)
     np.testing.assert_allclose(by_plan, whole, rtol=1e-4, atol=1e-4)

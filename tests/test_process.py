@@ -69,9 +69,10 @@ def test_a_program_that_was_cut_short_on_disk_is_compiled_and_kept_anew_without_
     )
     environ = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     environ |= {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
-    run = lambda: subprocess.run(
-        [sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ
-    )
+
+    def run():
+        return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environ)
+
     first = run()
     kept = {file: file.read_bytes() for file in tmp_path.rglob("*-cache")}
     assert len(kept) == ast.literal_eval(first.stdout.split(" ", 1)[1])["all"] > 0

@@ -35,7 +35,10 @@ def test_float64_is_the_definition_to_rounding(x64, scene, cameras):
 
 def test_jit_is_eager_and_vmap_is_a_loop(scene, cameras):
     features = random_features(scene.count, 3)
-    one = lambda camera, features: render(scene, camera, features)
+
+    def one(camera, features):
+        return render(scene, camera, features)
+
     looped = [one(cameras[t], features) for t in range(4)]
     jitted = jax.jit(one)(cameras[2], features)
     np.testing.assert_allclose(jitted.features, looped[2].features, atol=5e-6)

@@ -69,7 +69,10 @@ def test_rows_without_a_direction_are_unknown(rows):
 def test_jit_and_vmap_over_texts_equal_the_loop_for_many_regions():
     rng = np.random.default_rng(3)
     embeddings, texts, words = unit_rows(rng, 400, SIZE), unit_rows(rng, 3, SIZE), unit_rows(rng, 4, SIZE)
-    ask = lambda text: region_similarities(embeddings, text, words, "apart")
+
+    def ask(text):
+        return region_similarities(embeddings, text, words, "apart")
+
     together, known = jax.jit(jax.vmap(ask))(texts)
     assert np.asarray(known).all()
     for got, text in zip(together, texts):
@@ -183,7 +186,10 @@ def worded(scene, cameras):
 
 def test_a_text_is_refused_by_its_quantile_among_unrelated_words(worded):
     field, texts = worded
-    ask = lambda text: query_anchored(field, text)
+
+    def ask(text):
+        return query_anchored(field, text)
+
     together = jax.jit(jax.vmap(ask))(texts[:40])
     for k, text in enumerate(texts[:40]):
         expected = exact_quantile(field.regions.embeddings, text, field.reference)

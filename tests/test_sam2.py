@@ -88,7 +88,10 @@ class Twin:
         spatial = [out["memory"] for _, out in attended]
         pointers = np.array([out["pointer"] for _, out in known], np.float32).reshape(-1, MEMORY)
         places = [out["place"] + self.code[row] for row, out in attended]
-        flat = lambda image: image.reshape(CHANNELS, -1).T[:, None]
+
+        def flat(image):
+            return image.reshape(CHANNELS, -1).T[:, None]
+
         image = self.graphs["memory_attention"].run(
             {
                 "current_vision_features": flat(seen["feats2"]),

@@ -171,7 +171,12 @@ def test_numbers_that_are_not_finite_are_not_known_where_they_are_asked_for():
 
 
 COUNT, MANY = 3, 40
-_rows = lambda numbers: arrays(np.float32, (COUNT, KEPT), elements=numbers)
+
+
+def _rows(numbers):
+    return arrays(np.float32, (COUNT, KEPT), elements=numbers)
+
+
 _numbers = st.just(0.0) | st.floats(2.0**-80, 2.0**80, width=32)
 
 

@@ -60,7 +60,10 @@ def test_each_weighting_fits_best_what_it_weighs(world):
     gaussians, cameras, share = world
     before = share >= 0.5
     views = choose_views(gaussians, cameras, before)
-    fit = lambda weights: np.asarray(fit_silhouette(gaussians, cameras, share, weights=weights))
+
+    def fit(weights):
+        return np.asarray(fit_silhouette(gaussians, cameras, share, weights=weights))
+
     found = {weights: fit(weights) for weights in SILHOUETTE_WEIGHTS.values()}
     for weights in SILHOUETTE_WEIGHTS.values():
         value = {other: expected(gaussians, views, share, mask, weights) for other, mask in found.items()}

@@ -75,8 +75,13 @@ def test_a_bad_feature_stays_where_it_is_seen_however_wide_and_in_its_own_set_un
     sets = np.random.default_rng(0).normal(size=(2, 64, 12)).astype(np.float32)
     broken = sets.copy()
     broken[1, 5, 0] = np.nan
-    draw = lambda f: render(case.gaussians, case.camera, f, capacity=CAPACITY).features
-    loss = lambda f: (jnp.nan_to_num(draw(f)).sum(), draw(f))
+
+    def draw(f):
+        return render(case.gaussians, case.camera, f, capacity=CAPACITY).features
+
+    def loss(f):
+        return (jnp.nan_to_num(draw(f)).sum(), draw(f))
+
     compiled = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True)))
     ((_, clean), _), ((_, image), gradient) = compiled(sets), compiled(broken)
     np.testing.assert_array_equal(image[0], clean[0])

@@ -44,10 +44,13 @@ def test_every_row_of_blocks_is_in_one_strip(count, first, more):
 @pytest.mark.parametrize("count", [2, 3])
 def test_strips_hold_the_lists_of_the_whole(scene, camera, count):
     splats = project(scene, camera)
-    every = lambda splats, strip: (
-        tile_lists(splats, 48, 40, capacity=1024, strip=strip),
-        pair_counts(splats, 48, 40, strip=strip).sum(),
-    )
+
+    def every(splats, strip):
+        return (
+            tile_lists(splats, 48, 40, capacity=1024, strip=strip),
+            pair_counts(splats, 48, 40, strip=strip).sum(),
+        )
+
     whole, pairs = jax.tree.map(np.asarray, jax.jit(lambda splats: every(splats, FULL_IMAGE))(splats))
     across, down = tile_grid(48, 40, 8)
     lists_of = jax.jit(lambda splats, index: every(splats, Strip(index, count)))

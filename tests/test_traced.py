@@ -19,7 +19,10 @@ def calls(field, labels):
     scene, cameras, camera = field.gaussians, field.cameras, field.cameras[0]
     text = field.regions.embeddings[0]
     features = jnp.ones((scene.count, 2))
-    by_view = lambda: jsecon.region_votes(scene, cameras, labels, REGIONS, by_view=True)
+
+    def by_view():
+        return jsecon.region_votes(scene, cameras, labels, REGIONS, by_view=True)
+
     mask = np.arange(scene.count) < 9
     boxes = [np.array([[0.0, 0.0, 2.0, 2.0]])]
     descent = {"steps": 1, "key": jax.random.key(0)}

@@ -209,7 +209,9 @@ def scene_of(page) -> np.ndarray:
 
 
 def after_change(page, before: np.ndarray) -> np.ndarray:
-    changed = lambda: (np.abs(scene_of(page) - before).max(-1) > 12).mean() > 0.005
+    def changed():
+        return (np.abs(scene_of(page) - before).max(-1) > 12).mean() > 0.005
+
     until(changed, "the picture changes")
     return scene_of(page)
 

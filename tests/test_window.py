@@ -71,7 +71,10 @@ def test_one_step(count):
 def test_canonical(count):
     features, texts, phrases = normal(count, 8), normal(2, 8), normal(4, 8)
     expected = np.stack([exact_relevancy(features, text, phrases) for text in texts])
-    ask = lambda text, features, phrases: query_canonical(features, text, phrases, 0.5)
+
+    def ask(text, features, phrases):
+        return query_canonical(features, text, phrases, 0.5)
+
     found = compiled(ask, texts, features, phrases)
     np.testing.assert_allclose(found.similarity, expected, atol=3e-6)
     clear = np.abs(expected - 0.5) > 1e-5
@@ -149,7 +152,10 @@ def test_classes_of_all(field, count):
 def test_similarities_of_many_regions(count):
     rng = np.random.default_rng(3)
     embeddings, texts, words = (unit_rows(rng, n, of_retrieval.SIZE) for n in (count, 3, 4))
-    ask = lambda text, embeddings, words: region_similarities(embeddings, text, words, "apart")
+
+    def ask(text, embeddings, words):
+        return region_similarities(embeddings, text, words, "apart")
+
     found, known = compiled(ask, texts, embeddings, words)
     assert np.asarray(known).all()
     for n, text in enumerate(texts):
@@ -201,7 +207,10 @@ def test_coders(count):
     found = compiled(Spread(jnp.asarray(units), jnp.asarray(table)).encode, many)
     np.testing.assert_allclose(found, expected, atol=3e-5)
     rng = np.random.default_rng(3)
-    drawn = lambda leaf: rng.uniform(0.1, 0.2, leaf.shape).astype(np.float32) * rng.choice([-1, 1], leaf.shape)
+
+    def drawn(leaf):
+        return rng.uniform(0.1, 0.2, leaf.shape).astype(np.float32) * rng.choice([-1, 1], leaf.shape)
+
     coder = jax.tree.map(drawn, of_autoencoder.shapes_of(12, 3))
     variances = jax.tree.map(np.abs, coder.encoder["batch_stats"])
     coder = dataclasses.replace(coder, encoder=coder.encoder | {"batch_stats": variances})

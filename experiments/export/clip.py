@@ -74,7 +74,10 @@ def export_mobile(model: torch.nn.Module, name: str, folder: Path, *, seed: int,
     rows = export(model, name, folder, seed=seed, threads=threads)
     write_text(folder / "config.json", json.dumps(open_clip.get_model_config(name), indent=2) + "\n")
     ids = _tokenizer(name)(TEXTS, context_length=model.context_length)
-    encode = lambda pixels: model.encode_image(pixels, normalize=True)
+
+    def encode(pixels):
+        return model.encode_image(pixels, normalize=True)
+
     numbers = {"mean": list(usual["mean"]), "std": list(usual["std"]), "size": list(model.visual.image_size)}
     found = agreements(folder, encode, model.encode_text(ids, normalize=True), ids, numbers, threads)
     return told(rows, found)

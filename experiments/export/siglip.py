@@ -42,7 +42,10 @@ def export_open_clip(model: torch.nn.Module, name: str, folder: Path, *, seed: i
     write_text(folder / "visual" / "preprocess_cfg.json", json.dumps(preprocessing, indent=2) + "\n")
     write_text(folder / "config.json", json.dumps(settings, indent=2) + "\n")
     write_text(folder / LOGITS, json.dumps({"scale": SCALE, "bias": BIAS}) + "\n")
-    encode = lambda pixels: model.encode_image(pixels, normalize=True)
+
+    def encode(pixels):
+        return model.encode_image(pixels, normalize=True)
+
     found = agreements(folder, encode, model.encode_text(ids.long(), normalize=True), ids, preprocessing, threads)
     return told(rows, found)
 
@@ -86,7 +89,10 @@ def export_transformers(model: Any, folder: Path, *, seed: int, threads: int) ->
     write_text(folder / "preprocessor_config.json", json.dumps(preprocessing, indent=2) + "\n")
     write_text(folder / "config.json", json.dumps(model.config.to_diff_dict(), indent=2) + "\n")
     wanted = torch.nn.functional.normalize(model.text_model(input_ids=ids).pooler_output, dim=-1)
-    encode = lambda pixels: torch.nn.functional.normalize(model.vision_model(pixel_values=pixels).pooler_output, dim=-1)
+
+    def encode(pixels):
+        return torch.nn.functional.normalize(model.vision_model(pixel_values=pixels).pooler_output, dim=-1)
+
     numbers = {"mean": half, "std": half, "size": [size, size]}
     found = agreements(folder, encode, wanted, ids, numbers, threads)
     scale, bias = ClipEmbedder(folder, threads=threads).logits or (np.nan, np.nan)

@@ -127,7 +127,10 @@ def _loss(params: Any, data: Any, view: Array, step: Array, key: Array) -> Array
 
     def spatial(params):
         chosen = jax.random.randint(key, (KL_SAMPLES,), 0, count)
-        logs = lambda rows: jax.nn.log_softmax(params["identity"][rows] @ params["kernel"] + params["bias"])
+
+        def logs(rows):
+            return jax.nn.log_softmax(params["identity"][rows] @ params["kernel"] + params["bias"])
+
         own, others = logs(chosen), logs(nearest[chosen])
         divergence = jnp.sum(jnp.exp(own)[:, None] * (own[:, None] - others), axis=-1)
         return KL_WEIGHT * divergence.mean() / CLASSES

@@ -124,5 +124,7 @@ def view_overlaps(
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
 def _of_views(views, group_of, threshold, groups, slots):
-    one = lambda view: silhouette_overlaps(view[0], group_of, view[1], threshold, groups=groups, slots=slots)
+    def one(view):
+        return silhouette_overlaps(view[0], group_of, view[1], threshold, groups=groups, slots=slots)
+
     return lax.map(one, views)

@@ -213,7 +213,10 @@ def _quantised_loss_of(clusters: int) -> Callable:
 def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key) -> tuple[Array, Array]:
     """Features trained through their roots' means, and the root of each Gaussian."""
     roots = min(schedule.roots, count := len(scaled))
-    points = lambda f: jnp.concatenate([normalize(f[:count]), schedule.position_weight * scaled], axis=1)
+
+    def points(f):
+        return jnp.concatenate([normalize(f[:count]), schedule.position_weight * scaled], axis=1)
+
     centres = points(features)[jax.random.choice(centre_key, count, (roots,), replace=False)]
 
     def assign(features):
@@ -223,7 +226,10 @@ def _coarse(features, scaled, data, labels, schedule: Schedule, centre_key, key)
 
     loss = _quantised_loss_of(roots * schedule.leaves)  # as many as the fine stage has; no Gaussian is of the others
     room = _room(features, count)
-    given = lambda of: (*data, labels, room(of), room(of), jnp.asarray(count), jnp.asarray(False))
+
+    def given(of):
+        return (*data, labels, room(of), room(of), jnp.asarray(count), jnp.asarray(False))
+
     steps, rate = schedule.coarse_steps, schedule.coarse_rate
     return _clustered(loss, features, assign, given, steps=steps, refresh=REFRESH_COARSE, rate=rate, key=key)
 
@@ -233,9 +239,15 @@ def _fine(features, root_of, data, labels, schedule: Schedule, key) -> tuple[Arr
     count = len(root_of)
     roots, leaves, room = min(schedule.roots, count), schedule.leaves, _room(features, count)
     number = _leaves_wanted(room(root_of), data, labels, roots, leaves)
-    split = lambda f: split_roots(normalize(f[:count]), root_of, number, leaves)
+
+    def split(f):
+        return split_roots(normalize(f[:count]), root_of, number, leaves)
+
     loss = _quantised_loss_of(roots * leaves)
-    given = lambda of: (*data, labels, room(of), room(root_of), jnp.asarray(count), jnp.asarray(True))
+
+    def given(of):
+        return (*data, labels, room(of), room(root_of), jnp.asarray(count), jnp.asarray(True))
+
     steps, rate = schedule.fine_steps, schedule.rate
     features, of = _clustered(loss, features, split, given, steps=steps, refresh=REFRESH_FINE, rate=rate, key=key)
     return features, of, cluster_means(normalize(features[:count]), of, jnp.zeros((roots * leaves, SIZE)))

@@ -90,7 +90,10 @@ def made_text_space(names: Sequence[str], *, dim: int = 512, seed: int = 0, comm
     spread = np.exp(-np.arange(dim - 1) / (2 * SPREAD))
     own = _unit(draw.standard_normal((len(names), dim - 1)) * spread)
     if common:
-        word = lambda w: np.random.default_rng([seed, 6, zlib.crc32(w.encode())]).standard_normal(dim - 1) * spread
+
+        def word(w):
+            return np.random.default_rng([seed, 6, zlib.crc32(w.encode())]).standard_normal(dim - 1) * spread
+
         shared = _unit(np.stack([sum(_unit(word(w)) for w in name.split()) for name in names]))
         own = _unit((1 - WORDS * common) ** 0.5 * own + (WORDS * common) ** 0.5 * shared)
     local = np.concatenate([np.full((len(names), 1), PAIRWISE_COSINE**0.5), (1 - PAIRWISE_COSINE) ** 0.5 * own], axis=1)

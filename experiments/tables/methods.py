@@ -29,9 +29,15 @@ def by_features(setting: Setting, features: Float[Array, "n e"], *, relevancy: b
     """Selections by VALA's readout of the relevancy, or by the scene's most similar text; classes by the latter."""
     texts, features = jnp.asarray(setting.texts), jnp.asarray(features)
     labels, cosines = most_similar_text(features, texts)
-    by_text = lambda k: select_text(labels, cosines, k)
+
+    def by_text(k):
+        return select_text(labels, cosines, k)
+
     means = setting.evidence.gaussians.means
-    read = lambda k: lifting.query_relevancy(features, means, texts[k], jnp.asarray(setting.canonical))
+
+    def read(k):
+        return lifting.query_relevancy(features, means, texts[k], jnp.asarray(setting.canonical))
+
     return Answers(read if relevancy else by_text, lambda: np.asarray(labels), features=features)
 
 
@@ -50,7 +56,10 @@ def gaussian_grouping(setting: Setting, steps: Steps) -> Answers:
     """Tracked ids; a text is found in the first view or not at all."""
     model = gaussian_grouping_of(setting, steps)
     canonical = jnp.asarray(setting.canonical)
-    ask = lambda k: query_gaussian_grouping(model, setting.evidence, jnp.asarray(setting.texts[k]), canonical)
+
+    def ask(k):
+        return query_gaussian_grouping(model, setting.evidence, jnp.asarray(setting.texts[k]), canonical)
+
     return by_selection(setting, ask, model.identity)
 
 
@@ -82,7 +91,10 @@ def opengaussian_of(setting: Setting, steps: Steps, **codebook: Any) -> OpenGaus
     )
     given: Any = {"key": jax.random.key(setting.seed), "schedule": schedule}
     instances = shared.get(("instances", setting.seed), lambda: train_instances(evidence, **given))
-    train = lambda: train_opengaussian(evidence, **given, instances=instances)[0]
+
+    def train():
+        return train_opengaussian(evidence, **given, instances=instances)[0]
+
     return shared.get(("OpenGaussian", setting.seed, *sorted(codebook.items())), train)
 
 

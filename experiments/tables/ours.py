@@ -50,7 +50,10 @@ def association(
     if labels is not None:
         return setting.shared.get(by, lambda: associated(setting.levels, labels))
     how = {"abstain_if_unlabelled": by != "outspoken", "centre": centre, "agreement": agreement}
-    make = lambda: by_consensus(setting.levels, setting.frames, seed=setting.seed, **how)
+
+    def make():
+        return by_consensus(setting.levels, setting.frames, seed=setting.seed, **how)
+
     return setting.shared.get((by, centre, agreement), make)
 
 
@@ -185,9 +188,12 @@ def ask_field(
     if way not in ("votes", "all"):
         return by_selection(setting, ask, field.codes)
     texts = jnp.asarray(setting.texts)
-    classes = lambda: np.asarray(
-        query_classes(field, texts, rules=QueryRules(retrieval=retrieval), standardise=False, every=True)[0]
-    )
+
+    def classes():
+        return np.asarray(
+            query_classes(field, texts, rules=QueryRules(retrieval=retrieval), standardise=False, every=True)[0]
+        )
+
     return Answers(ask, classes, features=field.codes)
 
 

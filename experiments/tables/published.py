@@ -39,7 +39,10 @@ QUERIES = _read("QUERIES")
 
 def table(title: str, rows: Rows, columns: tuple[str, ...], remarks: str = "") -> str:
     """Writes published numbers as a Markdown table under a line that says what they are."""
-    show = lambda value: "-" if value is None else f"{value:.2f}"
+
+    def show(value):
+        return "-" if value is None else f"{value:.2f}"
+
     lines = [
         f"**{title}: published, measured on the real data (per cent: mIoU / mAcc, or these / Loc. Acc.).** No twin's "
         "number compares.",

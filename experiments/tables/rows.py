@@ -150,7 +150,10 @@ def _langsplat(setting: Setting, steps: Steps) -> Any:
 def _langsplat_row(rule: str, chooser: str) -> Method:
     if rule:
         return reading("LangSplat-m", _langsplat, rule, chooser)
-    published = lambda setting, steps: setting.shared.get("LangSplat-m", lambda: _langsplat(setting, steps))
+
+    def published(setting, steps):
+        return setting.shared.get("LangSplat-m", lambda: _langsplat(setting, steps))
+
     return lambda setting, steps: by_features(setting, published(setting, steps)[0], relevancy=False)
 
 

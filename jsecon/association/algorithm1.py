@@ -148,7 +148,9 @@ def joined(layers: "_Layers", proposals: "_Layers", *, join_rate: float) -> tupl
 
 def _agreement(tables: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(R, R) frames that hold both masklets in one proposal and frames that show both; (R,) mean area; (R,) support.
-    `tables` holds each frame's `_overlaps` of masklets and proposals."""
+
+    `tables` holds each frame's `_overlaps` of masklets and proposals.
+    """
     count = len(tables[0][0])
     together, both = np.zeros((count, count)), np.zeros((count, count))
     area, support, views = np.zeros(count), np.zeros(count), np.zeros(count)

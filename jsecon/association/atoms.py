@@ -131,8 +131,10 @@ def _distinct_atoms(atoms: Array, tile: int) -> Array:
 
 @functools.partial(jax.jit, static_argnums=3)
 def _sums_by_pair(plan: ViewPlan, atoms: Array, first: Array | int, centre: float) -> Array:
-    """(pairs, _SLOTS) weight of each pair of the tile lists on the distinct atoms `first`, `first` + 1, ... of its
-    tile."""
+    """Sums the weight of each pair of the tile lists on `_SLOTS` atoms of its tile.
+
+    The atoms are the distinct ones `first`, `first` + 1, ...; the result is (pairs, _SLOTS).
+    """
     splats, lists = plan.splats, plan.lists
     batches = make_batches(lists, plan.width)
     tiles = to_tiles(atoms + 1, lists.tile) - 1

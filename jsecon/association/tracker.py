@@ -38,6 +38,7 @@ class GeometricTracker:
         *,
         atoms_per_frame: int = 256,
     ):
+        """Prepares the views of a scene and their proposals."""
         self.views = SceneViews(gaussians, cameras, proposals, atoms_per_frame=atoms_per_frame)
 
     def __call__(
@@ -152,8 +153,11 @@ class GeometricTracker:
     def _match(
         self, view: FrameView, evidence: Float[np.ndarray, "n c"], best: Float[np.ndarray, " n"]
     ) -> Int[np.ndarray, " a"]:
-        """Class (A,) of each atom of a view, -1 if unassigned, from the evidence (n, B + C) of its Gaussians and their
-        best clarity (n,) in the frames of the evidence."""
+        """Classifies each atom of a view; returns (A,) ids, -1 if unassigned.
+
+        The evidence is (n, B + C) of the Gaussians of the view, and their best clarity (n,) in the frames of the
+        evidence.
+        """
         # A Gaussian on an outline overlaps its neighbours and is counted with them, in view after view. So it counts
         # only if another view has seen about as much of it as this one does, and has assigned it.
         assigned = evidence.sum(1) / np.maximum(view.totals * view.clarity, 1e-6)
@@ -170,7 +174,9 @@ class GeometricTracker:
 
 
 def _evidence(view: FrameView, owner: Int[np.ndarray, " a"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, classes and weights (times clarity) of the nonzero evidence of a view whose atoms have these classes (A,),
-    -1 if unassigned."""
+    """Returns rows, classes and weights (times clarity) of the nonzero evidence of a view.
+
+    `owner` (A,) is the class of each atom of the view, -1 if unassigned.
+    """
     cast = (view.votes @ one_hot(owner, count)).tocoo()
     return cast.row, cast.col, view.clarity[cast.row] * cast.data

@@ -75,6 +75,7 @@ class SceneViews:
         atoms_per_frame: int = 256,
         centre: float = 0.0,
     ):
+        """Prepares the weights of all views."""
         require(atoms_per_frame > 0, "atoms_per_frame", atoms_per_frame, "at least 1", "Use 200 for small frames.")
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
         self.atoms_per_frame, self.centre = atoms_per_frame, centre
@@ -90,8 +91,10 @@ class SceneViews:
         return atoms, atom_coverage(atoms, masks, int(atoms.max()) + 1)
 
     def _votes(self, frames: UInt8[np.ndarray, "t h w 3"], indices: Sequence[int]) -> Iterator[tuple]:
-        """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of each frame of `indices`. While
-        votes of one frame are added up, other frames are segmented on all cores."""
+        """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of each frame of `indices`.
+
+        While votes of one frame are added up, other frames are segmented on all cores.
+        """
         pool = ThreadPoolExecutor(cores())
         try:
             cuts = pool.map(self._cut, (frames[t] for t in indices), indices)

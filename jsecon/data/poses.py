@@ -42,7 +42,10 @@ def load_poses(path: str | Path, *, long_side: int | None = None) -> tuple[Camer
         raise InputError(path, "it has no frame", "at least one pose", "Estimate the poses again.")
     width, height = downscaled_size((posed[0][1].width, posed[0][1].height), None, long_side)
     sized = [lens.resized(width, height) for _, lens, _ in posed]
-    column = lambda name: np.array([getattr(lens, name) for lens in sized], np.float32)
+
+    def column(name):
+        return np.array([getattr(lens, name) for lens in sized], np.float32)
+
     poses = np.stack([make_rigid(pose, path, name) for name, _, pose in posed])
     cameras = Camera(poses, column("fx"), column("fy"), column("cx"), column("cy"), width, height)
     return cameras, frame_names([name for name, _, _ in posed], path)

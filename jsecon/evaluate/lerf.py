@@ -62,8 +62,10 @@ def evaluate_point_level_rendered(
     alpha_threshold: float = ALPHA_THRESHOLD,
     **options: Any,
 ) -> tuple[list[Row], dict]:
-    """Calls `evaluate_at_thresholds` with one threshold, by default that of the protocol; returns its rows and
-    summary."""
+    """Calls `evaluate_at_thresholds` with one threshold; returns its rows and summary.
+
+    By default it is the threshold of the protocol.
+    """
     results = evaluate_at_thresholds(gaussians, cameras, labels, select, alpha_thresholds=(alpha_threshold,), **options)
     return results[alpha_threshold]
 
@@ -119,8 +121,10 @@ def evaluate_at_thresholds(
 
 
 def summary(rows: Sequence[Row], alpha_threshold: float = ALPHA_THRESHOLD) -> dict:
-    """Summarises rows at one alpha threshold: protocol, pairs, frames, queries, missing, miou, macc, acc_50, loc_acc,
-    loc_mask and loc_box."""
+    """Summarises rows at one alpha threshold.
+
+    Keys: protocol, pairs, frames, queries, missing, miou, macc, acc_50, loc_acc, loc_mask and loc_box.
+    """
     ious = [row.iou for row in rows]
     return {
         "protocol": f"point level, rendered: selected Gaussians alone, alpha > {alpha_threshold:.3g}; mean over pairs",

@@ -135,7 +135,10 @@ def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level
     points = np.ones((len(chosen), MAX_POINTS, 3))
     point_grey = np.zeros((len(chosen), MAX_POINTS))
     valid = np.zeros((len(chosen), MAX_POINTS), bool)
-    shrink = lambda a: cv2.resize(np.asarray(a, np.float32), shape[:0:-1], interpolation=cv2.INTER_AREA)
+
+    def shrink(a):
+        return cv2.resize(np.asarray(a, np.float32), shape[:0:-1], interpolation=cv2.INTER_AREA)
+
     draw = np.random.default_rng(0)
     assert capture.depths is not None
     for k, t in enumerate(chosen):
@@ -158,8 +161,10 @@ def _level(capture: Capture, chosen: Int[np.ndarray, " c"], side: int) -> _Level
 
 
 def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray, "_ _ 3"]:
-    """Least-squares plane n x = 1 of the surface around each pixel of the camera, as 1 / z is linear in pixels; zero if
-    the window does not hold one plane, or too little of its depth is known."""
+    """Fits a least-squares plane n x = 1 to the surface around each pixel; 1 / z is linear in pixels.
+
+    n is zero if the window does not hold one plane, or too little of its depth is known.
+    """
     width, height = camera.width, camera.height
     down, across = depth.shape[0] / height, depth.shape[1] / width
     # Nearest depth, at its exact ray: between two depths there may be no surface.
@@ -173,7 +178,10 @@ def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray
     # Relative to the first pixel, so that sums of squares keep their digits in float64.
     u, v = np.broadcast_arrays(np.arange(width)[None, :] + at_u, np.arange(height)[:, None] + at_v)
     weight = known.astype(np.float64)
-    mean = lambda a: cv2.boxFilter(a * weight, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT)
+
+    def mean(a):
+        return cv2.boxFilter(a * weight, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT)
+
     share = mean(weight)
     safe = np.maximum(share, 1e-9)
     m_u, m_v, m_d = mean(u) / safe, mean(v) / safe, mean(inverse) / safe
@@ -256,7 +264,10 @@ def _step(
     along = np.stack([du, dv, -(du * q[..., 0] + dv * q[..., 1]) / z], axis=-1)
     diagonal, off_diagonal = np.zeros((count, 6, 6)), np.zeros((len(pairs), 6, 6))
     right_side = np.zeros((count, 6))
-    dot = lambda x, y: np.matmul(x.swapaxes(1, 2), y)
+
+    def dot(x, y):
+        return np.matmul(x.swapaxes(1, 2), y)
+
     # Twists along the axes of each camera: q' = q + w x q + v, and p' = p - w x p - v.
     for residual, slope in ((residuals.colour, along), (residuals.distance, residuals.normals)):
         scale = 1.4826 * float(np.median(np.abs(residual[seen]))) + 1e-9

@@ -46,7 +46,10 @@ def padded_row_count(count: int) -> int:
 
 def pad_rows(tree: Any, rows: int) -> Any:
     """Pads every array of a tree with zeros to `rows` rows."""
-    fill = lambda a: np.concatenate([a, np.zeros((rows - len(a), *a.shape[1:]), a.dtype)])
+
+    def fill(a):
+        return np.concatenate([a, np.zeros((rows - len(a), *a.shape[1:]), a.dtype)])
+
     return jax.tree.map(lambda a: fill(np.asarray(a)), tree)
 
 

@@ -37,8 +37,10 @@ def _window() -> np.ndarray:
 
 
 def _blur_once(image, axis: int):
-    """The window along one axis as shifted sums, which XLA fuses to one vectorised pass: 50 times faster on CPU than a
-    convolution."""
+    """Blurs along one axis by shifted sums.
+
+    XLA fuses them to one vectorised pass: 50 times faster on CPU than a convolution.
+    """
     size = image.shape[axis]
     padding = [(RADIUS_PX, RADIUS_PX) if a == axis else (0, 0) for a in range(image.ndim)]
     padded = jnp.pad(image, padding)
@@ -128,12 +130,17 @@ def _over_mesh(image: Array, target: Array, mesh: Mesh) -> Array:
 
 
 def _loss_and_gradient(image: Array, target: Array, mesh: Mesh) -> tuple[Array, Array]:
-    """Loss and its gradient (H, W, C) in `image`. Each device computes some rows, with a halo of 2 RADIUS_PX
-    rows on either side: the gradient of a pixel needs the SSIM in its window, and that needs the windows' pixels."""
+    """Loss and its gradient (H, W, C) in `image`.
+
+    Each device computes some rows, with a halo of 2 RADIUS_PX rows on either side: the gradient of a pixel needs the
+    SSIM in its window, and that needs the windows' pixels.
+    """
     height, width, channels = image.shape
     rows, halo = -(-height // mesh.size), 2 * RADIUS_PX
+
     # Rows of W C numbers: a shift by one pixel is a shift by C, and the innermost loop is long.
-    flat = lambda a: jnp.pad(a.reshape(height, -1), ((halo, halo + mesh.size * rows - height), (0, 0)))
+    def flat(a):
+        return jnp.pad(a.reshape(height, -1), ((halo, halo + mesh.size * rows - height), (0, 0)))
 
     def local(index, _, images):
         x, y = (jax.lax.dynamic_slice_in_dim(a, index * rows, rows + 2 * halo) for a in images)
@@ -158,15 +165,19 @@ def _shifts(image: Array, axis: int, step: int) -> Array:
 
 
 def _loss_of_rows(x: Array, y: Array, inside: Array, channels: int) -> tuple[Array, Array]:
-    """Sum of the loss over R rows, and its gradient (R, W C), from images (R + 4 RADIUS_PX, W C). `inside` (R + 2
-    RADIUS_PX, 1) marks rows inside of the image.
+    """Sum of the loss over R rows, and its gradient (R, W C), from images (R + 4 RADIUS_PX, W C).
+
+    `inside` (R + 2 RADIUS_PX, 1) marks rows inside of the image.
 
     With a = 2 m n + C1, b = 2 (p - m n) + C2, c = m^2 + n^2 + C1, d = q - m^2 + r - n^2 + C2 (m, n the blurred images,
     q, r, p their blurred squares and product) SSIM is S = a b / (c d), so dS/dm = 2 n (b - a) / (c d) - 2 m S
     (1 / c - 1 / d), dS/dq = -S / d, dS/dp = 2 a / (c d); the blur equals its transpose.
     """
     always = opaque_true(x[0, 0])
-    sides = lambda a: jnp.pad(a, ((0, 0), (RADIUS_PX * channels,) * 2))
+
+    def sides(a):
+        return jnp.pad(a, ((0, 0), (RADIUS_PX * channels,) * 2))
+
     down, across = lambda a: sides(_shifts(a, 0, 1)), lambda a: _shifts(a, 1, channels)
 
     def similarity(m, n, q, r, p):

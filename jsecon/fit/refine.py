@@ -191,7 +191,10 @@ class _Prober:
         """The corrections, with those of `frames` replaced by alignment to the frozen scene."""
         only = dataclasses.replace(capture, held_out=~frames)
         _, aligned = self.fit(only, scene, refine, size, visits * int(frames.sum()), _FROZEN)
-        pick = lambda a, b: np.where(frames.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+
+        def pick(a, b):
+            return np.where(frames.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+
         return jax.tree.map(pick, corrections, aligned)
 
 
@@ -282,8 +285,10 @@ def refine_capture(
 
 
 def _align_by_depth(capture: Capture, train: Bool[np.ndarray, " t"], others: Bool[np.ndarray, " t"]) -> Capture | None:
-    """Aligns the training cameras to each other by colour and depth, in the same world, and then the others to them;
-    None if they do not agree better so."""
+    """Aligns the training cameras to each other by colour and depth, then the others to them.
+
+    They stay in the same world. None if they do not agree better so.
+    """
     poses = np.asarray(capture.cameras.world_to_camera, np.float64)
     moved = align_cameras(capture, train)
     if moved is None:
@@ -424,7 +429,10 @@ def rigid_drift(moved: Float[Array, "t 4 4"], poses: Float[Array, "t 4 4"], exte
     Returns:
       (4, 4) map from points of the original world to the world of the moved cameras.
     """
-    centre = lambda poses: -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+
+    def centre(poses):
+        return -np.einsum("tji,tj->ti", poses[:, :3, :3], poses[:, :3, 3])
+
     a, b = centre(moved), centre(poses)
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     axes = np.einsum("tki,tkj->ij", moved[:, :3, :3], poses[:, :3, :3])
@@ -471,7 +479,10 @@ def _without_frames(capture: Capture, dropped: np.ndarray) -> Capture:
     if not len(dropped):
         return capture
     keep = np.setdiff1d(np.arange(len(capture.names)), dropped)
-    take = lambda a: None if a is None else np.asarray(a)[keep]
+
+    def take(a):
+        return None if a is None else np.asarray(a)[keep]
+
     names = ", ".join(capture.names[t] for t in dropped)
     return dataclasses.replace(
         capture,

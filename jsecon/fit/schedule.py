@@ -78,6 +78,7 @@ class Schedule:
     """Share of the fit after which the degree of the spherical harmonics rises by one."""
 
     def __post_init__(self) -> None:
+        """Checks the ranges of the numbers."""
         ends = [end for _, end in self.sizes]
         ordered = ends == sorted(ends) and ends[-1:] == [1.0] and all(0 < size <= 1 for size, _ in self.sizes)
         require(ordered, "sizes", self.sizes, "sizes in (0, 1] with rising ends, the last 1", "((1, 1),) is one size.")

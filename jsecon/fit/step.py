@@ -60,6 +60,11 @@ class TrainingViews:
     """
 
     def __init__(self, capture: Capture):
+        """Takes the training frames of a capture.
+
+        Raises:
+          InputError: Every frame is held out.
+        """
         self.frame_indices = np.flatnonzero(~np.asarray(capture.held_out))
         if not len(self.frame_indices):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
@@ -91,7 +96,10 @@ class TrainingViews:
 
 def _shrink_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Mean depth over each pixel of a smaller frame; 0 if a part is unknown or several surfaces meet there."""
-    shrink = lambda a: cv2.resize(a, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+
+    def shrink(a):
+        return cv2.resize(a, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+
     mean, square, known = shrink(depth), shrink(depth.astype(np.float64) ** 2), shrink(np.float32(depth > 0))
     one_surface = square - mean**2 <= (MAX_DEPTH_SPREAD * mean) ** 2
     return np.where((known > 0.999) & one_surface, mean, 0).astype(np.float32)
@@ -258,8 +266,11 @@ step_compiled = [
 
 
 def _shardings(mesh: Mesh) -> TrainState:
-    """How the state lies on the devices: rows of the scene, the moments and the votes are divided among them, as copies
-    would take as many times the memory and be exchanged at every step; corrections are replicated."""
+    """Says how the state lies on the devices.
+
+    Rows of the scene, the moments and the votes are divided among them: copies would take as many times the memory and
+    be exchanged at every step. Corrections are replicated.
+    """
     replicated, rows = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
     return cast(TrainState, TrainState(*cast(Any, (rows, rows, rows, rows, replicated))))
 
@@ -285,6 +296,7 @@ class StepRunner:
     """Runs steps on the views of a capture; keeps track of compiled programs and of the capacity of each size."""
 
     def __init__(self, views: TrainingViews, mesh: Mesh | None):
+        """Prepares steps on `mesh`; each size of the scene is compiled at its first step."""
         self.views, self.mesh = views, mesh
         self._capacity: dict[tuple[int, float], int] = {}
         self._compiled: set[tuple] = set()

@@ -100,8 +100,10 @@ def _match(a: _Features, b: _Features, fundamental: np.ndarray) -> np.ndarray:
 
 
 def _tracks(edges: np.ndarray, views: np.ndarray) -> list[np.ndarray]:
-    """Groups of features that `edges` (M, 2) connect, `views` being the view of each feature; groups with two features
-    of one view are dropped."""
+    """Groups the features that `edges` (M, 2) connect; `views` is the view of each feature.
+
+    Groups with two features of one view are dropped.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -33,10 +33,12 @@ class Autoencoder:
 
     @property
     def latent(self) -> int:
+        """Size of a code."""
         return _widths(self.encoder["params"])[-1]
 
     @property
     def dim(self) -> int:
+        """E, size of an embedding."""
         return self.encoder["params"]["Dense_0"]["kernel"].shape[0]
 
     def encode(self, embeddings: Float[Array, "*batch e"]) -> Float[Array, "*batch d"]:

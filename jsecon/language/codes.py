@@ -56,8 +56,10 @@ class Rotation:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """A table: each region's embedding and its code. Anything else lies among the regions that it is most similar to,
-    by a softmax over their cosines."""
+    """A table: each region's embedding and its code.
+
+    Anything else lies among the regions that it is most similar to, by a softmax over their cosines.
+    """
 
     embeddings: Array
     """(R, E) unit embeddings of the regions; zero rows have no code."""

@@ -33,7 +33,10 @@ def row_slices(tree: Any, count: int, rows: int | None = None) -> Iterator[slice
 
 def votes_of_rows(votes: Votes, rows: slice | Int[np.ndarray, " m"]) -> Votes:
     """The votes of some of the Gaussians, NumPy, without what has no row for each (`by_view`, `overlap`)."""
-    take = lambda column: None if column is None else np.asarray(column[rows])
+
+    def take(column):
+        return None if column is None else np.asarray(column[rows])
+
     columns = {field.name: getattr(votes, field.name) for field in dataclasses.fields(votes)}
     taken = {name: take(column) for name, column in columns.items() if name not in _NOT_BY_ROW}
     return dataclasses.replace(votes, **taken, by_view=None, overlap=None)

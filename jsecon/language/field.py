@@ -118,7 +118,10 @@ def load_field(path: str | os.PathLike, *, mapped: bool = False) -> LanguageFiel
 
 def subset_field(field: LanguageField, rows: Int[np.ndarray, " m"]) -> LanguageField:
     """The field of some of its Gaussians (M,), with NumPy columns; of mapped columns only their rows are read."""
-    take = lambda a: np.asarray(a)[rows]
+
+    def take(a):
+        return np.asarray(a)[rows]
+
     parts = None if field.parts is None else dataclasses.replace(field.parts, part=take(field.parts.part))
     gaussians = jax.tree.map(take, field.gaussians)
     votes = dataclasses.replace(votes_of_rows(field.votes, rows), overlap=field.votes.overlap)
@@ -191,7 +194,10 @@ def _on_device(leaf: object) -> object:
 
 def _array(field: LanguageField, name: str) -> Any:
     """An array by its dotted name; None if the field lacks it, or the record around it."""
-    step = lambda part, name: None if part is None else getattr(part, name)
+
+    def step(part, name):
+        return None if part is None else getattr(part, name)
+
     return functools.reduce(step, name.split("."), field)
 
 
@@ -213,8 +219,10 @@ def _disagreement(field: LanguageField) -> str | None:
 
 
 def _oddity(field: LanguageField, checked: bool = True) -> str | None:
-    """What is wrong with the numbers or texts of a field whose shapes agree, in words, or None. What is mapped is not
-    read unless it is to be `checked`."""
+    """What is wrong with the numbers or texts of a field whose shapes agree, in words, or None.
+
+    What is mapped is not read unless it is to be `checked`.
+    """
     sizes = {"votes.regions": field.regions.count, "parts.part": field.parts and len(field.parts.weight)}
     for place, leaf in jax.tree_util.tree_leaves_with_path(field):
         if isinstance(leaf, np.memmap) and not checked:

@@ -51,7 +51,10 @@ def region_embeddings(
       ValueError: Shapes disagree, a label is out of range, or the weighting is unknown.
     """
     require_shape("labels", labels, frames.shape[:3], "Give one label image per frame, of the frame's size.")
-    of_frame = lambda t, masks: embed(frames[t], masks)
+
+    def of_frame(t, masks):
+        return embed(frames[t], masks)
+
     return pool_embeddings(labels, of_frame, weighting=weighting, num_regions=num_regions, progress=progress)
 
 
@@ -98,8 +101,10 @@ def pool_embeddings(
     num_regions: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Regions:
-    """`region_embeddings` for an `embed` that takes a frame's index. Several processes (`jax.distributed`) share the
-    frames."""
+    """`region_embeddings` for an `embed` that takes a frame's index.
+
+    Several processes (`jax.distributed`) share the frames.
+    """
     require_one_of("weighting", weighting, ("pixels", "uniform"), "Use 'pixels', as the paper does.")
     count = int(labels.max(initial=-1)) + 1 if num_regions is None else num_regions
     require_labels(labels, count)

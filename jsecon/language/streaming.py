@@ -42,9 +42,13 @@ _MAX_CASTS = 1 << 26
 class Images(Protocol):
     """One image after the other: an array, or what reads them from where they lie."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """Returns the number of items."""
+        ...
 
-    def __getitem__(self, t: int, /) -> Any: ...
+    def __getitem__(self, t: int, /) -> Any:
+        """Returns item `t`."""
+        ...
 
 
 def region_votes_in_blocks(
@@ -232,8 +236,11 @@ def _sum_block(scratch: Path, views: int, rows: slice, regions: int, top: int, b
 
 
 def strongest(votes: Any, top: int) -> tuple[np.ndarray, np.ndarray]:
-    """The ids (N, top) int32 of the largest weights of each row of a sparse matrix (N, R), largest first as float32,
-    equal ones by id, -1 where a row has fewer; and the weights (N, top) float32."""
+    """Finds the largest weights of each row of a sparse matrix (N, R).
+
+    Returns ids (N, top) int32, largest first as float32, equal ones by id, -1 where a row has fewer; and weights (N,
+    top) float32.
+    """
     lengths, weights = np.diff(votes.indptr), votes.data.astype(np.float32)
     row = np.repeat(np.arange(votes.shape[0]), lengths)
     order = np.lexsort((votes.indices, -weights, row))

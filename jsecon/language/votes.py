@@ -83,7 +83,10 @@ def region_votes(
     for b, block in enumerate(blocks):
         report = None
         if progress is not None:
-            report = lambda done, total, b=b: progress(b * total + done, len(blocks) * total)
+
+            def report(done, total, b=b):
+                return progress(b * total + done, len(blocks) * total)
+
         options = {"by_view": by_view, "centre": centre, "near": near, "progress": report}
         state, totals, size = dense_votes(gaussians, cameras, labels, block, capacity=capacity, **options)
         capacity = size if capacity is None and size > _default_capacity(gaussians, cameras) else capacity
@@ -154,8 +157,10 @@ def dense_votes(
     near: float = NEAR,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[dict[str, Array], Array | None, int]:
-    """The votes of a block of regions, all of them: {"votes" (N, len(regions)), "total", "peak", "views" (N,),
-    "overflow"}, the total of each view (T, N) with `by_view`, and the capacity that was used. Host code.
+    """Computes the votes of a block of regions. Host code.
+
+    Returns {"votes" (N, len(regions)), "total", "peak", "views" (N,), "overflow"}, the total of each view (T, N) with
+    `by_view`, and the capacity that was used.
 
     `regions` are consecutive ids; other options as for `region_votes`.
     """
@@ -213,8 +218,11 @@ def _as_votes(kept: tuple[Array, Array], labelled: Any, state: Any, by_view: Any
 
 
 def votes_memory(count: int, views: int, regions: int) -> int:
-    """About how many bytes `region_votes` with `by_view` takes beside its inputs: the views' totals, a copy of the
-    Gaussians with one band of colour, and a dense block for each lane that is worked on and for their sum."""
+    """Estimates the bytes that `region_votes` with `by_view` takes beside its inputs.
+
+    These are the views' totals, a copy of the Gaussians with one band of colour, and a dense block for each lane that
+    is worked on and for their sum.
+    """
     dense = 4 * count * _block_size(count, regions)
     return (4 * views + _BARE_BYTES) * count + (concurrent_lanes(views, dense) + 1) * dense
 
@@ -263,7 +271,9 @@ def _add_view(
     centre: float,
 ) -> tuple[dict[str, Array], Array | None]:
     """Adds one view's votes to the dense accumulators; and (N,) the weight that the view sees, where it is wanted.
-    `common`: the scene, and the first region of the block and the one after its last. Pure."""
+
+    `common`: the scene, and the first region of the block and the one after its last. Pure.
+    """
     (_, (first, after)), (plan, labels) = common, view
     labels = jnp.asarray(labels, jnp.int32)
     labels = jnp.where((labels >= first) & (labels < after), labels - first, -1)
@@ -319,8 +329,10 @@ def _add_view(
 
 
 def at_centre(splats: Float[Array, "b c 6"], corners: tuple[Array, Array], tile: int) -> Float[Array, "b c pixels"]:
-    """1 in the pixel of a tile, whose upper left corner is in `corners` (B,), (B,) px, that holds the splat's centre; 0
-    elsewhere."""
+    """Marks the pixel of a tile that holds the splat's centre by 1; the others are 0.
+
+    `corners` (B,), (B,) px are the upper left corners of the tiles.
+    """
     x, y = (jnp.floor(splats[..., k] - corners[k][:, None]) for k in range(2))
     inside = (x >= 0) & (x < tile) & (y >= 0) & (y < tile)
     pixel = jnp.where(inside, y * tile + x, -1).astype(jnp.int32)

@@ -180,6 +180,7 @@ class Download:
         return sum(file.size for file in self.files)
 
     def __str__(self) -> str:
+        """Returns the address as the command line takes it."""
         megabytes = max(round(self.size / 1e6), 1)
         return f"{self.model.address} ({len(self.files)} files, {megabytes:,} MB, licence: {self.licence})"
 

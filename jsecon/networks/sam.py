@@ -135,6 +135,7 @@ class SamGraphs:
     """
 
     def __init__(self, files: SamFiles, *, batch: int = 64, threads: int | None = None):
+        """Opens the two graphs of a model."""
         self.files = files
         self._encoder = Graph(files.encoder, threads=threads)
         self._decoder = Graph(files.decoder, threads=threads)
@@ -318,6 +319,7 @@ class SamSegmenter:
         batch: int = 64,
         threads: int | None = None,
     ):
+        """Prepares the generator of masks."""
         self.files = model if isinstance(model, SamFiles) else find_sam(model)
         self.settings = settings or SamSettings()
         self.name = f"sam-{self.files.digest(extra=repr(self.settings))}"

@@ -223,6 +223,7 @@ class Prompt:
     labels: np.ndarray | None = None
 
     def __post_init__(self):
+        """Checks that the graphs fit each other."""
         present = [value is not None for value in (self.mask, self.points, self.labels)]
         fits = present in ([True, False, False], [False, True, True])
         require(fits, "Prompt", f"mask, points, labels: {present}", "a mask, or points with labels", "Use one of both.")
@@ -328,6 +329,7 @@ class Sam2Tracker:
     """
 
     def __init__(self, folder: Path, *, hole_area: int = 8, keep: int = 16, threads: int | None = None):
+        """Names the model of `folder`; its graphs are opened at the first frame."""
         self.name = f"sam2-{sam2_digest(folder, extra=repr(hole_area))}"
         self.hole_area = hole_area
         self._folder = folder
@@ -394,6 +396,7 @@ class FrameEncoder:
     """
 
     def __init__(self, graphs: Sam2Graphs, *, keep: int = 1):
+        """Keeps the features of the last `keep` frames."""
         self._graphs = graphs
         self._keep = max(keep, 1)
         self._known: OrderedDict[bytes, FrameFeatures] = OrderedDict()

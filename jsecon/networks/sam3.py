@@ -133,6 +133,7 @@ class Sam3:
     """
 
     def __init__(self, model: str | Path | Sam3Files, *, threads: int | None = None):
+        """Finds the files of `model`; its graphs are opened when they are needed."""
         self.files = model if isinstance(model, Sam3Files) else find_sam3(model)
         self._threads = threads
 
@@ -211,7 +212,7 @@ class Sam3:
 
     @property
     def side(self) -> int:
-        """px of the square image."""
+        """Px of the square image."""
         return self._image.inputs["image"].fixed(2) or IMAGE_SIDE
 
     @property

@@ -53,6 +53,7 @@ class Tensor:
     shape: tuple[Size, ...] | None
 
     def __str__(self) -> str:
+        """Returns the name and shape for messages."""
         if self.shape is None:
             return f"{self.name} {self.dtype}"
         return f"{self.name} {self.dtype}[{', '.join('?' if size is None else str(size) for size in self.shape)}]"
@@ -94,6 +95,7 @@ class Graph:
     """
 
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None, optimise: bool = True):
+        """Opens an ONNX graph."""
         self.path = Path(path)
         self._threads = threads or cores()
         _check_bytes(self.path)

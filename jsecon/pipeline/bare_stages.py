@@ -49,7 +49,10 @@ def planned_views(context: RunContext) -> Stage:
     if options.cameras is not None:
         how = f"the scene rendered from the poses of {options.cameras.name}"
         poses = options.cameras
-        files = lambda: [poses, options.capture]
+
+        def files():
+            return [poses, options.capture]
+
         key_options = context.key_options("long_side")
         skipped["planned views"] = f"the poses are given ({poses.name})"
         return Stage("load", how, _render_poses, key_options=key_options, files=files, skipped=skipped)
@@ -101,5 +104,8 @@ def _read_scene(stage: StageInput) -> StageResult:
 
 def no_photographs() -> Stage:
     """Plans the stage "held_out" of a bare scene, whose frames are its own renders: the quality of no frame."""
-    none = lambda stage: StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
+
+    def none(stage):
+        return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
+
     return Stage("held_out", "no photograph to compare with", none)

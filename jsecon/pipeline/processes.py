@@ -193,6 +193,7 @@ class Coordinator:
     """
 
     def __init__(self, several: bool):
+        """Makes the coordinator of one or of several processes."""
         self._several = several
         self._sent: set[str] = set()
 

@@ -85,11 +85,17 @@ class Listener:
 class Stream(Protocol):
     """A text stream: sys.stdout, sys.stderr, or a replacement."""
 
-    def write(self, text: str, /) -> object: ...
+    def write(self, text: str, /) -> object:
+        """Writes a text."""
+        ...
 
-    def flush(self) -> None: ...
+    def flush(self) -> None:
+        """Writes out what is buffered."""
+        ...
 
-    def isatty(self) -> bool: ...
+    def isatty(self) -> bool:
+        """Returns whether a person reads the stream."""
+        ...
 
 
 class Console(Listener):
@@ -101,6 +107,7 @@ class Console(Listener):
     """
 
     def __init__(self, out: Stream | None = None, err: Stream | None = None):
+        """Prints to `out`, and messages to `err`."""
         self._out = out or sys.stdout
         self._err = err or sys.stderr
 

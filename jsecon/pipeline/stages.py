@@ -94,8 +94,11 @@ def capture_stages(context: RunContext) -> list[Stage]:
     options = dataclasses.replace(context.options, capture=stage.output_dir)
     posed = dataclasses.replace(context, options=options)
     plan = load(posed)
+
     # The stage computes from the posed capture, whatever the context of the run says.
-    compute = lambda stage_input: plan.compute(stage_input._replace(context=posed))
+    def compute(stage_input):
+        return plan.compute(stage_input._replace(context=posed))
+
     return [stage, dataclasses.replace(plan, compute=compute, after=("poses",), files=None)]
 
 
@@ -119,7 +122,10 @@ def poses(context: RunContext) -> Stage:
         photographs = list_photographs(capture)
         what = f"{len(photographs)} photographs, which have none"
         key_options = {"names": [photo.relative_to(capture).as_posix() for photo in photographs]}
-        files = lambda: list_photographs(capture)
+
+        def files():
+            return list_photographs(capture)
+
     how = f"found by structure from motion (pycolmap) for {what}"
     return Stage("poses", how, _find_poses, key_options=key_options, files=files, output_dir=context.out / "poses")
 
@@ -576,12 +582,20 @@ def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Calla
     options, capture = context.options, results.load
     train = training_frames(capture)
     frames = np.asarray(capture.frames)[train]
-    by_model: Embed = lambda t, masks: context.networks.embedder.embed_regions(frames[t], masks)
+
+    def by_model(t, masks):
+        return context.networks.embedder.embed_regions(frames[t], masks)
+
     if options.features is not None:
         names = [capture.names[t] for t in train]
         features = load_features(options.features, names, frames.shape[1:3], **_mask_layout(options, capture))
-        rows = lambda t: np.flatnonzero(np.asarray(features.frame) == t)
-        masks = lambda t: features.labels[t][None] == rows(t)[:, None, None]
+
+        def rows(t):
+            return np.flatnonzero(np.asarray(features.frame) == t)
+
+        def masks(t):
+            return features.labels[t][None] == rows(t)[:, None, None]
+
         return masks, lambda t, masks: features.embeddings[rows(t)]
     if options.masks is not None:
         labels = results.masklets

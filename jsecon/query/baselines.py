@@ -1,5 +1,8 @@
-"""Queries that compare Gaussians with the text itself: one-step, by the cosine of codes (the paper's baseline), and
-canonical, by LERF's relevancy, the text's softmax share against each of a few canonical phrases."""
+"""Queries that compare Gaussians with the text itself.
+
+`query_one_step` uses the cosine of codes (the paper's baseline). `query_canonical` uses LERF's relevancy, the text's
+softmax share against each of a few canonical phrases.
+"""
 
 import jax
 import jax.numpy as jnp

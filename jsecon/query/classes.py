@@ -81,13 +81,18 @@ def query_classes(
 
 @functools.partial(jax.jit, static_argnames=("standardise", "every"))
 def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, standardise: bool, every: bool) -> Classes:
-    compare = lambda text: region_similarities(embeddings, text, reference, rules.retrieval)
+    def compare(text):
+        return region_similarities(embeddings, text, reference, rules.retrieval)
+
     similarity, known = jax.vmap(compare)(texts)  # (Q, R) both
     valid = jnp.any(known, axis=1)  # a text without a direction is no region's class
     plain, known = jnp.where(known, similarity, 0.0).T, jnp.any(known, axis=0)
     table = _standardised(plain, known, pixels) if standardise else plain
     best = jnp.argmax(jnp.where(valid, table, -jnp.inf), axis=1)
-    of_best = lambda table: jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
+
+    def of_best(table):
+        return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
+
     if rules.retrieval_threshold is None and reference is not None:
         scores = reference_similarities(embeddings, reference, rules.retrieval)
         below = jnp.sum(scores < of_best(plain), axis=0, dtype=plain.dtype)
@@ -126,8 +131,10 @@ def _classes(embeddings, texts, pixels, votes, reference, rules: QueryRules, sta
 
 
 def _standardised(table: Array, known: Array, pixels: Array) -> Array:
-    """Similarities (R, Q) in standard deviations from each text's mean over the known regions; 0 where a text's are all
-    alike. Regions count by their evidence."""
+    """Converts similarities (R, Q) to standard deviations from each text's mean over the known regions.
+
+    Regions count by their evidence. The result is 0 where a text's similarities are all alike.
+    """
     weight = jnp.where(known, evidence(pixels).astype(table.dtype), 0.0)[:, None]
     weight = weight / jnp.maximum(jnp.sum(weight), jnp.finfo(table.dtype).tiny)
     apart = jnp.where(known[:, None], table - jnp.sum(weight * table, axis=0), 0.0)

@@ -140,7 +140,10 @@ def _match(embeddings, pixels, overlap, queries, excluded, reference, rules: Que
     is_anchor = jnp.any((jnp.arange(count) == scores.anchor[:, None]) & scores.accepted[:, None], axis=0)
     best = jnp.argmax(jnp.where(chosen, closeness + _ANCHOR_BONUS * is_anchor, -jnp.inf))
     matches = jnp.any(chosen)
-    of_anchor = lambda rows: jnp.take_along_axis(rows, scores.anchor[:, None], axis=1)[:, 0]
+
+    def of_anchor(rows):
+        return jnp.take_along_axis(rows, scores.anchor[:, None], axis=1)[:, 0]
+
     known = of_anchor(scores.known)
     nearest = jnp.max(jnp.where(known, of_anchor(scores.similarity), -jnp.inf))
     nearest = jnp.where(jnp.any(known), nearest, 0.0)
@@ -183,8 +186,11 @@ def reference_words(field: LanguageField) -> Array | None:
 def text_direction(
     text: Float[Array, "*batch e"], reference: Float[Array, "w e"] | None, retrieval: str
 ) -> Float[Array, "*batch e"]:
-    """What of texts (..., E) is compared with regions: the unit text, by "apart" minus the mean of the W unit unrelated
-    words. Without such words the plain text."""
+    """Returns the directions of texts (..., E) that are compared with regions.
+
+    By "apart" these are the unit texts minus the mean of the W unit unrelated words. Without such words they are the
+    plain texts.
+    """
     unit = normalize(text)
     if retrieval == "cosine" or reference is None:
         return unit
@@ -215,8 +221,11 @@ def reference_similarities(
 def quantile_among(
     best: Float[Array, ""], text: Float[Array, " e"], reference: Float[Array, "w e"], scores: Float[Array, "w r"]
 ) -> Float[Array, ""]:
-    """The share of W unrelated words (W, E) whose largest score with any region, of `scores` (W, R), is below a text's
-    `best`. The REFERENCE_CUT share that is nearest to the text is left out; 1 if no word is left."""
+    """Computes the share of W unrelated words (W, E) that are less similar to the scene than a text.
+
+    A word's similarity is its largest score with any region, of `scores` (W, R); the text's is `best`. The
+    REFERENCE_CUT share that is nearest to the text is left out; 1 if no word is left.
+    """
     largest = jnp.max(jnp.where(jnp.isfinite(scores), scores, -jnp.inf), axis=1)
     units = normalize(reference.astype(text.dtype))
     mean = jnp.mean(units, axis=0)
@@ -228,8 +237,10 @@ def quantile_among(
 
 
 def presence(embeddings: Float[Array, "r e"], text: Float[Array, " e"], logits: Logits) -> Float[Array, " r"]:
-    """Probability that a text (E,) is true of each of R regions, by the sigmoid that the embedder was trained with:
-    sigmoid(scale cos + bias). 0 where either has no direction."""
+    """Computes the probability that a text (E,) is true of each of R regions: sigmoid(scale cos + bias).
+
+    The embedder was trained with this sigmoid. The probability is 0 where either has no direction.
+    """
     cosines, known = similarities(embeddings, text)
     return jnp.where(known, jax.nn.sigmoid(logits.scale * cosines + logits.bias), 0.0)
 
@@ -325,16 +336,20 @@ def answering_regions(
 def is_alike(
     embeddings: Float[Array, "r e"], region: Int[Array, ""], threshold: Number = ALIKE_THRESHOLD
 ) -> Bool[Array, " r"]:
-    """Which of R regions are the same object as `region`: what sets both apart from the mean region has a cosine of at
-    least `threshold`."""
+    """Finds which of R regions are the same object as `region`.
+
+    What sets both apart from the mean region then has a cosine of at least `threshold`.
+    """
     residuals, known = mean_residuals(embeddings)
     cosines, comparable = similarities(residuals, residuals[region])
     return known & comparable & (cosines >= threshold)
 
 
 def reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_score: Number) -> Bool[Array, " r"]:
-    """Which of R regions have a similarity of at least m + `relative_score` (b - m), m the median and b the largest;
-    none if all are equally similar."""
+    """Finds which of R regions have a similarity of at least m + `relative_score` (b - m).
+
+    m is the median and b the largest. No region does if all are equally similar.
+    """
     middle = jnp.nanmedian(jnp.where(known, similarity, jnp.nan))
     best = jnp.max(jnp.where(known, similarity, -jnp.inf))
     return known & (similarity >= middle + relative_score * (best - middle)) & (best > middle)
@@ -349,7 +364,10 @@ def is_piece(
     threshold: Number = PIECE_THRESHOLD,
     min_overlap: Number = MIN_PIECE_OVERLAP,
 ) -> Bool[Array, " r"]:
-    """Which of R regions are pieces of the objects that the `chosen` regions (R,) show: they reach the relative score
-    `threshold` and overlap (R, R) one of them. A second object of the kind is as similar, but has its own Gaussians."""
+    """Finds which of R regions are pieces of the objects that the `chosen` regions (R,) show.
+
+    They reach the relative score `threshold` and overlap (R, R) one of them. A second object of the kind is as similar,
+    but has its own Gaussians.
+    """
     overlaps = jnp.max(jnp.where(chosen[:, None], overlap, 0.0), axis=0) >= min_overlap
     return reaches(similarity, known, threshold) & overlaps

@@ -117,7 +117,10 @@ def parts_fallback(
     similarity = np.interp(scores, from_scores, to_similarity).astype(np.float32)
     similarity = np.where(mask | (scores < least), similarity, np.minimum(similarity, REJECTED_SIMILARITY))
     part = np.asarray(parts.part)
-    count = lambda rows: np.bincount(rows[rows >= 0], minlength=len(parts.weight)).astype(np.float32)
+
+    def count(rows):
+        return np.bincount(rows[rows >= 0], minlength=len(parts.weight)).astype(np.float32)
+
     inside = count(part[mask]) / np.maximum(count(part), 1.0)
     pooled, quantile = _pooled(parts.embeddings, parts.weight, inside, text, reference, retrieval=rules.retrieval)
     similar = float(region_similarities(pooled[None], text, reference, rules.retrieval)[0][0])
@@ -148,8 +151,10 @@ def _pooled(
 def best_cluster(
     mask: Bool[np.ndarray, " n"], scores: Float[np.ndarray, " n"], means: Float[Array, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """The cluster of the Gaussians `mask` (DBSCAN on their centres (N, 3), SPACINGS) whose UPPER quantile of scores is
-    best, among those with a tenth of the largest's Gaussians. All of them if there are too few to cluster. Host code.
+    """Finds the cluster of the Gaussians `mask` whose upper quantile of scores is best. Host code.
+
+    DBSCAN on their centres (N, 3) with SPACINGS; clusters with less than a tenth of the largest's Gaussians do not
+    compete. All Gaussians are returned if there are too few to cluster.
     """
     mask = mask & np.isfinite(np.asarray(means)).all(axis=1)
     chosen = np.flatnonzero(mask)

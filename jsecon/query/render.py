@@ -83,7 +83,9 @@ def _rendered(
 
 @jax.jit
 def _alone(logits: Array, mask: Array, similarity: Array | None) -> tuple[Array, Array]:
-    """Opacity logits that hide what is not selected, and what of each Gaussian is rendered: in three columns, so that
-    the program that renders colours serves."""
+    """Returns opacity logits that hide what is not selected, and the features of each Gaussian.
+
+    The features have three columns, so that the program that renders colours serves.
+    """
     features = jnp.where(mask, jnp.ones_like(logits) if similarity is None else similarity, 0.0)
     return jnp.where(mask, logits, HIDDEN_LOGIT), jnp.broadcast_to(features[:, None], (*features.shape, 3))

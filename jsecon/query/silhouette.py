@@ -130,8 +130,10 @@ def choose_views(gaussians: Gaussians, cameras: Camera, chosen: np.ndarray) -> C
 def footprints(
     gaussians: Gaussians, views: Camera, share: np.ndarray, candidates: np.ndarray, chosen: np.ndarray
 ) -> Footprints:
-    """What the Gaussians `candidates` (C,) absorb in `views`, padded so that texts share their programs. Of the others
-    the `chosen` ones (N,) are certainly taken."""
+    """What the Gaussians `candidates` (C,) absorb in `views`, padded so that texts share their programs.
+
+    Of the others the `chosen` ones (N,) are certainly taken.
+    """
     # One precision for all: jax.enable_x64 holds in its own thread alone, and views are planned in several.
     gaussians, views = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), (gaussians, views))
     rows = _padded(len(candidates))
@@ -169,8 +171,13 @@ def footprints(
     order = np.argsort(owner, kind="stable")
     begin = np.searchsorted(owner[order], np.arange(rows + 1)).astype(np.int32)
     size, empty = _padded(len(order) + _BLOCK), len(views.fx) * len(inside[0])
-    fill = lambda a, value: np.concatenate([a, np.full((size - len(a), *a.shape[1:]), value, a.dtype)])
-    last = lambda parts: np.concatenate([*parts, np.zeros((1, parts[0].shape[1]), np.float32)])
+
+    def fill(a, value):
+        return np.concatenate([a, np.full((size - len(a), *a.shape[1:]), value, a.dtype)])
+
+    def last(parts):
+        return np.concatenate([*parts, np.zeros((1, parts[0].shape[1]), np.float32)])
+
     return Footprints(
         fill(np.concatenate(values)[order], 0.0),
         fill(np.concatenate(tiles)[order].astype(np.int32), empty),
@@ -207,13 +214,18 @@ def ascend(
     count: int | Array,
     weights: Float[Array, " 2"] | tuple[float, float] = WEIGHTS,
 ) -> Bool[Array, " c"]:
-    """Which of C Gaussians are taken after SWEEPS sweeps over the first `count` from `taken` (C,), see
-    `fit_silhouette`. Pure."""
+    """Computes which of C Gaussians are selected after SWEEPS sweeps, see `fit_silhouette`. Pure.
+
+    The sweeps go over the first `count` Gaussians and start from `taken` (C,).
+    """
     prints = jax.tree.map(jnp.asarray, prints)
     levels = jnp.asarray([-np.log1p(-t) for t in (ALPHA_THRESHOLD, VALA_THRESHOLD)], prints.absorbed.dtype)
     worth = jnp.asarray(weights, levels.dtype)
     per_view = (prints.inside.shape[0] - 1) // views
-    by_view = lambda image: image[:-1].reshape(views, -1).sum(1)
+
+    def by_view(image):
+        return image[:-1].reshape(views, -1).sum(1)
+
     whole = by_view(prints.inside)
 
     def place(c, first):
@@ -225,7 +237,9 @@ def ascend(
         ), values
 
     def blocks(c, step, carry):
-        onward = lambda state: (state[0] + _BLOCK, step(*place(c, state[0]), state[1]))
+        def onward(state):
+            return (state[0] + _BLOCK, step(*place(c, state[0]), state[1]))
+
         return lax.while_loop(lambda state: state[0] < prints.starts[c + 1], onward, (prints.starts[c], carry))[1]
 
     def add_up(c, level):
@@ -236,7 +250,9 @@ def ascend(
     covered = [level > threshold for threshold in levels]
     hit = jnp.stack([by_view(jnp.where(c, prints.inside, 0.0)) for c in covered])  # (2, V)
     spilt = jnp.stack([by_view(jnp.where(c, prints.outside, 0.0)) for c in covered])
-    worth_of = lambda hit, spilt: (worth[:, None] * hit / jnp.maximum(whole + spilt, 1e-6)).sum()
+
+    def worth_of(hit, spilt):
+        return (worth[:, None] * hit / jnp.maximum(whole + spilt, 1e-6)).sum()
 
     def flip(k, state):
         c = k % count

@@ -28,6 +28,7 @@ class UnitCodes:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Shape of the codes."""
         return self.rows.shape
 
 
@@ -71,7 +72,7 @@ def similarities(codes: Codes, code: Float[Array, " d"]) -> tuple[Float[Array, "
 
 
 def _product(rows: Array, unit: Array) -> Array:
-    """rows @ unit. Under vmap over codes it is one (N, d) x (d, Q) product: no query walks the rows on its own."""
+    """Rows @ unit. Under vmap over codes it is one (N, d) x (d, Q) product: no query walks the rows on its own."""
     if rows.shape[1] <= NARROW:
         columns = (rows[:, k] * unit[k] for k in range(rows.shape[1]))
         return sum(columns, start=jnp.zeros(rows.shape[0], rows.dtype))
@@ -80,8 +81,10 @@ def _product(rows: Array, unit: Array) -> Array:
 
 
 def _by_column(codes: Array, unit: Array) -> tuple[Array, Array, Array]:
-    """Of each row: the largest size, and dot product and square once it is brought into range. Column by column: a
-    reduction over a short row does not vectorise (1 million rows of 3: 17 ms against 0.7)."""
+    """Of each row: the largest size, and dot product and square once it is brought into range.
+
+    Column by column: a reduction over a short row does not vectorise (1 million rows of 3: 17 ms against 0.7).
+    """
     columns = [codes[:, k] for k in range(codes.shape[1])]
     zero = jnp.zeros(codes.shape[0], codes.dtype)
     largest = functools.reduce(jnp.maximum, (jnp.abs(column) for column in columns), zero)

@@ -107,8 +107,11 @@ def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: 
 
 
 def _merging_channels(one: Callable, split: Callable) -> Callable:
-    """`one(splats, channels, lists)` with a rule for vmap: if only channels (S, ..., D) are batched, they become S D
-    channels of one call, whose result `split(result, S)` unmerges. Any other batch runs one after another."""
+    """Wraps `one(splats, channels, lists)` with a rule for vmap.
+
+    If only channels (S, ..., D) are batched, they become S D channels of one call, whose result `split(result, S)`
+    unmerges. Any other batch runs one after another.
+    """
     function = custom_vmap(one)
 
     @function.def_vmap
@@ -116,7 +119,9 @@ def _merging_channels(one: Callable, split: Callable) -> Callable:
         if any(jax.tree.leaves((batched[0], batched[2]))):
 
             def one_of(index):
-                take = lambda a, is_batched: lax.dynamic_index_in_dim(a, index, 0, False) if is_batched else a
+                def take(a, is_batched):
+                    return lax.dynamic_index_in_dim(a, index, 0, False) if is_batched else a
+
                 return function(*jax.tree.map(take, (splats, channels, lists), tuple(batched)))
 
             out = lax.map(one_of, jnp.arange(size))

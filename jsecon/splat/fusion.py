@@ -26,7 +26,10 @@ def materialize(always: Array, compute: Callable, *operands: Any) -> Any:
       Its result.
     """
     shapes = jax.eval_shape(compute, *operands)
-    zeros = lambda *_: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+
+    def zeros(*_):
+        return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+
     return lax.cond(always, compute, zeros, *operands)
 
 

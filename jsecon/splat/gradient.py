@@ -107,7 +107,7 @@ def _along(features: Array, cotangent: Array) -> Array:
 
 
 def _slopes(weight: Array, alpha: Array, along: Array, before: Array, final: Array) -> tuple[Array, Array]:
-    """alpha dL/dalpha of a chunk (B, CHUNK, pixels), and the running sum of w <G, f> behind it (B, pixels)."""
+    """Alpha dL/dalpha of a chunk (B, CHUNK, pixels), and the running sum of w <G, f> behind it (B, pixels)."""
     share = weight * along
     until, after = cumulative(jnp.add, before, share)
     rest = final[:, None] - (until + share)

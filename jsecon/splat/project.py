@@ -116,8 +116,11 @@ def _rotation(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
 
 
 def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tuple) -> tuple[list[Array], list[Array]]:
-    """Two rows, three (N,) each, of the 2x3 matrix M = J R S, where M M^T is the 2D covariance, J the Jacobian of the
-    ray, R the rotation from the axes of the Gaussian to those of the camera, and S its scales."""
+    """Computes two rows, three (N,) each, of the 2x3 matrix M = J R S.
+
+    M M^T is the 2D covariance, J the Jacobian of the ray, R the rotation from the axes of the Gaussian to those of the
+    camera, and S its scales.
+    """
     rotation = _rotation(*unit)
     x_ratio, y_ratio, focal_x, focal_y = rays
     row_1, row_2 = [], []
@@ -133,7 +136,10 @@ def _covariance_root(w2c: Array, unit: list[Array], log_scales: Array, rays: tup
 
 def _whitening(row_1: list[Array], row_2: list[Array]) -> tuple[Array, ...]:
     """(N,) variances of x and y with blur, and l11, l21, l22 of the root of the inverse covariance."""
-    dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    def dot(a, b):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
     norm_1, norm_2 = dot(row_1, row_1), dot(row_2, row_2)
     cov_xx, cov_yy = norm_1 + BLUR_PX2, norm_2 + BLUR_PX2
     # From here on the unit in y is the height of the splat (constant to the gradient, where it cancels): 1 / cov_yy^2,
@@ -247,17 +253,26 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float | Array = NEAR)
     visible = in_front & (opacities >= MIN_ALPHA) & touching
     for number in jax.lax.stop_gradient((centre_x, centre_y, extent_x, extent_y, l11, l21, l22, z, opacities)):
         visible &= jnp.isfinite(number)
-    stack = lambda *columns: jnp.stack(columns, axis=-1)
+
+    def stack(*columns):
+        return jnp.stack(columns, axis=-1)
+
     means_px, whitening, extents = stack(mean_px, mean_py), stack(l11, l21, l22), stack(extent_x, extent_y)
     return Projection(means_px, whitening, opacities, z, extents, visible)
 
 
 def _replace_non_finite(gaussians: Gaussians, camera: Camera) -> tuple[Gaussians, Camera, Array]:
-    """Both with finite numbers in place of others, and (N,) bool the unchanged Gaussians. Non-finite numbers must be
-    replaced before the first product: otherwise a gradient of zero times NaN is NaN and reaches the pose."""
+    """Both with finite numbers in place of others, and (N,) bool the unchanged Gaussians.
+
+    Non-finite numbers must be replaced before the first product: otherwise a gradient of zero times NaN is NaN and
+    reaches the pose.
+    """
     finite = all_finite(*jax.tree.leaves(camera))
     drawn = is_usable(gaussians) & finite
-    keep = lambda array: jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)
+
+    def keep(array):
+        return jnp.where(drawn.reshape(-1, *[1] * (array.ndim - 1)), array, 0.0)
+
     harmless = jax.tree.map(lambda a: jnp.ones((), a.dtype), camera)
     harmless = dataclasses.replace(harmless, world_to_camera=jnp.eye(4, dtype=camera.world_to_camera.dtype))
     kept = {name: keep(getattr(gaussians, name)) for name in ("means", "log_scales", "quaternions", "opacity_logits")}

@@ -138,5 +138,7 @@ def render_depth(
 
 @jax.jit
 def _nan_on_overflow(rendering: Rendering) -> DepthImage:
-    mask = lambda image: jnp.where(rendering.overflow > 0, jnp.nan, image)
+    def mask(image):
+        return jnp.where(rendering.overflow > 0, jnp.nan, image)
+
     return DepthImage(mask(rendering.depth), mask(rendering.alpha))

@@ -55,10 +55,15 @@ def _basis(x: Array, y: Array, z: Array, coefficients: int) -> list:
 
 @jax.custom_vjp
 def _colours(directions: Array, sh: Array) -> Array:
-    """(N, 3) sum of sh (N, K, 3) times the basis at unit `directions`, one column at a time: for stacked columns XLA's
-    CPU backend tests in the innermost loop which basis function a number belongs to."""
+    """Sums sh (N, K, 3) times the basis at unit `directions`, one column at a time; returns (N, 3).
+
+    For stacked columns XLA's CPU backend tests in the innermost loop which basis function a number belongs to.
+    """
     basis = materialize(opaque_true(sh[0, 0, 0]), lambda d: _basis(d[:, 0], d[:, 1], d[:, 2], sh.shape[1]), directions)
-    colour = lambda c: sum((b * sh[:, k, c] for k, b in enumerate(basis[1:], start=1)), basis[0] * sh[:, 0, c])
+
+    def colour(c):
+        return sum((b * sh[:, k, c] for k, b in enumerate(basis[1:], start=1)), basis[0] * sh[:, 0, c])
+
     return jnp.stack([colour(c) for c in range(3)], axis=-1)
 
 
@@ -67,8 +72,13 @@ def _colours_backward(residuals: tuple[Array, Array], bar: Array) -> tuple[Array
     coefficients = sh.shape[1]
     always, columns = opaque_true(sh[0, 0, 0]), [directions[:, i] for i in range(3)]
     by_basis = materialize(always, lambda sh, bar: [(sh[:, k] * bar).sum(1) for k in range(coefficients)], sh, bar)
-    evaluate = lambda x, y, z: _basis(x, y, z, coefficients)
-    along = lambda x, y, z, by: jnp.stack(jax.vjp(evaluate, x, y, z)[1](by), axis=-1)
+
+    def evaluate(x, y, z):
+        return _basis(x, y, z, coefficients)
+
+    def along(x, y, z, by):
+        return jnp.stack(jax.vjp(evaluate, x, y, z)[1](by), axis=-1)
+
     basis = materialize(always, lambda d: sh_basis(d, coefficients), directions)
     return materialize(always, along, *columns, by_basis), basis[:, :, None] * bar[:, None]
 

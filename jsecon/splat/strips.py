@@ -81,5 +81,8 @@ def map_strips(local: Callable, divided: Any, common: Any, mesh: Mesh | None, *,
     """
     if mesh is None:
         return local(FULL_IMAGE, divided, common)
-    run = lambda index, *arrays: local(Strip(index, mesh.size), *arrays)
+
+    def run(index, *arrays):
+        return local(Strip(index, mesh.size), *arrays)
+
     return map_over_devices(run, divided, common, mesh, total=total)

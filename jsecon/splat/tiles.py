@@ -64,8 +64,10 @@ def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
 
 
 def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
-    """Half-open ranges (x0, x1, y0, y1) of the strip's blocks of `edge` px that the box of each splat touches; empty if
-    invisible."""
+    """Computes the range (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat's box touches.
+
+    Ranges are half-open, and empty if the splat is invisible.
+    """
     across, down = tile_grid(width, height, edge)
     ranges = []
     for axis, limit in ((0, across), (1, down)):
@@ -117,8 +119,10 @@ def depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
 
 
 def _sort_packed(*fields: tuple[Array, int]) -> list[Array]:
-    """Sorts by fields of non-negative integers with their numbers of bits, at most 64 together, the most significant
-    first; returns the sorted fields as int32. 64-bit types are enabled only inside."""
+    """Sorts by fields of non-negative integers, the most significant first; returns the sorted fields as int32.
+
+    Each field comes with its number of bits, at most 64 together. 64-bit types are enabled only inside.
+    """
     with jax.enable_x64(True):
         wide = [lax.convert_element_type(values, jnp.uint64) for values, _ in fields]
         key = wide[0]
@@ -197,7 +201,10 @@ def tile_lists(
         within = pair - box[:, 0]
         block = (box[:, 2] + within // box[:, 3]) * across + box[:, 1] + within % box[:, 3]
         block = jnp.where(pair < total, block, number)
-        put = lambda array, part: lax.dynamic_update_slice(array, part, (first,))
+
+        def put(array, part):
+            return lax.dynamic_update_slice(array, part, (first,))
+
         return owner[-1], put(blocks, block), put(owners, owner)
 
     no_pairs = jnp.full(room, number, jnp.int32), jnp.zeros(room, jnp.int32)
@@ -235,8 +242,10 @@ def tile_lists(
 def _reached_tiles(
     ellipses: Array, owner: Array, blocks: Array, *, across: int, number: int, tile: int, strip: Strip
 ) -> Array:
-    """(pairs,) uint32: bit (row * BLOCK + column) is set if the ellipse alpha >= 1/255 reaches the rectangle between
-    the pixel centres of that tile; 0 for the block `number`. `ellipses` (N, 6) are centre, whitening and opacity.
+    """Computes for each pair which pixel blocks of the tile the ellipse reaches, as bits (pairs,) uint32.
+
+    Bit (row * BLOCK + column) is set if the ellipse alpha >= 1/255 reaches the rectangle between the pixel centres of
+    that tile; 0 for the block `number`. `ellipses` (N, 6) are centre, whitening and opacity.
 
     Exact up to a slack that only adds tiles: the ellipse is convex, so within a row of tiles its interval of x ends at
     its widest point, or at the edge of the row if that point lies beyond. A NaN counts as reached.
@@ -281,7 +290,10 @@ def round_up_to_words(pairs: int) -> int:
 
 def loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:
     """Runs `carry = step(first, carry)` for first = 0, size, 2 size, ... below `total`, and returns the last carry."""
-    advance = lambda state: (state[0] + size, step(*state))
+
+    def advance(state):
+        return (state[0] + size, step(*state))
+
     return lax.while_loop(lambda state: state[0] < total, advance, (jnp.int32(0), carry))[1]
 
 
@@ -309,14 +321,19 @@ def tile_bits(
       (words, tiles) bits, and (words, tiles) the number of set bits before, counted tile after tile and word after word
       within a tile.
     """
-    part = lambda a, first: lax.dynamic_slice(a, (first,), (chunk,))
+
+    def part(a, first):
+        return lax.dynamic_slice(a, (first,), (chunk,))
 
     def step(first: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         so_far, members, before = carry
         reached = materialize(first < total, reach, part(owner, first), part(blocks, first))
         bits = transpose_words(reached, tiles)
         ends = so_far + lax.cumsum(lax.population_count(bits).astype(jnp.int32))
-        put = lambda array, part: lax.dynamic_update_slice_in_dim(array, part, first // WORD, 0)
+
+        def put(array, part):
+            return lax.dynamic_update_slice_in_dim(array, part, first // WORD, 0)
+
         return ends[-1], put(members, bits), put(before, ends - lax.population_count(bits).astype(jnp.int32))
 
     words = owner.shape[0] // WORD

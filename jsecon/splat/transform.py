@@ -43,7 +43,10 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     expected, remedy = "a rotation, one positive scale and a shift", "Remove shear, mirrors and unequal scales."
     require(similar, "similarity", matrix.tolist(), expected, remedy)
     xp = gaussians.means.__array_namespace__()
-    like = lambda column, array: xp.asarray(array, column.dtype)
+
+    def like(column, array):
+        return xp.asarray(array, column.dtype)
+
     means, turns, sh = gaussians.means, gaussians.quaternions, gaussians.sh
     with jax.default_matmul_precision("highest"):  # WHOLE, for NumPy arrays too
         return Gaussians(

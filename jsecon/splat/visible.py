@@ -65,7 +65,10 @@ def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussi
     """The Gaussians `ids` (M,) in black, then transparent ones up to `padded_size`. NumPy, float32."""
     size = padded_size(len(ids))
     bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
-    fill = lambda a: np.zeros((size - len(ids), *a.shape[1:]), np.float32)
+
+    def fill(a):
+        return np.zeros((size - len(ids), *a.shape[1:]), np.float32)
+
     part = jax.tree.map(lambda a: np.concatenate([np.asarray(a[ids], np.float32), fill(a)]), bare)
     part.opacity_logits[len(ids) :] = _HIDDEN_LOGIT
     return dataclasses.replace(part, sh=np.zeros((size, 1, 3), np.float32))

@@ -160,8 +160,10 @@ def pixel_centres(tile: int, dtype) -> tuple[Array, Array]:
 
 
 def _alphas(coefficients: Array, tile: int) -> Array:
-    """(B, CHUNK, pixels) from l11, l21, c1, l22, c2, e (B, CHUNK, 6): with x, y from the tile's corner,
-    u = l11 x + l21 y + c1, v = l22 y + c2, alpha = 2^(e - u^2 - v^2)."""
+    """Computes alpha (B, CHUNK, pixels) from l11, l21, c1, l22, c2, e (B, CHUNK, 6).
+
+    With x, y from the tile's corner, u = l11 x + l21 y + c1, v = l22 y + c2 and alpha = 2^(e - u^2 - v^2).
+    """
     l11, l21, c1, l22, c2, e = (coefficients[..., i, None] for i in range(6))
     x, y = pixel_centres(tile, coefficients.dtype)
     u, v = l11 * x + (l21 * y + c1), l22 * y + c2

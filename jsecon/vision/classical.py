@@ -38,8 +38,10 @@ def require_contrib() -> None:
 
 @dataclasses.dataclass(frozen=True)
 class ClassicalSegmenter:
-    """Segmenter (jsecon.vision.protocols) from OpenCV alone. Thresholds are in CIELAB units, of which two are just
-    noticeable."""
+    """Segmenter (jsecon.vision.protocols) from OpenCV alone.
+
+    Thresholds are in CIELAB units, of which two are just noticeable.
+    """
 
     merge_distance: float = 16.0
     """Dissimilarity below which neighbours are joined, CIELAB units."""
@@ -101,8 +103,11 @@ class ClassicalSegmenter:
         )
 
     def _with_surface(self, colour: np.ndarray, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 6) colours and normals, where a crease equals a step of `merge_distance`; and (H, W, 7) features for
-        the oversegmentation: colours, normals at half weight, and depth."""
+        """Joins colours and normals as features of pixels.
+
+        Returns (H, W, 6) colours and normals, where a crease equals a step of `merge_distance`; and (H, W, 7) features
+        for the oversegmentation: colours, normals at half weight, and depth.
+        """
         for array in (surface.points, surface.normals):
             require_shape("surface", array, colour.shape, "Pass surfaces of the size of the frame.")
         crease = 2.0 * np.sin(np.radians(self.crease_degrees) / 2.0)

@@ -106,6 +106,7 @@ class ColourEmbedder:
     name = "colours-1"
 
     def __init__(self):
+        """Prepares the table of colour words."""
         self.names = tuple(PALETTE)
         self._points = lab_of(np.asarray(list(PALETTE.values())))
         self._by_name = dict(zip(self.names, self._points))
@@ -279,8 +280,10 @@ def _pixels_inside(lab: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _without_shadow_and_shine(lab: np.ndarray) -> np.ndarray:
-    """CIELAB pixels between the 30th and the 95th percentile of lightness: the lit side determines the colour name, and
-    shadows are more frequent than highlights."""
+    """Keeps the CIELAB pixels between the 30th and the 95th percentile of lightness.
+
+    The lit side determines the colour name, and shadows are more frequent than highlights.
+    """
     low, high = np.percentile(lab[:, 0], [30.0, 95.0])
     kept = (lab[:, 0] >= low) & (lab[:, 0] <= high)
     return lab[kept] if kept.any() else lab  # two pixels have no percentile between them

@@ -36,8 +36,10 @@ def smooth_depth(depth: Float32[np.ndarray, "h w"], *, noise: float = 0.06, roun
 
 
 def log_depth(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 1"]:
-    """Returns the logarithm (H, W, 1) of z-depth (H, W), 0 = unknown; filled from the nearest known pixel, 0
-    without."""
+    """Computes the logarithm (H, W, 1) of z-depth (H, W), where 0 is unknown.
+
+    Unknown pixels are filled from the nearest known pixel, with 0 if there is none.
+    """
     known = np.asarray(depth > 0)
     depth = fill_nearest(depth, known) if known.any() else np.ones_like(depth)
     return np.log(np.maximum(depth, 1e-12))[..., None].astype(np.float32)

@@ -40,8 +40,12 @@ def labeller_file(path):
 
     at = b.PrependUOffsetTRelativeSlot
     byte, word, integer = b.PrependInt8Slot, b.PrependUint32Slot, b.PrependInt32Slot
-    offsets = lambda items: vector(items, 4, b.PrependUOffsetTRelative)
-    ints = lambda items: vector(items, 4, b.PrependInt32)
+
+    def offsets(items):
+        return vector(items, 4, b.PrependUOffsetTRelative)
+
+    def ints(items):
+        return vector(items, 4, b.PrependInt32)
 
     def tensor(name, shape):
         scale, zero = vector([1 / 256], 4, b.PrependFloat32), vector([0], 8, b.PrependInt64)
@@ -110,7 +114,10 @@ def _unit(vector):
 def test_weights_are_probabilities_or_log_odds_above_the_least():
     scores = np.array([[0, 1, 128, 255]], np.uint8)
     np.testing.assert_allclose(class_weights(scores)[0], [0, 1 / 256, 0.5, 255 / 256])
-    odds = lambda p: np.log(p / (1 - p))
+
+    def odds(p):
+        return np.log(p / (1 - p))
+
     least = odds(1 / 512)
     expected = [0, odds(1 / 256) - least, -least, odds(255 / 256) - least]
     np.testing.assert_allclose(class_weights(scores, "log-odds")[0], expected, atol=1e-12)
@@ -205,7 +212,10 @@ def test_rules_on_a_table():
 
 def test_scores_of_all_texts_are_those_of_the_library():
     rng = np.random.default_rng(0)
-    unit = lambda shape: (lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True))(rng.normal(size=shape))
+
+    def unit(shape):
+        return (lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True))(rng.normal(size=shape))
+
     regions, texts, canonical = (unit(shape).astype(np.float32) for shape in ((6, 12), (3, 12), (4, 12)))
     pixels = rng.integers(0, 500, (6, 5)).astype(np.int32)
     regions[2] = 0

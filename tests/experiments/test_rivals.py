@@ -75,7 +75,10 @@ def test_gaussian_grouping(world):
         evidence, key=jax.random.key(0), steps=100, identity_rate=0.05, classifier_rate=0.02, classes=32
     )
     assert history[-20:].mean() < 0.7 * history[:5].mean()
-    ask = lambda query: query_gaussian_grouping(model, evidence, texts[query], canonical)
+
+    def ask(query):
+        return query_gaussian_grouping(model, evidence, texts[query], canonical)
+
     assert miou(world, ask) >= 0.6
     # A text that means two things finds both, or the better one where one alone is asked for.
     first = np.flatnonzero(np.asarray(evidence.frame) == 0)
@@ -111,9 +114,12 @@ def test_opengaussian(world):
     model, history = train_opengaussian(world[0], key=jax.random.key(0), schedule=SCHEDULE)
     assert np.isfinite(history).all()
     assert history[-20:].mean() < history[:5].mean()
-    ask = lambda query: select_leaf(
-        model.leaf_features, model.leaf_codes, model.leaf_of, world[3][query], siblings=model.siblings
-    )
+
+    def ask(query):
+        return select_leaf(
+            model.leaf_features, model.leaf_codes, model.leaf_of, world[3][query], siblings=model.siblings
+        )
+
     assert miou(world, ask) >= 0.6
     leaf_of = np.asarray(model.leaf_of)
     assert leaf_of.max() < 24
@@ -172,7 +178,10 @@ def test_lifting(world, train):
     assert (np.isclose(length, 1, atol=1e-5) | (length == 0)).all()
     assert by_most_similar_text(world, lifted.features) >= 0.6
     evidence, _, _, texts, canonical = world
-    ask = lambda query: lifting.query_relevancy(lifted.features, evidence.gaussians.means, texts[query], canonical)
+
+    def ask(query):
+        return lifting.query_relevancy(lifted.features, evidence.gaussians.means, texts[query], canonical)
+
     assert miou(world, ask) >= 0.6
 
 

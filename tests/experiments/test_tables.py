@@ -78,7 +78,10 @@ def test_table_1_and_its_resumption(folder, monkeypatch):
         lerf.main(plan)
     assert len(calls) == 1  # the lost cell alone was computed again
     again, _ = read(folder, "lerf")
-    strip = lambda cells: [{k: v for k, v in c.items() if k not in ("seconds", "peak_memory_mib")} for c in cells]
+
+    def strip(cells):
+        return [{k: v for k, v in c.items() if k not in ("seconds", "peak_memory_mib")} for c in cells]
+
     assert strip(again["cells"]) == strip(metrics["cells"])
 
 

@@ -165,9 +165,14 @@ def cameras() -> Iterator[Case]:
 
 def numbers() -> Iterator[Case]:
     """Quaternions and features at the ends of the float range; numbers that are none."""
-    length = lambda name, factor: changed(
-        ordinary(), name, [("quaternions", slice(0, 48), ordinary().gaussians.quaternions[:48] * np.float32(factor))]
-    )
+
+    def length(name, factor):
+        return changed(
+            ordinary(),
+            name,
+            [("quaternions", slice(0, 48), ordinary().gaussians.quaternions[:48] * np.float32(factor))],
+        )
+
     yield length("quaternions of length 0", 0.0)
     yield length("denormal quaternions, 1e-40", 1e-40)
     yield length("quaternions of length 1e-30", 1e-30)

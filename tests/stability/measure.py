@@ -142,7 +142,10 @@ def evaluate(case: Case, *, ulp: bool = True) -> Row:
     error = (np.abs(np.where(finite[..., None], image, 0) - expected) / unit).max(-1)
     undoubted_poison = poisoned & (jump == 0)
     everything = np.sqrt(sum(np.linalg.norm(g) ** 2 for g in exact.values()))
-    relative = lambda got, k: _relative(got[k], exact[k], 1e-20 * everything + 1e-30)
+
+    def relative(got, k):
+        return _relative(got[k], exact[k], 1e-20 * everything + 1e-30)
+
     value_ulp, gradient_ulps = float("nan"), dict.fromkeys(ARGUMENTS, float("nan"))
     if ulp and case.gaussians.count:
         moved = [twin_of(*_rounded((gaussians, camera, features), seed)) for seed in range(3)]
