@@ -6,7 +6,7 @@ A coder has `.encode` and `.decode`: `Rotation` (principal directions; exact whe
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import require
-from jsecon.language.autoencoder import require_finite, train_autoencoder
+from jsecon.language.autoencoder import Autoencoder, require_finite, train_autoencoder
 from jsecon.numerics import FULL_PRECISION, cosine_matrix, normalize
 from jsecon.types import Array, Key
 
@@ -31,9 +31,6 @@ SHARPNESS = 40.0
 """Factor of the softmax over regions with which `Spread` places a text among their codes."""
 SPREAD_STEPS = 400
 """Steps of Adam in `spread_codes`."""
-
-Coder = Any
-"""Autoencoder, Rotation, Spread, or None."""
 
 
 @jax.tree_util.register_dataclass
@@ -73,6 +70,10 @@ class Spread:
     def decode(self, codes: Float[Array, "*batch d"]) -> Float[Array, "*batch e"]:
         """(..., d) -> (..., E) unit embeddings."""
         return _among(jnp.asarray(codes), jnp.asarray(self.codes), jnp.asarray(self.embeddings))
+
+
+Coder: TypeAlias = Autoencoder | Rotation | Spread | None
+"""What encodes embeddings; None: the codes are the unit embeddings themselves."""
 
 
 def _among(x: Array, keys: Array, values: Array) -> Array:

@@ -81,18 +81,18 @@ def region_votes(
     blocks = region_blocks(gaussians.count, num_regions)
     kept, labelled, totals, state = _none_kept(np, gaussians), None, None, {}
     for b, block in enumerate(blocks):
-        report = None
-        if progress is not None:
-
-            def report(done, total, b=b):
-                return progress(b * total + done, len(blocks) * total)
-
+        report = None if progress is None else functools.partial(_report_block, progress, b, len(blocks))
         options = {"by_view": by_view, "centre": centre, "near": near, "progress": report}
         state, totals, size = dense_votes(gaussians, cameras, labels, block, capacity=capacity, **options)
         capacity = size if capacity is None and size > _default_capacity(gaussians, cameras) else capacity
         kept, weight = _keep_strongest(kept, state.pop("votes"), block.start, min(top, max(num_regions, 1)))
         labelled = weight if labelled is None else labelled + weight
     return _as_votes(kept, labelled, state, totals if by_view else None, num_regions)
+
+
+def _report_block(progress: Callable[[int, int], None], block: int, blocks: int, done: int, total: int) -> None:
+    """Reports the views of one of several blocks of regions."""
+    progress(block * total + done, blocks * total)
 
 
 def scan_region_votes(

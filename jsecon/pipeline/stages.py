@@ -6,6 +6,7 @@ Only `load`, `field_of` and the measurement of quality read held-out frames.
 """
 
 import dataclasses
+import functools
 import shutil
 import threading
 from collections.abc import Callable
@@ -122,9 +123,7 @@ def poses(context: RunContext) -> Stage:
         photographs = list_photographs(capture)
         what = f"{len(photographs)} photographs, which have none"
         key_options = {"names": [photo.relative_to(capture).as_posix() for photo in photographs]}
-
-        def files():
-            return list_photographs(capture)
+        files = functools.partial(list_photographs, capture)
 
     how = f"found by structure from motion (pycolmap) for {what}"
     return Stage("poses", how, _find_poses, key_options=key_options, files=files, output_dir=context.out / "poses")

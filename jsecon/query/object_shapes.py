@@ -140,8 +140,10 @@ def _upright_axes(points: np.ndarray, spreads: np.ndarray, up: np.ndarray) -> np
 
 
 def _box_ends(points: np.ndarray, spreads: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends (A,) of the Gaussians along each of A columns of `axes`, to one standard deviation, without
-    strays."""
+    """Returns the ends (A,) of the Gaussians along each of A columns of `axes`, without strays.
+
+    They reach to one standard deviation.
+    """
     reach = np.linalg.norm(axes.T @ spreads, axis=2)
     along = points @ axes
     return np.quantile(along - reach, BOX_TAIL, axis=0), np.quantile(along + reach, 1 - BOX_TAIL, axis=0)
