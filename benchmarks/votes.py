@@ -23,6 +23,7 @@ from metrics import Metric, interleaved, show
 
 import jsecon
 from jsecon.errors import InputError
+from jsecon.files import read_arrays
 from jsecon.parallel import accumulate_over_views
 from jsecon.types import Camera, Gaussians
 
@@ -30,12 +31,13 @@ from jsecon.types import Camera, Gaussians
 def voting_views(run: Path, width: int) -> tuple[Gaussians, Camera, np.ndarray, int]:
     """Gaussians, the voting views' cameras and labels (T, H, W) at `width` pixels, and the number of regions."""
     field = jsecon.load_field(run / "field.safetensors")
-    found = {kind: sorted((run / "cache").glob(f"{kind}-*.safetensors"), key=lambda file: file.stat().st_mtime)
-             for kind in ("masklets", "load")}  # fmt: skip
-    if not all(found.values()):
-        raise InputError(run, problem="no cache of masklets", expected="the folder of a whole run", remedy="jsecon run")
-    labels = np.load(found["masklets"][-1])["root.value"]
-    voting = ~np.load(found["load"][-1])["root.value.held_out"]
+    stored = {}
+    for stage in ("masklets", "load"):
+        files = sorted((run / "cache").glob(f"{stage}-*.safetensors"), key=lambda file: file.stat().st_mtime)
+        if not files:
+            raise InputError(run, f"it has no cache of the stage {stage}", "the folder of a whole run", "jsecon run")
+        stored[stage] = read_arrays(files[-1])[1]
+    labels, voting = stored["masklets"]["root.value"], ~stored["load"]["root.value.held_out"]
     scale = width / field.cameras.width
     height = round(field.cameras.height * scale)
     lens = {name: getattr(field.cameras, name) * np.float32(scale) for name in ("fx", "fy", "cx", "cy")}
