@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 import time
 from pathlib import Path
@@ -209,7 +210,7 @@ def test_help_of_every_verb_has_words_for_every_option(capsys, monkeypatch):
     for verb in VERB_NAMES:
         assert re.search(rf"^\W+{verb} +[A-Z]", told, re.MULTILINE)
         capsys.readouterr()
-        assert _run(verb, "--help") == 0
+        assert _run(verb, "--help-all") == 0
         rows = [line.strip("│| ") for line in capsys.readouterr().out.splitlines()]
         options = [n for n, row in enumerate(rows) if re.match("-h|--[a-z][a-z-]*( |,|$)|FIELD |CAPTURE ", row)]
         assert len(options) >= 3
@@ -218,8 +219,33 @@ def test_help_of_every_verb_has_words_for_every_option(capsys, monkeypatch):
         assert not any("None" in row or "[STR" in row for row in rows)
 
 
-def test_options_of_a_run_are_grouped(capsys):
+@pytest.mark.parametrize("verb", cli.verbs())
+def test_help_of_a_verb_fits_a_screen_and_its_examples_parse(verb, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert _run(verb, "--help") == 0
+    short = capsys.readouterr().out
+    assert short.count("\n") <= 52
+    examples = re.findall(rf"^  (jsecon {verb}\b.*)$", short, re.MULTILINE)
+    assert examples
+    for line in examples:
+        cli.parse(shlex.split(line.partition(" > ")[0])[1:])
+    assert _run(verb, "--help-all") == 0
+    whole = capsys.readouterr().out
+    flags = [set(re.findall(r"^\W+(--[a-z][a-z-]*)", told, re.MULTILINE)) for told in (short, whole)]
+    assert flags[0] <= flags[1]
+    assert {"--json", "--debug"} <= flags[1]
+
+
+def test_the_short_help_leaves_out_advanced_options(capsys):
     assert _run("run", "--help") == 0
+    told = capsys.readouterr().out
+    assert "--masks" in told
+    assert "--agreement" not in told
+    assert "jsecon run --help-all" in told
+
+
+def test_options_of_a_run_are_grouped(capsys):
+    assert _run("run", "--help-all") == 0
     told = capsys.readouterr().out
     order = ["--out", "scene options", "--downscale", "masks options", "--granularity", "models options", "--segmenter"]
     places = [told.index(word) for word in [*order, "field options", "--latent"]]
@@ -276,7 +302,7 @@ def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
     told = capsys.readouterr().err
     assert told.startswith("jsecon: jsecon")
     assert told.count("\n") == 1
-    assert "--help lists the" in told
+    assert re.search("--help(-all)? lists the", told)
     assert says in told
 
 

@@ -1,49 +1,144 @@
-"""The README is true: its Python runs, its command lines parse, and the CI finds the test command in it."""
+"""README and documentation are true: their Python runs, their command lines parse, their links lead somewhere, and the
+CI finds the test command in the README."""
 
-import ast
 import contextlib
+import importlib.util
 import io
 import os
 import re
 import shlex
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
+import pytest
+
+import jsecon
 from jsecon.app import cli
 
 HOME = Path(__file__).resolve().parent.parent
-README = (HOME / "README.md").read_text()
+PAGES = [HOME / "README.md", HOME / "CONTRIBUTING.md", *sorted((HOME / "docs").rglob("*.md"))]
+PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
+MAX_WORDS, MAX_SENTENCE = 1200, 18
+TOOLS = {"python3", "pip", "pytest", "ruff", "pyright", "deptry", "sphinx-build", "curl", ".ci/run", ".ci/newest"}
+"""programs that command lines call besides jsecon and modules of this repository"""
 
 
-def _blocks(language, text=README):
+def _name(page):
+    return str(page.relative_to(HOME))
+
+
+def _blocks(language, text):
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
-def test_the_python_blocks_run_one_after_the_other(room, room_run, tmp_path, monkeypatch):
-    _, out = room_run
+def _prose(text):
+    """The text without code, pictures, tables, headings and the addresses of links."""
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^(#|\||!).*$", "", text, flags=re.MULTILINE)
+    return re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+
+
+def _commands(text):
+    """The command lines of the bash blocks, and of code in tables, without comments."""
+    lines = [line for block in _blocks("bash", text) for line in block.splitlines()]
+    rows = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    lines += [code for code in re.findall(r"`([^`]+)`", rows) if re.match(r"(jsecon|python -m|pytest) ", code)]
+    parts = [part.strip() for line in lines for part in re.split(r"&&| \| ", line)]
+    return [part for part in parts if part and not part.startswith("#")]
+
+
+@pytest.fixture
+def demo_folder(room, room_run, tmp_path, monkeypatch):
+    """The current folder, with what the pages take from `jsecon demo`."""
     (tmp_path / "jsecon-demo").mkdir()
-    shutil.copy(out / "field.safetensors", tmp_path / "jsecon-demo")
+    shutil.copy(room_run[1] / "field.safetensors", tmp_path / "jsecon-demo")
     (tmp_path / "jsecon-demo" / "capture").symlink_to(room)
     monkeypatch.chdir(tmp_path)
-    blocks, names, told = _blocks("python"), {}, io.StringIO()
-    assert len(blocks) >= 3
-    with contextlib.redirect_stdout(told):
-        for block in blocks:
-            exec(compile(block, "README.md", "exec"), names)
-    lines = told.getvalue().splitlines()
-    assert re.match(r"[1-9]\d* of \d+ Gaussians, region \d+, score 0\.\d+", lines[0]), lines
-    assert sum(ast.literal_eval(lines[2].partition("}")[0] + "}").values()) > 0
-    assert min(ast.literal_eval(lines[3]).values()) > 0  # metres
-    assert "left out: 0" in lines[4]
 
 
-def test_every_command_line_is_one_that_the_program_takes():
-    lines = [line for block in _blocks("bash") for line in block.splitlines() if line.startswith("jsecon")]
-    lines += [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", cli.ABOUT, re.MULTILINE)]
+@pytest.mark.parametrize("page", [page for page in PAGES if _blocks("python", page.read_text())], ids=_name)
+def test_the_python_of_a_page_runs_one_block_after_the_other(page, demo_folder):
+    names, printed = {}, io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        for block in _blocks("python", page.read_text()):
+            exec(compile(block, _name(page), "exec"), names)
+    printed = printed.getvalue()
+    assert printed
+    if page.name == "README.md":
+        assert re.search(r"[1-9]\d* Gaussians, score 0\.\d+, at \[", printed), printed
+    if page.name == "python.md":
+        assert "left out: 0" in printed
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_every_command_line_of_a_page_is_one_that_its_program_takes(page):
+    for line in _commands(page.read_text()):
+        words = [word for word in shlex.split(line.partition(" > ")[0]) if not re.fullmatch(r"[A-Z_]+=\S*", word)]
+        if words[0] == "taskset":
+            words = words[3:]
+        if words[0] == "jsecon" and "..." not in words:
+            with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+                cli.parse(words[1:])
+        elif words[:2] == ["python", "-m"] and words[2] != "venv":
+            assert importlib.util.find_spec(words[2]) is not None, line
+        elif words[0] == "python":
+            assert (HOME / words[1]).is_file(), line
+        elif words[0] not in ("jsecon", "cd", "."):
+            assert words[0] in TOOLS, line
+        for extras in re.findall(r"(?:jsecon|\.)\[([\w,]+)\]", line):
+            assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"]), line
+        for file in re.findall(r"\b(?:tests|benchmarks|experiments|docs)/[\w./]+\.py", line):
+            assert (HOME / file).is_file(), line
+
+
+def test_every_example_of_the_program_parses():
+    lines = [line.split("  ")[0] for line in re.findall(r"^  (jsecon .*?)(?:  .*)?$", cli.ABOUT, re.MULTILINE)]
     assert len(lines) >= 10
     for line in lines:
         cli.parse(shlex.split(line)[1:])
+
+
+def _anchor(heading):
+    """The anchor of a heading, as GitHub and MyST make it."""
+    plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
+    return re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", [*PAGES, HOME / "CHANGELOG.md", HOME / "experiments" / "README.md"], ids=_name)
+def test_every_link_of_a_page_leads_somewhere(page):
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith(("https://", "http://")):
+            continue
+        file, _, anchor = target.partition("#")
+        path = page.parent / file if file else page
+        assert path.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+            assert anchor in {_anchor(heading) for heading in headings}, target
+
+
+def test_the_readme_is_short():
+    text = (HOME / "README.md").read_text()
+    assert len(text.split()) <= MAX_WORDS
+    sentences = [s for s in re.split(r"(?<=[.:?!])\s+|\n\s*\n|\n- ", _prose(text)) if len(s.split()) > 2]
+    assert sum(len(s.split()) for s in sentences) / len(sentences) <= MAX_SENTENCE
+    pictures = {HOME / path for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)}
+    assert sum(picture.stat().st_size for picture in pictures) <= 2e6
+
+
+def test_every_public_name_has_an_entry_in_the_reference():
+    pages = "".join(page.read_text() for page in (HOME / "docs" / "api").glob("*.md"))
+    entries = set(re.findall(r"\.\. auto(?:function|class|exception):: jsecon\.(\w+)", pages))
+    assert entries == set(jsecon.__all__) - {"__version__"}
+
+
+def test_the_version_is_the_same_everywhere():
+    assert PROJECT["version"] == jsecon.__version__
+    assert f"version: {jsecon.__version__}\n" in (HOME / "CITATION.cff").read_text()
+    assert f"\n## {jsecon.__version__}\n" in (HOME / "CHANGELOG.md").read_text()
 
 
 def test_the_ci_runs_exactly_the_second_command():
@@ -53,5 +148,5 @@ def test_the_ci_runs_exactly_the_second_command():
         ["bash", "-euo", "pipefail", "-c", f'{function}\nblock_after "Run the tests:"'],
         cwd=HOME, check=True, capture_output=True, text=True,
     ).stdout  # fmt: skip
-    assert found == _blocks("bash")[1]
+    assert found == _blocks("bash", (HOME / "README.md").read_text())[1]
     assert os.access(HOME / ".ci" / "run", os.X_OK)

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 import jsecon
+from jsecon.app import help
 from jsecon.app.actions import VERBS
 from jsecon.app.verbs import Completion, Output, Verb, VerbResult
 from jsecon.errors import InputError, describe_error
@@ -48,7 +49,8 @@ examples
   jsecon run my_capture --out my_field --dry-run        what would run, and why
   jsecon doctor                                         whether this machine has what runs need
 
-Repeat the command of a stopped run to resume it. jsecon --version prints the version."""
+jsecon VERB --help has the options of a verb. Repeat the command of a stopped run to resume it. jsecon --version prints
+the version."""
 
 MARKERS = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.PositionalMetavarFromFieldName)
 
@@ -110,20 +112,31 @@ def parse(argv: Sequence[str]) -> Verb:
       SystemExit: It asks for help, which is printed.
     """
     if argv and argv[0] in _VERBS:
-        return _read(_VERBS[argv[0]][1], f"jsecon {argv[0]}", argv[1:])
+        kind, prog = _VERBS[argv[0]][1], f"jsecon {argv[0]}"
+        if "--help-all" in argv:
+            return _read(kind, prog, ["--help"], description=help.description(kind, whole=True))
+        if {"-h", "--help"} & set(argv):
+            shown = help.common_options(kind)
+            return _read(shown, prog, ["--help"], description=help.description(kind, whole=False))
+        return _read(kind, prog, argv[1:])
     if argv and not argv[0].startswith("-"):
         similar = "".join(f"Did you mean {name}? " for name in difflib.get_close_matches(argv[0], _VERBS, 1))
         raise InputError("jsecon", f"{argv[0]} is not a verb", remedy=f"{similar}jsecon --help lists the verbs.")
     return _read(_all_verbs(), "jsecon", argv, description=ABOUT)
 
 
+def verbs() -> tuple[str, ...]:
+    """Returns the names of the verbs."""
+    return tuple(_VERBS)
+
+
 def _all_verbs() -> Any:
     """Returns the union of the verbs, of which tyro makes subcommands, with the first line of each description."""
-    verbs = []
+    kinds = []
     for name, (_, kind) in _VERBS.items():
         summary = (inspect.getdoc(kind) or "").partition("\n")[0]
-        verbs.append(Annotated[kind, tyro.conf.subcommand(name=name, description=summary, prefix_name=False)])
-    return Union[tuple(verbs)]  # noqa: UP007
+        kinds.append(Annotated[kind, tyro.conf.subcommand(name=name, description=summary, prefix_name=False)])
+    return Union[tuple(kinds)]  # noqa: UP007
 
 
 def _read(kind: Any, prog: str, argv: Sequence[str], description: str | None = None) -> Any:
@@ -135,7 +148,7 @@ def _read(kind: Any, prog: str, argv: Sequence[str], description: str | None = N
     except SystemExit as stop:
         if not stop.code:
             raise
-        remedy = f"{prog} --help lists the {'options' if ' ' in prog else 'verbs'}."
+        remedy = f"{prog} --help-all lists the options." if " " in prog else f"{prog} --help lists the verbs."
         raise InputError(prog, _sentence(printed.getvalue(), prog), remedy=remedy) from None
 
 

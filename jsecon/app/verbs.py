@@ -6,12 +6,13 @@ attributes are the help texts of the options.
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from jsecon.networks.hub import Precision, Role
 from jsecon.pipeline.options import (
+    Advanced,
     BareOptions,
     FieldOptions,
     InputOptions,
@@ -25,6 +26,8 @@ from jsecon.pipeline.options import (
 T = TypeVar("T")
 Repeated: TypeAlias = Option[UseAppendAction[list[T]]]
 """option that can be repeated"""
+RepeatedAdvanced: TypeAlias = Advanced[UseAppendAction[list[T]]]
+"""option that can be repeated and that few need"""
 By = Literal["votes", "silhouette", "code"]
 
 VerbResult: TypeAlias = dict[str, Any]
@@ -48,8 +51,9 @@ class Output:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verb:
-    """Base of the verbs."""
+    """Base of the verbs. The examples of a verb are command lines that its help shows."""
 
+    examples: ClassVar[tuple[str, ...]]
     output: Output = Output()
 
 
@@ -68,9 +72,14 @@ class Demo(Verb):
       steps: Number of optimisation steps of the photometric fit.
     """
 
+    examples = (
+        "jsecon demo",
+        "jsecon demo --seed 3 --out room_3",
+    )
+
     seed: Option[int] = 0
     out: Option[Path] = Path("jsecon-demo")
-    steps: Option[int] = 550
+    steps: Advanced[int] = 550
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,12 +102,19 @@ class Run(Verb, InputOptions):
       process: Index of this process on several machines, 0 to N - 1. Process 0 writes the output folder.
     """
 
+    examples = (
+        "jsecon run my_capture --out my_field",
+        "jsecon run my_capture --out my_field --gaussians point_cloud.ply",
+        "jsecon run my_capture --out my_field --models auto",
+        "jsecon run scene.ply --out my_field --up 0 0 1",
+    )
+
     out: Option[Path]
     dry_run: Option[bool] = False
     yes: Option[bool] = False
-    processes: Option[int] = 1
-    coordinator: Option[str | None] = None
-    process: Option[int | None] = None
+    processes: Advanced[int] = 1
+    coordinator: Advanced[str | None] = None
+    process: Advanced[int | None] = None
     scene: SceneOptions = dataclasses.field(default_factory=SceneOptions)
     bare: BareOptions = dataclasses.field(default_factory=BareOptions)
     masks: MaskOptions = dataclasses.field(default_factory=MaskOptions)
@@ -126,6 +142,8 @@ class Fit(Verb):
       dry_run: Only lists the stages that would run, and checks their inputs. It writes no file.
     """
 
+    examples = ("jsecon fit my_capture --out scene.ply --minutes 5",)
+
     capture: Positional[Path]
     out: Option[Path]
     dry_run: Option[bool] = False
@@ -152,8 +170,8 @@ class FieldVerb(Verb):
 
     field: Positional[Path]
     embedder: Option[Path | None] = None
-    yes: Option[bool] = False
-    template: Repeated[str] = dataclasses.field(default_factory=list)
+    yes: Advanced[bool] = False
+    template: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -167,6 +185,7 @@ class Query(FieldVerb):
     and --at, by votes or code.
 
     Attributes:
+      field: Path of field.safetensors, written by jsecon run, or a file of Gaussians without photographs.
       texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle".
       at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them. A
         frame is named by its name, the end of its name, or its place such as #10.
@@ -192,6 +211,12 @@ class Query(FieldVerb):
         their codes and regions too.
     """
 
+    examples = (
+        'jsecon query my_field/field.safetensors "red mug" "dark green bottle" --out answers',
+        "jsecon query my_field/field.safetensors --at frame_00012 310 145 --out answers",
+        'jsecon query scene.ply "red mug" --out answers',
+    )
+
     texts: Positional[list[str]]
     at: Annotated[Repeated[tuple[str, int, int]], arg(metavar="FRAME X Y")] = dataclasses.field(default_factory=list)
     mask: Annotated[Repeated[list[str]], arg(metavar="FRAME PNG ...")] = dataclasses.field(default_factory=list)
@@ -201,13 +226,13 @@ class Query(FieldVerb):
     out: Option[Path]
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
-    quantile: Option[float] = 0.82
+    quantile: Advanced[float] = 0.82
     all: Option[bool] = False
-    keep_outliers: Option[bool] = False
-    phrases: Option[Path | None] = None
-    images: Option[Path | None] = None
-    looks: Option[int] = 8
-    views: Option[int] = 3
+    keep_outliers: Advanced[bool] = False
+    phrases: Advanced[Path | None] = None
+    images: Advanced[Path | None] = None
+    looks: Advanced[int] = 8
+    views: Advanced[int] = 3
     format: Option[Literal["ply", "spz", "glb"]] = "ply"
 
 
@@ -222,6 +247,8 @@ class Export(Verb):
       field: Path of field.safetensors, written by jsecon run.
       out: The .ply (INRIA's layout), .spz or .glb to write.
     """
+
+    examples = ("jsecon export my_field/field.safetensors --out scene.glb",)
 
     field: Positional[Path]
     out: Option[Path]
@@ -246,13 +273,18 @@ class View(FieldVerb):
       allow_host: Name by which browsers reach this server besides localhost and --host, such as that of a proxy.
     """
 
+    examples = (
+        'jsecon view my_field/field.safetensors "red mug"',
+        "jsecon view my_field/field.safetensors --export page.html",
+    )
+
     texts: Positional[list[str]]
     export: Option[Path | None] = None
-    link: Option[str] = ""
+    link: Advanced[str] = ""
     host: Option[str] = "127.0.0.1"
     port: Option[int] = 8766
     token: Option[str] = ""
-    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
+    allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -267,6 +299,8 @@ class Eval(FieldVerb):
       labels: Folder of LERF label files (frame.json).
       out: Folder for evaluation.json. By default it is the field's folder.
     """
+
+    examples = ("jsecon eval my_field/field.safetensors --labels my_capture/label --out evaluation",)
 
     labels: Option[Path]
     out: Option[Path | None] = None
@@ -290,11 +324,13 @@ class Serve(Verb):
       embedder: Folder of the CLIP model that the fields were made with. By default it is where the runs had it.
     """
 
+    examples = ("jsecon serve my_field/field.safetensors other_field/field.safetensors",)
+
     fields: Positional[list[Path]]
     host: Option[str] = "127.0.0.1"
     port: Option[int] = 8765
     token: Option[str] = ""
-    allow_host: Repeated[str] = dataclasses.field(default_factory=list)
+    allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
     embedder: Option[Path | None] = None
 
 
@@ -316,9 +352,15 @@ class Models(Verb):
       yes: Fetches the models without asking first.
     """
 
+    examples = (
+        "jsecon models list",
+        "jsecon models get edgetam siglip2",
+        "jsecon models check my_models",
+    )
+
     action: Positional[Literal["list", "get", "check", "remove"]]
     names: Positional[list[str]] = dataclasses.field(default_factory=list)
-    role: Option[Role | None] = None
+    role: Advanced[Role | None] = None
     precision: Option[Precision | None] = None
     yes: Option[bool] = False
 
@@ -335,6 +377,11 @@ class Doctor(Verb):
       models: Folder with .onnx files, or of such folders, to examine.
     """
 
+    examples = (
+        "jsecon doctor",
+        "jsecon doctor --models my_models",
+    )
+
     models: Option[Path | None] = None
 
 
@@ -348,5 +395,7 @@ class Completion(Verb):
     Attributes:
       shell: The shell.
     """
+
+    examples = ("jsecon completion bash > ~/.local/share/bash-completion/completions/jsecon",)
 
     shell: Positional[Literal["bash", "zsh", "fish"]]
