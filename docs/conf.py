@@ -7,6 +7,7 @@ beside the pages.
 import contextlib
 import io
 import os
+import re
 from typing import Any
 
 import latex2mathml.converter
@@ -24,7 +25,7 @@ version = release = jsecon.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
-nitpicky = False
+default_role = "literal"
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
@@ -70,6 +71,19 @@ def _as_mathml(display: str) -> Any:
     return visit
 
 
+def _shorten_types(app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str) -> Any:
+    """Writes `Float[Array, "n 3"]` for jaxtyping's unions over the kinds of arrays."""
+
+    def shorten(text: str | None) -> str | None:
+        if text is None:
+            return None
+        text = text.replace("jaxlib._jax.Array", "Array").replace("jax._src.basearray.Array", "Array")
+        text = re.sub(r"(\w+\[)Array(, '[^']*'\]) \| \1ndarray\2", r"\1Array\2", text)
+        return text.replace("Array | ndarray", "Array")
+
+    return shorten(signature), shorten(returns)
+
+
 class CommandHelp(SphinxDirective):
     """The directive `jsecon-help`: a section for each verb, with what --help-all prints."""
 
@@ -92,4 +106,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_html_math_renderer("mathml", (_as_mathml("inline"), None), (_as_mathml("block"), None))
     app.add_css_file("jsecon.css")
     app.add_directive("jsecon-help", CommandHelp)
+    app.connect("autodoc-process-signature", _shorten_types)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

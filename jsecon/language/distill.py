@@ -152,8 +152,9 @@ def distill_l1(
     """The paper's distillation (as LangSplat's, train.py): Adam on the L1 between rendered and target codes.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The loss is the mean over all H W d
-    numbers of |F m - G m|: F the rendering of f / (|f| + 1e-9) without background or renormalisation, G the code of the
-    pixel's region, m = 1 on labelled pixels, so unlabelled ones count in the denominator alone. The geometry is fixed.
+    numbers of `|F m - G m|`: F the rendering of `f / (|f| + 1e-9)` without background or renormalisation, G the code of
+    the pixel's region, m = 1 on labelled pixels, so unlabelled ones count in the denominator alone. The geometry is
+    fixed.
 
     Args:
       gaussians: Scene of N Gaussians.
@@ -163,7 +164,7 @@ def distill_l1(
       region_codes: (R, d).
       steps: Number of steps.
       key: Of the order of views and of random codes.
-      init: "zero" is LangSplat's, and a trap: the gradient through f / (|f| + 1e-9) at zero is 1e9 times too large,
+      init: "zero" is LangSplat's, and a trap: the gradient through `f / (|f| + 1e-9)` at zero is 1e9 times too large,
         Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves from the corner of
         the cube that its first step took it to. "random" (length 0.01) or (N, d) codes, such as those of
         `distill_votes`, escape it.

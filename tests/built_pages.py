@@ -1,0 +1,86 @@
+"""Checks built pages of the documentation: `python -m tests.built_pages FOLDER`.
+
+No page may ask another host for anything, and every link inside the pages must lead to an element that exists.
+"""
+
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+LOADED = {
+    "img": "src",
+    "script": "src",
+    "link": "href",
+    "iframe": "src",
+    "source": "src",
+    "video": "src",
+    "embed": "src",
+}
+"""elements whose target a browser loads by itself"""
+REMOTE = re.compile(r"(?:https?:)?//", re.IGNORECASE)
+
+
+class Page(HTMLParser):
+    """The targets and the anchors of a page.
+
+    Args:
+      path: The page.
+    """
+
+    def __init__(self, path: Path):
+        """Reads the page."""
+        super().__init__()
+        self.loaded: list[str] = []
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Notes an element."""
+        values = {name: value or "" for name, value in attrs}
+        self.anchors |= {values[name] for name in ("id", "name") if name in values}
+        target = values.get(LOADED.get(tag, ""), "")
+        if target and values.get("rel") not in ("canonical", "search"):
+            self.loaded.append(target)
+        if tag == "a" and "href" in values:
+            self.links.append(values["href"])
+
+
+def faults(folder: Path) -> list[str]:
+    """Finds what is wrong with the pages of a folder.
+
+    Args:
+      folder: Output of sphinx-build.
+
+    Returns:
+      A sentence for each fault.
+    """
+    pages = {path.resolve(): Page(path) for path in folder.rglob("*.html")}
+    found = [f"{style} loads {url}" for style in folder.rglob("*.css") for url in _remote_urls(style.read_text())]
+    for path, page in pages.items():
+        name = path.relative_to(folder.resolve())
+        found += [f"{name} loads {target}" for target in page.loaded if REMOTE.match(target)]
+        for target in {*page.links, *page.loaded}:
+            parts = urlsplit(target)
+            if parts.scheme or parts.netloc:
+                continue
+            file = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not file.exists():
+                found.append(f"{name} links to {target}, which is missing")
+            elif parts.fragment and file in pages and unquote(parts.fragment) not in pages[file].anchors:
+                found.append(f"{name} links to {target}, which has no such element")
+    return found
+
+
+def _remote_urls(style: str) -> list[str]:
+    """Addresses of other hosts that a style sheet loads."""
+    targets = re.findall(r"""url\(\s*["']?([^"')]+)""", style) + re.findall(r"""@import\s+["']([^"']+)""", style)
+    return [target for target in targets if REMOTE.match(target)]
+
+
+if __name__ == "__main__":
+    messages = faults(Path(sys.argv[1]))
+    print("\n".join(messages) or "No page asks another host, and every link inside the pages leads somewhere.")
+    sys.exit(bool(messages))
