@@ -101,7 +101,7 @@ class BareOptions:
 
     views: Advanced[int] = 24
     up: Option[tuple[float, float, float] | None] = None
-    cameras: Option[Path | None] = None
+    cameras: Advanced[Path | None] = None
 
 
 @dataclasses.dataclass(frozen=True)
