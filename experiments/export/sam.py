@@ -12,15 +12,40 @@ STRETCH = 30.0
 
 
 def official(kind: str, weights: Path | None, *, seed: int) -> torch.nn.Module:
-    """segment_anything's model (vit_b, vit_l, vit_h); without weights, random ones in every parameter."""
+    """segment_anything's model (vit_b, vit_l, vit_h, or slimsam: vit_b pruned to the sizes of slimsam-77-uniform);
+    without weights, random ones in every parameter."""
     declare_missing_operators()
     from segment_anything import sam_model_registry
 
     torch.manual_seed(seed)
-    model = sam_model_registry[kind](checkpoint=None if weights is None else str(weights))
+    model = sam_model_registry["vit_b" if kind == "slimsam" else kind](
+        checkpoint=None if weights is None else str(weights)
+    )
+    if kind == "slimsam":
+        model.image_encoder = slim_encoder()
     if weights is None:
         make_random(model, seed)
     return model.eval().requires_grad_(False)
+
+
+def slim_encoder() -> torch.nn.Module:
+    """The image encoder of slimsam-77-uniform."""
+    from functools import partial
+
+    from segment_anything.modeling import ImageEncoderViT
+
+    width, hidden = 168, 696
+    return ImageEncoderViT(
+        embed_dim=width,
+        depth=12,
+        num_heads=12,
+        mlp_ratio=hidden / width,
+        norm_layer=partial(torch.nn.LayerNorm, eps=1e-6),
+        use_rel_pos=True,
+        window_size=14,
+        global_attn_indexes=[2, 5, 8, 11],
+        out_chans=256,
+    )
 
 
 def make_random(model: torch.nn.Module, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""SAM 2.1 on single images as transformers has it, in the layout of transformers.js (onnx-community's folders): the
+"""SAM 2.1 and EdgeTAM on single images as transformers has them, in the layout of transformers.js (onnx-community's folders): the
 names, shapes and colours are theirs; how their exporter joins points and boxes is not published, so that this decoder
 takes points alone, and `input_boxes` without any."""
 
@@ -22,13 +22,16 @@ POINTS = np.array([[40, 40], [120, 60], [60, 95], [3, 110]], np.float32)
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 
 
-def official(seed: int) -> torch.nn.Module:
-    """transformers' Sam2Model at its defaults, which are hiera-tiny, with random weights; mask logits stretched."""
+def official(name: str, seed: int) -> torch.nn.Module:
+    """transformers' model of that name (sam2.1-hiera-tiny, edgetam) with random weights; mask logits stretched."""
     declare_missing_operators()
     import transformers
 
     torch.manual_seed(seed)
-    model = transformers.Sam2Model(transformers.Sam2Config())
+    if name == "edgetam":
+        model = transformers.EdgeTamModel(_edgetam_config())
+    else:
+        model = transformers.Sam2Model(transformers.Sam2Config())  # its defaults are hiera-tiny
     shake(model, seed)
     with torch.no_grad():
         for head in model.mask_decoder.output_hypernetworks_mlps:
@@ -37,10 +40,19 @@ def official(seed: int) -> torch.nn.Module:
     return model.eval().requires_grad_(False)
 
 
+def _edgetam_config() -> Any:
+    """transformers' defaults for EdgeTAM, without the request for the backbone's configuration."""
+    from transformers import EdgeTamConfig, EdgeTamVisionConfig, TimmWrapperConfig
+
+    stages = {"in_chans": 3, "features_only": True, "out_indices": [0, 1, 2, 3]}
+    backbone = TimmWrapperConfig(architecture="repvit_m1", model_args=stages)
+    return EdgeTamConfig(vision_config=EdgeTamVisionConfig(backbone_config=backbone))
+
+
 def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
     """Writes the folder; compares its graphs, and the masks that jsecon asks of them for points of a frame with those
     of the model."""
-    side, onnx = model.config.vision_config.backbone_config.image_size[0], folder / "onnx"
+    side, onnx = model.prompt_encoder.input_image_size, folder / "onnx"
     image = torch.randn(1, 3, side, side, generator=torch.Generator().manual_seed(seed))
     rows = [
         write_graph(onnx / "vision_encoder.onnx", Encoder(model), {"pixel_values": image}, FEATURES, threads=threads)

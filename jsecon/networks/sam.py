@@ -1,17 +1,19 @@
 """Segmenter by SAM, SlimSAM, EdgeTAM, SAM 2.1 or SAM 3 on ONNX Runtime: the automatic mask generator.
 
-A grid of points prompts the frame and crops of it. Each point gives three masks: subpart, part and whole, the levels s,
-m and l; the level `default` pools all three. Masks that the model predicts to be poor, that are not stable or that a
-crop cuts off are dropped, then repetitions by box, then small holes and islands are removed, then LangSplat's
-suppression of masks by masks follows (minghanqin/LangSplat, preprocess.py). The steps are those of
-facebookresearch/segment-anything, automatic_mask_generator.py. All of it runs on the host, on NumPy arrays.
+Points prompt the frame and crops of it: one in the middle of each region that differs by colour, then some in what the
+masks of these do not explain (guided prompts), or the 1,024 points of SAM's grid. Each point gives three masks:
+subpart, part and whole, the levels s, m and l; the level `default` pools all three. Masks that the model predicts to be
+poor, that are not stable or that a crop cuts off are dropped, then repetitions by box, then small holes and islands are
+removed, then LangSplat's suppression of masks by masks follows (minghanqin/LangSplat, preprocess.py). The steps are
+those of facebookresearch/segment-anything, automatic_mask_generator.py. All of it runs on the host, on NumPy arrays.
 
 A model folder has onnx/vision_encoder.onnx and onnx/prompt_encoder_mask_decoder.onnx, as exported for transformers.js.
 The decoder takes input_points (1, B, P, 2) and input_labels (1, B, P) and gives iou_scores and pred_masks. There are
 two kinds, which differ in the decoder's other inputs:
     SAM      image_embeddings of a frame that is scaled by its longer side and padded; a batch of prompts in one run
     SAM 2    image_embeddings.0, .1 and .2 of a frame that is stretched to a square, as EdgeTAM, SAM 2.1 and SAM 3 have;
-             input_boxes (1, 0, 4), so one prompt a run; preprocessor_config.json states how colours are scaled
+             input_boxes (1, 0, 4), with which some exports take one prompt a run, so that this is tried first;
+             preprocessor_config.json states how colours are scaled
 """
 
 import dataclasses
@@ -31,6 +33,7 @@ from scipy import sparse
 from jsecon.errors import InputError, require
 from jsecon.networks.clip import read_preprocessing
 from jsecon.networks.hub import Precision, graph_variants
+from jsecon.networks.prompts import GuidedPrompts
 from jsecon.networks.session import Graph, batches, content_digest, describe, graph_files
 
 MEAN_STD = np.array([[123.675, 116.28, 103.53], [58.395, 57.12, 57.375]], np.float32)
@@ -48,7 +51,11 @@ PUBLISHED = (
 )
 _TOGETHER = "Take encoder and decoder from one export."
 
+SAME_LOGITS = 1e-2
+"""largest difference, as a share of the largest logit, between a prompt's masks alone and among others"""
+
 Level = Literal["default", "s", "m", "l"]
+Prompts = Literal["guided", "grid"]
 TOKENS: dict[str, tuple[int, ...]] = {"default": (0, 1, 2), "s": (0,), "m": (1,), "l": (2,)}
 """level -> which of a point's three masks it takes"""
 
@@ -126,7 +133,7 @@ class SamGraphs:
       threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
-      batch: Number of prompts of one run.
+      batch: Largest number of prompts of one run; 1 also for a graph with input_boxes until `decode` has tried more.
       side: Side of the encoder's square image in px.
       stretched: Whether frames are stretched to a square (SAM 2), else scaled and padded (SAM).
 
@@ -152,8 +159,9 @@ class SamGraphs:
         masks = self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
         if masks.fixed(2) not in (None, 3, 4):
             raise self._not_three_masks(str(masks))
-        self._fixed_batch = 1 if "input_boxes" in inputs else points.fixed(1)
-        self.batch = self._fixed_batch or batch
+        self._fixed_batch = points.fixed(1)
+        self._untried = None if self._fixed_batch or "input_boxes" not in inputs else batch
+        self.batch = self._fixed_batch or (batch if self._untried is None else 1)
         self.side = image.fixed(3) or (files.side if self.stretched else None) or IMAGE_SIDE
         self._links = self._checked_links()
         self._mean, self._std = MEAN_STD if files.colours is None else np.multiply(files.colours, 255).astype("f4")
@@ -207,17 +215,35 @@ class SamGraphs:
         Yields:
           Mask logits (B, 3, L, L) from part to whole, and predicted IoUs (B, 3).
         """
-        scale = np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
+        scaled = points * np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
+        if self._untried is not None and len(points) > 1:
+            self.batch = self._untried if self._takes_several(encoded, scaled[:2]) else 1
+            self._untried = None
+        for part, count in batches(scaled, self._fixed_batch, self.batch):
+            masks, scores = self._run_decoder(encoded, part)
+            yield masks[:count], scores[:count]
+
+    def _run_decoder(self, encoded: EncodedFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mask logits (B, 3, L, L) and predicted IoUs (B, 3) of points (B, 2) in px of the encoder's square."""
         labels_dtype = np.int64 if self._decoder.inputs["input_labels"].dtype.startswith("int") else np.float32
-        for part, count in batches(points * scale, self._fixed_batch, self.batch):
-            feeds = {"input_points": part[None, :, None], "input_labels": np.ones((1, len(part), 1), labels_dtype)}
-            if "input_boxes" in self._decoder.inputs:
-                feeds["input_boxes"] = np.zeros((1, 0, 4), np.float32)
-            outputs = self._decoder.run(encoded.features | feeds, ["pred_masks", "iou_scores"])
-            masks, scores = outputs["pred_masks"][0, :count], outputs["iou_scores"][0, :count]
-            if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
-                raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
-            yield masks[:, -3:].astype(np.float32), scores[:, -3:].astype(np.float32)  # of 4, the first is SAM's best
+        feeds = {"input_points": points[None, :, None], "input_labels": np.ones((1, len(points), 1), labels_dtype)}
+        if "input_boxes" in self._decoder.inputs:
+            feeds["input_boxes"] = np.zeros((1, 0, 4), np.float32)
+        outputs = self._decoder.run(encoded.features | feeds, ["pred_masks", "iou_scores"])
+        masks, scores = outputs["pred_masks"][0], outputs["iou_scores"][0]
+        if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
+            raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
+        return masks[:, -3:].astype(np.float32), scores[:, -3:].astype(np.float32)  # of 4, the first is SAM's best
+
+    def _takes_several(self, encoded: EncodedFrame, points: np.ndarray) -> bool:
+        """Whether a run with several points answers each as a run with that point alone does."""
+        alone = np.concatenate([self._run_decoder(encoded, point[None])[0] for point in points])
+        try:
+            together = self._run_decoder(encoded, points)[0]
+        except InputError:  # how graphs that take one prompt a run refuse two is up to them
+            return False
+        difference = np.abs(together - alone).max() if together.shape == alone.shape else np.inf
+        return bool(difference <= SAME_LOGITS * np.abs(alone).max())
 
     def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: EncodedFrame) -> Float32[np.ndarray, "h w"]:
         """Resizes the logits of a mask (L, L) to the frame (H, W), bilinearly, through the encoder's square as SAM."""
@@ -259,10 +285,12 @@ class Candidate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SamSettings:
-    """Settings of the automatic mask generator. The defaults are LangSplat's (preprocess.py).
+    """Settings of the automatic mask generator. The defaults are LangSplat's (preprocess.py), except for the prompts.
 
     Attributes:
       level: Level of the masks that a call returns.
+      prompts: Where the points are: "guided", in regions by colour and in what their masks leave unexplained
+        (`GuidedPrompts`), or "grid", SAM's own.
       points_per_side: Points along each side of the grid of a crop.
       predicted_iou: A mask must be predicted to be better than this.
       stability: Least IoU of the masks at logits of +- `stability_offset`.
@@ -278,6 +306,7 @@ class SamSettings:
     """
 
     level: Level = "l"
+    prompts: Prompts = "guided"
     points_per_side: int = 32
     predicted_iou: float = 0.7
     stability: float = 0.85
@@ -376,10 +405,26 @@ class SamSegmenter:
 
     def _candidates(self, frame: np.ndarray, crop: Crop, tokens: Sequence[int]) -> Iterable[Candidate]:
         """Yields the masks of one crop that are good, stable and not cut off, in the order of the points."""
-        height, width = frame.shape[:2]
         part = np.ascontiguousarray(frame[crop.top : crop.bottom, crop.left : crop.right])
         encoded = self._graphs.encode(part)
-        points = point_grid(self.settings.points_per_side) * np.array([part.shape[1], part.shape[0]], np.float32)
+        if self.settings.prompts == "grid":
+            points = point_grid(self.settings.points_per_side) * np.array([part.shape[1], part.shape[0]], np.float32)
+            yield from (candidate for _, candidate in self._predicted(frame, crop, encoded, points, tokens))
+            return
+        prompts = GuidedPrompts(part, len(tokens))
+        while len(points := prompts.next_points()):
+            for number, candidate in self._predicted(frame, crop, encoded, points, tokens):
+                mask = np.unpackbits(candidate.bits, count=frame[..., 0].size).reshape(frame.shape[:2]).astype(bool)
+                shown = mask[crop.top : crop.bottom, crop.left : crop.right]
+                prompts.explain(tokens.index(candidate.token), points[number], shown)
+                yield candidate
+
+    def _predicted(
+        self, frame: np.ndarray, crop: Crop, encoded: EncodedFrame, points: np.ndarray, tokens: Sequence[int]
+    ) -> Iterator[tuple[int, Candidate]]:
+        """Yields the masks of points (P, 2) in px of a crop, each with the number of its point."""
+        height, width = frame.shape[:2]
+        start = 0
         for logits, ious in self._graphs.decode(encoded, points):
             for prompt, token in zip(*np.nonzero(ious > self.settings.predicted_iou)):
                 if token not in tokens:
@@ -392,7 +437,9 @@ class SamSegmenter:
                 mask[crop.top : crop.bottom, crop.left : crop.right] = mask_logits > 0
                 box = box_of(mask)
                 if mask.any() and not cut_by_crop(box, crop, width, height):
-                    yield Candidate(np.packbits(mask), box, float(ious[prompt, token]), steady, int(token), crop)
+                    iou = float(ious[prompt, token])
+                    yield start + prompt, Candidate(np.packbits(mask), box, iou, steady, int(token), crop)
+            start += len(ious)
 
     def _filtered(
         self, size: tuple[int, int], by_crop: list[list[Candidate]], tokens: tuple[int, ...]

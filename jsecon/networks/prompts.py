@@ -1,0 +1,84 @@
+"""Guided prompts for SAM: a tenth of the points of its grid, each where something is. Host code."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Int64, UInt8
+
+from jsecon.vision.classical import ClassicalSegmenter
+
+MAX_PROMPTS = 96
+"""guided prompts of an image: a tenth of SAM's grid"""
+MAX_ROUNDS = 4
+"""rounds of guided prompts; those after the first go to what the masks so far do not explain"""
+LEAST_RADIUS = 0.008
+"""radius of an unexplained patch that gets a prompt, as a share of the image's shorter side; thinner ones lie along
+outlines"""
+PROPOSALS = ClassicalSegmenter(merge_distance=10.0)
+"""finds the regions that guided prompts start from: fine ones, because a region that covers two objects costs a further
+round, and two regions of one object cost a prompt"""
+
+
+class GuidedPrompts:
+    """Chooses points of an image, round by round: where its regions by colour are, then where masks explain too little.
+
+    A pixel is explained at a level if a mask of that level holds it that was prompted within the pixel's own region. A
+    mask of the table therefore does not explain the mug that stands on it.
+
+    Args:
+      image: (H, W, 3) uint8 RGB.
+      levels: Number of levels.
+    """
+
+    def __init__(self, image: UInt8[np.ndarray, "h w 3"], levels: int):
+        self._regions = PROPOSALS.partition(image, 0)
+        self._explained = np.zeros((levels, *self._regions.shape), bool)
+        self._prompted = np.zeros(self._regions.shape, bool)
+        self._rounds = 0
+        self._left = MAX_PROMPTS
+
+    def next_points(self) -> Float32[np.ndarray, "p 2"]:
+        """Returns the points (P, 2) x, y in px of the next round, those in the largest patches first; at last none."""
+        patches = np.asarray(self._regions, np.int32)
+        least = 0.0
+        if self._rounds:
+            open_pixels = ~self._explained.all(0) & ~self._prompted
+            borders = np.zeros_like(open_pixels)
+            borders[:, 1:] |= self._regions[:, 1:] != self._regions[:, :-1]
+            borders[1:] |= self._regions[1:] != self._regions[:-1]
+            _, patches = cv2.connectedComponents((open_pixels & ~borders).astype(np.uint8), connectivity=4)
+            patches = patches - 1
+            least = LEAST_RADIUS * min(patches.shape)
+        most = self._left if self._rounds < MAX_ROUNDS else 0
+        pixels = innermost_pixels(patches, least)[:most]
+        self._rounds += 1
+        self._left -= len(pixels)
+        self._prompted[pixels[:, 1], pixels[:, 0]] = True
+        return pixels.astype(np.float32) + np.float32(0.5)
+
+    def explain(self, level: int, point: Float32[np.ndarray, " 2"], mask: Bool[np.ndarray, "h w"]) -> None:
+        """Takes a mask (H, W) that a point x, y led to at a level."""
+        column, row = point.astype(int)
+        self._explained[level] |= mask & (self._regions == self._regions[row, column])
+
+
+def innermost_pixels(patches: Int32[np.ndarray, "h w"], least: float = 0.0) -> Int64[np.ndarray, "p 2"]:
+    """Finds the pixel of each patch that is farthest from its outline.
+
+    Args:
+      patches: (H, W) numbers of patches, negative outside.
+      least: px; a patch whose pixels are all nearer to its outline is left out.
+
+    Returns:
+      (P, 2) columns and rows, the farthest first.
+    """
+    padded = np.pad(patches, 1, constant_values=-1)
+    inner = padded >= 0
+    for axis in (0, 1):
+        for shift in (-1, 1):
+            inner &= padded == np.roll(padded, shift, axis)
+    distance = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    order = np.argsort(-distance, axis=None, kind="stable")
+    order = order[(patches.ravel()[order] >= 0) & (distance.ravel()[order] >= least)]
+    _, first = np.unique(patches.ravel()[order], return_index=True)
+    chosen = order[np.sort(first)]
+    return np.stack([chosen % patches.shape[1], chosen // patches.shape[1]], -1)
