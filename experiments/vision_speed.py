@@ -1,10 +1,10 @@
 """Seconds of vision on a CPU, and what guided prompts lose against SAM's grid.
 
-    python -m experiments.vision_speed                        masks: made-up rooms, a decoder with true masks
-    python -m experiments.vision_speed --graphs models        seconds: graphs of true size, from experiments.export_models
+    python -m experiments.vision_speed                      masks: made-up rooms, a decoder with true masks
+    python -m experiments.vision_speed --graphs models      seconds: graphs of true size by experiments.export_models
 
-`masks` counts the true masks of rooms that guided prompts and the grid find, at two levels of SAM. `seconds` times every
-graph of a folder of models, alone on the machine, and adds up a frame.
+`masks` counts the true masks of rooms that guided prompts and the grid find, at two levels of SAM. `seconds` times
+every graph in a folder of models and adds up a frame; the machine should do nothing else.
 """
 
 import argparse

@@ -202,6 +202,7 @@ def test_the_catalogue_says_what_is_cached(local):
         ("clap", "embedder", None, "clip, siglip2, mobileclip"),
         ("hub:owner", "embedder", None, "hub:owner/name"),
         ("mobileclip", "embedder", "int8", "wrong embeddings"),
+        ("hub:Xenova/mobileclip_s0", "embedder", "int8", "wrong embeddings"),
         ("edgetam", "segmenter", "fp16", "fp32"),
     ],
 )

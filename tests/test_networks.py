@@ -65,15 +65,13 @@ def splat(room, tmp_path_factory):
 def seen(room, splat, models, tmp_path_factory):
     """A run with both: the run, its folder, and what it told."""
     folder, listener = tmp_path_factory.mktemp("seen"), Recorder()
-    options = Options(
-        room, gaussians=splat, holdout=4, segmenter=models[0], embedder=models[1], points_per_side=10, level="m"
-    )
+    options = Options(room, gaussians=splat, holdout=4, segmenter=models[0], embedder=models[1], level="m")
     return pipeline.run(options, folder, listener=listener), folder, listener
 
 
 def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     run, folder, listener = seen
-    assert "proposals of level m by sam, asked at 10x10 points" in listener.planned["masklets"].why
+    assert "proposals of level m by sam, asked at points in regions by colour" in listener.planned["masklets"].why
     field = load_field(folder / "field.safetensors")
     assert field.embedder.startswith("clip-")
     assert field.regions.embeddings.shape[1] == 3
@@ -122,7 +120,7 @@ def test_sam_2_follows_what_sam_proposes(seen, tmp_path):
     listener = Recorder()
     options = dataclasses.replace(run.options, tracker=write_sam2(tmp_path / "sam2"))
     followed = pipeline.run(options, tmp_path / "out", listener=listener)
-    assert listener.planned["masklets"].why.endswith("followed by the SAM 2 of sam2")
+    assert listener.planned["masklets"].why.endswith("followed by sam2")
     assert listener.fresh["masklets"]
     assert not listener.fresh["gaussians"]
     assert not np.array_equal(followed.labels, run.labels)
@@ -247,11 +245,15 @@ def test_two_sources_of_masks_are_refused(room, models, tmp_path):
 def test_proposals_are_kept_by_content(models, tmp_path):
     frame = np.zeros((60, 80, 3), np.uint8)
     frame[10:40, 10:50] = (200, 30, 30)
-    stored = StoredSegmenter(SamSegmenter(models[0], SamSettings(points_per_side=4, crop_layers=0)), tmp_path)
+    stored = StoredSegmenter(
+        SamSegmenter(models[0], SamSettings(prompts="grid", points_per_side=4, crop_layers=0)), tmp_path
+    )
     assert isinstance(stored, NamedSegmenter)
     masks = stored(frame, 0)
     assert len(masks) >= 1
-    failing = StoredSegmenter(SamSegmenter(models[0], SamSettings(points_per_side=4, crop_layers=0)), tmp_path)
+    failing = StoredSegmenter(
+        SamSegmenter(models[0], SamSettings(prompts="grid", points_per_side=4, crop_layers=0)), tmp_path
+    )
     failing._segmenter = None  # whatever is asked of it now must come from disk
     np.testing.assert_array_equal(failing(frame, 5), masks)
     with pytest.raises(TypeError):
@@ -259,7 +261,7 @@ def test_proposals_are_kept_by_content(models, tmp_path):
     path = next(tmp_path.glob("*.safetensors"))
     path.write_bytes(path.read_bytes()[:60])
     np.testing.assert_array_equal(stored(frame, 0), masks)
-    finer = SamSegmenter(models[0], SamSettings(points_per_side=5, crop_layers=0))
+    finer = SamSegmenter(models[0], SamSettings(prompts="grid", points_per_side=5, crop_layers=0))
     assert finer.name != stored.name
 
 
@@ -269,11 +271,12 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     use_hub(hub, tmp_path / "cache", monkeypatch)
     out = tmp_path / "out"
     command = ["run", str(room), "--gaussians", str(splat), "--holdout", "4", "--out", str(out), "--models", "auto"]
-    command += ["--points-per-side", "10", "--level", "m"]
+    command += ["--prompts", "grid", "--points-per-side", "10", "--level", "m", "--vision-frames", "5"]
     assert cli.main(command) == 2  # without a terminal nothing is fetched unasked
     assert "jsecon models get edgetam" in (said := capsys.readouterr().err)
     assert "jsecon models get siglip2" in said
     assert cli.main([*command, "--yes"]) == 0
+    planned = capsys.readouterr().out
     asked = len(hub.requests)
     use_hub(hub, tmp_path / "cache", monkeypatch, offline=True)
     assert cli.main(command) == 0
@@ -284,6 +287,9 @@ def test_models_by_name_are_fetched_once_and_found_again_for_a_moved_field(
     query = ["query", str(field), "a red thing", "--out", str(tmp_path / "answers"), "--quantile", "0"]
     assert cli.main(query) == 0
     assert len(hub.requests) == asked
+    assert "SAM: 3 frames, about" in planned
+    assert "by edgetam, asked at 10x10 points" in planned
+    assert (np.asarray(load_field(field).regions.pixels).sum(0) > 0).sum() == 5
     use_hub(hub, tmp_path / "empty", monkeypatch)
     capsys.readouterr()
     assert cli.main(query) == 2

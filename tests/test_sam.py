@@ -1,7 +1,9 @@
 """SAM's automatic mask generator over small graphs of each dialect: the same masks as a plain twin, whatever the batch,
 and a message that names the tensor for a graph of another kind."""
 
+import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy import ndimage
 
 from jsecon.errors import InputError
 from jsecon.networks.sam import (
+    DECODER,
     MEAN_STD,
     TOKENS,
     SamFiles,
@@ -48,7 +51,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def segmenter(folders):
-    return SamSegmenter(folders["sam", "batch"], SamSettings(points_per_side=8), threads=1)
+    return SamSegmenter(folders["sam", "batch"], SamSettings(prompts="grid", points_per_side=8), threads=1)
 
 
 def by_definition(folder, frame, token_of_level, side=8):
@@ -106,7 +109,7 @@ def test_masks_are_those_of_the_definition(folders, frame, segmenter, level):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter, kind):
-    other = SamSegmenter(folders[kind], SamSettings(points_per_side=8), threads=1, batch=5)
+    other = SamSegmenter(folders[kind], SamSettings(prompts="grid", points_per_side=8), threads=1, batch=5)
     assert isinstance(other, Segmenter)
     masks = other(frame, 0)
     red, green = frame[..., 0] == 200, frame[..., 1] == 160
@@ -117,15 +120,42 @@ def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter
         np.testing.assert_array_equal(masks, segmenter(frame, 0))
 
 
-def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders, frame):
+@pytest.mark.parametrize("together", [True, False, None])
+def test_prompts_share_a_run_only_where_each_is_answered_as_if_alone(folders, frame, tmp_path, together):
+    folder = shutil.copytree(folders["sam2", "batch"], tmp_path / "sam2")
+    if together is not True:  # answers by the mean of its prompts, or takes none but one
+        write_decoder(folder / "onnx" / DECODER, 256, "sam2", "batch" if together is False else 1, mixed=True)
+    graphs = SamGraphs(find_sam(folder), threads=1)
+    points = np.float32([[40, 40], [120, 80], [5, 5]])
+    encoded = graphs.encode(frame)
+    answers = list(graphs.decode(encoded, points))
+    assert graphs.batch == (64 if together else 1)
+    assert len(answers) == (1 if together else 3)
+    alone = [next(graphs.decode(encoded, point[None])) for point in points]
+    for kind in (0, 1):
+        np.testing.assert_allclose(np.concatenate([a[kind] for a in answers]), np.concatenate([a[kind] for a in alone]))
+
+
+def test_guided_prompts_find_the_things_of_the_grid_with_a_tenth_of_the_points(folders, frame, segmenter, monkeypatch):
+    asked = []
+    decode = SamGraphs.decode
+    monkeypatch.setattr(SamGraphs, "decode", lambda self, *a: asked.append(len(a[1])) or decode(self, *a))
+    settings = SamSettings(crop_layers=0)
+    guided = SamSegmenter(folders["sam", "batch"], settings, threads=1)(frame, 0)
+    prompts, asked[:] = sum(asked), []
+    grid = SamSegmenter(folders["sam", "batch"], dataclasses.replace(settings, prompts="grid"), threads=1)(frame, 0)
+    assert prompts <= sum(asked) / 10
+    for mask in grid:
+        assert max((mask & other).sum() / (mask | other).sum() for other in guided) > 0.9
+
+
+def test_sam_2_takes_a_frame_stretched_to_a_square(folders, frame):
     graphs = SamGraphs(find_sam(folders["sam2", "batch"]), threads=1)
-    assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)
+    assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)  # several prompts a run are not tried yet
     encoded = graphs.encode(frame)
     assert encoded.scaled == (256, 256)
     cells = encoded.features["image_embeddings.2"][0, :3] * MEAN_STD[1][:, None, None] + MEAN_STD[0][:, None, None]
     np.testing.assert_allclose(cells[:, 5, 5], frame[40, 50], atol=1)  # (5.5 / 16) of height and width
-    found = list(graphs.decode(encoded, np.float32([[40, 40], [120, 80], [5, 5]])))
-    assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
 
 
 def test_sam_3_scales_colours_as_its_configuration_says(frame, tmp_path):
@@ -159,7 +189,7 @@ def test_without_crops_the_frame_is_encoded_once(folders, frame, monkeypatch):
     calls = []
     encode = SamGraphs.encode
     monkeypatch.setattr(SamGraphs, "encode", lambda self, part: calls.append(part.shape) or encode(self, part))
-    SamSegmenter(folders["sam2", "batch"], SamSettings(points_per_side=4, crop_layers=0), threads=1)(frame, 0)
+    SamSegmenter(folders["sam2", "batch"], SamSettings(crop_layers=0), threads=1)(frame, 0)
     assert calls == [(120, 160, 3)]
 
 
@@ -170,7 +200,7 @@ def test_graphs_can_be_closed_and_opened_again(segmenter, frame):
 
 
 def test_a_frame_without_anything_good_gives_no_masks(folders, frame):
-    strict = SamSegmenter(folders["sam", "batch"], SamSettings(points_per_side=4, predicted_iou=0.999), threads=1)
+    strict = SamSegmenter(folders["sam", "batch"], SamSettings(predicted_iou=0.999), threads=1)
     assert strict(frame, 0).shape == (0, 120, 160)
 
 

@@ -65,7 +65,10 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
       {"graphs": agreements, "tracking": figures of the clip}.
     """
     generator = torch.Generator().manual_seed(seed)
-    normal = lambda *shape: torch.randn(shape, generator=generator)
+
+    def normal(*shape):
+        return torch.randn(shape, generator=generator)
+
     side, channels, memory = model.image_size, model.hidden_dim, model.mem_dim
     grid = side // 16
     tokens, rows = grid * grid, SLOTS * grid * grid + POINTERS * channels // memory
@@ -73,10 +76,13 @@ def export(model: Any, folder: Path, *, seed: int, threads: int) -> dict:
         "feats0": normal(1, channels // 8, 4 * grid, 4 * grid),
         "feats1": normal(1, channels // 4, 2 * grid, 2 * grid),
     }
-    points = lambda count: {
-        "input_points": side * torch.rand(1, 1, count, 2, generator=generator),
-        "input_labels": torch.arange(count, dtype=torch.int32).reshape(1, 1, count) + 1,
-    }
+
+    def points(count):
+        return {
+            "input_points": side * torch.rand(1, 1, count, 2, generator=generator),
+            "input_labels": torch.arange(count, dtype=torch.int32).reshape(1, 1, count) + 1,
+        }
+
     image = {"feats2": normal(1, channels, grid, grid)}
     score = {"object_score_logits": torch.tensor([[-1.0]]), "binarize": torch.tensor(0.0)}
     current = {
@@ -281,7 +287,10 @@ def _tracked(model: Any, modules: dict[str, tuple], folder: Path, *, count: int 
         logits[name] = np.stack([at_size(tracked[t][0], frames.shape[1:3]) for t in range(count)])
         seconds[name] = time.perf_counter() - started
     logits["predictor"] = _by_predictor(model, frames, point)
-    same = lambda other: ((logits["onnxruntime"] > 0) == (logits[other] > 0)).mean((1, 2))
+
+    def same(other):
+        return ((logits["onnxruntime"] > 0) == (logits[other] > 0)).mean((1, 2))
+
     return {
         "frames": count,
         "largest_difference": float(np.abs(logits["onnxruntime"] - logits["torch"]).max()),

@@ -1,6 +1,8 @@
-"""SAM 2.1 and EdgeTAM on single images as transformers has them, in the layout of transformers.js (onnx-community's folders): the
-names, shapes and colours are theirs; how their exporter joins points and boxes is not published, so that this decoder
-takes points alone, and `input_boxes` without any."""
+"""SAM 2.1 and EdgeTAM on single images as transformers has them, in the layout of onnx-community's folders.
+
+Names, shapes and colours are theirs. How their exporter joins points and boxes is not published, so that this decoder
+takes points alone, and `input_boxes` without any.
+"""
 
 import dataclasses
 import json

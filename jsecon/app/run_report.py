@@ -11,7 +11,7 @@ from jsecon.app import pictures, report
 from jsecon.data.gaussians.files import save_gaussians
 from jsecon.files import write_text
 from jsecon.pipeline.progress import Listener
-from jsecon.pipeline.results import WARNING
+from jsecon.pipeline.results import WARNING, vision_frames
 from jsecon.pipeline.run import Run
 from jsecon.process import peak_memory_mib
 from jsecon.types import Capture, Gaussians, Quality
@@ -127,7 +127,7 @@ def _tiles(metrics: dict[str, Any]) -> dict[str, str]:
 
 def scene_parts(run: Run) -> list[str]:
     """Returns the parts of a page that show frames, masklets, codes and the rendered scene."""
-    train = np.flatnonzero(~np.asarray(run.capture.held_out))
+    train = vision_frames(run.capture, run.options)
     renderer = pictures.Renderer(run.field.gaussians, run.field.cameras)
     colours = pictures.code_colours(run.field)
     cells = []

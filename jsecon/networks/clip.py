@@ -12,6 +12,7 @@ it is; with several templates its embedding is the mean over them.
 
 import dataclasses
 import functools
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -381,6 +382,14 @@ class ClipEmbedder:
         phrases = [template.replace("{}", text) for text in texts for template in self.templates]
         rows = self._embed_phrases(phrases).reshape(len(texts), len(self.templates), -1)
         return _normalize(rows.mean(1), self.files.textual)
+
+    def seconds_per_crop(self) -> float:
+        """Measures the seconds of a region in a full batch."""
+        crops = np.zeros((self._batch, self.size, self.size, 3), np.uint8)
+        self._run_visual(crops)  # opens the graph
+        started = time.monotonic()
+        self._run_visual(crops)
+        return (time.monotonic() - started) / self._batch
 
     def check(self) -> None:
         """Runs the graphs on a black image and a word, and closes them.

@@ -97,6 +97,8 @@ class NamedModel:
       megabytes: Size of the files by precision. Precisions that are missing are not offered.
       licence: Licence of the weights.
       purpose: What it is good for, in one sentence.
+      seconds: Seconds of a frame by precision, on two cores of a Xeon with AVX-512: of a segmenter with guided prompts,
+        of an embedder for 40 regions, of a tracker for one object.
       precision: Precision that is taken unless the user asks for another.
       sha256: File -> hash of the content, where it is known from elsewhere than the hub.
       refused: Precision -> why it is not offered.
@@ -109,6 +111,7 @@ class NamedModel:
     licence: str
     purpose: str
     revision: str = "main"
+    seconds: Mapping[Precision, float] = dataclasses.field(default_factory=dict)
     precision: Precision = "fp32"
     sha256: Mapping[str, str] = dataclasses.field(default_factory=dict)
     refused: Mapping[Precision, str] = dataclasses.field(default_factory=dict)
@@ -203,6 +206,9 @@ def parse_model(text: str, role: Role, precision: Precision | None = None) -> Hu
         address = re.fullmatch(r"([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?", text.removeprefix(PREFIX))
         if address is None:
             raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
+        row = next((row for row in catalogue() if (row.role, row.repository) == (role, address[1])), None)
+        if row is not None and precision in row.refused:
+            raise _refused(row, precision)
         return HubModel(role, address[1], address[2] or "main", precision or "fp32")
     if Path(text).exists():
         return Path(text)
@@ -213,10 +219,21 @@ def parse_model(text: str, role: Role, precision: Precision | None = None) -> Hu
     row = names[text]
     precision = precision or row.precision
     if precision not in row.megabytes:
-        reason = row.refused.get(precision, "Its repository has no such graphs.")
-        problem = f"{text} is not offered in {precision}. {reason}"
-        raise InputError("--precision", problem, "", f"Use {' or '.join(row.megabytes)}.")
+        raise _refused(row, precision)
     return HubModel(role, row.repository, row.revision, precision, row.sha256)
+
+
+def _refused(row: NamedModel, precision: Precision) -> InputError:
+    """Returns the error that a named model is not offered in a precision."""
+    reason = row.refused.get(precision, "Its repository has no such graphs.")
+    problem = f"{row.name} is not offered in {precision}. {reason}"
+    return InputError("--precision", problem, "", f"Use {' or '.join(row.megabytes)}.")
+
+
+def named_model(folder: Path, role: Role) -> NamedModel | None:
+    """Returns the row of the catalogue whose files a folder of the hub's cache holds, or None for another folder."""
+    repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
+    return next((row for row in catalogue() if (row.role, row.repository) == (role, repository)), None)
 
 
 def choose_files(model: HubModel, paths: Sequence[str]) -> tuple[str, ...]:
@@ -406,6 +423,8 @@ def catalogue_rows() -> Iterator[dict[str, Any]]:
             "megabytes": dict(row.megabytes),
             "licence": row.licence,
             "purpose": row.purpose,
+            "seconds": dict(row.seconds),
+            "precision": row.precision,
             "cached": cached,
         }
 

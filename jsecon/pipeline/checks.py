@@ -52,7 +52,8 @@ def check_inputs(context: RunContext, running: Collection[str], results: Mapping
     if options.gaussians is not None and "gaussians" in running:
         read_scene(options.gaussians)
     if extent.names:
-        _check_masks(options, running, extent, [extent.names[t] for t in train])
+        seen = train[evenly_spaced(len(train), options.vision_frames)]
+        _check_masks(options, running, extent, [extent.names[t] for t in seen])
 
 
 def require_place(folder: Path) -> None:

@@ -4,14 +4,15 @@ Networks are opened when first needed and closed when their stage is done, to fr
 """
 
 import contextlib
-from collections.abc import Sequence
+import time
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 from jsecon.errors import InputError
-from jsecon.networks.hub import HubModel, cached_folder, get_command, parse_model
+from jsecon.networks.hub import HubModel, Role, cached_folder, get_command, named_model, parse_model
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.sources import Sources, locate_sources
 from jsecon.types import LanguageField
@@ -21,6 +22,10 @@ from jsecon.vision.stores import StoredSegmenter
 if TYPE_CHECKING:
     from jsecon.networks.clip import ClipFiles
 
+CROPS_PER_FRAME = 40
+"""regions of a frame, where no segmenter tells"""
+FEW_FRAMES = 4
+"""the time of fewer frames is not estimated"""
 _EXTERNAL = "given-"
 """prefix of the names of external spaces, as fields hold them"""
 
@@ -75,7 +80,7 @@ def open_networks(options: Options, store: Path) -> Networks:
         from jsecon.networks.sam import SamSegmenter, SamSettings, find_sam
 
         level, side, layers = options.level, options.points_per_side, options.crop_layers
-        settings = SamSettings(level=level, points_per_side=side, crop_layers=layers)
+        settings = SamSettings(level=level, prompts=options.prompts, points_per_side=side, crop_layers=layers)
         files = find_sam(options.segmenter, options.precision)
         segmenter = StoredSegmenter(SamSegmenter(files, settings), store / "proposals")
     if options.tracker is not None:
@@ -96,6 +101,50 @@ def open_networks(options: Options, store: Path) -> Networks:
 
         model = find_clip(options.embedder, options.precision)
     return Networks(open_embedder(name, folder=model, store=store / "embeddings"), segmenter, tracker)
+
+
+def describe_model(options: Options, role: Role) -> str:
+    """Returns the name of a model of a run: that of the catalogue, or of its folder."""
+    folder = getattr(options, role)
+    row = named_model(folder, role)
+    return folder.name if row is None else row.name
+
+
+def estimate_vision(networks: Networks, frames: np.ndarray, stages: Collection[str]) -> Iterator[str]:
+    """Measures the models on two frames, and estimates how long all of them take.
+
+    The masks of these two frames are stored, so that no work is lost.
+
+    Args:
+      networks: Models of the run.
+      frames: (T, H, W, 3) uint8 frames in which masks are found and embedded.
+      stages: Names of the stages that will run.
+
+    Yields:
+      A sentence for each model whose time can be measured.
+    """
+    crops = CROPS_PER_FRAME
+    segmenter = networks.segmenter
+    if "masklets" in stages and isinstance(segmenter, StoredSegmenter):
+        missing = [t for t in range(len(frames)) if not segmenter.has(frames[t])]
+        if len(missing) >= FEW_FRAMES:
+            seconds = 0.0
+            for t in missing[:2]:  # the first also opens the graphs
+                started = time.monotonic()
+                crops = len(segmenter(frames[t], t))
+                seconds = time.monotonic() - started
+            yield f"SAM: {len(missing) - 2} frames, about {_duration(seconds * (len(missing) - 2))}"
+    seconds_per_crop = getattr(networks.embedder, "seconds_per_crop", None)
+    if "regions" in stages and seconds_per_crop is not None and len(frames) >= FEW_FRAMES:
+        count = crops * len(frames)
+        yield f"CLIP: some {count:,} regions, about {_duration(seconds_per_crop() * count)}"
+    networks.close()
+
+
+def _duration(seconds: float) -> str:
+    """Writes seconds for a reader."""
+    minutes = seconds / 60
+    return f"{seconds:.0f} s" if minutes < 1.5 else f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 def open_embedder(

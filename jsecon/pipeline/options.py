@@ -139,13 +139,18 @@ class ModelOptions:
       segmenter: SAM model that finds the proposals, instead of colour and texture: a name (edgetam, slimsam, sam2),
         hub:owner/name of huggingface.co, or a folder. `jsecon models list` has sizes and licences.
       level: Level of SAM's proposals and of LangSplat's files: subparts (s), parts (m), wholes (l), or all (default).
-      points_per_side: For SAM, number of points along each side of the grid of prompts.
+      prompts: For SAM, where the points are that it makes masks of. With guided, they lie in the regions that differ by
+        colour, and then in what the masks of these do not explain: at most 96 a frame. With grid, they are SAM's own
+        1,024, which takes more than eight times longer.
+      points_per_side: With --prompts grid, number of points along each side of the grid.
       crop_layers: For SAM, number of layers of crops that are prompted too, 4^k crops in layer k. LangSplat uses 1,
         which takes five times longer.
       tracker: SAM 2 model that follows the proposals (Algorithm 1 of the paper), instead of consensus: a name (sam2,
         edgetam), hub:owner/name, or a folder.
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
         hub:owner/name, or a folder.
+      vision_frames: Maximum number of training frames, evenly spaced, in which masks are found and embedded. The fit
+        uses all of them. By default vision does too.
       precision: Precision of the models' graphs. By default it is the one that is fastest on a CPU, fp32.
       features: Folder language_features of LangSplat. Regions take their embeddings from <frame>_s.npy and _f.npy, and
         texts then need the CLIP model that made them (--embedder, here or of query).
@@ -154,10 +159,12 @@ class ModelOptions:
     models: Option[Literal["auto"] | None] = None
     segmenter: Option[Path | None] = None
     level: Advanced[Literal["default", "s", "m", "l"]] = "l"
+    prompts: Advanced[Literal["guided", "grid"]] = "guided"
     points_per_side: Advanced[int] = 32
     crop_layers: Advanced[int] = 0
     tracker: Advanced[Path | None] = None
     embedder: Option[Path | None] = None
+    vision_frames: Option[int | None] = None
     precision: Advanced[Precision | None] = None
     features: Advanced[Path | None] = None
 
@@ -205,6 +212,7 @@ LEAST: dict[str, float] = {
     "minutes": 0.05,
     "gaussians_at_most": 1,
     "points_per_side": 1,
+    "vision_frames": 2,
     "crop_layers": 0,
     "latent": 1,
     "top": 1,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jsecon.data.frames import evenly_spaced
 from jsecon.errors import InputError
 from jsecon.language.codes import Coder
 from jsecon.pipeline import cache
@@ -233,6 +234,16 @@ def training_frames(capture: Capture) -> np.ndarray:
     train = np.flatnonzero(~np.asarray(capture.held_out))
     require_training(len(train), len(capture.names))
     return train
+
+
+def vision_frames(capture: Capture, options: Options) -> np.ndarray:
+    """Returns the indices of the training frames in which masks are found and embedded.
+
+    Raises:
+      InputError: There are fewer than two.
+    """
+    train = training_frames(capture)
+    return train[evenly_spaced(len(train), options.vision_frames)]
 
 
 def require_training(count: int, total: int) -> None:

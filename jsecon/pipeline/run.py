@@ -38,7 +38,16 @@ from jsecon.pipeline.checks import check_inputs
 from jsecon.pipeline.options import Options, require_inputs, require_own_folder, require_writable
 from jsecon.pipeline.processes import Coordinator
 from jsecon.pipeline.progress import Listener, Step
-from jsecon.pipeline.results import KEY_FILE, Checkpoint, Results, RunContext, Stage, StageInput, StageResult
+from jsecon.pipeline.results import (
+    KEY_FILE,
+    Checkpoint,
+    Results,
+    RunContext,
+    Stage,
+    StageInput,
+    StageResult,
+    vision_frames,
+)
 from jsecon.pipeline.sources import hub_addresses, relative_folders
 from jsecon.process import compilation_counts
 from jsecon.types import Capture, Gaussians, LanguageField, Quality
@@ -56,7 +65,7 @@ class Run:
     Attributes:
       field: The language field.
       capture: The capture.
-      labels: (T, H, W) int16 masklets of the training frames.
+      labels: (T, H, W) int16 masklets of the training frames that vision uses.
       held_out: PSNR and SSIM of the held-out frames.
       seconds: Wall time of each stage, also of one that was computed in an earlier run.
       steps: Stages, and what was skipped.
@@ -196,11 +205,23 @@ def compute_stages(
         for name in plan.stale:
             plan.paths[name].unlink(missing_ok=True)
         listener.steps(f"{context.options.capture} -> {context.out}", plan.steps)
-        context.networks.require_ready([step.name for step in plan.steps if step.status == "run"])
+        running = [step.name for step in plan.steps if step.status == "run"]
+        context.networks.require_ready(running)
         computed = Computed(Results(), plan.keys, plan.steps)
         for stage in stage_list:
             _compute_stage(context, stage, plan, computed, listener, coordinator)
+            if stage.name == "load":
+                _note_vision_time(context, computed.results.load, running, listener)
     return computed
+
+
+def _note_vision_time(context: RunContext, capture: Capture, running: list[str], listener: Listener) -> None:
+    """Says how long the models will take, before the long stages."""
+    frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
+    with listener.progress("vision"):
+        notes = list(networks.estimate_vision(context.networks, frames, running))
+    for note in notes:
+        listener.note(f"{note}. Fewer frames: --vision-frames.")
 
 
 def _compute_stage(
@@ -268,7 +289,7 @@ def run(
     results, embedder = computed.results, context.networks.embedder
     started = time.monotonic()
     with listener.progress("field"):
-        field = stages.field_of(results, embedder, _provenance(options, computed.keys, embedder.name, out))
+        field = stages.field_of(results, embedder, _provenance(options, computed.keys, embedder.name, out), options)
         save_field(out / FIELD_FILE, field)
     computed.seconds["field"] = time.monotonic() - started
     listener.done("field", computed.seconds["field"], True)

@@ -46,6 +46,7 @@ from jsecon.language.regions import Embed, embeddings_of_masks, region_embedding
 from jsecon.language.streaming import codes_in_blocks, finish_votes_in_blocks, region_votes_in_blocks
 from jsecon.language.votes import region_votes, votes_memory
 from jsecon.pipeline.bare_stages import no_photographs, planned_views, require_options_apply, scene_itself
+from jsecon.pipeline.networks import describe_model
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.progress import Progress
 from jsecon.pipeline.results import (
@@ -57,6 +58,7 @@ from jsecon.pipeline.results import (
     StageInput,
     StageResult,
     training_frames,
+    vision_frames,
 )
 from jsecon.pipeline.scene_files import check_overlap, place_in_capture, read_scene
 from jsecon.process import memory_budget
@@ -336,7 +338,7 @@ def masklets(context: RunContext) -> Stage:
             f"read from {folder.name}",
             _read_masklets,
             after=("load",),
-            key_options=context.key_options("level"),
+            key_options=context.key_options("level", "vision_frames"),
             files=folder,
             skipped=skipped,
         )
@@ -345,8 +347,9 @@ def masklets(context: RunContext) -> Stage:
     elif networks.segmenter is not None:
         assert options.segmenter is not None
         crops = f" and {options.crop_layers} layers of crops" if options.crop_layers else ""
-        grid = f"{options.points_per_side}x{options.points_per_side}"
-        how = f"proposals of level {options.level} by {options.segmenter.name}, asked at {grid} points{crops}"
+        grid = f"at {options.points_per_side}x{options.points_per_side} points"
+        asked = "at points in regions by colour" if options.prompts == "guided" else grid
+        how = f"proposals of level {options.level} by {describe_model(options, 'segmenter')}, asked {asked}{crops}"
         key_options = {"model": networks.segmenter.name}
     else:
         how = f"{options.granularity} proposals by colour and texture"
@@ -355,11 +358,14 @@ def masklets(context: RunContext) -> Stage:
         how += ", what the views agree on"
         key_options |= context.key_options("agreement", "seed", "centre")
     else:
-        by = "through the Gaussians" if options.tracker is None else f"by the SAM 2 of {options.tracker.name}"
+        by = "through the Gaussians" if options.tracker is None else f"by {describe_model(options, 'tracker')}"
         how += f", followed {by}"
         key_options |= context.key_options("iou_threshold")
     tracker = None if networks.tracker is None else networks.tracker.name
     key_options = {**key_options, "association": options.associated_by, "tracker": tracker}
+    key_options |= context.key_options("vision_frames")
+    if options.vision_frames is not None:
+        how += f", in at most {options.vision_frames} frames"
     return Stage(
         "masklets",
         how,
@@ -374,7 +380,7 @@ def masklets(context: RunContext) -> Stage:
 def _read_masklets(stage: StageInput) -> StageResult:
     options, capture = stage.context.options, stage.results.load
     assert options.masks is not None
-    names = [capture.names[t] for t in training_frames(capture)]
+    names = [capture.names[t] for t in vision_frames(capture, options)]
     layout = _mask_layout(options, capture)
     size = int(capture.frames.shape[1]), int(capture.frames.shape[2])
     loaded = load_labels(options.masks, names, size, **layout, progress=stage.progress)
@@ -404,7 +410,7 @@ def frame_proposals(
     Returns:
       A function of t that gives the masks (M, H, W) of the t-th training frame, and notes.
     """
-    options, train = context.options, training_frames(capture)
+    options, train = context.options, vision_frames(capture, context.options)
     frames = np.asarray(capture.frames)[train]
     if options.proposals is not None:
         names = [capture.names[t] for t in train]
@@ -418,18 +424,18 @@ def frame_proposals(
                 return segmenter(frames[t], t)
 
         return segment, ()
-    classical = _classical_segmenter(options.granularity, capture, gaussians)
+    classical = _classical_segmenter(options, capture, gaussians)
     return memoized_masks(lambda t: classical(frames[t], t)), ()
 
 
-def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussians) -> Segmenter:
+def _classical_segmenter(options: Options, capture: Capture, gaussians: Gaussians) -> Segmenter:
     """Opens the segmenter without weights for the training frames.
 
     Surfaces come from the capture's depth. Without depth, the coarse granularity takes the depth that the Gaussians
     render; the finer ones do not, as rendered depth costs them more outline than it tells.
     """
-    train = training_frames(capture)
-    setting = GRANULARITIES[granularity]
+    train = vision_frames(capture, options)
+    setting = GRANULARITIES[options.granularity]
     depths = None if capture.depths is None else np.asarray(capture.depths)[train]
     if depths is not None and depths[:, ::4, ::4].any():
         known = depths[:, ::4, ::4]
@@ -439,7 +445,7 @@ def _classical_segmenter(granularity: str, capture: Capture, gaussians: Gaussian
             cloud = points_from_depth(capture, max_points=MAX_CLOUD_POINTS, stride=4)
         surfaces = surfaces_from_depth(depths, capture.cameras[train], cloud.points)
         return ClassicalSegmenter(**setting, surfaces=surfaces)
-    if granularity != "coarse":
+    if options.granularity != "coarse":
         return ClassicalSegmenter(**setting)
     cameras = jax.tree.map(jnp.asarray, capture.cameras[train])
 
@@ -471,7 +477,7 @@ def associate_masks(
     Returns:
       (T, H, W) int16 labels of the training frames, -1 for no region.
     """
-    options, train = context.options, training_frames(capture)
+    options, train = context.options, vision_frames(capture, context.options)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
     if options.associated_by == "consensus":
         scene = SceneViews(gaussians, cameras, proposals, centre=options.centre)
@@ -524,7 +530,7 @@ def regions(context: RunContext) -> Stage:
 
 def _embed_regions(stage: StageInput) -> StageResult:
     context, capture = stage.context, stage.results.load
-    frames = np.asarray(capture.frames)[training_frames(capture)]
+    frames = np.asarray(capture.frames)[vision_frames(capture, context.options)]
     embed = context.networks.embedder.embed_regions
     weighting = context.options.weighting
     embedded = region_embeddings(frames, stage.results.masklets, embed, weighting=weighting, progress=stage.progress)
@@ -535,7 +541,7 @@ def _embed_regions(stage: StageInput) -> StageResult:
 def _read_regions(stage: StageInput) -> StageResult:
     options, capture, labels = stage.context.options, stage.results.load, stage.results.masklets
     assert options.features is not None
-    names = [capture.names[t] for t in training_frames(capture)]
+    names = [capture.names[t] for t in vision_frames(capture, options)]
     features = load_features(options.features, names, labels.shape[1:], **_mask_layout(options, capture))
     if not len(features.embeddings):
         problem = f"no mask of level {options.level} in any frame"
@@ -566,7 +572,7 @@ def parts(context: RunContext) -> Stage:
 
 def _find_parts(stage: StageInput) -> StageResult:
     context, capture = stage.context, stage.results.load
-    options, train = context.options, training_frames(capture)
+    options, train = context.options, vision_frames(capture, context.options)
     frames, cameras = np.asarray(capture.frames)[train], jax.tree.map(jnp.asarray, capture.cameras[train])
     masks, embed = _masks_with_embeddings(context, stage.results)
     views = SceneViews(stage.results.gaussians, cameras, masks, centre=options.centre)
@@ -579,7 +585,7 @@ def _find_parts(stage: StageInput) -> StageResult:
 def _masks_with_embeddings(context: RunContext, results: Results) -> tuple[Callable[[int], np.ndarray], Embed]:
     """Masks (M, H, W) of the t-th training frame and their embeddings: of --features, of --masks, or proposals."""
     options, capture = context.options, results.load
-    train = training_frames(capture)
+    train = vision_frames(capture, options)
     frames = np.asarray(capture.frames)[train]
 
     def by_model(t, masks):
@@ -639,7 +645,7 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     """Accumulates votes; in blocks on disk if they do not fit into memory, to the same up to float32's rounding."""
     options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
     labels, folder = stage.results.masklets, stage.checkpoint.folder
-    cameras = capture.cameras[training_frames(capture)]
+    cameras = capture.cameras[vision_frames(capture, options)]
     count = int(labels.max()) + 1
     settings = {"top": options.top, "centre": options.centre, "by_view": True, "progress": stage.progress}
     needed, budget = votes_memory(scene.count, len(labels), count), memory_budget()
@@ -669,11 +675,11 @@ def _distil(stage: StageInput) -> StageResult:
     return StageResult(distill_votes(cast, table, reduce=reduce))
 
 
-def field_of(results: Results, embedder: Embedder, provenance: str) -> LanguageField:
-    """Joins the results to a field. It has all views; in held-out frames no region has any pixels."""
+def field_of(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:
+    """Joins the results to a field. It has all views; in frames that vision left out no region has any pixels."""
     capture, embedded = results.load, results.regions
     pixels = np.zeros((embedded.count, len(capture.names)), np.int32)
-    pixels[:, training_frames(capture)] = embedded.pixels
+    pixels[:, vision_frames(capture, options)] = embedded.pixels
     table, coder = results.codes
     return LanguageField(
         gaussians=results.gaussians,

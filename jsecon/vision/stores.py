@@ -104,7 +104,7 @@ class StoredSegmenter:
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
         """Returns the masks (M, H, W) bool of the segmenter for a frame (H, W, 3) uint8."""
-        path = self._folder / f"{frame_digest(self.name, frame)}.safetensors"
+        path = self._path(frame)
         try:
             bits, pixels = read_arrays(path)[1]["bits"], frame.shape[0] * frame.shape[1]
             if bits.shape[1] != -(-pixels // 8):
@@ -115,6 +115,13 @@ class StoredSegmenter:
         bits = np.packbits(masks.reshape(len(masks), frame.shape[0] * frame.shape[1]), axis=1)
         _write(path, bits=bits, shape=np.asarray(masks.shape))
         return masks
+
+    def has(self, frame: UInt8[np.ndarray, "h w 3"]) -> bool:
+        """Returns whether the masks of a frame (H, W, 3) uint8 are cached."""
+        return self._path(frame).is_file()
+
+    def _path(self, frame: np.ndarray) -> Path:
+        return self._folder / f"{frame_digest(self.name, frame)}.safetensors"
 
     def check(self) -> None:
         """Raises InputError if the segmenter cannot work."""
