@@ -1,6 +1,6 @@
 """The licences of what jsecon needs and of what its extras bring, as the installed packages tell them: LICENSES.md.
 
-pip install '.[all,dev]' && python -m tests.licences > LICENSES.md
+pip install '.[all,dev,docs]' && python -m tests.licences > LICENSES.md
 """
 
 import re
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 
-EXTRAS = ("figures", "formats", "serve", "sfm", "viewer", "words", "dev")
+EXTRAS = ("figures", "formats", "serve", "sfm", "viewer", "words", "dev", "docs")
 SHARE_ALIKE = re.compile(r"\b(A?GPL|LGPL|MPL|EPL|CDDL|EUPL)\b|(?:GNU (?:LESSER |AFFERO )?GENERAL|Mozilla) Public", re.I)
 """licences that ask something of whoever passes the package on, changed or linked"""
 _DATED = ",? Version [0-9.]+,? [0-9]+ [A-Z][a-z]+ [0-9]{4}"
@@ -68,7 +68,7 @@ def brought(extra: str | None) -> set[str]:
             try:
                 metadata.distribution(other)
             except metadata.PackageNotFoundError:
-                raise SystemExit(f"{other} is not installed: pip install '.[all,dev]'") from None
+                raise SystemExit(f"{other} is not installed: pip install '.[all,dev,docs]'") from None
             if other not in found:
                 found.add(other)
                 wanted.append((other, more))
@@ -81,7 +81,7 @@ def licence_of(name: str) -> str:
     named = [line.rpartition(" :: ")[2] for line in told.get_all("Classifier", []) if line.startswith("License ::")]
     text = told.get("License-Expression") or ""
     short = (told.get("License") or "").strip()
-    if not text and short and len(short) < 60:
+    if not text and short not in ("", "UNKNOWN") and len(short) < 60:
         text = short
     return text or ", ".join(named) or (short.splitlines() or ["not told"])[0]
 
