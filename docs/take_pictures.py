@@ -52,14 +52,14 @@ def save(image: Image.Image, name: str) -> None:
 
 def picture_viewer(field: Path) -> None:
     """Pictures the viewer with the answers of three texts."""
-    command = [sys.executable, "-m", "jsecon", "view", str(field), *TEXTS, "--port", "8799"]
+    command = [sys.executable, "-u", "-m", "jsecon", "view", str(field), *TEXTS, "--port", "8799"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
             for line in process.stdout:
                 if "http://" in line:
                     address = line[line.index("http://") :].split()[0]
-                    save(photograph(address, 1200, 720, SECONDS), "viewer")
+                    save(photograph(address, 960, 600, SECONDS), "viewer")
                     break
         finally:
             process.terminate()
