@@ -80,5 +80,5 @@ def _help_text(owner: Any, name: str) -> str:
 
 def _first_sentence(text: str) -> str:
     """The text up to the first full stop that ends a sentence; a stop before a small letter or a digit ends none."""
-    end = re.search(r"[.:](?= [A-Z])", text)
+    end = re.search(r"[.:](?= [A-Z`])", text)
     return text if end is None else text[: end.start()] + "."
