@@ -40,6 +40,8 @@ def photograph(address: str, width: int, height: int, seconds: float) -> Image.I
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         page.send("Emulation.setDeviceMetricsOverride", **size)
         time.sleep(seconds)
+        page.js("document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())")
+        time.sleep(min(seconds, 4))  # the notice that WebGL runs in software fades
         return Image.open(io.BytesIO(page.png())).convert("RGB")
 
 
@@ -59,10 +61,10 @@ def picture_viewer(field: Path) -> None:
             for line in process.stdout:
                 if "http://" in line:
                     address = line[line.index("http://") :].split()[0]
-                    save(photograph(address, 960, 600, SECONDS), "viewer")
+                    save(photograph(address, 1200, 720, SECONDS), "viewer")
                     break
-        finally:
-            process.terminate()
+        finally:  # it would wait for the page to close
+            process.kill()
 
 
 def main() -> None:
