@@ -143,6 +143,18 @@ def test_every_link_of_a_page_leads_somewhere(page):
             assert anchor in {_anchor(heading) for heading in headings}, target
 
 
+def test_the_messages_that_the_pages_explain_are_those_of_the_program():
+    sources = " ".join(" ".join(path.read_text() for path in (HOME / "jsecon").rglob("*.py")).split())
+    sources = re.sub(r"""["'] f?["']""", "", sources)  # strings that are joined over lines
+    explained = [row.split("|")[1] for page in PAGES for row in page.read_text().splitlines() if row.startswith('| "')]
+    messages = [message for cell in explained for message in re.findall(r'"([^"]*)"', cell)]
+    assert len(messages) >= 25
+    for message in messages:
+        parts = re.split(r"\b[NMXYWH]\b|\bWxH\b|\.\.\.|\(\w+\)|\d[\dx]*|'[^']*'|frame_12|[A-Z]{6,}|expected", message)
+        for part in parts:
+            assert len(part.split()) < 3 or part.strip(" ,") in sources, message
+
+
 def test_the_readme_is_short():
     text = (HOME / "README.md").read_text()
     assert len(text.split()) <= MAX_WORDS
