@@ -8,6 +8,7 @@ import contextlib
 import io
 import os
 import re
+import textwrap
 from typing import Any
 
 import latex2mathml.converter
@@ -96,7 +97,8 @@ class CommandHelp(SphinxDirective):
             with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
                 cli.parse([verb, "--help-all"])
             section = nodes.section("", nodes.title(text=f"jsecon {verb}"), ids=[f"jsecon-{verb}"])
-            section += nodes.literal_block(printed.getvalue(), printed.getvalue(), language="text")
+            lines = [textwrap.fill(line, 92) if len(line) > 92 else line for line in printed.getvalue().splitlines()]
+            section += nodes.literal_block("", "\n".join(lines), language="text")
             sections.append(section)
         return sections
 
