@@ -5,7 +5,7 @@
 A column per method: first its features, by their three principal directions, then what it selects for each text,
 rendered alone, with its IoU: of pixels, or, on Replica, of the points that have a label, each of the class that it
 answers best, in a frame that was seen. On real data the picture shows the capture's own pixels and goes to pictures/,
-which git ignores; a twin's is figure.png.
+which git ignores; a twin's is figure.webp.
 """
 
 import argparse
@@ -122,11 +122,11 @@ def main(plan: Plan) -> str:
     table = results.table(("text", *plan.methods), [tuple(row) for row in rows.values()])
     source = f"{'a twin in the layout of ' if setting.bench.twin else ''}{setting.bench.dataset}"
     judged = "of points" if frame.truth_at_points else "of pixels, alpha > 0.7"
-    text = f"IoU in {frame.name} of {scene}, {source}, {judged}; figure.png shows the masks.\n\n{table}"
+    text = f"IoU in {frame.name} of {scene}, {source}, {judged}; figure.webp shows the masks.\n\n{table}"
     drawing, out = draw(panels), Path(plan.out)
     results.save(out, plan, {"iou": {text: row[1:] for text, row in rows.items()}}, text, drawing)
     if not setting.bench.twin:
-        (out / "figure.png").unlink()
+        (out / "figure.webp").unlink()
         results.save_picture(out, "selections.png", drawing)
     print(text)
     return text

@@ -68,7 +68,7 @@ STABLE_PX = 0.25
 """Median movement of the image by a probe, px at full size, below which the poses are stable."""
 MIN_GAIN_DB = 0.5
 """PSNR that corrections must gain on the frames kept aside. In the demo's room they gain 0.1 dB without errors,
-0.9 if poses are off by 3 mm and 0.15 degrees, and 2 to 3 at three times as much (experiments/retired.md)."""
+0.9 if poses are off by 3 mm and 0.15 degrees, and 2 to 3 at three times as much."""
 MIN_ASIDE, MAX_ASIDE = 2, 8
 """Number of training frames kept aside for the decision, a third of all at most."""
 ALIGNED_POSE_RATE = 1e-4

@@ -17,8 +17,8 @@ LONG_STEPS = 3000
 LONG_MINUTES = 3.0
 """Minutes from which a fit counts as long."""
 MAX_GAUSSIANS = 100_000
-"""Default limit on the number of Gaussians: more make each step slower. bonsai at 400x266 after two minutes has 28.3 dB
-with 50,000, 28.5 with 100,000 and 27.8 with 200,000 (experiments/retired.md)."""
+"""Default limit on the number of Gaussians: more make each step slower. bonsai at 400x266 after two minutes has 28.6 dB
+with 50,000, 28.8 with 100,000 and 28.2 with 200,000 (experiments/retired.md)."""
 
 
 @record

@@ -32,7 +32,7 @@ SHARE_THRESHOLD = 0.5
 LABELLED_PART = 0.4
 """Smallest part of a Gaussian's weight in any region that its share is measured against. With SHARE_THRESHOLD a region
 is selected where it has a fifth of that weight or more. Measured on replica_apartment_0, with masks as they are, lost
-in 30 to 90 % of the views, and swallowed by their neighbours (experiments/retired.md)."""
+in 30 to 90 % of the views, and swallowed by their neighbours."""
 SEEN_PART = 0.05
 """The same of its weight on all pixels, for scenes of which only a few objects have masks."""
 CORRELATION = 0.05

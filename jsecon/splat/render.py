@@ -53,7 +53,7 @@ def render(
       gaussians: Scene of N Gaussians. Its `sh` has no influence and may be None.
       camera: One camera.
       features: (N, D). bfloat16 features are read as such and summed in the dtype of the Gaussians: the error is that
-        of rounding the features (experiments/retired.md), the time on a CPU is the same.
+        of rounding the features (benchmarks/results.md), the time on a CPU is the same.
       background: (D,), added with weight 1 - alpha.
       capacity: Number of (block, Gaussian) pairs; by default `default_capacity`, a multiple of what scenes need, so
         that one program serves all views of a size. A given capacity is used as it is (`plan_capacity`).

@@ -52,8 +52,8 @@ def with_gaussians(plan, *levels):
 
 def read(folder, name):
     place = folder / name
-    assert {file.name for file in place.iterdir()} >= {"config.json", "metrics.json", "table.md", "figure.png"}
-    assert (place / "figure.png").stat().st_size > 1000
+    assert {file.name for file in place.iterdir()} >= {"config.json", "metrics.json", "table.md", "figure.webp"}
+    assert (place / "figure.webp").stat().st_size > 1000
     return json.loads((place / "metrics.json").read_text()), (place / "table.md").read_text()
 
 
