@@ -129,7 +129,11 @@ def _anchor(heading):
     return re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
 
 
-@pytest.mark.parametrize("page", [*PAGES, HOME / "CHANGELOG.md", HOME / "experiments" / "README.md"], ids=_name)
+LINKED = [HOME / name for name in ("CHANGELOG.md", "experiments/README.md", "benchmarks/results.md")]
+"""pages outside of docs/ whose links are checked too"""
+
+
+@pytest.mark.parametrize("page", [*PAGES, *LINKED], ids=_name)
 def test_every_link_of_a_page_leads_somewhere(page):
     text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for target in re.findall(r"\]\(([^)\s]+)\)", text):

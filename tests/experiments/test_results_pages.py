@@ -1,4 +1,4 @@
-"""The figures on the pages of results are those of the committed results, and their links and pictures exist."""
+"""The figures on the pages of results are those of the committed results."""
 
 import json
 import re
@@ -8,8 +8,7 @@ import pytest
 
 HOME = Path(__file__).resolve().parent.parent.parent
 RESULTS = HOME / "experiments" / "results"
-PAGES = sorted((HOME / "docs" / "results").glob("*.md"))
-GUIDES = [HOME / "experiments" / "README.md", HOME / "experiments" / "retired.md", HOME / "benchmarks" / "results.md"]
+GUIDE, SPEED = HOME / "experiments" / "README.md", HOME / "benchmarks" / "results.md"
 TABLES = ("lerf", "ovs3d", "replica")
 # fmt: off
 WORLDS = (
@@ -124,27 +123,11 @@ def test_shared_errors_and_exports_and_real_captures():
 
 
 def test_the_guide_repeats_the_pages():
-    claims = {row[1].strip("`").split("`")[0]: row[3] for row in tables(GUIDES[0])[0][1:]}
+    claims = {row[1].strip("`").split("`")[0]: row[3] for row in tables(GUIDE)[0][1:]}
     for name in TABLES:
         means = metrics(name)["means"]
         other = max(mean for method, mean in means.items() if not method.startswith("ours"))
         told = re.findall(r"0\.\d{3}", claims[f"python -m experiments.{name}"])
         assert told == [f"{means['ours, consensus']:.3f}", f"{other:.3f}"]
-    assert len(GUIDES[0].read_text().split()) <= 2500
-    assert len(GUIDES[2].read_text().split()) <= 2000
-
-
-def named(path):
-    return f"{path.parent.name}/{path.name}"
-
-
-@pytest.mark.parametrize("path", [*PAGES, *GUIDES], ids=named)
-def test_links_lead_somewhere(path):
-    text = re.sub(r"^```.*?^```$|`[^`]*`", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
-    for target, anchor in re.findall(r"\]\(([^)#]*)(#[^)]*)?\)", text):
-        file = (path.parent / target).resolve() if target else path
-        assert file.exists(), target
-        if anchor:
-            titles = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
-            slugs = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
-            assert anchor[1:] in slugs, (target, anchor)
+    assert len(GUIDE.read_text().split()) <= 2500
+    assert len(SPEED.read_text().split()) <= 2000
