@@ -21,7 +21,7 @@ def test_an_upright_box_is_that_of_a_brick_that_was_turned_about_the_up_axis(shi
     turn = Rotation.from_euler("z", 40, degrees=True)
     means = np.concatenate([brick(turn, shift), brick(turn, shift + 2.0), np.full((5, 3), np.nan)])
     labels = np.concatenate([np.zeros(4002, int), np.ones(4002, int), np.full(5, -1)])
-    shapes = object_shapes(means, labels, [0, 0, 2.0])
+    shapes = object_shapes(means, labels, np.array([0, 0, 2.0]))
     assert len(shapes) == 2
     assert shapes.count.tolist() == [4002, 4002]
     np.testing.assert_allclose(shapes.center - shift, [[0, 0, 0], [2, 2, 2]], atol=0.02)
@@ -44,7 +44,7 @@ def test_without_an_up_axis_the_box_follows_the_points():
 def test_spreads_make_boxes_larger_and_few_points_are_repeated():
     points = np.array([[0.0, 0, 0], [1, 0, 0]])
     spreads = np.broadcast_to(0.1 * np.eye(3), (2, 3, 3))
-    shapes = object_shapes(points, np.zeros(2, int), [0, 0, 1], spreads=spreads, points=8)
+    shapes = object_shapes(points, np.zeros(2, int), np.array([0, 0, 1.0]), spreads=spreads, points=8)
     np.testing.assert_allclose(shapes.half_size[0], [0.6, 0.1, 0.1], atol=0.02)
     assert shapes.points.shape == (1, 8, 3)
     assert {tuple(point) for point in shapes.points[0]} == {(0, 0, 0), (1, 0, 0)}

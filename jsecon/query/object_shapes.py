@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jsecon.errors import require, require_shape
-from jsecon.types import Array, Camera, Gaussians, record
+from jsecon.types import Array, Camera, Gaussians, Leaf, record
 
 BOX_TAIL = 0.02
 """share of the Gaussians at each end of an axis that a box leaves out as strays"""
@@ -31,21 +31,21 @@ class ObjectShapes:
     Subtract a common origin before the coordinates become float32: those of a map projection lose their last metres.
     """
 
-    center: Array
+    center: Leaf
     """(K, 3) middle of the oriented box."""
-    axes: Array
+    axes: Leaf
     """(K, 3, 3) unit columns, right-handed: axes of the box. With an up axis the third is that axis, and the first is
     the longer of the two horizontal ones. Without one they are the principal axes of the points, the longest first."""
-    half_size: Array
+    half_size: Leaf
     """(K, 3) half of the length of the oriented box along each of its axes."""
-    low: Array
+    low: Leaf
     """(K, 3) lower corner of the box along the axes of the world."""
-    high: Array
+    high: Leaf
     """(K, 3) upper corner of that box."""
-    points: Array
+    points: Leaf
     """(K, P, 3) centres of Gaussians in the oriented box, spread evenly over them, for distances between surfaces. An
     object with fewer than P repeats them."""
-    count: Array
+    count: Leaf
     """(K,) int number of Gaussians."""
 
     def __getitem__(self, index) -> "ObjectShapes":
