@@ -1,5 +1,6 @@
 """Public names of `jsecon`, and the module of each."""
 
+from .app.catalogue import Catalogue as Catalogue, objects as objects
 from .app.locate import Place as Place, locate as locate
 from .app.notebook import show as show, to_html as to_html, to_png as to_png
 from .association.algorithm1 import masklets as masklets
@@ -35,6 +36,7 @@ from .query.baselines import query_canonical as query_canonical, query_one_step 
 from .query.blocks import query_in_blocks as query_in_blocks
 from .query.classes import query_classes as query_classes
 from .query.match import RegionMatch as RegionMatch, match_regions as match_regions
+from .query.object_shapes import ObjectShapes as ObjectShapes, object_shapes as object_shapes
 from .query.outliers import remove_outliers as remove_outliers
 from .query.outline import lift as lift
 from .query.pixel import region_at as region_at

@@ -199,7 +199,8 @@ def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, 
     assert told["error"]["problem"]
 
 
-VERB_NAMES = ("demo", "run", "fit", "query", "export", "view", "eval", "serve", "models", "doctor", "completion")
+VERB_NAMES = ("demo", "run", "fit", "query", "objects", "export", "view", "eval", "serve", "models", "doctor")
+VERB_NAMES += ("completion",)
 
 
 def test_help_of_every_verb_has_words_for_every_option(capsys, monkeypatch):

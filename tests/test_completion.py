@@ -55,7 +55,20 @@ def test_bash_completes(script, tmp_path, words, expected):
 def test_every_verb_is_completed(script):
     text = TRY.format(script=script("bash"), words="jsecon ''", at=1)
     found = subprocess.run([_shell("bash"), "-c", text], capture_output=True, text=True, check=True)
-    verbs = {"demo", "run", "fit", "query", "export", "view", "eval", "serve", "models", "doctor", "completion"}
+    verbs = {
+        "demo",
+        "run",
+        "fit",
+        "query",
+        "objects",
+        "export",
+        "view",
+        "eval",
+        "serve",
+        "models",
+        "doctor",
+        "completion",
+    }
     assert verbs <= set(found.stdout.split())
 
 

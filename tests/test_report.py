@@ -55,6 +55,11 @@ def page():
             report.section(
                 "Answers", "", report.grid([report.pair(_image(), _image(1), "mask", strong="<i>mug</i>")], 1)
             ),
+            report.search_box("Search"),
+            report.cards(
+                report.card(_image(), name, "words", report.grid([report.figure(_image(), "view")], 3), search=name)
+                for name in ("red <mug>", "blue mug")
+            ),
             report.wide(_image(), "in 3 of 4 frames", strong="region 7"),
             report.film(b"RIFF", "a film"),
             report.shades(["text", "votes", "code"], [("red <mug>", [0.5, None]), ("mean", [1.0, 0.0])]),
@@ -120,6 +125,11 @@ const wait = ms => new Promise(done => setTimeout(done, ms));
   const cut = () => getComputedStyle(document.querySelector(".pair .after")).clipPath;
   found.half = cut(); input.value = 80; input.dispatchEvent(new Event("input", { bubbles: true })); found.moved = cut();
   found.covers = [side(".pair input").width, side(".pair .after").width];
+  const box = document.getElementById("search"), cards = [...document.querySelectorAll(".card")];
+  box.value = "MUG blue"; box.dispatchEvent(new Event("input", { bubbles: true }));
+  found.shown = cards.map(card => getComputedStyle(card).display !== "none");
+  cards[1].querySelector("summary").click(); await wait(50);
+  found.opened = side(".card[open] .grid").height > 0;
   found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
   found.requests = performance.getEntriesByType("resource").filter(e => !e.name.startsWith("data:")).length;
   const out = document.createElement("pre"); out.id = "found"; out.textContent = JSON.stringify(found);
@@ -141,6 +151,8 @@ def test_in_a_browser_pictures_are_enlarged_and_the_slider_moves(page, tmp_path)
     assert "25%" in found["half"]
     assert "80%" in found["moved"]
     assert found["covers"][0] == pytest.approx(found["covers"][1])
+    assert found["shown"] == [False, True]
+    assert found["opened"]
     assert found["overflow"] <= 0  # nothing makes a narrow page scroll sideways
     assert found["requests"] == 0
 

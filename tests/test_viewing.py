@@ -74,6 +74,8 @@ def test_controls_apply_to_all_that_is_lit_up_and_stay_within_their_ends():
     assert state.view_queries == (ViewQuery("a", 0.7, 1.0, True), ViewQuery("b", 0.7, 1.0, True))
     assert state.colouring == "code"
     assert with_controls(state, threshold=-1).threshold == 0
+    grown = with_controls(MUG, shells=-2)
+    assert from_link(to_link(grown)).view_queries == (ViewQuery("red mug", shells=-2),)
 
 
 def test_only_and_hidden_keep_how_they_were_asked():
@@ -126,7 +128,7 @@ def test_a_link_holds_only_what_is_not_as_usual():
     ["", "red mug", "[]", "7", "null", "{", '{"queries": "red"}', '{"queries": [-1]}', '{"queries": [1.5]}',
      '{"queries": [true]}', '{"queries": [""]}', '{"queries": [["a"]]}', '{"threshold": 2}', '{"threshold": "a"}',
      '{"part_vs_whole": NaN}', '{"all_matches": 1}', '{"colouring": "red"}', '{"colouring": []}',
-     '{"camera": [1, 2]}', '{"isolated": [1]}',
+     '{"camera": [1, 2]}', '{"shells": 9}', '{"shells": 0.5}', '{"isolated": [1]}',
      '{"camera": [1, 1, 1, 1, 1, 1, 1, 1, Infinity]}', '{"isolated": [{"query": -2}]}', '{"hidden": [{"text": "a"}]}',
      '{"file": "/etc/passwd"}', '{"queries": 4}', "[" * 100_000, json.dumps({"queries": list(range(MAX_QUERIES + 1))})],
 )  # fmt: skip

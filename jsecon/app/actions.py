@@ -11,7 +11,21 @@ from typing import Any
 from urllib.parse import urlencode
 
 from jsecon.app.models import folders_of_models, with_models
-from jsecon.app.verbs import Demo, Doctor, Eval, Export, FieldVerb, Fit, Models, Query, Run, Serve, VerbResult, View
+from jsecon.app.verbs import (
+    Demo,
+    Doctor,
+    Eval,
+    Export,
+    FieldVerb,
+    Fit,
+    Models,
+    Objects,
+    Query,
+    Run,
+    Serve,
+    VerbResult,
+    View,
+)
 from jsecon.errors import InputError
 from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
@@ -84,7 +98,9 @@ def _query(verb: Query, console: Console) -> VerbResult:
     with console.progress("field"):
         large = ask.larger_than_memory(verb.field)
         if large:
-            ask.require_blocks(verb.field, by=verb.by, outlined=bool(verb.mask or verb.box or verb.phrases))
+            edited = bool(verb.grow or verb.shrink or verb.invert)
+            outlined = bool(verb.mask or verb.box or verb.phrases)
+            ask.require_blocks(verb.field, by=verb.by, outlined=outlined, edited=edited)
             check_field(verb.field)
         field = load_field(verb.field, mapped=large)
         texts = verb.texts if verb.phrases is None else []
@@ -101,6 +117,7 @@ def _query(verb: Query, console: Console) -> VerbResult:
         ):
             answers += more
             errors += refused
+        answers = ask.edit_answers(field, answers, grow=verb.grow, shrink=verb.shrink, invert=verb.invert)
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
     return result | {"errors": errors}
@@ -134,6 +151,9 @@ def _check_query(verb: Query) -> None:
     if not 0 <= verb.quantile <= 1:
         remedy = f"{Query.quantile:g} is the default; 0 refuses no text."
         raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
+    for name, shells in (("--grow", verb.grow), ("--shrink", verb.shrink)):
+        if shells < 0:
+            raise InputError(name, f"{shells}", "a number of shells, 0 or more", "1 is a small step.")
     if (verb.mask or verb.box) and verb.by != "votes":
         problem = "--mask and --box select by the outline alone"
         raise InputError("--by", problem, remedy="Leave --by out, or ask by a text.")
@@ -176,19 +196,83 @@ def _ask_phrases(field: Any, verb: Query, console: Console) -> tuple[list[Any], 
     return answers, errors
 
 
-def _export(verb: Export, console: Console) -> VerbResult:
+def _objects(verb: Objects, console: Console) -> VerbResult:
+    if verb.out is not None:
+        require_writable(verb.out)
     with console.progress("field"):
+        from jsecon.app import catalogue, catalogue_files
+        from jsecon.language.field import load_field
+
+        names = None if verb.vocabulary is None else catalogue.read_vocabulary(verb.vocabulary)
+        field = load_field(verb.field)
+        by_model = names is not None or verb.template or verb.embedder is not None  # else its words may be in the field
+        listed = catalogue.objects(field, names, _embedder(field, verb, console) if by_model else None)
+    catalogue_files.print_catalogue(listed, console)
+    result: VerbResult = {"objects": [catalogue_files.object_record(listed, n) for n in range(len(listed))]}
+    if verb.out is None:
+        return result
+    files = catalogue_files.write_catalogue(field, listed, verb.out, console)
+    console.say(f"pictures  {files['catalogue']}")
+    return result | {"written": files}
+
+
+def _export(verb: Export, console: Console) -> VerbResult:
+    _check_export(verb)
+    with console.progress("field"):
+        import numpy as np
+
+        from jsecon.app import ask, catalogue_files
+        from jsecon.app.catalogue import objects
         from jsecon.app.outputs import save_scene
         from jsecon.data.gaussians.files import require_writable_format
         from jsecon.language.field import check_field, load_field
 
-        require_writable_format(verb.out)
+        if verb.out is not None:
+            require_writable_format(verb.out)
+        text = verb.only if verb.only is not None else verb.without
+        listed_ids = verb.with_labels or verb.labels is not None or verb.objects is not None
         check_field(verb.field)
-        field = load_field(verb.field, mapped=True)
-        save_scene(field, verb.out)
-    count, size = field.gaussians.count, verb.out.stat().st_size
-    console.say(f"{count} Gaussians, {size / 2**20:.1f} MiB  {verb.out}")
-    return {"written": {"scene": verb.out}, "gaussians": count, "bytes": size}
+        field = load_field(verb.field, mapped=text is None and not listed_ids)
+    rows = None
+    if text is not None:
+        mask = ask.ask_text(field, _embedder(field, verb, console), text).mask
+        if not mask.any():
+            option = "--only" if verb.only is not None else "--without"
+            raise InputError(option, f"{text!r} selects no Gaussian", remedy="Ask with other words.")
+        rows = np.flatnonzero(mask if verb.only is not None else ~mask)
+    result: VerbResult = {"written": {}, "gaussians": field.gaussians.count if rows is None else len(rows)}
+    with console.progress("files"):
+        listed = objects(field) if listed_ids else None
+        if verb.out is not None:
+            save_scene(field, verb.out, rows=rows, object_ids=listed.labels if listed and verb.with_labels else None)
+            result["bytes"] = verb.out.stat().st_size
+            result["written"]["scene"] = verb.out
+            console.say(f"{result['gaussians']} Gaussians, {result['bytes'] / 2**20:.1f} MiB  {verb.out}")
+        if listed is not None and verb.labels is not None:
+            ids = listed.labels if rows is None else listed.labels[rows]
+            catalogue_files.save_labels(ids, verb.labels)
+            result["written"]["labels"] = verb.labels
+            console.say(f"{len(ids)} ids of objects, {int((ids < 0).sum())} of them -1  {verb.labels}")
+        if listed is not None and verb.objects is not None:
+            files = catalogue_files.save_objects(field, listed, verb.objects)
+            result["written"]["objects"] = files
+            console.say(f"{len(files)} objects  {verb.objects}")
+    return result
+
+
+def _check_export(verb: Export) -> None:
+    """Raises InputError for options of an export that say nothing, or that cannot be combined."""
+    if verb.out is None and verb.labels is None and verb.objects is None:
+        raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --labels or --objects.")
+    if verb.with_labels and (verb.out is None or verb.out.suffix.lower() != ".ply"):
+        raise InputError("--with-labels", "only a .ply holds them", remedy="Give --out scene.ply, or --labels ids.npy.")
+    if verb.only is not None and verb.without is not None:
+        raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
+    if verb.objects is not None and (verb.only is not None or verb.without is not None):
+        problem = "it writes all objects, so --only and --without cannot be combined with it"
+        raise InputError("--objects", problem, remedy="Leave one of them out.")
+    if verb.labels is not None and verb.labels.suffix != ".npy":
+        raise InputError("--labels", f"{verb.labels} does not end in .npy", remedy="For example: --labels ids.npy")
 
 
 def _view(verb: View, console: Console) -> VerbResult:
@@ -319,6 +403,7 @@ VERBS: dict[str, tuple[Any, type]] = {
     "run": (_run, Run),
     "fit": (_fit, Fit),
     "query": (_query, Query),
+    "objects": (_objects, Objects),
     "export": (_export, Export),
     "view": (_view, View),
     "eval": (_eval, Eval),

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jsecon.data.images import read_pixels
 from jsecon.data.masks import resize_nearest
@@ -26,6 +26,7 @@ from jsecon.language.field import subset_field
 from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.language.regions import ALIKE_THRESHOLD
 from jsecon.process import MEMORY, memory_budget
+from jsecon.query import edits
 from jsecon.query.blocks import SparseSelection, select_in_blocks
 from jsecon.query.composite import parse_query
 from jsecon.query.match import ONE_REGION, RegionMatch, best_presence, match_region, match_regions
@@ -334,6 +335,43 @@ def drop_outliers(field: LanguageField, answer: Answer, enabled: bool = True, *,
     return dataclasses.replace(answer, mask=result.mask, skipped=skipped, clusters=clusters)
 
 
+def edit_answers(
+    field: LanguageField,
+    answers: Sequence[Answer],
+    *,
+    grow: int = 0,
+    shrink: int = 0,
+    invert: bool = False,
+    near: Int[np.ndarray, "n k"] | None = None,
+) -> list[Answer]:
+    """Grows the selections of answers, then shrinks them, then inverts them.
+
+    Args:
+      field: The field, with a row for each row of the answers.
+      answers: The answers.
+      grow: Number of shells of neighbours to add (`jsecon.query.edits`).
+      shrink: Number of shells to remove.
+      invert: Whether to select what is not selected.
+      near: `mutual_neighbours` of the field's Gaussians, if they are at hand.
+
+    Returns:
+      The answers with other masks. Those that select no Gaussian stay.
+    """
+    if not (grow or shrink or invert):
+        return list(answers)
+    if near is None and (grow or shrink):
+        near = edits.mutual_neighbours(field.gaussians.means)
+    edited = []
+    for answer in answers:
+        if answer.mask.any():
+            mask = answer.mask if near is None else edits.shrink(edits.grow(answer.mask, near, grow), near, shrink)
+            mask = np.asarray(edits.invert(mask) if invert else mask)
+            selection = dataclasses.replace(answer.selection, mask=mask)
+            answer = dataclasses.replace(answer, selection=selection, mask=mask)
+        edited.append(answer)
+    return edited
+
+
 def with_phrases(field: LanguageField, embedder: Any) -> LanguageField:
     """Adds to a field what texts are compared with, unless it has that already.
 
@@ -530,18 +568,20 @@ def larger_than_memory(file: Path) -> bool:
     return file.is_file() and file.stat().st_size > memory_budget()
 
 
-def require_blocks(file: Path, *, by: str, outlined: bool) -> None:
+def require_blocks(file: Path, *, by: str, outlined: bool, edited: bool) -> None:
     """Checks that queries of a field larger than memory can be answered in blocks.
 
     Args:
       file: Path of the field.
       by: How Gaussians are selected.
       outlined: Whether a query is an outline or a phrase.
+      edited: Whether answers are grown, shrunk or inverted.
 
     Raises:
       InputError: They need the whole field in memory.
     """
     options = {f"--by {by}": by not in ("votes", "code"), "--mask, --box or --phrases": outlined}
+    options |= {"--grow, --shrink or --invert": edited}
     for option, used in options.items():
         if used:
             size, budget = file.stat().st_size / 2**30, memory_budget() / 2**30

@@ -39,6 +39,8 @@ examples
   jsecon fit my_capture --out scene.ply --minutes 5     only the Gaussians, the best that five minutes give
   jsecon query my_field/field.safetensors "red mug" "dark green bottle" --out answers
   jsecon query my_field/field.safetensors --at frame_00012 310 145 --out answers
+  jsecon objects my_field/field.safetensors --out catalogue
+                                                        what is in it: names, boxes, sizes, a page of pictures
   jsecon export my_field/field.safetensors --out scene.glb
                                                         the whole scene for other programs, codes included
   jsecon view my_field/field.safetensors "red mug"      in a browser; --export page.html writes a page

@@ -21,6 +21,7 @@ from jsecon.app import pictures, report
 from jsecon.app.ask import Answer, quantile_message
 from jsecon.app.locate import decimals, rounded, selected_centers
 from jsecon.data.gaussians.files import save_gaussians
+from jsecon.data.gaussians.ply import save_ply
 from jsecon.files import atomic_write, write_text
 from jsecon.language.columns import vote_blocks
 from jsecon.language.field import subset_field
@@ -256,13 +257,27 @@ def _outliers_message(outliers: Mapping[str, int]) -> str:
     return f"{count} selected Gaussians stand apart and were dropped{clusters}; --keep-outliers keeps them"
 
 
-def save_scene(field: LanguageField, file: Path) -> None:
-    """Writes all Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
+def save_scene(
+    field: LanguageField,
+    file: Path,
+    *,
+    rows: Int[np.ndarray, " m"] | None = None,
+    object_ids: Int[np.ndarray, " n"] | None = None,
+) -> None:
+    """Writes Gaussians in the world of the capture's files, in blocks, so that a mapped field need not fit memory.
 
     Args:
       field: The field.
       file: The .ply, .spz or .glb to write. A .glb also holds codes and regions.
+      rows: The Gaussians to write, in this order; None writes all.
+      object_ids: (N,) ids of all Gaussians for the property `object_id` of a .ply.
     """
+    if rows is not None:
+        field = subset_field(field, rows)
+        object_ids = None if object_ids is None else object_ids[rows]
+    if file.suffix.lower() == ".ply":
+        save_ply(file, field.gaussians, similarity=field.to_source, object_ids=object_ids)
+        return
     columns = {"codes": field.codes, "regions": main_regions(field)} if file.suffix.lower() == ".glb" else {}
     save_gaussians(file, field.gaussians, similarity=field.to_source, **columns)
 
@@ -276,7 +291,7 @@ def file_stem(answer: Answer) -> str:
     Returns:
       The name without ending.
     """
-    plain = _slug(answer.query)
+    plain = slug(answer.query)
     pointed = POINTED.fullmatch(answer.query) is not None  # a text may be called like a pixel
     by_name = answer.key == answer.query if pointed else answer.key is None
     short = len(plain.encode()) <= MAX_SLUG_BYTES and plain not in DEVICES
@@ -290,10 +305,10 @@ def _frame_stem(field: LanguageField, frame: int) -> str:
     name = field.names[frame]
     unique = sum(other.casefold() == name.casefold() for other in field.names) == 1  # on a file system without case
     ordinary = re.fullmatch(r"[A-Za-z0-9_]+", name) and len(name) <= MAX_SLUG_BYTES and unique
-    return name if ordinary else _hashed(_slug(name), name)
+    return name if ordinary else _hashed(slug(name), name)
 
 
-def _slug(text: str) -> str:
+def slug(text: str) -> str:
     """Returns the letters and digits of a text, in lower case, with hyphens between; "query" without any."""
     folded = unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
     return re.sub(r"[^\w]+", "-", folded).strip("-") or "query"

@@ -21,6 +21,10 @@ UNKNOWN = 0.25
 """grey of Gaussians without a code, 0 to 1"""
 GOLDEN_ANGLE = 0.61803398875
 """difference of neighbouring hues, in turns"""
+MARGIN = 0.3
+"""margin around an object in its picture, as a share of its size"""
+MIN_CROP_PX = 16
+"""smallest size of an object in its picture"""
 _FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.36)
 
 
@@ -119,6 +123,45 @@ def masklet_strip(
             tile = cv2.warpAffine(_outlined(frame, mask, SELECTED, 1), matrix, (side, side), borderValue=(40, 40, 40))
         tiles += [tile, np.full((side, 3, 3), 128, np.uint8)]
     return np.concatenate(tiles[:-1], axis=1)
+
+
+def crop_to_points(
+    photo: UInt8[np.ndarray, "h w 3"], camera: Camera, points: Float[np.ndarray, "m 3"]
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Cuts out the part of a photograph that shows points.
+
+    Args:
+      photo: The photograph.
+      camera: Its camera.
+      points: Points in the camera's world.
+
+    Returns:
+      A square with a margin around all but 3 % of the points on each side, as far as the photograph reaches; the whole
+      photograph if it shows none of them.
+    """
+    height, width = photo.shape[:2]
+    pose = np.asarray(camera.world_to_camera)
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    points = points[points[:, 2] > 1e-6]
+    fx, fy, cx, cy = (float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy"))
+    u = fx * points[:, 0] / points[:, 2] + cx
+    v = fy * points[:, 1] / points[:, 2] + cy
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    if not inside.any():
+        return photo
+    (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
+    half = max(right - left, bottom - top, MIN_CROP_PX) * (0.5 + MARGIN)
+    x = (left + right) / 2
+    y = (top + bottom) / 2
+    rows = slice(int(max(y - half, 0)), int(min(y + half, height)) + 1)
+    return photo[rows, int(max(x - half, 0)) : int(min(x + half, width)) + 1]
+
+
+def fitted(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Returns an image whose longer side has `side` pixels."""
+    scale = side / max(image.shape[:2])
+    size = max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
 
 
 def _outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thickness: int) -> np.ndarray:

@@ -111,6 +111,25 @@ def grid(figures: Iterable[str], columns: int) -> str:
     return f'<div class="grid" style="--columns:{columns}">{"".join(figures)}</div>'
 
 
+def search_box(words: str) -> str:
+    """Returns an input that shows only the cards whose `search` has each of its words."""
+    return f'<input id="search" type="search" placeholder="{_escaped(words)}" aria-label="{_escaped(words)}">'
+
+
+def cards(elements: Iterable[str]) -> str:
+    """Returns cards side by side."""
+    return f'<div class="cards">{"".join(elements)}</div>'
+
+
+def card(image: np.ndarray, title: str, words: str, *parts: str, search: str) -> str:
+    """Returns a picture with a title and words, which a click opens to show its elements.
+
+    `search` is the text that a search box compares.
+    """
+    summary = f"<summary>{_image(image, title)}<b>{_escaped(title)}</b><span>{_escaped(words)}</span></summary>"
+    return f'<details class="card" data-search="{_escaped(search.lower())}">{summary}{"".join(parts)}</details>'
+
+
 def folded(title: str, *parts: str) -> str:
     """Returns elements that a click on their title shows."""
     return f"<details><summary>{_escaped(title)}</summary>{''.join(parts)}</details>"

@@ -202,6 +202,9 @@ class Query(FieldVerb):
         similarity lies at least 0.75 of the way from the median region to the best one (by votes or silhouette).
       keep_outliers: Keeps the Gaussians that stand apart from the rest of an answer. By default DBSCAN drops them, and
         clusters with less than a tenth of the largest one's weight in the views. The .json counts them.
+      grow: Adds this many shells of neighbouring Gaussians to each answer.
+      shrink: Removes this many shells from each answer, after growing. The same number of both closes gaps.
+      invert: Selects the Gaussians that an answer does not select, after both.
       phrases: Folder of a SAM 3 model (.onnx), which masks the objects that each text names in some frames of the
         capture. A text then selects what lies in the masks in most of the frames that see it.
       images: With --phrases, the capture whose frames are used. By default it is where the run had it.
@@ -229,6 +232,9 @@ class Query(FieldVerb):
     quantile: Advanced[float] = 0.82
     all: Option[bool] = False
     keep_outliers: Advanced[bool] = False
+    grow: Advanced[int] = 0
+    shrink: Advanced[int] = 0
+    invert: Advanced[bool] = False
     phrases: Advanced[Path | None] = None
     images: Advanced[Path | None] = None
     looks: Advanced[int] = 8
@@ -237,21 +243,56 @@ class Query(FieldVerb):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Export(Verb):
-    """Writes the whole scene of a field for other programs.
+class Objects(FieldVerb):
+    """Lists the objects of a field with names, boxes and sizes.
+
+    Prints a table. With --out it also writes objects.json, objects.csv and catalogue.html, a page with pictures of each
+    object. Regions that show one object are joined, and parts are listed under their whole. Boxes stand upright, in the
+    capture's world. An object's id is that of jsecon export.
+
+    Attributes:
+      out: Output folder.
+      vocabulary: Text file of names to choose from, one a line. By default these are colours for a field without
+        models, and some 330 common nouns for one with CLIP.
+    """
+
+    examples = (
+        "jsecon objects my_field/field.safetensors",
+        "jsecon objects my_field/field.safetensors --vocabulary names.txt --out catalogue",
+    )
+
+    out: Option[Path | None] = None
+    vocabulary: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export(FieldVerb):
+    """Writes the scene of a field, or objects of it, for other programs.
 
     The scene is in the capture's world. A .glb is glTF with Khronos' KHR_gaussian_splatting, y up, and holds each
     Gaussian's code (_CODE_0, _CODE_1 ...) and region (_REGION) too.
 
     Attributes:
-      field: Path of field.safetensors, written by jsecon run.
       out: The .ply (INRIA's layout), .spz or .glb to write.
+      with_labels: Adds to the .ply the property object_id, the id of each Gaussian's object in jsecon objects, or -1.
+      labels: File (.npy) to write with these ids, int32, in the order of the Gaussians in the .ply.
+      objects: Folder to write a .ply of each object to, named by its id and name.
+      only: Exports only the Gaussians that jsecon query selects for this text.
+      without: Exports all other Gaussians than those. Both exports together hold each Gaussian of the scene once.
     """
 
-    examples = ("jsecon export my_field/field.safetensors --out scene.glb",)
+    examples = (
+        "jsecon export my_field/field.safetensors --out scene.glb",
+        "jsecon export my_field/field.safetensors --objects objects --labels ids.npy",
+        'jsecon export my_field/field.safetensors --without "red mug" --out rest.ply',
+    )
 
-    field: Positional[Path]
-    out: Option[Path]
+    out: Option[Path | None] = None
+    with_labels: Option[bool] = False
+    labels: Option[Path | None] = None
+    objects: Option[Path | None] = None
+    only: Option[str | None] = None
+    without: Option[str | None] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

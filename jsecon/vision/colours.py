@@ -53,6 +53,11 @@ _SURROUNDINGS = {
 # fmt: on
 BASIC = ("black", "white", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple", "grey")
 """the eleven basic colour terms"""
+VOCABULARY = (*(name for name in PALETTE if name.split()[-1] in BASIC), "turquoise", "lilac")
+"""Names that objects get: basic terms, their dark and light variants, and the two that came to be basic terms in
+English since (Mylonas & MacDonald 2016)."""
+SOFTMAX_SCALE = 20.0
+"""Scale of cosines in the softmax over names."""
 # A bare basic term names a family of colours: itself and these shades, and so their neighbours (burgundy, sky) too.
 _SHADES = {basic: tuple(f"{shade} {basic}" for shade in ("dark", "light")) for basic in BASIC} | {
     "black": ("charcoal",),
@@ -104,6 +109,8 @@ class ColourEmbedder:
     """
 
     name = "colours-1"
+    vocabulary = (*VOCABULARY, *(f"{name} background" for name in VOCABULARY))
+    softmax_scale = SOFTMAX_SCALE
 
     def __init__(self):
         """Prepares the table of colour words."""

@@ -78,7 +78,8 @@ class Embedder(Protocol):
     """A joint space of images and texts; every vector has unit length, so that a cosine is a similarity.
 
     An embedder may also have `reference`, (W, E) float32 unit: embeddings of texts unrelated to any scene. Without it
-    `REFERENCE_WORDS` are embedded (`reference_words.reference_of`).
+    `REFERENCE_WORDS` are embedded (`reference_words.reference_of`). Texts in a tuple `vocabulary` are the names that a
+    catalogue gives to objects by default, and `softmax_scale` scales their cosines before a softmax.
     """
 
     name: str

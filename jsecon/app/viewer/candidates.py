@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from jsecon.app.ask import with_phrases
 from jsecon.app.outputs import main_regions
-from jsecon.app.pictures import Renderer
+from jsecon.app.pictures import Renderer, crop_to_points
 from jsecon.language.regions import mean_residuals
 from jsecon.query.composite import parse_query
 from jsecon.query.match import ROUNDING, RULES, evidence, reference_words, region_similarities
@@ -21,8 +21,6 @@ from jsecon.types import Camera, LanguageField
 
 RAY_VIEW_SIDE = 1025
 """side of the view that looks along a ray, px; the ray meets the centre of its middle pixel"""
-MARGIN = 0.3
-"""margin around a region in its picture, as a share of its size"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,27 +105,12 @@ class RegionPictures:
         self.renderer = Renderer(field.gaussians, field.cameras)
         self.regions = main_regions(field)
         self._means = np.asarray(field.gaussians.means)
-        self._poses = np.asarray(field.cameras.world_to_camera)
-        self._intrinsics = [np.asarray(getattr(field.cameras, name)) for name in ("fx", "fy", "cx", "cy")]
+        self._cameras = jax.tree.map(np.asarray, field.cameras)
 
     def region(self, region: int, frame: int) -> UInt8[np.ndarray, "h w 3"]:
         """Returns the part of a frame that shows a region's Gaussians, or else the whole frame."""
-        photo = self.renderer.photo(frame)
-        height, width = photo.shape[:2]
-        points = self._means[self.regions == region] @ self._poses[frame, :3, :3].T + self._poses[frame, :3, 3]
-        points = points[points[:, 2] > 1e-6]
-        fx, fy, cx, cy = (a[frame] for a in self._intrinsics)
-        u = fx * points[:, 0] / points[:, 2] + cx
-        v = fy * points[:, 1] / points[:, 2] + cy
-        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        if not inside.any():
-            return photo
-        (left, right), (top, bottom) = (np.quantile(a[inside], (0.03, 0.97)) for a in (u, v))
-        half = max(right - left, bottom - top, 16) * (0.5 + MARGIN)
-        x = (left + right) / 2
-        y = (top + bottom) / 2
-        rows = slice(int(max(y - half, 0)), int(min(y + half, height)) + 1)
-        return photo[rows, int(max(x - half, 0)) : int(min(x + half, width)) + 1]
+        points = self._means[self.regions == region]
+        return crop_to_points(self.renderer.photo(frame), self._cameras[frame], points)
 
 
 def region_along(

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from jsecon.app.ask import Answer, quantile_message
+from jsecon.app.pictures import fitted
 from jsecon.app.viewer import view_state
 from jsecon.app.viewer.candidates import Candidate
 from jsecon.app.viewer.view_state import COLOURINGS, ViewState, answer_colours
@@ -62,6 +63,9 @@ class Panel:
         self._part_vs_whole = gui.add_slider(
             "part or whole", 0.0, 1.0, 0.05, default.part_vs_whole, disabled=not has_overlap, hint=hint
         )
+        most = view_state.MAX_SHELLS
+        hint = "Shells of neighbouring Gaussians that each selection is grown by; below 0 it is shrunk"
+        self._shells = gui.add_slider("grow or shrink", -most, most, 1, default.shells, hint=hint)
         self._colouring = gui.add_dropdown("colour", COLOURINGS, initial_value=default.colouring)
         selection_buttons = gui.add_button_group("selection", ("isolate", "hide", "export"))
         view_buttons = gui.add_button_group("", ("show all", "undo"))
@@ -80,7 +84,7 @@ class Panel:
 
         text_form.on_submit(_in_order(lambda _: viewer.then(lambda s: view_state.with_texts(s, self._text.value))))
         link_form.on_submit(_in_order(lambda _: viewer.restore(self._link.value)))
-        for name in ("all_matches", "threshold", "part_vs_whole", "colouring"):
+        for name in ("all_matches", "threshold", "part_vs_whole", "shells", "colouring"):
             control = getattr(self, f"_{name}")
             control.on_update(_in_order(lambda event, name=name: self._set_control(name, event.target.value)))
         for buttons in (selection_buttons, view_buttons):
@@ -144,6 +148,7 @@ class Panel:
         self._colouring.value = state.colouring
         self._threshold.value = state.threshold
         self._part_vs_whole.value = state.part_vs_whole
+        self._shells.value = state.shells
 
     def show_messages(self, content: str) -> None:
         """Shows messages about the answers, and removes the notice."""
@@ -257,8 +262,7 @@ def candidate_grid(
     """
     cells = []
     for number, (place, candidate, picture) in enumerate(pictured):
-        scale = THUMBNAIL / max(picture.shape[:2])
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = fitted(picture, THUMBNAIL)
         data = base64.b64encode(cv2.imencode(".jpg", small[..., ::-1])[1].tobytes()).decode()
         answer = answers[place]
         selected = not isinstance(answer, InputError) and int(answer.selection.region) == candidate.region

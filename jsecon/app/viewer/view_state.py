@@ -29,6 +29,8 @@ GOLDEN_ANGLE = 0.61803398875
 """difference of neighbouring hues, in turns"""
 MAX_QUERIES = 40
 """number of queries that are highlighted at once"""
+MAX_SHELLS = 5
+"""shells of neighbours that a selection is grown or shrunk by"""
 MAX_TEXT = 4000
 """letters of a text in a link"""
 MAX_UNDO = 100
@@ -45,12 +47,14 @@ class ViewQuery:
       part_vs_whole: 0 selects the best region alone, 1 all regions that overlap it and are nearer to the query than
         most.
       all_matches: Whether to select all regions that match instead of the best one.
+      shells: Shells of neighbours that the selection is grown by; below 0 it is shrunk.
     """
 
     query: str | int
     threshold: float = SHARE_THRESHOLD
     part_vs_whole: float = 1 - PIECE_THRESHOLD
     all_matches: bool = False
+    shells: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +70,7 @@ class ViewState:
       isolated: If any, only their Gaussians are visible.
       hidden: Queries whose Gaussians are invisible.
       camera: In a link, position, point looked at and up direction, nine numbers in the field's world; else empty.
+      shells: As in `ViewQuery`.
     """
 
     queries: tuple[str | int, ...] = ()
@@ -76,11 +81,13 @@ class ViewState:
     isolated: tuple[ViewQuery, ...] = ()
     hidden: tuple[ViewQuery, ...] = ()
     camera: tuple[float, ...] = ()
+    shells: int = 0
 
     @property
     def view_queries(self) -> tuple[ViewQuery, ...]:
         """The highlighted queries with their options."""
-        return tuple(ViewQuery(q, self.threshold, self.part_vs_whole, self.all_matches) for q in self.queries)
+        options = self.threshold, self.part_vs_whole, self.all_matches, self.shells
+        return tuple(ViewQuery(query, *options) for query in self.queries)
 
 
 def with_texts(state: ViewState, line: str) -> ViewState:
@@ -108,7 +115,7 @@ def replace_match(state: ViewState, place: int, region: int) -> ViewState:
 
 
 def with_controls(state: ViewState, **controls: Any) -> ViewState:
-    """Sets threshold, part_vs_whole (both clipped to 0 .. 1), all_matches, colouring or camera."""
+    """Sets threshold, part_vs_whole (both clipped to 0 .. 1), all_matches, shells, colouring or camera."""
     for name in ("threshold", "part_vs_whole"):
         if name in controls:
             controls[name] = round(min(max(float(controls[name]), 0.0), 1.0), 3)
@@ -148,7 +155,7 @@ class History:
         if state == self.state:
             return self
         changed = _differences(self.state, state)
-        is_slider = changed in ({"threshold"}, {"part_vs_whole"})
+        is_slider = changed in ({"threshold"}, {"part_vs_whole"}, {"shells"})
         if is_slider and self.past and _differences(self.past[-1], state) == changed:
             return History(state, self.past)
         return History(state, (*self.past, self.state)[-MAX_UNDO:])
@@ -202,7 +209,8 @@ def from_link(link: str) -> ViewState:
 def _checked_query(**fields: Any) -> ViewQuery:
     """Returns the query of a link, or raises ValueError."""
     query = ViewQuery(**fields)
-    _check_fields(ViewState((query.query,), query.threshold, query.part_vs_whole, query.all_matches))
+    options = {field.name: getattr(query, field.name) for field in dataclasses.fields(ViewQuery)[1:]}
+    _check_fields(ViewState((query.query,), **options))
     return query
 
 
@@ -224,6 +232,7 @@ def _check_fields(state: ViewState) -> None:
         "threshold": is_number(state.threshold) and 0 <= state.threshold <= 1,
         "part_vs_whole": is_number(state.part_vs_whole) and 0 <= state.part_vs_whole <= 1,
         "all_matches": isinstance(state.all_matches, bool),
+        "shells": is_int(state.shells) and abs(state.shells) <= MAX_SHELLS,
         "colouring": state.colouring in COLOURINGS,
         "camera": len(state.camera) in (0, 9) and all(is_number(x) and abs(x) < 1e9 for x in state.camera),
     }

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from jsecon.app.access import listen, token_for
-from jsecon.app.ask import Answer, ask_region, ask_text
+from jsecon.app.ask import Answer, ask_region, ask_text, edit_answers
 from jsecon.app.outputs import answer_masks, file_stem, write_answer
 from jsecon.app.pictures import UNKNOWN, code_colours, palette
 from jsecon.app.viewer import view_state
@@ -29,6 +29,7 @@ from jsecon.app.viewer.panel import Panel, candidate_grid, messages
 from jsecon.app.viewer.scene import FieldScene
 from jsecon.app.viewer.view_state import History, ViewQuery, ViewState
 from jsecon.errors import InputError
+from jsecon.query.edits import mutual_neighbours
 from jsecon.types import LanguageField
 
 REMEDY = 'Run: pip install "jsecon[viewer]". Or write a page with --export.'
@@ -78,6 +79,11 @@ class Viewer:
     def pictures(self) -> RegionPictures:
         """Pictures of the frames and regions."""
         return RegionPictures(self.field)
+
+    @functools.cached_property
+    def _neighbours(self) -> np.ndarray:
+        """The Gaussians next to each."""
+        return mutual_neighbours(self.field.gaussians.means)
 
     def start(self, state: ViewState) -> None:
         """Draws a first state, compiles what queries need, and starts the thread."""
@@ -229,8 +235,13 @@ class Viewer:
         options: dict[str, Any] = {"several": query.all_matches, "piece_threshold": 1 - query.part_vs_whole}
         try:
             if isinstance(query.query, str):
-                return ask_text(self.field, self.embedder, query.query, threshold=query.threshold, **options)
-            return ask_region(self.field, query.query, threshold=query.threshold, **options)
+                answer = ask_text(self.field, self.embedder, query.query, threshold=query.threshold, **options)
+            else:
+                answer = ask_region(self.field, query.query, threshold=query.threshold, **options)
+            if not query.shells:
+                return answer
+            shells: dict[str, Any] = {"grow": max(query.shells, 0), "shrink": max(-query.shells, 0)}
+            return edit_answers(self.field, [answer], near=self._neighbours, **shells)[0]
         except InputError as error:
             return error
 

@@ -18,7 +18,7 @@ from typing import BinaryIO
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from jsecon.errors import InputError, describe_error, require_shape
 from jsecon.files import atomic_write
@@ -527,6 +527,7 @@ def save_ply(
     *,
     rgb: Float[Array, "n 3"] | None = None,
     similarity: Float[Array, "4 4"] | None = None,
+    object_ids: Int[Array, " n"] | None = None,
 ) -> None:
     """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
 
@@ -539,6 +540,7 @@ def save_ply(
       gaussians: N Gaussians.
       rgb: (N, 3) in 0..1, one colour a Gaussian instead of its spherical harmonics, to show codes or similarities.
       similarity: (4, 4) transform into the world of the file.
+      object_ids: (N,) written as a further property `object_id`, int32, which other readers skip.
 
     Raises:
       ValueError: Shapes disagree.
@@ -546,19 +548,23 @@ def save_ply(
     """
     check_gaussians(gaussians)
     count = gaussians.count
+    if object_ids is not None:
+        require_shape("object_ids", object_ids, (count,), "Give one id per Gaussian.")
     if rgb is not None:
         require_shape("rgb", rgb, (count, 3), "Give one colour per Gaussian.")
     rest_names = (f"f_rest_{index}" for index in range(0 if rgb is not None else 3 * (gaussians.sh.shape[1] - 1)))
     names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
     double = needs_float64(gaussians, similarity)
     kinds = ("double" if double and name in _POSITION else "float" for name in names)
-    properties = (f"property {kind} {name}" for kind, name in zip(kinds, names))
+    properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
+    properties += [] if object_ids is None else ["property int object_id"]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode())
         for rows, block in usable_blocks(path, gaussians, similarity):
             sh = block.sh if rgb is None else ((np.asarray(rgb[rows], np.float64) - 0.5) / C0)[:, None]
-            file.write(_table(block, np.asarray(sh, np.float32), double).tobytes())  # tofile hides a full disk
+            ids = None if object_ids is None else object_ids[rows]
+            file.write(_table(block, np.asarray(sh, np.float32), double, ids).tobytes())  # tofile hides a full disk
 
 
 def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
@@ -575,17 +581,20 @@ def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None =
     return far > 0.01 * gaussians.count
 
 
-def _table(block: Gaussians, sh: np.ndarray, double: bool) -> np.ndarray:
+def _table(block: Gaussians, sh: np.ndarray, double: bool, object_ids: np.ndarray | None = None) -> np.ndarray:
     """The rows of a file."""
     count = len(sh)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
     normals, opacity = np.zeros((count, 3)), np.asarray(block.opacity_logits)[:, None]
     columns = [block.means, normals, sh[:, 0], rest, opacity, block.log_scales, block.quaternions]
     table = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1).astype("<f4", copy=False)
-    if not double:
+    if not double and object_ids is None:
         return table
-    rows = np.empty(count, [("means", "<f8", 3), ("others", "<f4", table.shape[1] - 3)])
+    last = [] if object_ids is None else [("object_id", "<i4")]
+    rows = np.empty(count, [("means", "<f8" if double else "<f4", 3), ("others", "<f4", table.shape[1] - 3), *last])
     rows["means"], rows["others"] = block.means, table[:, 3:]
+    if object_ids is not None:
+        rows["object_id"] = object_ids
     return rows
 
 

@@ -1,0 +1,202 @@
+"""The catalogue of a made-up room against its true objects: how many are found, once each, where, and by which colour.
+
+    python -m experiments.catalogue [--seeds 23 24 ...] [--rooms FOLDER] [--quick] [--out FOLDER]
+
+The rooms are those of `jsecon demo`, with its options: default vision, colours, 24 of 30 frames. The true object of a
+Gaussian is the one with most of its weight in the true masks of these frames, or none where the background has more.
+Found: an object and a whole of the catalogue overlap by an IoU of at least 0.5 of their Gaussians. One row: of the
+objects to which most Gaussians of any row belong, those with exactly one such row. The true boxes are those of the
+solids. Box: along the axes of the world; upright: the box of the catalogue and the one along the object's own axes.
+Named: the best name of a found object is the colour that it was made with; objects without a name do not count. Seeds
+20 to 22 chose the constants.
+"""
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+import jsecon
+from experiments import results
+from jsecon.app.catalogue import Catalogue
+from jsecon.data.masks import load_labels
+from jsecon.demo import write_room
+from jsecon.demo.room import Room, RoomObject, crowded_room
+from jsecon.demo.shapes import contains
+from jsecon.pipeline import run as pipeline
+from jsecon.pipeline.options import Options as RunOptions
+from jsecon.pipeline.progress import Listener
+from jsecon.types import LanguageField
+
+FOUND = 0.5
+"""IoU from which an object is found."""
+GRID = 48
+"""Points along each side of a grid that fills a solid's bounding box."""
+HOLDOUT = 5
+QUICK_ROOM = {"views": 8, "width": 96, "height": 72}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the experiment can vary."""
+
+    seeds: tuple[int, ...] = (23, 24, 25, 26, 27)
+    quick: bool = False
+    rooms: str = str(results.HOME.parent / "demos")
+    """Folder that keeps the rooms and their fields."""
+    out: str = str(results.HOME / "results" / "catalogue")
+
+
+@dataclasses.dataclass(frozen=True)
+class Figures:
+    """Figures of one room."""
+
+    objects: int
+    rows: int
+    found: float
+    one_row: float
+    box: float
+    upright: float
+    named: float
+    surroundings: float
+    """Share of the found objects that are taken for surroundings."""
+    seconds: float
+
+
+def field_of_room(folder: Path, seed: int, options: Options) -> LanguageField:
+    """The field of a room, which is made unless the folder has it."""
+    capture = folder / "capture"
+    if not (capture / "scene.json").is_file():
+        write_room(capture, crowded_room(seed), holdout=HOLDOUT, **(QUICK_ROOM if options.quick else {}))
+    steps = 60 if options.quick else 550
+    run = RunOptions(capture, holdout=HOLDOUT, steps=steps, downscale=1.0, seed=seed)
+    pipeline.run(run, folder, listener=Listener())
+    return jsecon.load_field(folder / pipeline.FIELD_FILE)
+
+
+def true_objects(field: LanguageField, capture: Path) -> Int[np.ndarray, " n"]:
+    """Index of the object of each Gaussian by the true masks, or -1."""
+    frames = jsecon.load_capture(capture, holdout=0)
+    rows = [frames.names.index(name) for name in field.names]
+    labels, ids, _ = load_labels(capture / "masks", frames.names, frames.frames.shape[1:3])
+    labels = np.asarray(labels)[rows]
+    count = len(json.loads((capture / "scene.json").read_text())["objects"])
+    original = np.array([*map(int, ids), 0]) - 1  # pixels hold ids from 1 on; the last is the background
+    votes = jsecon.region_votes(field.gaussians, field.cameras, original[labels].astype(np.int16), count)
+    best, weight = np.asarray(votes.regions)[:, 0], np.asarray(votes.weights)[:, 0]
+    return np.where(2 * weight > np.asarray(votes.total), best, -1)
+
+
+def true_points(item: RoomObject) -> Float[np.ndarray, "p 3"]:
+    """Points that fill the solids of an object, world."""
+    steps = np.linspace(-1, 1, GRID)
+    grid = np.stack(np.meshgrid(steps, steps, steps)).reshape(3, -1)
+    points = []
+    for part in item.parts:
+        bound = part.solid.bound
+        inside = bound[:3, None] + bound[3] * grid
+        points.append(inside[:, contains(part.solid, inside.astype(np.float32), margin=1e-6)].T)
+    return np.concatenate(points)
+
+
+def box_iou(low: np.ndarray, high: np.ndarray, points: np.ndarray) -> float:
+    """IoU of a box along the axes of the world and that of points."""
+    sides = np.minimum(high, points.max(0)) - np.maximum(low, points.min(0))
+    both = np.prod(np.maximum(sides, 0))
+    return float(both / (np.prod(high - low) + np.prod(np.ptp(points, axis=0)) - both))
+
+
+def upright_iou(catalogue: Catalogue, row: int, item: RoomObject, points: np.ndarray) -> float:
+    """IoU of an upright box and that of points along an object's own axes."""
+    shape = catalogue.shapes[row]
+    local = points @ item.axes
+    middle = item.axes @ ((local.min(0) + local.max(0)) / 2)
+    size = np.ptp(local, axis=0)
+
+    def footprint(center, axes, size):
+        degrees = np.degrees(np.arctan2(axes[1, 0], axes[0, 0]))
+        return tuple(map(float, center[:2])), tuple(map(float, size[:2])), float(degrees)
+
+    mine = footprint(shape.center, shape.axes, 2 * shape.half_size)
+    crossing = cv2.rotatedRectangleIntersection(mine, footprint(middle, item.axes, size))[1]
+    area = 0.0 if crossing is None else cv2.contourArea(cv2.convexHull(crossing))
+    tops = min(shape.center[2] + shape.half_size[2], middle[2] + size[2] / 2)
+    feet = max(shape.center[2] - shape.half_size[2], middle[2] - size[2] / 2)
+    both = area * max(tops - feet, 0)
+    return float(both / (np.prod(2 * shape.half_size) + np.prod(size) - both))
+
+
+def compare(catalogue: Catalogue, truth: Int[np.ndarray, " n"], room: Room, seconds: float) -> Figures:
+    """Compares a catalogue with the objects of a room."""
+    wholes = np.flatnonzero(catalogue.parent < 0)
+    count = len(room.objects)
+    table = np.zeros((len(catalogue) + 1, count + 1), int)
+    np.add.at(table, (catalogue.labels, truth), 1)  # -1 is the last
+    both = table[wholes, :count]
+    iou = both / np.maximum(table[wholes].sum(1)[:, None] + table[:, :count].sum(0) - both, 1)
+    best = iou.argmax(0)
+    seen = table[:, :count].sum(0) > 0
+    found = np.flatnonzero(iou.max(0) >= FOUND)
+    most = np.bincount(table[wholes].argmax(1), minlength=count + 1)[:count]
+    boxes, upright, named = [], [], []
+    for k in found:
+        row, item = int(wholes[best[k]]), room.objects[k]
+        points = true_points(item)
+        boxes.append(box_iou(catalogue.shapes.low[row], catalogue.shapes.high[row], points))
+        upright.append(upright_iou(catalogue, row, item, points))
+        if item.name:
+            named.append(catalogue.names[row, 0] == item.colour)
+            if not named[-1]:
+                print(f"  {item.name}: {list(zip(catalogue.names[row], catalogue.probability[row].round(2)))}")
+    for k in np.flatnonzero(seen & (iou.max(0) < FOUND)):
+        name = room.objects[k].name or "clutter"
+        print(f"  not found: {name}, {table[:, k].sum()} Gaussians, IoU {iou[:, k].max():.2f}")
+    return Figures(
+        objects=int(seen.sum()),
+        rows=int((~catalogue.surroundings[wholes]).sum()),
+        found=len(found) / int(seen.sum()),
+        one_row=float((most[most > 0] == 1).mean()),
+        box=float(np.median(boxes)),
+        upright=float(np.median(upright)),
+        named=float(np.mean(named)),
+        surroundings=float(catalogue.surroundings[wholes[best[found]]].mean()),
+        seconds=seconds,
+    )
+
+
+def main(options: Options) -> str:
+    """Measures, writes the results and returns the table."""
+    metrics: dict[str, dict] = {}
+    for seed in options.seeds:
+        folder = Path(options.rooms) / f"{'quick-' if options.quick else ''}{seed}"
+        field = field_of_room(folder, seed, options)
+        jsecon.objects(field)  # compiles
+        started = time.perf_counter()
+        catalogue = jsecon.objects(field)
+        seconds = time.perf_counter() - started
+        figures = compare(catalogue, true_objects(field, folder / "capture"), crowded_room(seed), seconds)
+        metrics[f"seed {seed}"] = dataclasses.asdict(figures)
+        print(seed, figures, flush=True)
+    names = list(next(iter(metrics.values())))
+    rows = [(seed, *(row[name] for name in names)) for seed, row in metrics.items()]
+    metrics["mean"] = {name: float(np.mean([row[name] for row in metrics.values()])) for name in names}
+    text = results.table(("room", *names), [*rows, ("mean", *metrics["mean"].values())])
+    results.save(Path(options.out), options, metrics, text)
+    print(text)
+    return text
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(Options.seeds))
+    parser.add_argument("--rooms", default=Options.rooms)
+    parser.add_argument("--quick", action="store_true", help="one tiny room")
+    parser.add_argument("--out", default="")
+    given = parser.parse_args()
+    place = given.out or str(results.HOME / "results" / ("quick/catalogue" if given.quick else "catalogue"))
+    main(Options((0,) if given.quick else tuple(given.seeds), given.quick, given.rooms, place))

@@ -1,0 +1,303 @@
+"""The catalogue of a field: its objects with names, boxes, sizes and parts."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+
+from jsecon.errors import InputError
+from jsecon.language.columns import vote_blocks
+from jsecon.language.membership import membership_probability, vote_shares
+from jsecon.numerics import normalize
+from jsecon.query.groups import containment, objects_of_gaussians, same_object
+from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes, scene_up
+from jsecon.query.outliers import MIN_SAMPLES
+from jsecon.splat.transform import transform_gaussians_float64
+from jsecon.types import LanguageField
+from jsecon.vision.reference_words import REFERENCE_WORDS, reference_of
+
+NAMES = 3
+"""names of each object"""
+FRAMES = 3
+"""frames of each object, those that show most of it"""
+PART_CONTAINMENT = 0.4
+"""Share of a region inside another one from which it is a part of it. A handle that half of the views take for a part
+of its mug lies in the mug by one half."""
+SOFTMAX_SCALE = 100.0
+"""Scale of cosines in CLIP's softmax over texts, to which its training is clipped (arXiv 2103.00020)."""
+# fmt: off
+SURROUNDINGS = frozenset((
+    "wall", "walls", "floor", "ceiling", "ground", "background", "sky", "lawn", "grass", "road", "pavement", "carpet",
+    "rug", "room", "forest", "desert", "beach", "sand", "mud", "sea", "water", "river", "mountain",
+))
+# fmt: on
+"""words of names that tell surroundings from things"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Catalogue:
+    """K objects of a field of N Gaussians and R regions, in the world of the capture and its unit.
+
+    An object's id is its row. Things come first, the one with most Gaussians first, each followed by its parts;
+    surroundings come last.
+    """
+
+    names: np.ndarray
+    """(K, 3) str: names of the vocabulary, the most probable first; "" beyond its end, and where a field of
+    embeddings from files has no model for texts."""
+    probability: np.ndarray
+    """(K, 3) probability of each name, if exactly one of the vocabulary is right."""
+    surroundings: np.ndarray
+    """(K,) bool: the best name is one of walls, floors and the like."""
+    parent: np.ndarray
+    """(K,) int id of the object that this one is a part of, or -1. A parent has none."""
+    confidence: np.ndarray
+    """(K,) mean probability that a Gaussian of the object belongs to it (`membership_probability`)."""
+    views: np.ndarray
+    """(K,) int number of frames that show it."""
+    frames: np.ndarray
+    """(K, 3) int frames that show most of it, best first; -1 beyond the last."""
+    shapes: ObjectShapes
+    """its boxes, points and number of Gaussians; boxes stand upright along `up`."""
+    labels: np.ndarray
+    """(N,) int32 id of the object of each Gaussian that is no part of another, or -1."""
+    part_labels: np.ndarray
+    """(N,) int32 id of the part of each Gaussian, or -1."""
+    regions: np.ndarray
+    """(R,) int32 id of the object that each region belongs to, or -1."""
+    up: np.ndarray
+    """(3,) up axis in the world of the capture."""
+    frame_names: tuple[str, ...]
+    """names of the field's frames."""
+
+    def __len__(self) -> int:
+        """K."""
+        return len(self.parent)
+
+    def mask(self, index: int | np.integer) -> Bool[np.ndarray, " n"]:
+        """(N,) Gaussians of an object: of a whole also those of its parts."""
+        return self.labels == index if self.parent[index] < 0 else self.part_labels == index
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Returns a column of plain values for each figure, as `pandas.DataFrame` takes them."""
+        columns: dict[str, Any] = {"id": np.arange(len(self)), "parent": self.parent}
+        for n in range(NAMES):
+            suffix = f"_{n + 1}" if n else ""
+            columns |= {f"name{suffix}": self.names[:, n], f"probability{suffix}": self.probability[:, n].round(4)}
+        columns |= {"surroundings": self.surroundings, "gaussians": self.shapes.count}
+        columns |= {"confidence": self.confidence.round(4), "views": self.views}
+        shapes = self.shapes
+        for name, values in (("center", shapes.center), ("low", shapes.low), ("high", shapes.high)):
+            columns |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+        for k, name in enumerate(("length", "width", "height")):
+            columns[name] = 2 * shapes.half_size[:, k]
+            columns |= {f"{name}_{axis}": shapes.axes[:, j, k].round(6) for j, axis in enumerate("xyz")}
+        columns["frames"] = [[self.frame_names[t] for t in frames if t >= 0] for frames in self.frames]
+        return {name: column if isinstance(column, list) else column.tolist() for name, column in columns.items()}
+
+
+class _Names(NamedTuple):
+    """Names of a vocabulary, and what they are compared by."""
+
+    texts: tuple[str, ...]
+    embeddings: np.ndarray
+    """(V, E)"""
+    scale: float
+    """of cosines in the softmax"""
+
+
+def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embedder: Any = None) -> Catalogue:
+    """Lists the objects of a field.
+
+    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`). An
+    object most of which lies in another one's masks is a part of it. Every Gaussian belongs to one whole at most.
+
+    Args:
+      field: The field.
+      vocabulary: Names to choose from. None takes those of the embedder: of colours their names, of things and of the
+        background; of others common nouns.
+      embedder: Embedder of the field; None opens it if names need it.
+
+    Returns:
+      The catalogue. It is empty if the field has no regions.
+
+    Raises:
+      InputError: The vocabulary is empty, or the embedder cannot represent a name.
+    """
+    names = _vocabulary(field, vocabulary, embedder)
+    count = field.regions.count
+    groups = connected_components(np.asarray(same_object(field)))[1] if count else np.zeros(0, int)
+    size = np.zeros(count)
+    for votes in vote_blocks(field.votes):
+        shares, regions = np.nan_to_num(np.asarray(vote_shares(votes))), np.asarray(votes.regions)
+        size += np.bincount(regions[regions >= 0], shares[regions >= 0], count)[:count]
+    members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
+    pixels = np.asarray(field.regions.pixels, np.float64)
+    weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
+    order, probability = _name(members @ weighted, names)
+    text = np.asarray((*names.texts, ""), object)
+    surroundings = np.array([bool(SURROUNDINGS & set(name.lower().split())) for name in text[order[:, 0]]], bool)
+    whole = _wholes(field, groups, members, size, surroundings)
+    labels, part_labels, confidence = _assign(field, groups, whole)
+    gaussians = np.where(whole < 0, _counts(labels, len(whole)), _counts(part_labels, len(whole)))
+    rows = _rows(gaussians, whole, surroundings)
+
+    renumber = np.full(len(whole) + 1, -1, np.int32)  # the last entry is that of -1
+    renumber[rows] = np.arange(len(rows))
+    labels, part_labels = renumber[labels], renumber[part_labels]
+    shown = members[rows] @ pixels
+    best = np.argsort(-shown, axis=1, kind="stable")[:, :FRAMES]
+    best = np.where(np.take_along_axis(shown, best, axis=1) > 0, best, -1)
+    to_source = np.asarray(field.to_source, np.float64)
+    up = to_source[:3, :3] @ scene_up(field.cameras)
+    up /= np.linalg.norm(up)
+    return Catalogue(
+        names=text[order[rows]],
+        probability=probability[rows],
+        surroundings=surroundings[rows],
+        parent=renumber[whole[rows]],
+        confidence=confidence[rows],
+        views=(shown > 0).sum(1),
+        frames=np.pad(best, ((0, 0), (0, FRAMES - best.shape[1])), constant_values=-1),
+        shapes=_shapes(field, labels, part_labels, renumber[whole[rows]], up),
+        labels=labels,
+        part_labels=part_labels,
+        regions=renumber[groups],
+        up=up,
+        frame_names=field.names,
+    )
+
+
+def read_vocabulary(file: Path) -> list[str]:
+    """Reads names, one a line. Empty lines and those that begin with # are left out.
+
+    Args:
+      file: The text file, in UTF-8.
+
+    Returns:
+      The names, each once.
+
+    Raises:
+      InputError: The file cannot be read, or has no names.
+    """
+    try:
+        lines = [line.strip() for line in Path(file).read_text(encoding="utf-8-sig").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(file, f"cannot read it ({error})", remedy="Give a text file with one name a line.") from error
+    names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    if not names:
+        raise InputError(file, "it has no names", remedy="Write one name a line.")
+    return names
+
+
+def _vocabulary(field: LanguageField, vocabulary: Sequence[str] | None, embedder: Any) -> _Names:
+    """Returns the names to choose from, with their embeddings."""
+    words_known = field.reference is not None and len(field.reference) == len(REFERENCE_WORDS)
+    if vocabulary is None and embedder is None and words_known and not field.embedder.startswith("colours"):
+        return _Names(REFERENCE_WORDS, np.asarray(field.reference, np.float32), SOFTMAX_SCALE)  # without the model
+    if embedder is None:
+        from jsecon.pipeline.networks import external_dim, field_embedder
+
+        if vocabulary is None and external_dim(field.embedder) is not None:
+            return _Names((), np.zeros((0, field.regions.embeddings.shape[1]), np.float32), SOFTMAX_SCALE)
+        embedder = field_embedder(field)
+    logits = getattr(embedder, "logits", None)
+    scale = getattr(embedder, "softmax_scale", SOFTMAX_SCALE) if logits is None else logits.scale
+    texts = tuple(getattr(embedder, "vocabulary", REFERENCE_WORDS) if vocabulary is None else vocabulary)
+    if not texts:
+        raise InputError("vocabulary", "it has no names", remedy="Give at least one name.")
+    rows = reference_of(embedder) if texts == REFERENCE_WORDS else np.asarray(embedder.embed_text(list(texts)))
+    return _Names(texts, rows, scale)
+
+
+def _name(embeddings: np.ndarray, names: _Names) -> tuple[Int[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
+    """Returns the most probable names of K embeddings (K, E) of any length, and their probabilities.
+
+    A name's index is the number of names where the vocabulary has fewer than `NAMES`, and its probability 0.
+    """
+    if not names.texts:
+        return np.zeros((len(embeddings), NAMES), int), np.zeros((len(embeddings), NAMES))
+    cosines = np.asarray(normalize(jnp.asarray(embeddings)) @ normalize(jnp.asarray(names.embeddings)).T)
+    probability = np.asarray(jax.nn.softmax(names.scale * cosines.reshape(-1, len(names.texts)), axis=1))
+    order = np.argsort(-probability, axis=1, kind="stable")[:, :NAMES]
+    missing = ((0, 0), (0, NAMES - order.shape[1]))
+    best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
+    return np.pad(order, missing, constant_values=len(names.texts)), best
+
+
+def _wholes(
+    field: LanguageField, groups: np.ndarray, members: np.ndarray, size: np.ndarray, surroundings: np.ndarray
+) -> Int[np.ndarray, " g"]:
+    """Returns the group of which each of G groups is a part, or -1. The tree has two levels."""
+    whole = np.full(len(members), -1)
+    if field.votes.overlap is None or not len(groups):
+        return whole
+    inside = np.asarray(containment(jnp.asarray(field.votes.overlap), jnp.asarray(size)))
+    sizes = members @ size
+    for group in np.argsort(-sizes, kind="stable"):  # wholes before their parts
+        largest = int(np.argmax(np.where(members[group], size, -1)))
+        larger = (sizes[groups] > sizes[group]) & ~surroundings[groups]
+        region = int(np.argmax(np.where(larger, inside[largest], -1)))
+        if larger[region] and inside[largest, region] >= PART_CONTAINMENT and not surroundings[group]:
+            whole[group] = groups[region] if whole[groups[region]] < 0 else whole[groups[region]]
+    return whole
+
+
+def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the whole (N,) and the part (N,) of each Gaussian, and the confidence (G,) of each group."""
+    tops = jnp.asarray(np.where(whole < 0, np.arange(len(whole)), whole)[groups].astype(np.int32))
+    parts = jnp.asarray(np.where(whole < 0, -1, np.arange(len(whole)))[groups].astype(np.int32))
+    labels, part_labels, total = [], [], np.zeros(len(whole))
+    for votes in vote_blocks(field.votes):
+        if not len(groups):
+            labels.append(np.full(len(votes.views), -1, np.int32))
+            part_labels.append(labels[-1])
+            continue
+        top, top_share = objects_of_gaussians(votes, tops)
+        part, part_share = objects_of_gaussians(votes, parts)
+        top, part = np.array(top), np.array(part)
+        part[(part >= 0) & (whole[part] != top)] = -1
+        for label, share in ((top, top_share), (part, part_share)):
+            inside = np.asarray(membership_probability(share, votes))
+            total += np.bincount(label[label >= 0], inside[label >= 0], len(whole))
+        labels.append(top)
+        part_labels.append(part)
+    labels, part_labels = np.concatenate(labels), np.concatenate(part_labels)
+    counts = _counts(labels, len(whole)) + _counts(part_labels, len(whole))
+    return labels, part_labels, total / np.maximum(counts, 1)
+
+
+def _counts(labels: np.ndarray, count: int) -> np.ndarray:
+    """Returns how many labels each of `count` groups has."""
+    return np.bincount(labels[labels >= 0], minlength=count)
+
+
+def _rows(gaussians: np.ndarray, whole: np.ndarray, surroundings: np.ndarray) -> Int[np.ndarray, " k"]:
+    """Returns the groups that are listed, in the order of the catalogue."""
+    listed = gaussians >= MIN_SAMPLES
+    rows: list[int] = []
+    for group in np.lexsort((-gaussians, surroundings)):
+        if listed[group] and whole[group] < 0:
+            parts = np.flatnonzero(listed & (whole == group))
+            rows += [int(group), *map(int, parts[np.argsort(-gaussians[parts], kind="stable")])]
+    return np.array(rows, int)
+
+
+def _shapes(
+    field: LanguageField, labels: np.ndarray, part_labels: np.ndarray, parent: np.ndarray, up: np.ndarray
+) -> ObjectShapes:
+    """Measures the objects in the world of the capture."""
+    chosen = np.concatenate([np.flatnonzero(labels >= 0), np.flatnonzero(part_labels >= 0)])
+    own = np.concatenate([labels[labels >= 0], part_labels[part_labels >= 0]])
+    plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # the place does not need colours
+    taken = jax.tree.map(lambda column: np.asarray(column)[chosen], plain)
+    placed = transform_gaussians_float64(taken, field.to_source)
+    to_source = np.asarray(field.to_source, np.float64)
+    means = np.asarray(taken.means, np.float64) @ to_source[:3, :3].T + to_source[:3, 3]
+    return object_shapes(means, own, up, spreads=gaussian_spreads(placed))

@@ -1,0 +1,80 @@
+"""Regions that are one object, regions that are parts of another, and the object of each Gaussian. Pure functions."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from jsecon.language.membership import SHARE_THRESHOLD, ratio, vote_columns
+from jsecon.query.match import RULES, match_region
+from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
+from jsecon.types import Array, LanguageField, Votes
+
+
+def same_object(field: LanguageField, rules: QueryRules = RULES) -> Bool[Array, "r r"]:
+    """Finds the pairs of regions that show one object.
+
+    A query with either region as its text would add the other: as a piece of the same object, or as alike
+    (`match_region`). Both also overlap by MIN_PIECE_OVERLAP, since two objects of a kind are alike as well.
+
+    Args:
+      field: Field of R regions.
+      rules: `piece_threshold` and `alike_threshold` are read.
+
+    Returns:
+      (R, R) symmetric, true on the diagonal. Without `Votes.overlap` no other pair.
+    """
+    ids = jnp.arange(field.regions.count)
+    itself = ids[:, None] == ids
+    if field.votes.overlap is None or not len(ids):
+        return itself
+    joins = jax.vmap(lambda region: match_region(field, region, rules).chosen)(ids)
+    return itself | (joins & joins.T & (jnp.asarray(field.votes.overlap) >= MIN_PIECE_OVERLAP))
+
+
+@jax.jit
+def containment(overlap: Float[Array, "r r"], size: Float[Array, " r"]) -> Float[Array, "r r"]:
+    """Computes how much of a region lies in another: sum_n min(p_nr, p_ns) / sum_n p_nr, with p the shares.
+
+    Args:
+      overlap: Soft IoU of R regions (`Votes.overlap`).
+      size: Sum of each region's shares.
+
+    Returns:
+      (R, R) of each region in row r, its part in region s; 0 for a region without votes.
+    """
+    both = overlap * (size[:, None] + size) / (1 + overlap)
+    return jnp.where(size[:, None] > 0, both / jnp.where(size > 0, size, 1.0)[:, None], 0.0)
+
+
+@functools.partial(jax.jit, static_argnames="threshold")
+def objects_of_gaussians(
+    votes: Votes, objects: Int[Array, " r"], *, threshold: float = SHARE_THRESHOLD
+) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    """Assigns each Gaussian to the object with the largest share in it.
+
+    The share is that of all regions of the object together (`share_of`), so a query for exactly these regions selects
+    the same Gaussians, and those that belong to another object even more.
+
+    Args:
+      votes: Of N Gaussians on R regions.
+      objects: Object of each region, or -1.
+      threshold: Smallest share.
+
+    Returns:
+      (N,) object or -1, and (N,) its share; 0 without votes. Each row stands for itself.
+    """
+    columns = list(vote_columns(votes))
+    owners = [jnp.where(region >= 0, objects[jnp.maximum(region, 0)], -1) for region, _, _ in columns]
+    best_share = jnp.zeros(votes.total.shape, votes.weights.dtype)
+    best = jnp.full(votes.total.shape, -1, jnp.int32)
+    for owner in owners:
+        weight = sum(jnp.where(other == owner, columns[k][1], 0.0) for k, other in enumerate(owners))
+        seen = functools.reduce(
+            jnp.maximum, (jnp.where(other == owner, columns[k][2], 0.0) for k, other in enumerate(owners))
+        )
+        share = jnp.nan_to_num(ratio(weight, seen))
+        better = (owner >= 0) & (votes.views > 0) & (share > best_share)
+        best, best_share = jnp.where(better, owner, best), jnp.where(better, share, best_share)
+    return jnp.where(best_share >= threshold, best, -1).astype(jnp.int32), best_share

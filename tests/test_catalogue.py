@@ -1,0 +1,207 @@
+"""The catalogue of a small field of known regions: rows, names, parts, files, and exports that follow it."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from small_field import REGIONS, make_field, shares, true_regions
+
+import jsecon
+from jsecon.app import cli
+from jsecon.data.gaussians.files import load_gaussians
+from jsecon.data.gaussians.ply import read_vertices
+from jsecon.errors import InputError
+from jsecon.language.field import save_field
+from jsecon.types import Regions, Votes
+from jsecon.vision.colours import ColourEmbedder
+
+EMBEDDER = ColourEmbedder()
+COLOURS = ["red", "green", "blue", "orange", "pink"]
+
+
+@pytest.fixture(scope="module")
+def field(scene, cameras):
+    """Five slabs of plain colours; a fifth of each lies in the masks of the next one."""
+    field, _ = make_field(scene, cameras, dim=EMBEDDER.dim)
+    own = true_regions(scene).astype(np.int32)
+    count = len(own)
+    votes = Votes(
+        regions=np.stack([own, (own + 1) % REGIONS, np.full(count, -1, np.int32)], axis=1),
+        weights=np.tile(np.array([8.0, 2.0, 0.0], np.float32), (count, 1)),
+        labelled=np.full(count, 10, np.float32),
+        total=np.full(count, 10, np.float32),
+        peak=np.full(count, 0.5, np.float32),
+        views=np.full(count, 4, np.int32),
+        overflow=np.zeros((), np.int32),
+        num_regions=REGIONS,
+    )
+    field = dataclasses.replace(field, votes=votes)
+    regions = Regions(EMBEDDER.embed_text([f"plain {colour} thing" for colour in COLOURS]), field.regions.pixels)
+    reference = EMBEDDER.reference.astype(np.float16)
+    field = dataclasses.replace(field, regions=regions, embedder=EMBEDDER.name, reference=reference)
+    return with_overlap(field, np.eye(REGIONS, dtype=np.float32))
+
+
+def with_overlap(field, overlap):
+    return dataclasses.replace(field, votes=dataclasses.replace(field.votes, overlap=overlap))
+
+
+def pair(first, second, share):
+    overlap = np.eye(REGIONS, dtype=np.float32)
+    overlap[first, second] = overlap[second, first] = share
+    return overlap
+
+
+@pytest.fixture
+def file(field, tmp_path):
+    save_field(tmp_path / "field.safetensors", field)
+    return tmp_path / "field.safetensors"
+
+
+def run(*arguments) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def test_each_region_is_an_object_with_its_gaussians_and_its_colour(field):
+    catalogue = jsecon.objects(field)
+    assert sorted(catalogue.names[:, 0]) == sorted(COLOURS[r] for r in range(REGIONS) if catalogue.regions[r] >= 0)
+    share = np.stack([shares(field, [r]) for r in range(REGIONS)])
+    best = np.where(share.max(0) >= 0.5, catalogue.regions[share.argmax(0)], -1)
+    np.testing.assert_array_equal(catalogue.labels, best)
+    np.testing.assert_array_equal(catalogue.shapes.count, np.bincount(best[best >= 0]))
+    assert (np.diff(catalogue.shapes.count) <= 0).all()
+    assert (catalogue.parent == -1).all()
+    assert (catalogue.part_labels == -1).all()
+    assert ((catalogue.confidence > 0.5) & (catalogue.confidence <= 1)).all()
+    assert (np.diff(catalogue.probability, axis=1) <= 0).all()
+    region = int(np.flatnonzero(catalogue.regions == 0)[0])
+    seen = np.asarray(field.regions.pixels)[region]
+    assert catalogue.views[0] == (seen > 0).sum()
+    assert catalogue.frames[0, 0] == seen.argmax()
+
+
+def test_pieces_are_joined_and_two_of_a_kind_are_not(field):
+    alike = np.array(field.regions.embeddings)
+    alike[1] = alike[0]
+    field = dataclasses.replace(field, regions=dataclasses.replace(field.regions, embeddings=alike))
+    apart = jsecon.objects(field)
+    assert len(set(apart.regions)) == REGIONS
+    joined = jsecon.objects(with_overlap(field, pair(0, 1, 0.4)))
+    assert joined.regions[0] == joined.regions[1]
+    assert len(joined) == len(apart) - 1
+    np.testing.assert_array_equal(joined.mask(int(joined.regions[0])), shares(field, [0, 1]) >= 0.5)
+
+
+def test_a_region_inside_another_is_a_part_and_its_gaussians_are_those_of_the_whole(field):
+    plain = jsecon.objects(field)
+    found = jsecon.objects(with_overlap(field, pair(0, 1, 0.35)))
+    part, whole = found.regions[:2]  # the first has a little less of all masks than the second
+    assert found.parent[part] == whole == part - 1
+    assert found.parent[whole] == -1
+    assert not found.surroundings.any()
+    np.testing.assert_array_equal(found.mask(part), plain.mask(plain.regions[0]))
+    np.testing.assert_array_equal(found.mask(whole), np.isin(plain.labels, plain.regions[:2]))
+
+
+def test_names_come_from_the_vocabulary_that_is_given(field):
+    catalogue = jsecon.objects(field, ["red floor", "green mug"])
+    floor = catalogue.regions[0]
+    assert catalogue.names[floor].tolist() == ["red floor", "green mug", ""]
+    assert catalogue.surroundings[floor]
+    assert floor >= (~catalogue.surroundings).sum()
+    np.testing.assert_allclose(catalogue.probability[:, :2].sum(1), 1, atol=1e-5)
+    with pytest.raises(InputError, match="no names"):
+        jsecon.objects(field, [])
+    with pytest.raises(InputError, match="no colour word"):
+        jsecon.objects(field, ["mug"])
+    columns = catalogue.to_dict()
+    assert {len(column) for column in columns.values()} == {len(catalogue)}
+    assert columns["name"][floor] == "red floor"
+
+
+def test_a_field_of_words_or_without_a_model_needs_none(field):
+    words = np.tile(np.array(EMBEDDER.reference[:1], np.float16), (len(jsecon_words()), 1))
+    named = jsecon.objects(dataclasses.replace(field, embedder="clip-x", reference=words))
+    assert set(named.names[:, 0]) <= set(jsecon_words())
+    bare = jsecon.objects(dataclasses.replace(field, embedder=f"given-{EMBEDDER.dim}", reference=words[:0]))
+    assert (bare.names == "").all()
+    assert len(bare) == len(named)
+
+
+def jsecon_words():
+    from jsecon.vision.reference_words import REFERENCE_WORDS
+
+    return REFERENCE_WORDS
+
+
+def test_a_field_without_regions_has_an_empty_catalogue(field):
+    votes = dataclasses.replace(
+        field.votes, regions=np.full_like(field.votes.regions, -1), num_regions=0, overlap=np.zeros((0, 0), np.float32)
+    )
+    regions = Regions(np.zeros((0, EMBEDDER.dim), np.float32), np.zeros((0, 4), np.int32))
+    empty = jsecon.objects(dataclasses.replace(field, votes=votes, regions=regions))
+    assert len(empty) == 0
+    assert (empty.labels == -1).all()
+    assert empty.to_dict()["id"] == []
+
+
+def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_path, capsys):
+    (tmp_path / "names.txt").write_text("# things\nred mug\ngreen mug\n\nblue wall\n")
+    assert run("objects", file, "--vocabulary", tmp_path / "names.txt", "--out", tmp_path / "out") == 0
+    printed = capsys.readouterr().out
+    listed = json.loads((tmp_path / "out" / "objects.json").read_text())["objects"]
+    catalogue = jsecon.objects(field, ["red mug", "green mug", "blue wall"])
+    assert [row["gaussians"] for row in listed] == catalogue.shapes.count.tolist()
+    assert listed[-1]["surroundings"]
+    with (tmp_path / "out" / "objects.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert [row["name"] for row in rows] == catalogue.names[:, 0].tolist()
+    np.testing.assert_allclose([float(row["center_x"]) for row in rows], catalogue.shapes.center[:, 0])
+    page = (tmp_path / "out" / "catalogue.html").read_text()
+    assert page.count('class="card"') == len(catalogue)
+    assert all(f"{row['names'][0]['name']}" in printed and row["frames"][0] in page for row in listed)
+    (tmp_path / "names.txt").write_text("#\n")
+    assert run("objects", file, "--vocabulary", tmp_path / "names.txt") == 2
+    assert "names.txt" in capsys.readouterr().err
+
+
+def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp_path):
+    scene, ids, folder = tmp_path / "scene.ply", tmp_path / "ids.npy", tmp_path / "objects"
+    assert run("export", file, "--out", scene, "--with-labels", "--labels", ids, "--objects", folder) == 0
+    catalogue = jsecon.objects(field)
+    labels = np.load(ids)
+    assert labels.dtype == np.int32
+    np.testing.assert_array_equal(labels, catalogue.labels)
+    vertices = read_vertices(scene)
+    np.testing.assert_array_equal(vertices["object_id"], labels)
+    whole = load_gaussians(scene)
+    np.testing.assert_array_equal(whole.means, field.gaussians.means)
+    files = sorted(folder.iterdir())
+    assert len(files) == len(catalogue)
+    for n, path in enumerate(files):
+        assert path.name.startswith(f"{n:03d}-{catalogue.names[n, 0]}")
+        np.testing.assert_array_equal(load_gaussians(path).means, np.asarray(whole.means)[labels == n])
+
+
+def test_only_and_without_part_the_scene_bit_for_bit(field, file, tmp_path, capsys):
+    paths = {name: tmp_path / f"{name}.ply" for name in ("scene", "only", "without")}
+    assert run("export", file, "--out", paths["scene"]) == 0
+    for name in ("only", "without"):
+        ids = tmp_path / f"{name}.npy"
+        assert run("export", file, f"--{name}", "red thing", "--out", paths[name], "--labels", ids) == 0
+        assert len(np.load(ids)) == load_gaussians(paths[name]).count
+    rows = {name: [row.tobytes() for row in read_vertices(path)] for name, path in paths.items()}
+    assert sorted(rows["only"] + rows["without"]) == sorted(rows["scene"])
+    assert 0 < len(rows["only"]) < len(rows["scene"])
+    assert rows["only"] == [row for row in rows["scene"] if row in set(rows["only"])]
+    for wrong in (
+        (),
+        ("--only", "red", "--without", "red", "--out", paths["only"]),
+        ("--with-labels", "--out", tmp_path / "scene.glb"),
+        ("--only", "red", "--objects", tmp_path / "objects"),
+        ("--labels", tmp_path / "ids.txt"),
+    ):
+        assert run("export", file, *wrong) == 2
+        assert "jsecon:" in capsys.readouterr().err
