@@ -2,7 +2,6 @@
 
 import ast
 import importlib
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +39,7 @@ def test_importing_the_package_starts_nothing_and_changes_no_environment():
     code = (
         "import os, sys; before = dict(os.environ); import jsecon; "
         "assert 'jax' not in sys.modules and 'numpy' not in sys.modules; "
+        "import jsecon.types; assert not any(name.startswith('jsecon.app') for name in sys.modules); "
         "import jsecon.app.cli; assert dict(os.environ) == before"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
@@ -111,13 +111,3 @@ def test_no_module_touches_global_configuration():
         text = path.read_text()
         assert "jax.config.update" not in text, path
         assert "os.environ[" not in text, path
-
-
-def test_help_runs_as_a_program():
-    environ = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
-    text = subprocess.run(
-        [sys.executable, "-m", "jsecon", "--help"], check=True, capture_output=True, text=True, env=environ
-    )
-    for verb in ("demo", "run", "query", "eval"):
-        assert verb in text.stdout
-    importlib.import_module("jsecon.app.cli")

@@ -75,16 +75,10 @@ def test_equal_values_give_equal_bytes(scene, cameras, tmp_path):
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: data[: len(data) // 2],
-        lambda data: b"",
-        lambda data: data[:200] + bytes(64) + data[264:],
-        lambda data: b"no archive at all",
-    ],
-    ids=["cut", "empty", "overwritten", "other"],
-)
+@pytest.mark.parametrize("damage", [
+    lambda data: data[: len(data) // 2], lambda data: b"", lambda data: data[:200] + bytes(64) + data[264:],
+    lambda data: b"no archive at all",
+], ids=["cut", "empty", "overwritten", "other"])  # fmt: skip
 def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
     value = np.random.default_rng(0).normal(size=500)
     cache.fetch(cache.path_of(tmp_path, "stage", "k"), lambda: value)

@@ -32,17 +32,10 @@ def test_formats_are_detected(tmp_path):
     assert len(load_capture(tmp_path / "colmap").points) == len(CAPTURE.points)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"downscale": 0.5},
-        {"downscale": float("nan")},
-        {"long_side": 0},
-        {"frames": 0},
-        {"holdout": 1},
-        {"holdout": -8},
-    ],
-)
+@pytest.mark.parametrize("options", [
+    {"downscale": 0.5}, {"downscale": float("nan")}, {"long_side": 0}, {"frames": 0}, {"holdout": 1},
+    {"holdout": -8},
+])  # fmt: skip
 def test_options_are_checked(tmp_path, options):
     write_colmap(CAPTURE, tmp_path)
     with refused(*options):

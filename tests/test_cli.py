@@ -25,6 +25,10 @@ def _run(*arguments):
     return cli.main([str(argument) for argument in arguments])
 
 
+FITTED = "--holdout", 4, "--steps", 150, "--gaussians-at-most", 1
+"""options of `room_run`'s fit"""
+
+
 @pytest.fixture
 def capture(room, tmp_path):
     """A copy of the tiny room, to be damaged."""
@@ -37,7 +41,7 @@ def capture(room, tmp_path):
 def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, tmp_path, capsys):
     _, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")  # the stages are cached: only the verb itself is tested
-    options = "--masks", room / "masks", "--holdout", 4, "--steps", 150, "--sh-degree", 2
+    options = "--masks", room / "masks", *FITTED, "--sh-degree", 2
     line = "run", room, "--out", tmp_path / "out", *options
     assert _run(*line, "--dry-run") == 0
     plan = capsys.readouterr().out.partition("Nothing was written.")[0].splitlines()[1:]
@@ -61,7 +65,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
 def test_fit_writes_a_scene_in_the_captures_world_and_says_how_good_it_is(room, room_run, tmp_path, capsys):
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "scene" / "cache")  # a run into the folder, gone on with
-    asked = "fit", room, "--out", tmp_path / "scene.ply", "--holdout", 4, "--steps", 150
+    asked = "fit", room, "--out", tmp_path / "scene.ply", *FITTED
     assert _run(*asked) == 0
     told = capsys.readouterr().out
     assert "gaussians        cached" in told
@@ -159,6 +163,10 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
         assert summary["miou"] == pytest.approx(np.mean([row["iou"] for row in summary["rows"]]), abs=1e-3)
     assert "mAcc@0.25" in told
     assert "alpha > 0.7" in told
+    (tmp_path / "one").mkdir()
+    shutil.copy(sorted((room / "label").glob("*.json"))[0], tmp_path / "one")
+    told, _ = _object(capsys, "eval", out / "field.safetensors", "--labels", tmp_path / "one", "--out", tmp_path)
+    assert 0 <= told["anchored"]["miou"] <= 1
 
 
 def _object(capsys, *arguments):
@@ -172,8 +180,8 @@ def _object(capsys, *arguments):
 def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, capsys):
     run, out = room_run
     shutil.copytree(out / "cache", tmp_path / "out" / "cache")
-    field, fitted = out / "field.safetensors", ["--holdout", 4, "--steps", 150]
-    line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", *fitted]
+    field = out / "field.safetensors"
+    line = ["run", room, "--out", tmp_path / "out", "--masks", room / "masks", *FITTED]
     told, _ = _object(capsys, *line, "--dry-run")
     assert {stage["status"] for stage in told["stages"]} == {"cached", "skipped"}
     assert not (tmp_path / "out" / "field.safetensors").exists()
@@ -182,15 +190,13 @@ def test_every_verb_tells_what_it_wrote_as_one_object(room_run, room, tmp_path, 
     assert "gaussians        cached" in err
     assert all(Path(file).exists() for file in told["written"])
     (tmp_path / "scene").symlink_to(tmp_path / "out")
-    told, _ = _object(capsys, "fit", room, "--out", tmp_path / "scene.ply", *fitted)
+    told, _ = _object(capsys, "fit", room, "--out", tmp_path / "scene.ply", *FITTED)
     assert told["held_out_psnr"] == pytest.approx(run.psnr.mean(), abs=1e-3)
     assert load_ply(told["written"]["scene"]).count == told["gaussians"]
     told, _ = _object(capsys, "query", field, "red", "--out", tmp_path / "answers", "--views", 1)
     assert [answer["query"] for answer in told["answers"]] == ["red"]
     told, _ = _object(capsys, "view", field, "red", "--export", tmp_path / "page.html")
     assert (told["written"]["page"], told["answers"]) == (str(tmp_path / "page.html"), ["red"])
-    told, _ = _object(capsys, "eval", field, "--labels", room / "label", "--out", tmp_path / "found")
-    assert 0 <= told["anchored"]["miou"] <= 1
     told, err = _object(capsys, "completion", "bash")
     assert told["script"].count("jsecon") > 10
     assert _run("query", field, "red", "zzz", "--out", tmp_path / "answers", "--json") == 2
@@ -263,41 +269,30 @@ def test_what_is_not_given_has_the_default_of_the_dataclass():
     assert cli.parse(["fit", "room", "--out", "a.ply", "--steps", "7"]).options == Options(Path("room"), steps=7)
 
 
-@pytest.mark.parametrize(
-    ("line", "options"),
-    [
-        ("f a b --all --at 0 1 2 --out o", {"texts": ["a", "b"], "at": [("0", 1, 2)], "all": True}),
-        ("f --out o --at #1 2 3 --at x 4 5", {"texts": [], "at": [("#1", 2, 3), ("x", 4, 5)]}),
-        ("f --mask 0 a.png 1 b.png --mask 2 c.png --out o", {"mask": [["0", "a.png", "1", "b.png"], ["2", "c.png"]]}),
-        ("f --box x 1 2 3 4 --out o", {"box": [("x", 1, 2, 3, 4)]}),
-        ("--out o f a --threshold -0.5 --by votes --by code", {"texts": ["a"], "threshold": -0.5, "by": "code"}),
-        ("f a --out o --template x --template y --json", {"template": ["x", "y"], "output": verbs.Output(json=True)}),
-        ("f --out o --keep_outliers -- -ish", {"texts": ["-ish"], "keep_outliers": True}),
-    ],
-)
+@pytest.mark.parametrize(("line", "options"), [
+    ("f a b --all --at 0 1 2 --out o", {"texts": ["a", "b"], "at": [("0", 1, 2)], "all": True}),
+    ("f --out o --at #1 2 3 --at x 4 5", {"texts": [], "at": [("#1", 2, 3), ("x", 4, 5)]}),
+    ("f --mask 0 a.png 1 b.png --mask 2 c.png --out o", {"mask": [["0", "a.png", "1", "b.png"], ["2", "c.png"]]}),
+    ("f --box x 1 2 3 4 --out o", {"box": [("x", 1, 2, 3, 4)]}),
+    ("--out o f a --threshold -0.5 --by votes --by code", {"texts": ["a"], "threshold": -0.5, "by": "code"}),
+    ("f a --out o --template x --template y --json", {"template": ["x", "y"], "output": verbs.Output(json=True)}),
+    ("f --out o --keep_outliers -- -ish", {"texts": ["-ish"], "keep_outliers": True}),
+])  # fmt: skip
 def test_options_of_a_query_are_read(line, options):
     query = cli.parse(["query", *line.split()])
     assert (query.field, query.out) == (Path("f"), Path("o"))
     assert {name: getattr(query, name) for name in options} == options
 
 
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ("run", "CAPTURE --out PATH"),
-        ("fly", "fly is not a verb"),
-        ("qurey f x", "Did you mean query?"),
-        ("", "{demo, run,"),
-        ("query f x --out o --thresold 3", "Perhaps you meant: --threshold FLOAT"),
-        ("query f x --out o --threshold a", "--threshold does not take 'a'"),
-        ("run c --out o --steps 1.5", "--steps does not take '1.5'"),
-        ("run c --out o --latent few", "--latent does not take 'few'"),
-        ("query f x --out o --by magic", "'silhouette'"),
-        ("query f --out o --at 0 1", "--at'. Expected 3"),
-        ("query f x --out", "--out'. Expected 1"),
-        ("models look x", "'check'"),
-    ],
-)
+@pytest.mark.parametrize(("line", "says"), [
+    ("run", "CAPTURE --out PATH"), ("fly", "fly is not a verb"), ("qurey f x", "Did you mean query?"),
+    ("", "{demo, run,"), ("query f x --out o --thresold 3", "Perhaps you meant: --threshold FLOAT"),
+    ("query f x --out o --threshold a", "--threshold does not take 'a'"),
+    ("run c --out o --steps 1.5", "--steps does not take '1.5'"),
+    ("run c --out o --latent few", "--latent does not take 'few'"),
+    ("query f x --out o --by magic", "'silhouette'"), ("query f --out o --at 0 1", "--at'. Expected 3"),
+    ("query f x --out", "--out'. Expected 1"), ("models look x", "'check'"),
+])  # fmt: skip
 def test_a_wrong_line_is_one_sentence_and_exit_code_2(capsys, line, says):
     assert _run(*line.split()) == 2
     told = capsys.readouterr().err
@@ -367,16 +362,11 @@ def _write_a_text(capture):
     (capture / "scene.ply").write_text("no ply")
 
 
-@pytest.mark.parametrize(
-    ("damage", "option", "says"),
-    [
-        (lambda capture: _image(capture).unlink(), None, ".png"),
-        (_cut_an_image, None, ".png"),
-        (_cut_the_model, None, "images.bin"),
-        (_shrink_the_masks, "masks", "100x100"),
-        (_write_a_text, "gaussians", "scene.ply"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "option", "says"), [
+    (lambda capture: _image(capture).unlink(), None, ".png"), (_cut_an_image, None, ".png"),
+    (_cut_the_model, None, "images.bin"), (_shrink_the_masks, "masks", "100x100"),
+    (_write_a_text, "gaussians", "scene.ply"),
+])  # fmt: skip
 def test_a_damaged_capture_is_one_message(capture, tmp_path, capsys, damage, option, says):
     """The tests of each reader have all kinds of damage."""
     damage(capture)
@@ -419,21 +409,13 @@ def test_a_text_that_is_not_understood_does_not_stop_the_others(room_run, tmp_pa
     assert list((tmp_path / "none").iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--at", "nowhere", 3, 3], "nowhere"),
-        (["--at", "#0", 160, 3], "159"),
-        (["--at", "#0", "left", 3], "left"),
-        (["--at", "", 3, 3], "no such frame"),
-        (["--at", "#99", 3, 3], "a place, #0 to #"),
-        (["--mask", "#0", "a.png", "#1"], "FRAME PNG, in pairs"),
-        (["--mask", "#0", "nowhere.png"], "No such file"),
-        (["--box", "#0", 3, 3, "x", 9], "--box does not take '#0 3 3 x 9'"),
-        (["--box", "#0", 500, 3, 600, 9], "pixels of a frame of 160x120"),
-        ([], "there is no query"),
-    ],
-)
+@pytest.mark.parametrize(("options", "says"), [
+    (["--at", "nowhere", 3, 3], "nowhere"), (["--at", "#0", 160, 3], "159"), (["--at", "#0", "left", 3], "left"),
+    (["--at", "", 3, 3], "no such frame"), (["--at", "#99", 3, 3], "a place, #0 to #"),
+    (["--mask", "#0", "a.png", "#1"], "FRAME PNG, in pairs"), (["--mask", "#0", "nowhere.png"], "No such file"),
+    (["--box", "#0", 3, 3, "x", 9], "--box does not take '#0 3 3 x 9'"),
+    (["--box", "#0", 500, 3, 600, 9], "pixels of a frame of 160x120"), ([], "there is no query"),
+])  # fmt: skip
 def test_queries_that_cannot_be(room_run, tmp_path, capsys, options, says):
     _refused(capsys, "query", room_run[1] / "field.safetensors", *options, "--out", tmp_path, says=[says])
 

@@ -132,15 +132,12 @@ def test_an_empty_text_is_refused(folders):
 # Folders that are no such model
 
 
-@pytest.mark.parametrize(
-    ("layout", "lost", "words"),
-    [
-        ("immich", "textual/model.onnx", r"visual/model\.onnx without its other half"),
-        ("immich", "textual/tokenizer.json", "no tokenizer"),
-        ("transformers.js", "onnx/vision_model.onnx", r"onnx/text_model\.onnx without its other half"),
-        ("flat", "clip_text.onnx", r"clip_image\.onnx takes x float32\[4, 3, 32, 32\]"),
-    ],
-)
+@pytest.mark.parametrize(("layout", "lost", "words"), [
+    ("immich", "textual/model.onnx", r"visual/model\.onnx without its other half"),
+    ("immich", "textual/tokenizer.json", "no tokenizer"),
+    ("transformers.js", "onnx/vision_model.onnx", r"onnx/text_model\.onnx without its other half"),
+    ("flat", "clip_text.onnx", r"clip_image\.onnx takes x float32\[4, 3, 32, 32\]"),
+])  # fmt: skip
 def test_what_is_missing_is_named_and_where_to_get_it(tmp_path, layout, lost, words):
     folder = write_clip(tmp_path / "clip", layout)
     (folder / lost).unlink()
@@ -207,21 +204,13 @@ def test_embeddings_that_are_not_finite_are_refused(tmp_path, folders, frame, ma
         ClipEmbedder(model, threads=1).embed_regions(frame, masks)
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        ({"size": 16}, 16),
-        ({"size": {"shortest_edge": 24}, "crop_size": 16, "image_mean": [0, 0, 0]}, 16),
-        ({"size": {"shortest_edge": 24}}, 24),
-        ({"preprocess_cfg": {"mean": [0, 0, 0], "std": [1, 1, 1], "size": [16, 16]}}, 16),
-        ({}, None),
-        ({"size": [16, 24]}, "not of a square"),
-        ({"mean": [0, 0]}, "mean"),
-        ({"std": [0, 1, 1]}, "std"),
-        ({"std": "abc"}, "cannot be read"),
-        ([], "cannot be read"),
-    ],
-)
+@pytest.mark.parametrize(("content", "expected"), [
+    ({"size": 16}, 16), ({"size": {"shortest_edge": 24}, "crop_size": 16, "image_mean": [0, 0, 0]}, 16),
+    ({"size": {"shortest_edge": 24}}, 24),
+    ({"preprocess_cfg": {"mean": [0, 0, 0], "std": [1, 1, 1], "size": [16, 16]}}, 16), ({}, None),
+    ({"size": [16, 24]}, "not of a square"), ({"mean": [0, 0]}, "mean"), ({"std": [0, 1, 1]}, "std"),
+    ({"std": "abc"}, "cannot be read"), ([], "cannot be read"),
+])  # fmt: skip
 def test_preprocessing_in_all_its_spellings(tmp_path, content, expected):
     path = tmp_path / "preprocessor_config.json"
     path.write_text(json.dumps(content))

@@ -31,18 +31,12 @@ def script(tmp_path):
     return made
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["ru"], {"run"}),
-        (["run", "--gra"], {"--granularity"}),
-        (["run", "x", "--granularity", ""], {"fine", "medium", "coarse"}),
-        (["query", "x", "--by", "sil"], {"silhouette"}),
-        (["completion", ""], {"bash", "zsh", "fish"}),
-        (["run", "som"], {"somewhere", "some.safetensors"}),
-        (["query", "so"], {"somewhere", "some.safetensors"}),
-    ],
-)
+@pytest.mark.parametrize(("words", "expected"), [
+    (["ru"], {"run"}), (["run", "--gra"], {"--granularity"}),
+    (["run", "x", "--granularity", ""], {"fine", "medium", "coarse"}),
+    (["query", "x", "--by", "sil"], {"silhouette"}), (["completion", ""], {"bash", "zsh", "fish"}),
+    (["run", "som"], {"somewhere", "some.safetensors"}), (["query", "so"], {"somewhere", "some.safetensors"}),
+])  # fmt: skip
 def test_bash_completes(script, tmp_path, words, expected):
     (tmp_path / "somewhere").mkdir()
     (tmp_path / "some.safetensors").touch()

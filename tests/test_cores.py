@@ -26,10 +26,10 @@ VIEWS, HEIGHT, WIDTH = 5, 43, 50
 def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
     """Votes, a rendering, a few steps of a fit and a query on this process's devices, into the folder `out`."""
     import jax
-    from conftest import look_at
 
     import jsecon
     from jsecon.app.cli import main
+    from jsecon.demo.capture import look_at
     from jsecon.fit.optimise import fit_gaussians
     from jsecon.fit.schedule import Schedule
 
@@ -42,7 +42,7 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
         opacity_logits=rng.uniform(-1.0, 3.0, count).astype(np.float32),
         sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
     )
-    poses = np.stack([look_at((2.5 * np.sin(a), -0.7, -2.5 * np.cos(a))) for a in np.linspace(0, 1, VIEWS)])
+    poses = np.stack([look_at((2.5 * np.sin(a), -2.5 * np.cos(a), 0.7), np.zeros(3)) for a in np.linspace(0, 1, VIEWS)])
     lens = (np.full(VIEWS, value, np.float32) for value in (45, 43, 25.5, 21))
     cameras = jsecon.Camera(poses, *lens, width=WIDTH, height=HEIGHT)
     labels = rng.integers(-1, 7, (VIEWS, HEIGHT, WIDTH))
@@ -91,31 +91,6 @@ def two(asked, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("devices", "parts"),
-    [(3, ("votes", "fit", "query")), *(pytest.param(n, PARTS, marks=pytest.mark.long) for n in (1, 5, 6, 8, 16))],
-)
-def test_any_number_of_devices_gives_the_same_answers(two, asked, tmp_path, devices, parts):
-    environ = os.environ | {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {compiling.ENVIRONMENT}",
-        "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
-    }
-    program = f"import jax; from test_cores import work; work{str(tmp_path), *asked, parts}; "
-    line = [sys.executable, "-c", f"{program}assert jax.local_device_count() == {devices}"]
-    done = subprocess.run(line, env=environ, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    expected, found = (np.load(folder / "found.npz") for folder in (two, tmp_path))
-    assert expected["weights"].max() > 1
-    for name in found.files:
-        if name in VOTES:  # added up in one order everywhere
-            np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
-        else:  # the sums of gradients in another
-            tolerance = 1e-6 if name == "image" else 2e-3
-            np.testing.assert_allclose(found[name], expected[name], atol=tolerance, err_msg=name)
-    assert answers(two / "answer")
-    assert answers(tmp_path / "answer") == answers(two / "answer")
-
-
 HIDDEN = "fcntl", "resource", "termios", "pwd", "grp"
 WITHOUT = f"""
 import importlib, importlib.abc, pathlib, sys
@@ -140,18 +115,38 @@ home = pathlib.Path(jsecon.__file__).parent
 for path in sorted(home.rglob("*.py")):
     if path.stem != "__main__":
         importlib.import_module(".".join(path.relative_to(home.parent).with_suffix("").parts).removesuffix(".__init__"))
-from jsecon.app.cli import main
-code = main(["query", sys.argv[1], sys.argv[2], "--out", sys.argv[3]])
+import jax
+from test_cores import work
+out, field, word, devices, parts = sys.argv[1:]
+assert jax.local_device_count() == int(devices)
+work(out, field, word, parts.split())
 assert memory_budget() > 1 << 20 and peak_memory_mib() >= 0
 assert not set({HIDDEN}) & set(sys.modules), set({HIDDEN}) & set(sys.modules)
-sys.exit(code)
 """
 
 
-def test_every_module_is_imported_and_a_query_answered_without_the_modules_of_unix(two, asked, tmp_path):
-    environ = os.environ | {"PYTHONPATH": str(TESTS.parent)}
-    line = [sys.executable, "-c", WITHOUT, *asked, str(tmp_path)]
-    done = subprocess.run(line, env=environ, capture_output=True, text=True)
+def agree(two: Path, found: Path) -> None:
+    """Whether other devices gave the answers of two."""
+    expected, found_arrays = (np.load(folder / "found.npz") for folder in (two, found))
+    assert expected["weights"].max() > 1
+    for name in found_arrays.files:
+        if name in VOTES:  # added up in one order everywhere
+            np.testing.assert_array_equal(found_arrays[name], expected[name], err_msg=name)
+        else:  # the sums of gradients in another
+            tolerance = 1e-6 if name == "image" else 2e-3
+            np.testing.assert_allclose(found_arrays[name], expected[name], atol=tolerance, err_msg=name)
+    assert answers(two / "answer")
+    assert answers(found / "answer") == answers(two / "answer")
+
+
+@pytest.mark.parametrize("devices", [3, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 5, 6, 8, 16))])
+def test_any_number_of_devices_gives_the_same_answers_without_the_modules_of_unix(two, asked, tmp_path, devices):
+    """Every module is imported there."""
+    environ = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {compiling.ENVIRONMENT}",
+        "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
+    }
+    line = [sys.executable, "-c", WITHOUT, str(tmp_path), *asked, str(devices), " ".join(PARTS)]
+    done = subprocess.run(line, env=environ, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert answers(tmp_path)
-    assert answers(tmp_path) == answers(two / "answer")
+    agree(two, tmp_path)

@@ -55,7 +55,8 @@ def truth():
 
 
 def photographed(truth, poses):
-    """A capture of `truth` with depth, the third frame held out."""
+    """A capture of `truth` with depth, the third frame held out; no pixel is ignored, so that all fits share programs
+    with the one that ignores some."""
     count = len(poses)
     cameras = Camera(np.stack(poses), *(np.full(count, v, np.float32) for v in (30, 30, 16, 12)), width=32, height=24)
     views = [render(truth, camera, np.maximum(0.5 + 0.28209479 * truth.sh[:, 0], 0), depth=True) for camera in
@@ -64,7 +65,8 @@ def photographed(truth, poses):
     depths = np.stack([np.where(view.alpha > 0.5, view.depth, 0) for view in views]).astype(np.float32)
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     names = tuple(f"f{t}" for t in range(count))
-    return Capture(frames, cameras, *nothing, np.arange(count) == 2, depths, np.eye(4), names)
+    ignored = np.zeros(frames.shape[:3], bool)
+    return Capture(frames, cameras, *nothing, np.arange(count) == 2, depths, np.eye(4), names, ignored=ignored)
 
 
 @pytest.fixture(scope="module")

@@ -107,16 +107,12 @@ def test_an_error_reads_as_sentences(error, message):
     assert ";" not in str(error)
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (OSError(28, "No space left on device"), "No space left on device"),
-        (KeyError("counts"), "'counts' is missing"),
-        (TypeError("'NoneType' object is not subscriptable"), "its values are of another kind or number"),
-        (EOFError(), "it ends early"),
-        (UnicodeDecodeError("utf-8", b"\xe9", 0, 1, "invalid"), "its text is not UTF-8"),
-        (ValueError("odd header.\n  at line 3"), "odd header"),
-    ],
-)
+@pytest.mark.parametrize(("error", "words"), [
+    (OSError(28, "No space left on device"), "No space left on device"),
+    (KeyError("counts"), "'counts' is missing"),
+    (TypeError("'NoneType' object is not subscriptable"), "its values are of another kind or number"),
+    (EOFError(), "it ends early"), (UnicodeDecodeError("utf-8", b"\xe9", 0, 1, "invalid"), "its text is not UTF-8"),
+    (ValueError("odd header.\n  at line 3"), "odd header"),
+])  # fmt: skip
 def test_the_reason_of_a_failure_is_in_words(error, words):
     assert describe_error(error) == words

@@ -37,16 +37,13 @@ def no_room():
     resource.setrlimit(resource.RLIMIT_FSIZE, own)
 
 
-@pytest.mark.parametrize(
-    ("name", "write"),
-    [
-        ("a.safetensors", lambda path: save_field(path, _field())),
-        ("a.safetensors", lambda path: cache.save(path, np.zeros(9999))),
-        ("a.ply", lambda path: save_ply(path, _field().gaussians)),
-        ("a.png", lambda path: write_image(path, np.random.default_rng(0).integers(0, 255, (99, 99, 3), np.uint8))),
-        ("a.txt", lambda path: write_text(path, "x" * 5000)),
-    ],
-)
+@pytest.mark.parametrize(("name", "write"), [
+    ("a.safetensors", lambda path: save_field(path, _field())),
+    ("a.safetensors", lambda path: cache.save(path, np.zeros(9999))),
+    ("a.ply", lambda path: save_ply(path, _field().gaussians)),
+    ("a.png", lambda path: write_image(path, np.random.default_rng(0).integers(0, 255, (99, 99, 3), np.uint8))),
+    ("a.txt", lambda path: write_text(path, "x" * 5000)),
+])  # fmt: skip
 def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, no_room, name, write):
     with refused(name, f"on writing to {tmp_path}", "free some room"):
         write(tmp_path / name)

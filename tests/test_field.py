@@ -158,24 +158,19 @@ def exchanged(header, record, name, other):
     fields[record]["fields"][name] = fields[other]
 
 
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        (lambda h, a: h.update(version=99), "version 99"),
-        (lambda h, a: h.pop("field"), "damaged"),
-        (lambda h, a: a.pop("codes"), "damaged"),
-        (lambda h, a: a.update(codes=a["codes"][:-1]), "damaged"),
-        (lambda h, a: h["field"]["fields"].pop("codes"), "damaged"),
-        (lambda h, a: h["field"].update(record="Popen"), "damaged"),
-        (lambda h, a: h.update(field={"value": 3}), "no field at its root"),
-        (lambda h, a: h["field"]["fields"].update(gaussians={"value": None}), "damaged"),
-        (lambda h, a: exchanged(h, "gaussians", "sh", "cameras"), "damaged"),
-        (lambda h, a: exchanged(h, "cameras", "fy", "gaussians"), "damaged"),
-        (lambda h, a: exchanged(h, "votes", "overflow", "regions"), "damaged"),
-        (lambda h, a: h["field"]["fields"]["names"].update(value=["one"]), "1 frame names"),
-        (lambda h, a: h["field"]["fields"]["votes"]["fields"]["num_regions"].update(value=4), "votes over 4 regions"),
-    ],
-)
+@pytest.mark.parametrize(("change", "match"), [
+    (lambda h, a: h.update(version=99), "version 99"), (lambda h, a: h.pop("field"), "damaged"),
+    (lambda h, a: a.pop("codes"), "damaged"), (lambda h, a: a.update(codes=a["codes"][:-1]), "damaged"),
+    (lambda h, a: h["field"]["fields"].pop("codes"), "damaged"),
+    (lambda h, a: h["field"].update(record="Popen"), "damaged"),
+    (lambda h, a: h.update(field={"value": 3}), "no field at its root"),
+    (lambda h, a: h["field"]["fields"].update(gaussians={"value": None}), "damaged"),
+    (lambda h, a: exchanged(h, "gaussians", "sh", "cameras"), "damaged"),
+    (lambda h, a: exchanged(h, "cameras", "fy", "gaussians"), "damaged"),
+    (lambda h, a: exchanged(h, "votes", "overflow", "regions"), "damaged"),
+    (lambda h, a: h["field"]["fields"]["names"].update(value=["one"]), "1 frame names"),
+    (lambda h, a: h["field"]["fields"]["votes"]["fields"]["num_regions"].update(value=4), "votes over 4 regions"),
+])  # fmt: skip
 def test_a_header_that_does_not_fit(path, change, match):
     rewritten(path, change)
     fails(path, match)

@@ -63,20 +63,12 @@ def saved(array):
     return stream.getvalue()
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        saved(np.zeros((2, 3))).replace(b"(2, 3)", b"(9, 9)"),
-        saved(np.zeros((2, 3))).replace(b"(2, 3)", b"(1, 3)"),
-        saved(np.zeros((2, 3))).replace(b"(2, 3),", b"(99999999999999999999, 0),"),
-        saved(np.zeros(3))[:-1],
-        saved(np.zeros(3)) + b"more",
-        saved(np.array(["a"])),
-        saved(np.zeros(2, "<M8[s]")),
-        b"",
-        b"\x93NUMPY\1\0\xff\xff",
-    ],
-)
+@pytest.mark.parametrize("content", [
+    saved(np.zeros((2, 3))).replace(b"(2, 3)", b"(9, 9)"), saved(np.zeros((2, 3))).replace(b"(2, 3)", b"(1, 3)"),
+    saved(np.zeros((2, 3))).replace(b"(2, 3),", b"(99999999999999999999, 0),"), saved(np.zeros(3))[:-1],
+    saved(np.zeros(3)) + b"more", saved(np.array(["a"])), saved(np.zeros(2, "<M8[s]")), b"",
+    b"\x93NUMPY\1\0\xff\xff",
+])  # fmt: skip
 def test_what_the_bytes_do_not_hold_is_refused(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
     with pytest.raises(READ_ERRORS):

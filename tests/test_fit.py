@@ -24,6 +24,8 @@ KEY = jax.random.key(0)
 RATES = LearningRates(means=1e-3, means_last=1e-4, log_scales=0.02, colors=0.02, quaternions=0.01)
 VIEWS, STEPS = 5, 40
 SCHEDULE = Schedule(max_gaussians=0, degree_interval=0.25)
+FITTED = {"steps": STEPS, "key": KEY, "schedule": SCHEDULE, "rates": RATES, "chunk": 10}
+"""options of the fit that several tests look at"""
 WHOLE = Schedule(sizes=((1.0, 1.0),), max_gaussians=0)
 INRIA_RATES = LearningRates(
     means=1.6e-4,
@@ -57,16 +59,8 @@ def capture(truth):
     cameras = Camera(poses, *(np.full(VIEWS, v, np.float32) for v in (30, 30, 16, 12)), width=32, height=24)
     images = [render_rgb(truth, jax.tree.map(jnp.asarray, cameras[t])).features for t in range(VIEWS)]
     frames = np.stack([np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in images])
-    return Capture(
-        frames,
-        cameras,
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        np.arange(VIEWS) == 2,
-        None,
-        np.eye(4),
-        tuple("abcde"),
-    )
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return Capture(frames, cameras, *nothing, np.arange(VIEWS) == 2, None, np.eye(4), tuple("abcde"))
 
 
 @pytest.fixture(scope="module")
@@ -85,16 +79,7 @@ def start(truth):
 @pytest.fixture(scope="module")
 def fitted(capture, start):
     states = []
-    gaussians, losses = fit_gaussians(
-        capture,
-        steps=STEPS,
-        key=KEY,
-        start=start,
-        schedule=SCHEDULE,
-        rates=RATES,
-        chunk=10,
-        on_checkpoint=states.append,
-    )
+    gaussians, losses = fit_gaussians(capture, start=start, on_checkpoint=states.append, **FITTED)
     return gaussians, losses, states
 
 
@@ -115,15 +100,7 @@ def test_fit_brings_the_held_out_view_closer(capture, start, truth, fitted):
 def test_held_out_frames_are_never_fitted_to(capture, start, fitted):
     frames = capture.frames.copy()
     frames[2] = 255 - frames[2]
-    again, losses = fit_gaussians(
-        dataclasses.replace(capture, frames=frames),
-        steps=STEPS,
-        key=KEY,
-        start=start,
-        schedule=SCHEDULE,
-        rates=RATES,
-        chunk=10,
-    )
+    again, losses = fit_gaussians(dataclasses.replace(capture, frames=frames), start=start, **FITTED)
     assert same(again, fitted[0])
     np.testing.assert_array_equal(losses, fitted[1])
 
@@ -133,16 +110,7 @@ def test_a_fit_goes_on_from_a_checkpoint_to_the_same_result(capture, fitted):
     assert stopped.losses.shape == (20,)
     assert float(stopped.done) == 0.5
     seen = []
-    again, losses = fit_gaussians(
-        capture,
-        steps=STEPS,
-        key=KEY,
-        state=stopped,
-        schedule=SCHEDULE,
-        rates=RATES,
-        chunk=10,
-        progress=lambda done, total: seen.append((done, total)),
-    )
+    again, losses = fit_gaussians(capture, state=stopped, progress=lambda *at: seen.append(at), **FITTED)
     assert same(again, fitted[0])
     np.testing.assert_array_equal(losses, fitted[1])
     assert seen == [(30, 40), (40, 40)]
@@ -284,16 +252,10 @@ def _odd(capture, start, kind):
     return dataclasses.replace(capture, cameras=dataclasses.replace(capture.cameras, world_to_camera=poses)), start
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "one view",
-        "black images",
-        pytest.param("two points", marks=pytest.mark.long),
-        "all behind the cameras",
-        "nothing but rotation",
-    ],
-)
+@pytest.mark.parametrize("kind", [
+    "one view", "black images", pytest.param("two points", marks=pytest.mark.long), "all behind the cameras",
+    "nothing but rotation",
+])  # fmt: skip
 def test_odd_captures_are_fitted_without_a_number_that_is_none(capture, start, kind):
     capture, start = _odd(capture, start, kind)
     schedule = dataclasses.replace(WHOLE, max_gaussians=80, growth_start=0.1)

@@ -183,16 +183,11 @@ def test_a_sog_with_a_short_codebook(tmp_path):
         load_gaussians(tmp_path / "a.sog")
 
 
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("scene.ksplat", "npx @playcanvas/splat-transform scene.ksplat scene.ply"),
-        ("meta.json", "npx @playcanvas/splat-transform meta.json meta.ply"),
-        ("scene", "ends in no suffix"),
-        ("scene.gltf", "one .glb file"),
-        ("scene.obj", "Export the scene as a .ply"),
-    ],
-)
+@pytest.mark.parametrize(("name", "says"), [
+    ("scene.ksplat", "npx @playcanvas/splat-transform scene.ksplat scene.ply"),
+    ("meta.json", "npx @playcanvas/splat-transform meta.json meta.ply"), ("scene", "ends in no suffix"),
+    ("scene.gltf", "one .glb file"), ("scene.obj", "Export the scene as a .ply"),
+])  # fmt: skip
 def test_other_formats_say_what_to_run(tmp_path, name, says):
     (tmp_path / name).write_bytes(b"something")
     with refused(name, says, ".spz, .sog or .splat"):

@@ -105,15 +105,11 @@ def test_a_broken_transfer_goes_on_where_it_stopped(local):
     assert any("bytes=" in request for request in local.requests)
 
 
-@pytest.mark.parametrize(
-    ("change", "clause"),
-    [
-        (lambda local: local.repositories.clear(), "no such repository"),
-        (lambda local: setattr(local.repositories[NAME], "gated", True), "HF_TOKEN"),
-        (lambda local: local.repositories[NAME].files.pop("onnx/vision_encoder.onnx"), "onnx/vision_encoder.onnx"),
-    ],
-    ids=["unknown", "gated", "incomplete"],
-)
+@pytest.mark.parametrize(("change", "clause"), [
+    (lambda local: local.repositories.clear(), "no such repository"),
+    (lambda local: setattr(local.repositories[NAME], "gated", True), "HF_TOKEN"),
+    (lambda local: local.repositories[NAME].files.pop("onnx/vision_encoder.onnx"), "onnx/vision_encoder.onnx"),
+], ids=["unknown", "gated", "incomplete"])  # fmt: skip
 def test_what_the_hub_refuses_is_said_in_a_sentence(local, change, clause):
     change(local)
     with pytest.raises(InputError, match=clause):
@@ -196,16 +192,11 @@ def test_the_catalogue_says_what_is_cached(local):
     assert cached["sam2", "tracker"] == []
 
 
-@pytest.mark.parametrize(
-    ("text", "role", "precision", "clause"),
-    [
-        ("clap", "embedder", None, "clip, siglip2, mobileclip"),
-        ("hub:owner", "embedder", None, "hub:owner/name"),
-        ("mobileclip", "embedder", "int8", "wrong embeddings"),
-        ("hub:Xenova/mobileclip_s0", "embedder", "int8", "wrong embeddings"),
-        ("edgetam", "segmenter", "fp16", "fp32"),
-    ],
-)
+@pytest.mark.parametrize(("text", "role", "precision", "clause"), [
+    ("clap", "embedder", None, "clip, siglip2, mobileclip"), ("hub:owner", "embedder", None, "hub:owner/name"),
+    ("mobileclip", "embedder", "int8", "wrong embeddings"), ("edgetam", "segmenter", "fp16", "fp32"),
+    ("hub:Xenova/mobileclip_s0", "embedder", "int8", "wrong embeddings"),
+])  # fmt: skip
 def test_what_is_no_model_is_refused(text, role, precision, clause):
     with pytest.raises(InputError, match=clause):
         hub.parse_model(text, role, precision)

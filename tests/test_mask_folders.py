@@ -154,21 +154,11 @@ def test_resizing_takes_the_value_at_each_centre(tmp_path, width):
     np.testing.assert_array_equal(np.array(ids)[labels[0]], image[rows[:, None], columns])
 
 
-@pytest.mark.parametrize(
-    ("frame", "file"),
-    [
-        ("a", "a.PNG"),
-        ("frame.0001", "frame.0001.png"),
-        ("frame.0001", "frame.0001.jpg.png"),
-        ("a", "a.JPG.Png"),
-        ("a", "a_mask.png"),
-        ("frame.0001", "frame.0001_masks.png"),
-        ("0001", "mask_0001.png"),
-        ("a", "a.jpg_mask.png"),
-        ("cam0_a", "cam0/a.png"),
-        ("cam0_a", "cam0_a.png"),
-    ],
-)
+@pytest.mark.parametrize(("frame", "file"), [
+    ("a", "a.PNG"), ("frame.0001", "frame.0001.png"), ("frame.0001", "frame.0001.jpg.png"), ("a", "a.JPG.Png"),
+    ("a", "a_mask.png"), ("frame.0001", "frame.0001_masks.png"), ("0001", "mask_0001.png"), ("a", "a.jpg_mask.png"),
+    ("cam0_a", "cam0/a.png"), ("cam0_a", "cam0_a.png"),
+])  # fmt: skip
 def test_what_a_mask_may_be_called(tmp_path, frame, file):
     image = ids_image()
     write(tmp_path / file, image)
@@ -317,20 +307,12 @@ def test_one_coco_file_of_all_frames(tmp_path):
         load_proposals(tmp_path, ("a",), SIZE)
 
 
-@pytest.mark.parametrize(
-    ("segmentation", "words"),
-    [
-        ([[1, 2, 3, 4]], "three corners"),
-        ([[1, 2, 3, 4, 5]], "x and y in turn"),
-        ([["a", 2, 3, 4, 5, 6]], "x and y in turn"),
-        ([[0, 0, 900, 0, 900, 900]], "900"),
-        ("61X13mN000`0", "61X13mN000`0"),
-        (None, "None"),
-        ({"size": ["a", 3], "counts": []}, "size"),
-        ({"size": [12, 16], "counts": {}}, "another kind"),
-        ({"counts": [192]}, "'size' is missing"),
-    ],
-)
+@pytest.mark.parametrize(("segmentation", "words"), [
+    ([[1, 2, 3, 4]], "three corners"), ([[1, 2, 3, 4, 5]], "x and y in turn"),
+    ([["a", 2, 3, 4, 5, 6]], "x and y in turn"), ([[0, 0, 900, 0, 900, 900]], "900"),
+    ("61X13mN000`0", "61X13mN000`0"), (None, "None"), ({"size": ["a", 3], "counts": []}, "size"),
+    ({"size": [12, 16], "counts": {}}, "another kind"), ({"counts": [192]}, "'size' is missing"),
+])  # fmt: skip
 def test_wrong_masks_in_json_are_told_in_words(tmp_path, segmentation, words):
     (tmp_path / "a.json").write_text(json.dumps([{"segmentation": segmentation}]))
     read, _ = load_proposals(tmp_path, ("a",), SIZE)

@@ -22,15 +22,12 @@ def folders(tmp_path_factory):
     }
 
 
-@pytest.mark.parametrize(
-    ("model", "words"),
-    [
-        ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
-        ("SAM", ["decoder of SAM, 64 prompts per run", "images of 256 px", "--segmenter"]),
-        ("SAM 2", ["images of 64 px", "--tracker"]),
-        ("SAM 3", ["a phrase of 32 tokens", "raw decoder, images of 112 px", "--phrases"]),
-    ],
-)
+@pytest.mark.parametrize(("model", "words"), [
+    ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
+    ("SAM", ["decoder of SAM, 64 prompts per run", "images of 256 px", "--segmenter"]),
+    ("SAM 2", ["images of 64 px", "--tracker"]),
+    ("SAM 3", ["a phrase of 32 tokens", "raw decoder, images of 112 px", "--phrases"]),
+])  # fmt: skip
 def test_what_a_folder_is_good_for(folders, model, words):
     findings = inspect_models(folders[model])
     told = {use.model: use for use in findings.uses}

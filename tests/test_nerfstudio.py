@@ -114,22 +114,10 @@ def test_depth_maps(tmp_path):
 
 
 def test_points_from_a_ply(tmp_path):
-    lines = [
-        "ply",
-        "format ascii 1.0",
-        "element vertex 2",
-        "property float x",
-        "property float y",
-        "property float z",
-        "property uchar red",
-        "property uchar green",
-        "property uchar blue",
-        "end_header",
-        "1 2 3 4 5 6",
-        "-1 0.5 0 7 8 9",
-        "",
-    ]
-    (tmp_path / "sparse.ply").write_text("\n".join(lines))
+    properties = [f"property float {axis}" for axis in "xyz"]
+    properties += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    lines = ["ply", "format ascii 1.0", "element vertex 2", *properties, "end_header", "1 2 3 4 5 6", "-1 0.5 0 7 8 9"]
+    (tmp_path / "sparse.ply").write_text("\n".join([*lines, ""]))
     loaded = load_changed(tmp_path, lambda content: content.update(ply_file_path="sparse.ply"))
     np.testing.assert_array_equal(loaded.points, np.array([[1, 2, 3], [-1, 0.5, 0]], np.float32))
     np.testing.assert_array_equal(loaded.point_colors, [[4, 5, 6], [7, 8, 9]])
@@ -189,29 +177,21 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (_drop("frames"), "no key 'frames'"),
-        (_drop("frames", 2, "transform_matrix"), "no key 'transform_matrix' in frame 2 (images/frame_002.png)"),
-        (_drop("frames", 1, "file_path"), "no key 'file_path' in frame 1"),
-        (_put("x", "frames"), "type str"),
-        (_put([], "frames"), "0 frames"),
-        (_put(7, "frames", 0), "not an object"),
-        (_put("wide", "w"), "w = 'wide'"),
-        (_put(None, "cx"), "cx = None"),
-        (_put(0, "w"), "0x16"),
-        (_put([[1, 2], [3, 4]], "frames", 0, "transform_matrix"), "shape (2, 2)"),
-        (_put([["a"] * 4] * 4, "frames", 0, "transform_matrix"), "more than numbers"),
-        (_put(NAN_POSE, "frames", 3, "transform_matrix"), "pose of images/frame_003.png has NaN"),
-        (_put(MIRROR, "frames", 3, "transform_matrix"), "not rigid"),
-        (_put(SCALED, "frames", 3, "transform_matrix"), "not rigid"),
-        (_put(0.0, "applied_scale"), "cannot be inverted"),
-        (_put("gone.ply", "ply_file_path"), "gone.ply"),
-        (_put("spar\0se.ply", "ply_file_path"), "no such file"),
-        (_put(["sparse.ply"], "ply_file_path"), "'ply_file_path' of type list"),
-    ],
-)
+@pytest.mark.parametrize(("change", "said"), [
+    (_drop("frames"), "no key 'frames'"),
+    (_drop("frames", 2, "transform_matrix"), "no key 'transform_matrix' in frame 2 (images/frame_002.png)"),
+    (_drop("frames", 1, "file_path"), "no key 'file_path' in frame 1"), (_put("x", "frames"), "type str"),
+    (_put([], "frames"), "0 frames"), (_put(7, "frames", 0), "not an object"), (_put("wide", "w"), "w = 'wide'"),
+    (_put(None, "cx"), "cx = None"), (_put(0, "w"), "0x16"),
+    (_put([[1, 2], [3, 4]], "frames", 0, "transform_matrix"), "shape (2, 2)"),
+    (_put([["a"] * 4] * 4, "frames", 0, "transform_matrix"), "more than numbers"),
+    (_put(NAN_POSE, "frames", 3, "transform_matrix"), "pose of images/frame_003.png has NaN"),
+    (_put(MIRROR, "frames", 3, "transform_matrix"), "not rigid"),
+    (_put(SCALED, "frames", 3, "transform_matrix"), "not rigid"),
+    (_put(0.0, "applied_scale"), "cannot be inverted"), (_put("gone.ply", "ply_file_path"), "gone.ply"),
+    (_put("spar\0se.ply", "ply_file_path"), "no such file"),
+    (_put(["sparse.ply"], "ply_file_path"), "'ply_file_path' of type list"),
+])  # fmt: skip
 def test_damage_is_told(tmp_path, change, said):
     with refused(said):
         load_changed(tmp_path, change)

@@ -98,18 +98,14 @@ def test_frames_are_those_of_the_field_at_the_size_of_their_files(room_run, room
         load_frames(field, room, 0)
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--phrases", "MODEL"], "there is no query"),
-        (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: there is no text"),
-        (["red", "--phrases", "MODEL", "--all", "--by", "code"], "--by --all"),
-        (["red", "--images", "x"], "--images: it needs --phrases"),
-        (["red", "--looks", "3"], "--looks: it needs --phrases"),
-        (["red", "--phrases", "nowhere"], "no such folder"),
-        (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: there is no such file or folder"),
-    ],
-)
+@pytest.mark.parametrize(("options", "says"), [
+    (["--phrases", "MODEL"], "there is no query"),
+    (["--at", "#0", 3, 3, "--phrases", "MODEL"], "--phrases: there is no text"),
+    (["red", "--phrases", "MODEL", "--all", "--by", "code"], "--by --all"),
+    (["red", "--images", "x"], "--images: it needs --phrases"),
+    (["red", "--looks", "3"], "--looks: it needs --phrases"), (["red", "--phrases", "nowhere"], "no such folder"),
+    (["red", "--phrases", "MODEL", "--images", "nowhere"], "nowhere: there is no such file or folder"),
+])  # fmt: skip
 def test_phrases_that_cannot_be_asked(room_run, model, tmp_path, capsys, options, says):
     options = [model if option == "MODEL" else option for option in options]
     assert _query(room_run[1] / "field.safetensors", tmp_path, *options) == 2

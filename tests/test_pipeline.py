@@ -83,14 +83,10 @@ def test_a_second_run_reads_every_stage_and_writes_the_same_bytes(room_run, tmp_
     assert again.skipped == run.skipped
 
 
-@pytest.mark.parametrize(
-    ("changes", "rerun"),
-    [
-        ({"reduce": "mean"}, {"distil"}),
-        pytest.param({"latent": 3}, {"codes", "distil"}, marks=pytest.mark.long),
-        ({"top": 4}, {"votes", "distil"}),
-    ],
-)
+@pytest.mark.parametrize(("changes", "rerun"), [
+    ({"reduce": "mean"}, {"distil"}), pytest.param({"latent": 3}, {"codes", "distil"}, marks=pytest.mark.long),
+    ({"top": 4}, {"votes", "distil"}),
+])  # fmt: skip
 def test_a_changed_option_reruns_only_what_depends_on_it(room_run, tmp_path, monkeypatch, changes, rerun):
     monkeypatch.setattr(autoencoder, "MIN_STEPS", 1)  # it is enough that one is trained, by LangSplat's 100 epochs
     run, out = room_run
@@ -142,7 +138,7 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tm
     run, _ = room_run
     given, listener = on_given_gaussians
     assert {"segmenter", "association"} <= set(run.skipped)
-    flat = dataclasses.replace(run.options, sh_degree=0, gaussians_at_most=1)
+    flat = dataclasses.replace(run.options, sh_degree=0)
     work, bare = (RunContext(options, Networks(ColourEmbedder()), tmp_path) for options in (run.options, flat))
     left = set(gaussians(bare).skipped) - set(gaussians(work).skipped)
     assert left == {"view-dependent colour"}
@@ -259,18 +255,11 @@ def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):
     assert found_as[0] > 0.4
 
 
-@pytest.mark.parametrize(
-    ("changes", "where"),
-    [
-        ({"capture": Path("nowhere")}, "nowhere"),
-        ({"gaussians": Path("nowhere.ply")}, "nowhere.ply"),
-        ({"masks": Path("nowhere")}, "nowhere"),
-        ({"steps": 0}, "--steps"),
-        ({"frames": 1}, "--frames"),
-        ({"downscale": 0.5}, "--downscale"),
-        ({"latent": 0}, "--latent"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "where"), [
+    ({"capture": Path("nowhere")}, "nowhere"), ({"gaussians": Path("nowhere.ply")}, "nowhere.ply"),
+    ({"masks": Path("nowhere")}, "nowhere"), ({"steps": 0}, "--steps"), ({"frames": 1}, "--frames"),
+    ({"downscale": 0.5}, "--downscale"), ({"latent": 0}, "--latent"),
+])  # fmt: skip
 def test_what_cannot_be_is_refused_before_any_work(room_run, tmp_path, changes, where):
     run, _ = room_run
     listener = Recorder()
@@ -373,7 +362,7 @@ compiling.install()
 room, out, victim, nth = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 test.results.CHECKPOINT_SECONDS = 0.0
 test.cache.write_arrays = test.writer_that_stops(test.kill, victim, nth)
-test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, steps=150), out)
+test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, steps=150, gaussians_at_most=1), out)
 """
 
 

@@ -168,16 +168,10 @@ def test_cut_short(tmp_path, form):
             load_ply(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "field"),
-    [
-        ("y", np.nan, "means"),
-        ("scale_1", np.inf, "log_scales"),
-        ("rot_0", np.nan, "quaternions"),
-        ("opacity", np.nan, "opacity_logits"),
-        ("f_dc_2", -np.inf, "sh"),
-    ],
-)
+@pytest.mark.parametrize(("name", "value", "field"), [
+    ("y", np.nan, "means"), ("scale_1", np.inf, "log_scales"), ("rot_0", np.nan, "quaternions"),
+    ("opacity", np.nan, "opacity_logits"), ("f_dc_2", -np.inf, "sh"),
+])  # fmt: skip
 def test_numbers_that_are_none(tmp_path, name, value, field):
     given = columns()
     given[name][4] = value

@@ -80,17 +80,10 @@ def test_what_is_wrong_with_the_input_is_said_once(tmp_path):
     assert "empty" in ended.stderr
 
 
-@pytest.mark.parametrize(
-    ("count", "coordinator", "index", "where"),
-    [
-        (0, None, None, "processes"),
-        (2, "127.0.0.1:7733", None, "processes"),
-        (2, None, 1, "processes"),
-        (2, "127.0.0.1:7733", 2, "processes"),
-        (2, "nowhere", 0, "--coordinator"),
-        (2, "host:port", 0, "--coordinator"),
-    ],
-)
+@pytest.mark.parametrize(("count", "coordinator", "index", "where"), [
+    (0, None, None, "processes"), (2, "127.0.0.1:7733", None, "processes"), (2, None, 1, "processes"),
+    (2, "127.0.0.1:7733", 2, "processes"), (2, "nowhere", 0, "--coordinator"), (2, "host:port", 0, "--coordinator"),
+])  # fmt: skip
 def test_numbers_that_do_not_fit_are_refused(count, coordinator, index, where):
     with pytest.raises(InputError) as caught:
         launch([], count, coordinator, index)

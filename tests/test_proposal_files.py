@@ -67,16 +67,11 @@ def test_masks_of_larger_frames_are_resized_and_others_refused(tmp_path, masks):
         read(0)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("[{", "not JSON"),
-        ('[{"bbox": [1, 2, 3, 4]}]', "'segmentation' is missing"),
-        ('{"info": 1}', "'annotations' is missing"),
-        ('[{"segmentation": [[1, 2, 3, 4]]}]', "mask 0"),
-        ('[{"segmentation": {"size": [20, 30], "counts": [5]}}]', "5 of 20x30"),
-    ],
-)
+@pytest.mark.parametrize(("content", "words"), [
+    ("[{", "not JSON"), ('[{"bbox": [1, 2, 3, 4]}]', "'segmentation' is missing"),
+    ('{"info": 1}', "'annotations' is missing"), ('[{"segmentation": [[1, 2, 3, 4]]}]', "mask 0"),
+    ('[{"segmentation": {"size": [20, 30], "counts": [5]}}]', "5 of 20x30"),
+])  # fmt: skip
 def test_damaged_json_is_named(tmp_path, content, words):
     (tmp_path / "a.json").write_text(content)
     read, _ = load_proposals(tmp_path, ("a",), SIZE)
@@ -131,19 +126,14 @@ def test_every_mask_comes_back(seed, height, width, density):
         np.testing.assert_array_equal(decode_rle({"size": size, "counts": counts}, "here"), mask)
 
 
-@pytest.mark.parametrize(
-    ("rle", "words"),
-    [
-        ({"size": [9, 10], "counts": "61X13mN000"}, "69 of 9x10"),
-        ({"size": [9, 10], "counts": "61X13mN000`"}, "breaks off"),
-        ({"size": [9, 10], "counts": "61 X"}, "is not a digit"),
-        ({"size": [9, 10], "counts": [-10, 100]}, "90 of 9x10"),
-        ({"size": [0, 10], "counts": []}, "0 of 0x10"),
-        ({"size": [9, 10]}, "'counts' is missing"),
-        ([[10, 10, 20, 20, 10, 20]], "another kind"),
-        ({"size": [2, 2], "counts": "abc\u00e9"}, "is not a digit"),
-    ],
-)
+@pytest.mark.parametrize(("rle", "words"), [
+    ({"size": [9, 10], "counts": "61X13mN000"}, "69 of 9x10"),
+    ({"size": [9, 10], "counts": "61X13mN000`"}, "breaks off"),
+    ({"size": [9, 10], "counts": "61 X"}, "is not a digit"),
+    ({"size": [9, 10], "counts": [-10, 100]}, "90 of 9x10"), ({"size": [0, 10], "counts": []}, "0 of 0x10"),
+    ({"size": [9, 10]}, "'counts' is missing"), ([[10, 10, 20, 20, 10, 20]], "another kind"),
+    ({"size": [2, 2], "counts": "abc\u00e9"}, "is not a digit"),
+])  # fmt: skip
 def test_what_is_no_mask_is_refused_where_it_lies(rle, words):
     with pytest.raises(InputError, match=words) as caught:
         decode_rle(rle, "frame_0001.json, mask 3")

@@ -260,28 +260,24 @@ def test_tum_names_with_spaces(tmp_path):
     assert len(load_capture(tmp_path, holdout=0).names) == 11
 
 
-@pytest.mark.parametrize(
-    ("name", "file", "text", "says"),
-    [
-        ("scannet", "pose/3.txt", "1 2 3\n", "3.txt"),
-        ("scannet", "pose/3.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not rigid"),
-        ("scannet", "intrinsic/intrinsic_color.txt", "", "intrinsic_color.txt"),
-        ("tum", "groundtruth.txt", "1 2 three\n", "groundtruth.txt"),
-        ("tum", "groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n", "zero norm"),
-        ("tum", "rgb.txt", "1305031102.17\n", "rgb.txt"),
-        ("tum", "rgb.txt", "# nothing\n", "rgb.txt"),
-        ("tum", "intrinsics.txt", "500 500\n", "intrinsics.txt"),
-        ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers after"),
-        ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
-        ("arkitscenes", "lowres_wide_intrinsics/41069021_100.000.pincam", "24 16 x\n", "pincam"),
-        ("polycam", "keyframes/corrected_cameras/101.json", "{", "101.json"),
-        ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'fy'"),
-        ("polycam", "keyframes/corrected_cameras/101.json", "[]", "101.json"),
-        ("record3d", "rgb/left.png", "", "metadata.json"),
-        ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
-        ("record3d", "metadata.json", "[]", "metadata.json"),
-    ],
-)
+@pytest.mark.parametrize(("name", "file", "text", "says"), [
+    ("scannet", "pose/3.txt", "1 2 3\n", "3.txt"),
+    ("scannet", "pose/3.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "not rigid"),
+    ("scannet", "intrinsic/intrinsic_color.txt", "", "intrinsic_color.txt"),
+    ("tum", "groundtruth.txt", "1 2 three\n", "groundtruth.txt"),
+    ("tum", "groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n", "zero norm"),
+    ("tum", "rgb.txt", "1305031102.17\n", "rgb.txt"), ("tum", "rgb.txt", "# nothing\n", "rgb.txt"),
+    ("tum", "intrinsics.txt", "500 500\n", "intrinsics.txt"),
+    ("tum", "intrinsics.txt", "500 500 12 8" + 9 * " 0.01", "9 numbers after"),
+    ("arkitscenes", "lowres_wide.traj", "1 2 3\n", "lowres_wide.traj"),
+    ("arkitscenes", "lowres_wide_intrinsics/41069021_100.000.pincam", "24 16 x\n", "pincam"),
+    ("polycam", "keyframes/corrected_cameras/101.json", "{", "101.json"),
+    ("polycam", "keyframes/corrected_cameras/101.json", '{"fx": 3}', "'fy'"),
+    ("polycam", "keyframes/corrected_cameras/101.json", "[]", "101.json"),
+    ("record3d", "rgb/left.png", "", "metadata.json"),
+    ("record3d", "metadata.json", '{"poses": [[0, 0, 0]]}', "metadata.json"),
+    ("record3d", "metadata.json", "[]", "metadata.json"),
+])  # fmt: skip
 def test_damaged_files_are_told(tmp_path, name, file, text, says):
     FORMATS[name](tmp_path)
     (tmp_path / file).write_text(text)

@@ -153,23 +153,20 @@ def _sized(name, axis, size):
     return edit
 
 
-@pytest.mark.parametrize(
-    ("file", "edit", "says"),
-    [
-        ("sam3_image_encoder.onnx", _renamed("image", "pixels"), "image_encoder.onnx, input 'image'"),
-        ("sam3_image_encoder.onnx", _sized("image", 1, 1 << 40), "an input 'image' of"),
-        ("sam3_image_encoder.onnx", _renamed("backbone_fpn_1", "fpn"), "decoder.onnx, input 'backbone_fpn_1'"),
-        ("sam3_language_encoder.onnx", _renamed("tokens", "ids"), "language_encoder.onnx, input 'tokens'"),
-        ("sam3_language_encoder.onnx", _renamed("text_memory", "memory"), "output 'text_memory'"),
-        ("sam3_language_encoder.onnx", _sized("tokens", 1, 1 << 30), "an input 'tokens' of"),
-        ("sam3_decoder.onnx", _renamed("box_masks", "boxes_masks"), "decoder.onnx, input 'box_masks'"),
-        ("sam3_decoder.onnx", _renamed("language_features", "words"), "input 'language_features'"),
-        ("sam3_decoder.onnx", _renamed("vision_pos_enc_2", "where"), "input 'where'"),
-        ("sam3_decoder.onnx", _renamed("presence_logit_dec", "there_at_all"), "output 'presence_logit_dec'"),
-        ("sam3_decoder.onnx", _renamed("pred_logits", "logits"), "output 'scores'"),
-        ("sam3_decoder.onnx", _sized("backbone_fpn_2", 1, CHANNELS + 1), "input 'backbone_fpn_2'"),
-    ],
-)
+@pytest.mark.parametrize(("file", "edit", "says"), [
+    ("sam3_image_encoder.onnx", _renamed("image", "pixels"), "image_encoder.onnx, input 'image'"),
+    ("sam3_image_encoder.onnx", _sized("image", 1, 1 << 40), "an input 'image' of"),
+    ("sam3_image_encoder.onnx", _renamed("backbone_fpn_1", "fpn"), "decoder.onnx, input 'backbone_fpn_1'"),
+    ("sam3_language_encoder.onnx", _renamed("tokens", "ids"), "language_encoder.onnx, input 'tokens'"),
+    ("sam3_language_encoder.onnx", _renamed("text_memory", "memory"), "output 'text_memory'"),
+    ("sam3_language_encoder.onnx", _sized("tokens", 1, 1 << 30), "an input 'tokens' of"),
+    ("sam3_decoder.onnx", _renamed("box_masks", "boxes_masks"), "decoder.onnx, input 'box_masks'"),
+    ("sam3_decoder.onnx", _renamed("language_features", "words"), "input 'language_features'"),
+    ("sam3_decoder.onnx", _renamed("vision_pos_enc_2", "where"), "input 'where'"),
+    ("sam3_decoder.onnx", _renamed("presence_logit_dec", "there_at_all"), "output 'presence_logit_dec'"),
+    ("sam3_decoder.onnx", _renamed("pred_logits", "logits"), "output 'scores'"),
+    ("sam3_decoder.onnx", _sized("backbone_fpn_2", 1, CHANNELS + 1), "input 'backbone_fpn_2'"),
+])  # fmt: skip
 def test_graphs_of_another_kind_are_refused_by_the_tensor(folder, file, edit, says):
     _edited(folder / file, edit)
     with pytest.raises(InputError, match=says):
@@ -191,15 +188,12 @@ def test_damaged_files_are_refused(folder, frame):
         (folder / name).write_bytes(whole)
 
 
-@pytest.mark.parametrize(
-    ("scores", "masks", "says"),
-    [
-        (np.float32([0.9]), np.full((1, 1, 4, 4), np.nan, np.float32), "not finite"),
-        (np.float32([0.9, 0.8]), np.ones((1, 1, 4, 4), np.float32), "a score and a mask of each query"),
-        (np.float32([np.inf]), np.ones((1, 1, 4, 4), np.float32), "not finite"),
-        (np.float32([0.9]), np.ones((1, 1, 0, 4), np.float32), "a score and a mask of each query"),
-    ],
-)
+@pytest.mark.parametrize(("scores", "masks", "says"), [
+    (np.float32([0.9]), np.full((1, 1, 4, 4), np.nan, np.float32), "not finite"),
+    (np.float32([0.9, 0.8]), np.ones((1, 1, 4, 4), np.float32), "a score and a mask of each query"),
+    (np.float32([np.inf]), np.ones((1, 1, 4, 4), np.float32), "not finite"),
+    (np.float32([0.9]), np.ones((1, 1, 0, 4), np.float32), "a score and a mask of each query"),
+])  # fmt: skip
 def test_what_a_decoder_gives_is_not_trusted(folder, frame, scores, masks, says):
     given = {"language_mask": ("bool", [1, LENGTH]), "language_features": ("float32", [LENGTH, 1, CHANNELS])}
     given |= {"box_coords": ("float32", [1, 1, 4]), "box_labels": ("int64", [1, 1]), "box_masks": ("bool", [1, 1])}

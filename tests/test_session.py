@@ -45,16 +45,13 @@ def test_a_scalar_stays_one(tmp_path):
     assert (found.shape, int(found)) == ((), -7)
 
 
-@pytest.mark.parametrize(
-    ("feeds", "outputs", "named"),
-    [
-        ({"x": np.zeros((1, 4), np.float32)}, None, ["input 'x'", "[batch, 3]", "[1, 4]"]),
-        ({"x": np.zeros((1, 3), np.int64)}, None, ["input 'x'", "float32[batch, 3]", "int64[1, 3]"]),
-        ({"image": np.zeros((1, 3), np.float32)}, None, ["tensor 'image'", "x float32[batch, 3]"]),
-        ({}, None, ["tensor 'x'"]),
-        ({"x": np.zeros((1, 3), np.float32)}, ["embedding"], ["tensor 'embedding'", "y float32[batch, 2]"]),
-    ],
-)
+@pytest.mark.parametrize(("feeds", "outputs", "named"), [
+    ({"x": np.zeros((1, 4), np.float32)}, None, ["input 'x'", "[batch, 3]", "[1, 4]"]),
+    ({"x": np.zeros((1, 3), np.int64)}, None, ["input 'x'", "float32[batch, 3]", "int64[1, 3]"]),
+    ({"image": np.zeros((1, 3), np.float32)}, None, ["tensor 'image'", "x float32[batch, 3]"]),
+    ({}, None, ["tensor 'x'"]),
+    ({"x": np.zeros((1, 3), np.float32)}, ["embedding"], ["tensor 'embedding'", "y float32[batch, 2]"]),
+])  # fmt: skip
 def test_a_tensor_that_does_not_fit_is_named(affine, feeds, outputs, named):
     with pytest.raises(InputError) as caught:
         Graph(affine, threads=1).run(feeds, outputs)
@@ -87,17 +84,10 @@ def _damage(kind, path):
         path.write_bytes(b"PK\x03\x04" + bytes(200))
 
 
-@pytest.mark.parametrize(
-    ("kind", "words"),
-    [
-        ("missing", "No such file"),
-        ("empty", "an empty file"),
-        ("cut", "cannot open"),
-        ("page", "cannot open"),
-        ("pointer", "Git LFS pointer"),
-        ("torch", "cannot open"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "words"), [
+    ("missing", "No such file"), ("empty", "an empty file"), ("cut", "cannot open"), ("page", "cannot open"),
+    ("pointer", "Git LFS pointer"), ("torch", "cannot open"),
+])  # fmt: skip
 def test_a_file_that_is_no_graph_is_refused_by_name(affine, kind, words):
     _damage(kind, affine)
     with pytest.raises(InputError, match=words) as caught:

@@ -110,21 +110,18 @@ def test_mobileclip_s_images_are_not_normalised(tmp_path):
 # What a folder leaves open
 
 
-@pytest.mark.parametrize(
-    ("layout", "name", "change", "words"),
-    [
-        ("immich", "visual/preprocess_cfg.json", None, "does not state how it takes images.*huggingface"),
-        ("immich", "visual/preprocess_cfg.json", {"mean": None}, r"preprocess_cfg\.json.*cannot be read"),
-        ("immich", "textual/tokenizer_config.json", None, r"tokenizer_config\.json: No such file"),
-        ("immich", "textual/tokenizer_config.json", {"pad_token": None}, "pad_token None.*pads short texts"),
-        ("immich", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),
-        ("immich", "config.json", [], "JSON of list"),
-        ("transformers.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' tokens"),
-        ("transformers.js", "preprocessor_config.json", {"rescale_factor": 1}, "pixels times 1, not 1/255"),
-        ("transformers.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, "'BertTokenizer'.*Siglip"),
-        ("immich", "config.json", {"text_cfg": {}}, "no tokenizer of this model.*config"),
-    ],
-)
+@pytest.mark.parametrize(("layout", "name", "change", "words"), [
+    ("immich", "visual/preprocess_cfg.json", None, "does not state how it takes images.*huggingface"),
+    ("immich", "visual/preprocess_cfg.json", {"mean": None}, r"preprocess_cfg\.json.*cannot be read"),
+    ("immich", "textual/tokenizer_config.json", None, r"tokenizer_config\.json: No such file"),
+    ("immich", "textual/tokenizer_config.json", {"pad_token": None}, "pad_token None.*pads short texts"),
+    ("immich", "textual/tokenizer_config.json", {"pad_token": "<none>"}, "without '<none>'"),
+    ("immich", "config.json", [], "JSON of list"),
+    ("transformers.js", "config.json", {"text_config": {"max_position_embeddings": "x"}}, "texts of 'x' tokens"),
+    ("transformers.js", "preprocessor_config.json", {"rescale_factor": 1}, "pixels times 1, not 1/255"),
+    ("transformers.js", "tokenizer_config.json", {"tokenizer_class": "BertTokenizer"}, "'BertTokenizer'.*Siglip"),
+    ("immich", "config.json", {"text_cfg": {}}, "no tokenizer of this model.*config"),
+])  # fmt: skip
 def test_what_a_folder_leaves_open_is_named(tmp_path, layout, name, change, words):
     folder = write_siglip(tmp_path / "model", layout)
     path = folder / name
@@ -136,14 +133,11 @@ def test_what_a_folder_leaves_open_is_named(tmp_path, layout, name, change, word
         ClipEmbedder(folder).check()
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ({"context_length": 0}, "texts of 0 tokens"),
-        ({"tokenizer_kwargs": {"clean": "upper"}}, "cleaned by 'upper'.*canonicalize"),
-        ({"tokenizer_kwargs": {"strip_sep_token": True}}, "tokenizer_kwargs.*strip_sep_token"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ({"context_length": 0}, "texts of 0 tokens"),
+    ({"tokenizer_kwargs": {"clean": "upper"}}, "cleaned by 'upper'.*canonicalize"),
+    ({"tokenizer_kwargs": {"strip_sep_token": True}}, "tokenizer_kwargs.*strip_sep_token"),
+])  # fmt: skip
 def test_rules_of_open_clip_that_are_not_known_are_refused(tmp_path, text, words):
     folder = write_siglip(tmp_path / "model", "immich")
     own = {"context_length": LENGTH, "hf_tokenizer_name": "x"} | text

@@ -56,15 +56,12 @@ def test_a_spz_places_gaussians_within_half_a_step_at_any_magnitude(tmp_path, re
         assert error.max() < reach / 2**16
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"means": 1e7}, ("10,000,000 units from the origin", "Write a .ply")),
-        ({"means": 2**22 + 1.0}, ("4,194,305 units from the origin",)),
-        ({"log_scales": 6.5}, ("665 units large", "at most 379")),
-        ({"log_scales": -12.0}, ("60 of 60 Gaussians are smaller",)),
-    ],
-)
+@pytest.mark.parametrize(("changes", "says"), [
+    ({"means": 1e7}, ("10,000,000 units from the origin", "Write a .ply")),
+    ({"means": 2**22 + 1.0}, ("4,194,305 units from the origin",)),
+    ({"log_scales": 6.5}, ("665 units large", "at most 379")),
+    ({"log_scales": -12.0}, ("60 of 60 Gaussians are smaller",)),
+])  # fmt: skip
 def test_a_spz_refuses_what_it_cannot_hold(tmp_path, changes, says):
     given = scene(60, 1)
     for name, value in changes.items():
@@ -147,16 +144,11 @@ def test_what_a_spz_says_and_is_not_done_is_told(tmp_path):
         jsecon.load_gaussians(tmp_path / "a.spz")
 
 
-@pytest.mark.parametrize(
-    ("how", "says"),
-    [
-        ({"degree": 4}, ("degree 4", "degree of 0 to 3")),
-        ({"version": 5}, ("version 5",)),
-        ({"records": record(0xADBE0003, struct.pack("<I", 17))}, ("unknown number 17",)),
-        ({"records": record(0xADBE0003, b"")[:-1] + b"\1"}, ("damaged",)),
-        ({"fraction": 31}, ("31 bits",)),
-    ],
-)
+@pytest.mark.parametrize(("how", "says"), [
+    ({"degree": 4}, ("degree 4", "degree of 0 to 3")), ({"version": 5}, ("version 5",)),
+    ({"records": record(0xADBE0003, struct.pack("<I", 17))}, ("unknown number 17",)),
+    ({"records": record(0xADBE0003, b"")[:-1] + b"\1"}, ("damaged",)), ({"fraction": 31}, ("31 bits",)),
+])  # fmt: skip
 def test_a_spz_of_another_kind_is_refused_by_name(tmp_path, how, says):
     how = {"version": 4, **how}
     data = splat_files.spz(SCENE | {"means": 0 * SCENE["means"]}, how.pop("version"), **how)
@@ -290,18 +282,14 @@ def test_a_compressed_ply_with_and_without_bounds_of_colours(tmp_path, basis, co
     compare(jsecon.load_gaussians(tmp_path / "a.ply"), given, steps)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        (b"float min_scale_x", b"float odd_scale_x", "no properties min_scale_x"),
-        (b"float max_b", b"float odd_b", "no properties max_b"),
-        (b"uint packed_color", b"uint odd", "no properties packed_color"),
-        (b"uint packed_color", b"ushort packed_color", "of type uint16"),
-        (b"element sh 600", b"element sh 599", "599 rows of sh for 600 Gaussians"),
-        (b"uchar f_rest_8\n", b"uchar odd\n", "9 properties"),
-        (b"binary_little_endian", b"ascii", "ascii"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "says"), [
+    (b"float min_scale_x", b"float odd_scale_x", "no properties min_scale_x"),
+    (b"float max_b", b"float odd_b", "no properties max_b"),
+    (b"uint packed_color", b"uint odd", "no properties packed_color"),
+    (b"uint packed_color", b"ushort packed_color", "of type uint16"),
+    (b"element sh 600", b"element sh 599", "599 rows of sh for 600 Gaussians"),
+    (b"uchar f_rest_8\n", b"uchar odd\n", "9 properties"), (b"binary_little_endian", b"ascii", "ascii"),
+])  # fmt: skip
 def test_a_compressed_ply_of_another_kind_is_refused_by_name(tmp_path, old, new, says):
     whole = splat_files.compressed_ply(scene(600, 4))
     assert old in whole

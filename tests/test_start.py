@@ -84,16 +84,9 @@ def wall_capture(height=24, width=32, views=3):
         poses.append(pose)
     depths[0][:4] = 0  # unknown
     camera = Camera(np.array(poses), *(np.full(views, v) for v in (focal, focal, width / 2, height / 2)), width, height)
-    return Capture(
-        np.array(frames),
-        camera,
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        np.array([False] * (views - 1) + [True]),
-        np.array(depths),
-        np.eye(4),
-        tuple(f"{t}" for t in range(views)),
-    )
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    held_out, names = np.arange(views) == views - 1, tuple(f"{t}" for t in range(views))
+    return Capture(np.array(frames), camera, *nothing, held_out, np.array(depths), np.eye(4), names)
 
 
 def test_points_from_depth_lie_on_the_wall_and_agree_between_views():

@@ -57,18 +57,12 @@ def test_the_ids_spell_the_cleaned_text(tokenizer, text):
     assert decoders.ByteLevel().decode([spelled]) == "".join(tokenizer.clean(text).split())
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "{",
-        "[]",
-        '{"model": 3}',
-        '{"model": {"type": "Unigram", "unk_id": 0, "vocab": [["a", 0.0]]}}',
-        '{"model": {"type": "BPE", "vocab": {"a": 0}, "merges": []}}',
-        '{"model": {"type": "BPE", "vocab": {"a": "b"}, "merges": []}}',
-        '{"model": {"type": "BPE", "vocab": {"a": 0}, "merges": ["a b c"]}}',
-    ],
-)
+@pytest.mark.parametrize("content", [
+    "{", "[]", '{"model": 3}', '{"model": {"type": "Unigram", "unk_id": 0, "vocab": [["a", 0.0]]}}',
+    '{"model": {"type": "BPE", "vocab": {"a": 0}, "merges": []}}',
+    '{"model": {"type": "BPE", "vocab": {"a": "b"}, "merges": []}}',
+    '{"model": {"type": "BPE", "vocab": {"a": 0}, "merges": ["a b c"]}}',
+])  # fmt: skip
 def test_what_is_no_tokenizer_of_clip_is_refused(tmp_path, content):
     (tmp_path / "tokenizer.json").write_text(content)
     with pytest.raises(InputError, match="no tokenizer of this model") as caught:

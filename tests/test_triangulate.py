@@ -54,16 +54,8 @@ def plane_capture(count=5, textured=True):
     held_out = np.zeros(count, bool)
     held_out[2] = True
     camera = Camera(pose, *(np.full(count, v) for v in (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)), WIDTH, HEIGHT)
-    return Capture(
-        frames,
-        camera,
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        held_out,
-        None,
-        np.eye(4),
-        tuple(map(str, range(count))),
-    )
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return Capture(frames, camera, *nothing, held_out, None, np.eye(4), tuple(map(str, range(count))))
 
 
 def test_exact_tracks_give_exact_points():

@@ -224,37 +224,56 @@ def input_of(label: str) -> str:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
+def test_in_a_browser_a_text_lights_up_and_a_click_selects(viewer, tmp_path):
     word, address = word_of(viewer), f"http://127.0.0.1:{viewer.server.get_port()}/"
-    with opened(address, tmp_path, width=800, height=420) as page:
-        page.until(f"{input_of('find')} && {input_of('link')} && true")
-        page.js(
-            "document.head.append(Object.assign(document.createElement('style'), { textContent: '" + QUIET + "' }))"
-        )
-        first = after_change(page, np.full_like(scene_of(page), scene_of(page)[-1, 0]))
-        assert len(np.unique(first.reshape(-1, 3) // 16, axis=0)) > 8, "the canvas is blank"
-
+    with opened(address, tmp_path, width=640, height=360) as page:
+        first = begun(page)
         page.type(input_of("find"), word)
         until(lambda: viewer.history.state.queries == (word,), "the text arrives")
         after_change(page, first)
         count = int(viewer.answer(view_state.ViewQuery(word)).mask.sum())
         page.until(f"document.body.innerText.includes('{word}: {count} Gaussians')")
         page.until("document.querySelectorAll('figure img').length >= 3")
+        click_a_region(viewer, page)
+        outside = [url for url in page.asked if not url.startswith((address, "data:", "blob:", "ws://127.0.0.1"))]
+        assert not outside
 
+
+def begun(page) -> np.ndarray:
+    """The picture once the scene is shown."""
+    page.until(f"{input_of('find')} && {input_of('link')} && true")
+    page.js("document.head.append(Object.assign(document.createElement('style'), { textContent: '" + QUIET + "' }))")
+    first = after_change(page, np.full_like(scene_of(page), scene_of(page)[-1, 0]))
+    assert len(np.unique(first.reshape(-1, 3) // 16, axis=0)) > 8, "the canvas is blank"
+    return first
+
+
+def click_a_region(viewer, page):
+    """(region, its camera, left, top, width, height): clicks the region below the middle; the canvas's place, px."""
+    width, height = page.js(f"(() => {{ const c = {CANVAS}; return [c.clientWidth, c.clientHeight]; }})()")
+    x, y = round(0.4 * width), round(0.55 * height)
+    focal = height / 2 / np.tan(viewer.scene.fov(0) / 2)
+    lens = (np.float32(v) for v in (focal, focal, width / 2, height / 2))
+    seen_from = Camera(viewer.field.cameras.world_to_camera[0], *lens, width=width, height=height)
+    region = int(region_shares_seen(viewer.field, seen_from, x, y).argmax())
+    left, top = page.js(f"(() => {{ const r = {CANVAS}.getBoundingClientRect(); return [r.x, r.y]; }})()")
+    page.click(left + x, top + y)
+    until(lambda: viewer.history.state.queries == (region,), f"region {region} is clicked")
+    return region, seen_from, left, top, width, height
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
+    """Sliders, shift and clicks, downloads, links, undo, frames. What each does to the field is tested above."""
+    address = f"http://127.0.0.1:{viewer.server.get_port()}/"
+    with opened(address, tmp_path, width=800, height=420) as page:
+        begun(page)
         page.js("document.querySelectorAll('[role=slider]')[0].focus()")
         page.key("ArrowRight", 39)
         until(lambda: viewer.history.state.threshold == 0.51, "the threshold moves")
 
-        width, height = page.js(f"(() => {{ const c = {CANVAS}; return [c.clientWidth, c.clientHeight]; }})()")
-        x, y = round(0.4 * width), round(0.55 * height)
-        focal = height / 2 / np.tan(viewer.scene.fov(0) / 2)
-        lens = (np.float32(v) for v in (focal, focal, width / 2, height / 2))
-        seen_from = Camera(viewer.field.cameras.world_to_camera[0], *lens, width=width, height=height)
-        region = int(region_shares_seen(viewer.field, seen_from, x, y).argmax())
-        left, top = page.js(f"(() => {{ const r = {CANVAS}.getBoundingClientRect(); return [r.x, r.y]; }})()")
-        page.click(left + x, top + y)
-        until(lambda: viewer.history.state.queries == (region,), f"region {region} is clicked")
-
+        region, seen_from, left, top, width, height = click_a_region(viewer, page)
         other = next(
             (u, v)
             for v in range(60, height - 40, 7)
@@ -296,5 +315,3 @@ def test_in_a_browser_it_does_what_a_person_tries(viewer, tmp_path):
         page.click(left + width / 2 + focal * place[0] / place[2], top + height / 2 + focal * place[1] / place[2])
         until(lambda: viewer.panel._frame.value == "frame_0", "the camera of another frame is clicked")
         assert viewer.history.state.queries == things
-        outside = [url for url in page.asked if not url.startswith((address, "data:", "blob:", "ws://127.0.0.1"))]
-        assert not outside

@@ -10,6 +10,7 @@ import jsecon
 from jsecon.app.cli import main
 from jsecon.splat.transform import transform_gaussians_float64
 from jsecon.types import Gaussians
+from jsecon.views import plan
 from jsecon.views.frame import scene_frame, surface_points
 from jsecon.views.plan import free_places, greedy_cover, plan_views
 
@@ -66,6 +67,22 @@ def object_alone():
     return scene_of(balls())
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_candidates():
+    """A quarter of the views that are looked at."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "PLACES", 6)
+        patch.setattr(plan, "ORBIT_YAWS", 8)
+        patch.setattr(plan, "VIEWS_AT_ONCE", 48)
+        yield
+
+
+@pytest.fixture(scope="module")
+def around(object_alone):
+    """Planned views of the object."""
+    return plan_views(object_alone, views=6, width=160, height=120)
+
+
 def moved(gaussians, seed, scale=None):
     """The scene turned, scaled (by default at random) and shifted at random; and the similarity."""
     rng = np.random.default_rng(seed)
@@ -100,7 +117,7 @@ def test_free_places_lie_in_the_room_away_from_its_things(room):
     points = surface_points(room)
     frame = scene_frame(points)
     places = free_places(points, frame)
-    assert len(places) == 24
+    assert len(places) == plan.PLACES
     assert (np.abs(places[:, 0]) < 3).all()
     assert (np.abs(places[:, 1]) < 2.5).all()
     distance = np.linalg.norm(places[:, None] - np.asarray(room.means), axis=2).min(1)
@@ -125,13 +142,12 @@ def test_greedy_cover_gains_at_each_step_the_most_that_any_view_would():
     assert len(set(picked)) == 5
 
 
-def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone):
-    inside = plan_views(room, views=6)
+def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone, around):
+    inside = plan_views(room, views=6, width=160, height=120)
     assert inside.kind == "room"
     centres = np.asarray(inside.cameras.centres)
     assert (np.abs(centres[:, 0]) < 3).all()
     assert (np.abs(centres[:, 1]) < 2.5).all()
-    around = plan_views(object_alone, views=6)
     assert around.kind == "object"
     assert (np.linalg.norm(np.asarray(around.cameras.centres) - around.frame.centre, axis=1) > 1).all()
     for scene, planned in ((room, inside), (object_alone, around)):
@@ -140,15 +156,11 @@ def test_a_room_is_seen_from_inside_and_an_object_from_around(room, object_alone
         assert planned.coverage > 0.7
 
 
-@pytest.mark.parametrize(
-    ("change", "clause"),
-    [
-        (lambda g: {"opacity_logits": np.full(g.count, -9.0, np.float32)}, "visible"),
-        (lambda g: {"means": np.zeros_like(g.means)}, "one place"),
-        (lambda g: {"log_scales": np.full_like(g.log_scales, 5.0)}, "wide"),
-    ],
-    ids=["transparent", "one place", "fog"],
-)
+@pytest.mark.parametrize(("change", "clause"), [
+    (lambda g: {"opacity_logits": np.full(g.count, -9.0, np.float32)}, "visible"),
+    (lambda g: {"means": np.zeros_like(g.means)}, "one place"),
+    (lambda g: {"log_scales": np.full_like(g.log_scales, 5.0)}, "wide"),
+], ids=["transparent", "one place", "fog"])  # fmt: skip
 def test_a_scene_that_cannot_be_judged_is_refused(object_alone, change, clause):
     import dataclasses
 
@@ -173,11 +185,11 @@ def test_a_splat_without_photographs_answers_a_text(room, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("kind", ["transforms", "colmap"])
-def test_given_cameras_take_the_place_of_planned_views(object_alone, tmp_path, kind):
+def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp_path, kind):
     """In the world of the scene's file, which is moved and 200 times larger; no image is needed."""
     there, similarity = moved(object_alone, 3, scale=200.0)
     jsecon.save_ply(tmp_path / "scene.ply", there)
-    planned = plan_views(object_alone, views=4, width=160, height=120).cameras
+    planned = around.cameras[:4]
     poses = np.array(planned.world_to_camera, np.float64) @ np.linalg.inv(similarity)
     poses[:, :3] /= np.linalg.norm(poses[:, :1, :3], axis=2, keepdims=True)
     lens = {"w": 160, "h": 120, "fl_x": float(planned.fx[0]), "fl_y": float(planned.fy[0])}
@@ -196,7 +208,7 @@ def test_given_cameras_take_the_place_of_planned_views(object_alone, tmp_path, k
     out = tmp_path / "field"
     assert main(["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(out)]) == 0
     field = jsecon.load_field(out / "field.safetensors")
-    assert field.frames == ("a0.png", "a1.png", "a2.png", "a3.png")
+    assert field.names == ("a0.png", "a1.png", "a2.png", "a3.png")
     mine = jsecon.render_rgb(field.gaussians, field.cameras[1]).alpha
     assert np.abs(mine - jsecon.render_rgb(object_alone, planned[1]).alpha).mean() < 0.01
 

@@ -56,7 +56,7 @@ def test_equals_the_oracles_weights(cast, expected):
     np.testing.assert_array_equal(cast.views, views)
 
 
-@pytest.mark.parametrize("share", [0.4, 1.0])
+@pytest.mark.parametrize("share", [0.4, pytest.param(1.0, marks=pytest.mark.long)])
 def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels, cast, share):
     found = region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True, centre=share)
     votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
@@ -74,7 +74,7 @@ def test_at_the_centre_they_are_the_weights_of_that_pixel(scene, cameras, labels
     assert votes.max() > 0.1
 
 
-@pytest.mark.parametrize("t", [0, 1, 2])
+@pytest.mark.parametrize("t", [1, *(pytest.param(t, marks=pytest.mark.long) for t in (0, 2))])
 def test_votes_on_atoms_are_those_of_the_view(scene, cameras, labels, expected, t):
     """Also where a tile shows more atoms than one walk counts (the noise of view 1)."""
     camera, atoms = cameras[t], labels[t] + 1

@@ -1,7 +1,8 @@
 """What computes on many rows, as it ships, under jit and vmap, against NumPy in float64, where jax was silently wrong
 in float32 (its issue 39103: about 32,769 to 43,000 rows; in float64 from 16,385 on).
 
-The definitions that results are compared with are those of the files that test each function itself.
+The definitions that results are compared with are those of the files that test each function itself. In every run
+test_numerics.py has the products that all of them are made of at such a size.
 """
 
 import dataclasses
@@ -34,7 +35,7 @@ from jsecon.splat.sh import colours_from_sh
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Gaussians
 
-pytestmark = pytest.mark.as_shipped
+pytestmark = [pytest.mark.as_shipped, pytest.mark.long]
 
 REGIONS = of_classes.REGIONS
 
@@ -53,7 +54,6 @@ def compiled(function, batch, *given):
     return jax.jit(jax.vmap(function, in_axes=(0, *(None for _ in given))))(batch, *given)
 
 
-@pytest.mark.long
 def test_one_step(count):
     codes, texts = normal(count, 3), normal(2, 3)
     expected = np.stack([exact_cosines(codes, text) for text in texts])
@@ -67,7 +67,6 @@ def test_one_step(count):
     np.testing.assert_allclose(by_row, expected[0], atol=1e-6)
 
 
-@pytest.mark.long
 def test_canonical(count):
     features, texts, phrases = normal(count, 8), normal(2, 8), normal(4, 8)
     expected = np.stack([exact_relevancy(features, text, phrases) for text in texts])
@@ -82,7 +81,6 @@ def test_canonical(count):
     np.testing.assert_allclose(query_canonical(features, texts[1], phrases, 0.5).similarity, expected[1], atol=3e-6)
 
 
-@pytest.mark.long
 def test_unit_codes(count):
     codes, texts = normal(count, 40), normal(2, 40)
     codes[:3] = [[0] * 40, [np.nan] * 40, [1e30] * 40]
@@ -120,7 +118,6 @@ def test_anchored(field):
         np.testing.assert_allclose(by_code[n], exact_cosines(field.codes, field.region_codes[region]), atol=1e-6)
 
 
-@pytest.mark.long
 def test_several(field):
     sets = field.regions.embeddings[np.array([[0, 3], [1, 2]])]
     ask = {"rules": QueryRules(retrieval="cosine")}
@@ -129,7 +126,6 @@ def test_several(field):
         np.testing.assert_allclose(found[n], share(field, regions), atol=1e-6)
 
 
-@pytest.mark.long
 def test_classes_of_all(field, count):
     sets = unit_rows(np.random.default_rng(2), 10, of_classes.SIZE).reshape(2, 5, -1)
     rules = QueryRules(retrieval="cosine", retrieval_threshold=-1.0)
@@ -148,7 +144,6 @@ def test_classes_of_all(field, count):
         np.testing.assert_array_equal(np.asarray(labels)[n][rows][clear], expected.argmax(1)[clear])
 
 
-@pytest.mark.long
 def test_similarities_of_many_regions(count):
     rng = np.random.default_rng(3)
     embeddings, texts, words = (unit_rows(rng, n, of_retrieval.SIZE) for n in (count, 3, 4))
@@ -162,7 +157,7 @@ def test_similarities_of_many_regions(count):
         np.testing.assert_allclose(found[n], of_retrieval.exact(embeddings, text, words), atol=5e-6)
 
 
-@pytest.mark.parametrize("shown", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.parametrize("shown", [True, False])
 def test_shares(count, shown):
     votes = jax.tree.map(jnp.asarray, of_shares.known_votes(count, shown=shown))
     chosen = np.random.default_rng(1).random((3, of_shares.REGIONS)) < 0.5
@@ -180,9 +175,7 @@ def test_shown_and_overlap(count):
     np.testing.assert_allclose(with_overlap(found).overlap, of_shares.exact_overlap(found), rtol=2e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "reduce", ["median", *(pytest.param(name, marks=pytest.mark.long) for name in ("mean", "mode"))]
-)
+@pytest.mark.parametrize("reduce", ["median", "mean", "mode"])
 def test_reductions_of_votes(count, reduce):
     rng = np.random.default_rng(0)
     small, tables = of_distill.random_votes(rng, 100, 4, 8), np.stack([unit_rows(rng, 8, 3) for _ in range(2)])
@@ -193,7 +186,6 @@ def test_reductions_of_votes(count, reduce):
         np.testing.assert_allclose(found[n], of_distill.exact(small, table, reduce)[rows], atol=3e-5)
 
 
-@pytest.mark.long
 def test_coders(count):
     units, many = unit_rows(np.random.default_rng(0), 5, 12), unit_rows(np.random.default_rng(1), count, 12)
     basis = np.linalg.qr(normal(12, 4))[0]
@@ -244,7 +236,6 @@ def test_projection(cloud):
     np.testing.assert_allclose(found.depths[0], inside[:, 2], rtol=1e-5)
 
 
-@pytest.mark.long
 def test_colours(cloud):
     gaussians, camera = cloud
     x, y, z = (away := gaussians.means - np.asarray(camera.centres, np.float64)).T / np.linalg.norm(away, axis=1)
@@ -263,7 +254,6 @@ def test_another_world(cloud):
     np.testing.assert_allclose(moved.means, expected, atol=2e-6)
 
 
-@pytest.mark.long
 def test_losses_of_many_pixels(count):
     image, target = np.random.default_rng(0).random((2, count, 1, 3)).astype(np.float32)
     error = np.float64(image) - target

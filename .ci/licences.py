@@ -1,6 +1,6 @@
 """The licences of what jsecon needs and of what its extras bring, as the installed packages tell them: LICENSES.md.
 
-pip install '.[all,dev,docs]' && python -m tests.licences > LICENSES.md
+pip install '.[all,dev,docs]' && python .ci/licences.py > LICENSES.md
 """
 
 import re
@@ -35,7 +35,7 @@ LINKED = {b"SuiteSparse": "SuiteSparse: LGPL-2.1, parts GPL-2.0", b"CGAL": "CGAL
 HEAD = """# Licences
 
 jsecon itself is under Apache-2.0 (LICENSE). What it needs, and what each extra brings, directly or by way of another
-package, as the packages installed on {system} tell; written by `python -m tests.licences`. "Within": copyleft
+package, as the packages installed on {system} tell; written by `python .ci/licences.py`. "Within": copyleft
 libraries that its wheel brings along or has linked in, and copyleft licences whose text lies in it.
 """
 
