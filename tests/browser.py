@@ -2,8 +2,10 @@
 
 import base64
 import contextlib
+import html
 import itertools
 import json
+import re
 import shutil
 import subprocess
 import time
@@ -13,10 +15,14 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+WEBGL = (
+    "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+"""options of pages that draw"""
 OPTIONS = (
-    "--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--disable-extensions", "--disable-dev-shm-usage", "--remote-debugging-port=0", "--remote-allow-origins=*",
+    "--headless=new", "--no-sandbox", *WEBGL, "--disable-extensions", "--disable-dev-shm-usage",
+    "--remote-debugging-port=0", "--remote-allow-origins=*",
 )  # fmt: skip
 
 
@@ -95,6 +101,14 @@ def until(found: Callable[[], Any], told: str, seconds: float = 20.0) -> Any:
             raise TimeoutError(f"not within {seconds:g} s: {told}")
         time.sleep(0.05)
     return value
+
+
+def dumped(address: str, folder: Path, *options: str) -> dict:
+    """What a page wrote as JSON into its element `found`, without a person; `options` are Chromium's."""
+    assert CHROMIUM is not None
+    given = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'browser'}", "--dump-dom"]
+    done = subprocess.run([CHROMIUM, *given, *options, address], capture_output=True, text=True, timeout=120)
+    return json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL).group(1)))
 
 
 @contextlib.contextmanager

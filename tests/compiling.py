@@ -10,11 +10,7 @@ import importlib.metadata
 _KNOWN = tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < (0, 12)
 """whether XLA knows the flag of its old emitters; an unknown flag ends the process"""
 EMITTERS = {"xla_cpu_use_fusion_emitters": False} if _KNOWN else {}
-FAST = {
-    **EMITTERS,
-    "xla_backend_optimization_level": 0,
-    "xla_cpu_parallel_codegen_split_count": 1,
-}
+FAST = {**EMITTERS, "xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
 """options of most programs: a fifth of XLA's CPU time with its defaults. They stand in XLA_FLAGS, so that subprocesses
 share the compiled programs on disk."""
 SHIPPED = {

@@ -327,9 +327,7 @@ def masks(folder: Path) -> Iterator[Case]:
         for name, image in zip(names, ids):
             (folder / "objects" / object / f"{name}.png").write_bytes(kinds["grey"]((image == int(object)) * 255))
     yield Case(
-        sorted((folder / "objects").rglob("*.png")),
-        lambda: load_labels(folder / "objects", names, (24, 36)),
-        whole,
+        sorted((folder / "objects").rglob("*.png")), lambda: load_labels(folder / "objects", names, (24, 36)), whole
     )
     (folder / "levels").mkdir()
     for name, image in zip(names, ids):

@@ -86,10 +86,7 @@ def write_decoder(path: Path, side: int, kind: str, batch: int | str, *, masks: 
         coords: ("float32", [1, batch, "points", 2]),
         labels: ("int64", [1, batch, "points"]),
     }
-    outputs = {
-        logits: ("float32", [1, batch, masks, low, low]),
-        scores: ("float32", [1, batch, masks]),
-    }
+    outputs = {logits: ("float32", [1, batch, masks, low, low]), scores: ("float32", [1, batch, masks])}
     if boxed:  # as the published graphs do it: no boxes, and so one prompt a call
         inputs |= {f"image_embeddings.{n}": ("float32", [1, CHANNELS, grid, grid]) for n in (0, 1)}
         inputs["input_boxes"] = ("float32", ["images", "boxes", 4])

@@ -27,7 +27,7 @@ def _query(field, out, *more):
     return cli.main([str(word) for word in ("query", field, *more, "--out", out, "--views", 1)])
 
 
-@pytest.mark.parametrize("more", [(), ("--by", "code", "--format", "glb")])
+@pytest.mark.parametrize("more", [(), pytest.param(("--by", "code", "--format", "glb"), marks=pytest.mark.long)])
 def test_the_same_files_as_in_memory(room_run, tmp_path, forced, monkeypatch, capsys, more):
     run, out = room_run
     texts = [text for text in TEXTS if " " not in text or "code" not in more]
@@ -72,10 +72,7 @@ def test_parts_and_what_no_text_names(room_run, tmp_path, forced):
     assert few.votes.overlap.shape == field.votes.overlap.shape
 
 
-@pytest.mark.parametrize(
-    "more",
-    [("--by", "silhouette"), ("--box", "#1", 2, 2, 9, 9), ("--phrases", ".")],
-)
+@pytest.mark.parametrize("more", [("--by", "silhouette"), ("--box", "#1", 2, 2, 9, 9), ("--phrases", ".")])
 def test_what_needs_all_columns_at_once_is_refused(room_run, tmp_path, forced, capsys, more):
     _, out = room_run
     assert _query(out / "field.safetensors", tmp_path / "answers", "red", *more) == 2

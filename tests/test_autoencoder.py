@@ -161,11 +161,7 @@ def test_what_cannot_be_trained_on_is_told():
         with pytest.raises(ValueError, match=match):
             train_autoencoder(rows.astype(np.float32), latent=3, key=KEY)
     good = unit_rows(np.random.default_rng(0), 4, 8)
-    for options in (
-        {"latent": 0},
-        {"latent": 3, "batch": 0},
-        {"latent": 3, "epochs": 0},
-    ):
+    for options in ({"latent": 0}, {"latent": 3, "batch": 0}, {"latent": 3, "epochs": 0}):
         with pytest.raises(ValueError, match="train_autoencoder"):
             train_autoencoder(good, key=KEY, **options)
 

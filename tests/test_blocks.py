@@ -56,14 +56,7 @@ def assert_alike(blocks, memory, *, pixels=0):
 
 
 @pytest.mark.parametrize("rows", [16, *(pytest.param(rows, marks=pytest.mark.long) for rows in (5, 64, 1 << 18))])
-def test_equal_to_votes_in_memory_and_to_the_oracle(
-    scene,
-    cameras,
-    labels,
-    expected,
-    tmp_path,
-    rows,
-):
+def test_equal_to_votes_in_memory_and_to_the_oracle(scene, cameras, labels, expected, tmp_path, rows):
     memory = region_votes(scene, cameras, labels, REGIONS, top=REGIONS)
     cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, top=REGIONS, folder=tmp_path / "v", rows=rows)
     assert_alike(cast, memory)
@@ -78,12 +71,7 @@ def test_equal_to_votes_in_memory_and_to_the_oracle(
     )
 
 
-def test_weights_at_the_centre(
-    scene,
-    cameras,
-    labels,
-    tmp_path,
-):
+def test_weights_at_the_centre(scene, cameras, labels, tmp_path):
     how = {"top": REGIONS, "centre": 0.7}
     memory = region_votes(scene, cameras, labels, REGIONS, **how)
     cast = region_votes_in_blocks(scene, cameras, labels, REGIONS, **how, folder=tmp_path / "v", rows=16)

@@ -40,13 +40,6 @@ def test_binary_round_trip(folder):
     np.testing.assert_array_equal(loaded.to_source, np.eye(4))
 
 
-def test_text_model_in_sparse_without_a_number(tmp_path):
-    """Written by the test itself, with quaternions from OpenCV: an independent witness of both readers."""
-    write_text_model(CAPTURE, tmp_path / "sparse")
-    write_images(CAPTURE, tmp_path / "images")
-    assert_same(load_capture(tmp_path, holdout=0), CAPTURE)
-
-
 def test_quaternions_in_every_quadrant(tmp_path):
     """Half turns about each axis are where the common formulas divide by zero."""
     poses = ring_poses(4)

@@ -117,21 +117,6 @@ def test_a_file_cut_short(path, share):
     fails(path, "damaged")
 
 
-def test_a_file_with_bytes_changed(path):
-    content = bytearray(path.read_bytes())
-    rng = np.random.default_rng(0)
-    told = 0
-    for place in rng.integers(0, len(content), 40):
-        changed = bytearray(content)
-        changed[place] ^= 0xFF
-        path.write_bytes(changed)
-        try:
-            load_field(path)  # a byte that does not matter (a date, padding) may pass; nothing else may escape
-        except InputError:
-            told += 1
-    assert told >= 20
-
-
 def test_another_programs_file(tmp_path):
     save_file({"a": np.ones(3)}, tmp_path / "other.safetensors")
     fails(tmp_path / "other.safetensors", "another program")

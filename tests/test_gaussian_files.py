@@ -1,6 +1,5 @@
 """Gaussians of other programs' files, against files packed byte by byte here: each number within its format's step."""
 
-import contextlib
 import dataclasses
 import importlib.util
 import json
@@ -16,7 +15,6 @@ from splat_files import RUB, opacity, scene
 
 from jsecon.data.gaussians.files import load_gaussians, save_gaussians
 from jsecon.data.gaussians.ply import save_ply
-from jsecon.errors import InputError
 from jsecon.splat import transform
 from jsecon.splat.render import render_rgb
 from jsecon.types import Camera, Gaussians
@@ -134,16 +132,9 @@ def test_a_spz_of_a_wide_scene_of_sure_opacities_and_of_nothing(tmp_path):
         save_gaussians(tmp_path / "a.spz", gaussians(wide))
 
 
-def test_a_plain_ply_is_read_as_before(tmp_path):
-    given = gaussians(SCENE)
-    save_gaussians(tmp_path / "a.ply", given)
-    found = load_gaussians(tmp_path / "a.ply")
-    for field in dataclasses.fields(Gaussians):
-        np.testing.assert_array_equal(getattr(found, field.name), getattr(given, field.name))
-
-
 @pytest.mark.parametrize("name", FILES)
-def test_spoilt_files_are_refused(tmp_path, name):
+def test_files_cut_short_are_refused(tmp_path, name):
+    """Damaged anywhere: test_fuzz."""
     write, given = FILES[name]
     whole = write(given)
     for length in [0, 1, 40, len(whole) // 2 + 1, len(whole) - 1]:
@@ -152,14 +143,6 @@ def test_spoilt_files_are_refused(tmp_path, name):
         (tmp_path / name).write_bytes(whole[:length])
         with refused(name):
             load_gaussians(tmp_path / name)
-    rng = np.random.default_rng(0)
-    for _ in range(20):  # damaged anywhere: Gaussians, or a reason, and nothing else
-        bytes_ = bytearray(whole)
-        for place in rng.integers(0, len(whole), 8):
-            bytes_[place] = rng.integers(256)
-        (tmp_path / name).write_bytes(bytes_)
-        with contextlib.suppress(InputError):
-            assert load_gaussians(tmp_path / name).count <= 600
 
 
 def test_a_compressed_ply_with_too_few_chunks(tmp_path):

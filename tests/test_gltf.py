@@ -1,6 +1,5 @@
 """A .glb read byte by byte: the container, the extension's attributes, the axes, and what belongs to a field."""
 
-import contextlib
 import json
 import struct
 
@@ -14,7 +13,6 @@ from test_gaussian_files import gaussians, image
 from jsecon.data.gaussians import gltf
 from jsecon.data.gaussians.files import load_gaussians
 from jsecon.data.gaussians.gltf import load_glb, save_glb
-from jsecon.errors import InputError
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Gaussians
 
@@ -182,22 +180,15 @@ def test_what_is_none_or_not_known(tmp_path, change, says):
         load_glb(tmp_path / "a.glb")
 
 
-def test_spoilt_files_are_refused(tmp_path):
+def test_files_cut_short_are_refused(tmp_path):
     save_glb(tmp_path / "a.glb", gaussians(scene(30, 1)))
-    whole, rng = (tmp_path / "a.glb").read_bytes(), np.random.default_rng(0)
+    whole = (tmp_path / "a.glb").read_bytes()
     for length in [*range(0, len(whole), 97), len(whole) - 1]:
         (tmp_path / "a.glb").write_bytes(whole[:length])
         with refused("a.glb"):
             load_glb(tmp_path / "a.glb")
     with refused("none.glb", "No such file"):
         load_gaussians(tmp_path / "none.glb")
-    for _ in range(50):
-        spoilt = bytearray(whole)
-        for place in rng.integers(0, 1500, 4):
-            spoilt[place] = rng.integers(256)
-        (tmp_path / "a.glb").write_bytes(spoilt)
-        with contextlib.suppress(InputError):
-            assert load_glb(tmp_path / "a.glb").count <= 30
 
 
 @pytest.mark.parametrize("size", [1, 4, 6, 16])

@@ -10,11 +10,7 @@ import pytest
 from experiments.datasets.lerf_ovs import LERF_PAIRS
 from jsecon.data.labels import LabelledFrame
 from jsecon.errors import InputError
-from jsecon.evaluate.lerf import (
-    VALA_THRESHOLD,
-    evaluate_at_thresholds,
-    evaluate_point_level_rendered,
-)
+from jsecon.evaluate.lerf import VALA_THRESHOLD, evaluate_at_thresholds, evaluate_point_level_rendered
 from jsecon.fit.resize import resize_camera
 from jsecon.query.render import selection_mask
 from jsecon.types import Selection

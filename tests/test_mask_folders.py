@@ -218,11 +218,7 @@ def test_arrays_of_ids(tmp_path):
 def test_masks_of_stored_pixels_are_turned_like_their_photographs(tmp_path):
     """A lies on its side (6: its stored pixels are turned clockwise), b stands on its head, c is upright."""
     upright = [ids_image() for _ in range(3)]
-    files = {
-        "a": ImageFile("a.jpg", 16, 12, 6),
-        "b": ImageFile("b.jpg", 16, 12, 3),
-        "c": ImageFile("c.jpg", 16, 12, 1),
-    }
+    files = {"a": ImageFile("a.jpg", 16, 12, 6), "b": ImageFile("b.jpg", 16, 12, 3), "c": ImageFile("c.jpg", 16, 12, 1)}
     for name, image in zip("abc", upright):
         write(tmp_path / f"{name}.png", image)
     labels, _, notes = load_labels(tmp_path, tuple("abc"), SIZE, files=files)

@@ -8,12 +8,7 @@ from hypothesis import given, settings, strategies as st
 from sklearn.metrics import jaccard_score, recall_score
 
 from experiments.protocols.points import point_accuracy, point_class_means
-from jsecon.evaluate.metrics import (
-    accuracy_at,
-    iou,
-    localization_accuracy,
-    mean_iou,
-)
+from jsecon.evaluate.metrics import accuracy_at, iou, localization_accuracy, mean_iou
 
 
 @settings(deadline=None, max_examples=20)

@@ -13,25 +13,8 @@ from jsecon.errors import InputError
 from jsecon.types import Gaussians
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-NAMES = [
-    "x",
-    "y",
-    "z",
-    "nx",
-    "ny",
-    "nz",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    "scale_0",
-    "scale_1",
-    "scale_2",
-    "rot_0",
-    "rot_1",
-    "rot_2",
-    "rot_3",
-]
+NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+NAMES += [*(f"scale_{n}" for n in range(3)), *(f"rot_{n}" for n in range(4))]
 
 
 def random_gaussians(count: int, basis: int = 4) -> Gaussians:
@@ -76,13 +59,6 @@ def test_round_trip_is_exact(tmp_path, basis, count):
         np.testing.assert_array_equal(getattr(loaded, field), getattr(gaussians, field))
         assert getattr(loaded, field).dtype == jnp.float32
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
-
-
-def test_round_trip_of_many(tmp_path):
-    gaussians = random_gaussians(40000, 1)
-    save_ply(tmp_path / "a.ply", gaussians)
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(load_ply(tmp_path / "a.ply"), field), getattr(gaussians, field))
 
 
 def test_layout_is_inrias(tmp_path):
@@ -146,13 +122,6 @@ def test_missing_properties(tmp_path, missing):
         assert np.isneginf(load_ply(tmp_path / "a.ply").log_scales[:, 2]).all()
         return
     with refused("a.ply", f"no {missing}"):
-        load_ply(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize("rest", [3, 10, 72])
-def test_odd_harmonics(tmp_path, rest):
-    write(tmp_path / "a.ply", columns(rest=rest))
-    with refused(f"{rest} properties f_rest"):
         load_ply(tmp_path / "a.ply")
 
 

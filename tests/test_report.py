@@ -1,21 +1,16 @@
 """The page and its pictures: self-contained, escaped, colours that stay the same from view to view."""
 
 import base64
-import html
-import json
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
+from browser import CHROMIUM, dumped
 
 from jsecon.app import pictures, report
 from jsecon.pipeline.progress import Step
-
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 class _Reader(HTMLParser):
@@ -138,14 +133,11 @@ const wait = ms => new Promise(done => setTimeout(done, ms));
 </script></body>"""
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_in_a_browser_pictures_are_enlarged_and_the_slider_moves(page, tmp_path):
     file = tmp_path / "page.html"
     file.write_text(page.replace("</body>", PILOT))
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'browser'}"]
-    options += ["--window-size=500,800", "--virtual-time-budget=5000", "--dump-dom", f"file://{file}"]
-    told = subprocess.run([BROWSER, *options], capture_output=True, text=True, timeout=120)
-    found = json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', told.stdout, re.S).group(1)))
+    found = dumped(f"file://{file}", tmp_path, "--window-size=500,800", "--virtual-time-budget=5000")
     assert found["enlarged"] == [True, True]
     assert found["closed"] is False
     assert "25%" in found["half"]

@@ -255,11 +255,3 @@ def test_tensors_that_do_not_fit_are_named(tmp_path):
     )
     with pytest.raises(InputError, match=r"flat\.onnx, input 'pixel_values': pixel_values float32\[1, 5\], expected"):
         SamGraphs(SamFiles(flat, decoder))
-
-
-def test_a_truncated_graph_is_named(tmp_path, frame):
-    folder = write_sam(tmp_path, "sam2")
-    decoder = folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
-    decoder.write_bytes(decoder.read_bytes()[:-300])
-    with pytest.raises(InputError, match=r"prompt_encoder_mask_decoder\.onnx: ONNX Runtime"):
-        SamSegmenter(folder)(frame, 0)

@@ -1,14 +1,12 @@
 """The page of a field: it holds the field within its digits, and in a browser it does what a person would try."""
 
 import base64
-import html
 import json
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, OPTIONS, dumped
 from small_field import make_field
 
 from jsecon.app.ask import Answer
@@ -17,8 +15,6 @@ from jsecon.app.viewer.static_page import NO_REGION, page
 from jsecon.language.membership import vote_shares
 from jsecon.splat.sh import C0
 from jsecon.types import Selection
-
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -122,17 +118,12 @@ def driven(text, spots, folder, link=""):
     """What a page says after a person's steps in headless Chromium."""
     file = folder / "page.html"
     file.write_text(text.replace("</body>", PILOT.replace("SPOTS", json.dumps(spots))))
-    options = [
-        "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=angle",
-        "--use-angle=swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking",
-        "--disable-component-update", "--disable-sync", f"--user-data-dir={folder / 'browser'}",
-        "--window-size=640,480", "--virtual-time-budget=20000", "--dump-dom",
-    ]  # fmt: skip
-    told = subprocess.run([BROWSER, *options, f"file://{file}{link}"], capture_output=True, text=True, timeout=120)
-    return json.loads(html.unescape(re.search(r'<pre id="found">(.*?)</pre>', told.stdout, re.S).group(1)))
+    return dumped(
+        f"file://{file}{link}", folder, *OPTIONS[1:10], "--window-size=640,480", "--virtual-time-budget=20000"
+    )
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_in_a_browser_it_does_what_a_person_tries(made, tmp_path):
     _, answers, text, _ = made
     found = driven(text, [[320, 240], [2, 470]], tmp_path)

@@ -102,7 +102,7 @@ def test_strongest_first_and_what_is_cut_is_counted(cast, scene, cameras, labels
 def test_traced_is_eager(cast, scene, cameras, labels):
     capacity = plan_capacity(scene, cameras)
     cast_by = jax.jit(
-        lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, by_view=True, capacity=capacity),
+        lambda g, seen: region_votes(g, cameras, seen, REGIONS, top=REGIONS, by_view=True, capacity=capacity)
     )
     traced = cast_by(scene, labels)
     np.testing.assert_allclose(traced.dense(), cast.dense(), rtol=1e-4, atol=1e-4)

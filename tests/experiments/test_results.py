@@ -1,12 +1,14 @@
-"""What an experiment leaves behind: whole files, and nothing of the machine that made them."""
+"""What an experiment leaves behind: whole files, and nothing of the machine that made them; the page that names all
+experiments; and the verdicts of the export (the export itself needs torch, and is no part of CI)."""
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
 
-from experiments import results
+from experiments import export_models, results
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,3 +45,33 @@ def test_committed_configs_are_portable(file):
     config = json.loads(file.read_text())
     assert results.portable(config) == config
     assert "../.." not in file.read_text()
+
+
+EXPERIMENTS = Path(__file__).parent.parent.parent / "experiments"
+TEXT = (EXPERIMENTS / "README.md").read_text()
+SHARED = {"cells", "results"}
+"""modules at the root that are no experiments"""
+
+
+def test_the_readme_names_every_experiment_and_no_other():
+    runnable = {path.stem for path in EXPERIMENTS.glob("*.py")} - SHARED
+    runnable |= {path.parent.name for path in EXPERIMENTS.glob("*/__main__.py")}
+    assert set(re.findall(r"python -m experiments\.(\w+)", TEXT)) == runnable
+
+
+def test_options_come_from_the_command_line():
+    assert export_models.parsed([]) == export_models.Options()
+    found = export_models.parsed(["--only", "sam", "siglip", "--threads", "2", "--sam", "vit_l", "--out", "there"])
+    assert (found.only, found.threads, found.sam, found.out) == (("sam", "siglip"), 2, "vit_l", "there")
+    with pytest.raises(SystemExit):
+        export_models.parsed(["--only", "sam3"])
+
+
+def test_the_table_says_what_is_within_the_bounds():
+    graph = {"graph": "a.onnx", "outputs": {"x": 1e-6}, "scales": {"x": 3.0}, "same_signs": {"x": 1.0}}
+    graphs = [graph, graph | {"outputs": {"x": 1e-6, "y": 2e-3}}, graph | {"same_signs": {"x": 0.998}}]
+    metrics = {"sam_images": {"tiny": {"graphs": graphs}}}
+    rows = export_models.table(metrics).splitlines()[2:]
+    assert [row.split("|")[-2].strip() for row in rows] == ["yes", "no", "no"]
+    assert "2.0e-03" in rows[1]
+    assert "99.80000%" in rows[2]

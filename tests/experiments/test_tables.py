@@ -9,12 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments import (
-    lerf,
-    ovs3d,
-    replica,
-    threshold_sweep,
-)
+from experiments import lerf, ovs3d, replica, threshold_sweep
 from experiments.datasets.replica import REPLICA_SCENES
 from experiments.tables import fill, layout, published, twins
 from experiments.tables.methods import METHODS, RECOMMENDED
