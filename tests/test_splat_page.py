@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, OPTIONS, dumped
+from browser import CHROMIUM, WEBGL, dumped
 from small_field import make_field
 
 from jsecon.app.ask import Answer
@@ -118,9 +118,7 @@ def driven(text, spots, folder, link=""):
     """What a page says after a person's steps in headless Chromium."""
     file = folder / "page.html"
     file.write_text(text.replace("</body>", PILOT.replace("SPOTS", json.dumps(spots))))
-    return dumped(
-        f"file://{file}{link}", folder, *OPTIONS[1:10], "--window-size=640,480", "--virtual-time-budget=20000"
-    )
+    return dumped(f"file://{file}{link}", folder, *WEBGL, "--window-size=640,480", "--virtual-time-budget=20000")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
