@@ -39,8 +39,8 @@ def exact_cosine(a, b):
 
 @pytest.mark.parametrize("shown", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_region_has_the_same_members_however_it_is_asked_for(made, shown):
-    """By text, by its number, by a pixel, by class, with all of its kind, and as one of several texts. (Long: votes of an
-    old field, whose shares test_shares has.)"""
+    """By text, by its number, by a pixel, by class, with all of its kind, and as one of several texts. (Long: votes of
+    an old field, whose shares test_shares has.)"""
     field, labels = made
     cast = region_votes(field.gaussians, field.cameras, jnp.asarray(labels), REGIONS, top=3, by_view=True)
     texts = np.eye(REGIONS, 12, dtype=np.float32)
