@@ -25,7 +25,7 @@ def _run(*arguments):
     return cli.main([str(argument) for argument in arguments])
 
 
-FITTED = "--holdout", 4, "--steps", 150, "--gaussians-at-most", 1
+FITTED = "--holdout", 4, "--steps", 150
 """options of `room_run`'s fit"""
 
 

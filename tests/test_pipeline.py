@@ -138,7 +138,7 @@ def test_the_plan_says_what_is_left_out_and_why(room_run, on_given_gaussians, tm
     run, _ = room_run
     given, listener = on_given_gaussians
     assert {"segmenter", "association"} <= set(run.skipped)
-    flat = dataclasses.replace(run.options, sh_degree=0)
+    flat = dataclasses.replace(run.options, sh_degree=0, gaussians_at_most=1)
     work, bare = (RunContext(options, Networks(ColourEmbedder()), tmp_path) for options in (run.options, flat))
     left = set(gaussians(bare).skipped) - set(gaussians(work).skipped)
     assert left == {"view-dependent colour"}
@@ -362,7 +362,7 @@ compiling.install()
 room, out, victim, nth = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4])
 test.results.CHECKPOINT_SECONDS = 0.0
 test.cache.write_arrays = test.writer_that_stops(test.kill, victim, nth)
-test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, steps=150, gaussians_at_most=1), out)
+test.pipeline.run(test.pipeline.Options(room, masks=room / "masks", holdout=4, steps=150), out)
 """
 
 
