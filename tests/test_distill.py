@@ -219,7 +219,9 @@ def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denomin
     assert (np.asarray(history) == 0).all()
 
 
+@pytest.mark.long
 def test_under_jit_too_small_a_capacity_is_data_and_outside_an_error(task):
+    """In every run test_capacity has what exceeds a capacity."""
     scene, cameras, labels, codes, _, _capacity = task
     assert plan_capacity(scene, cameras) > 64
     with pytest.raises(ValueError, match="capacity=64"):

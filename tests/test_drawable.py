@@ -88,7 +88,9 @@ def test_what_can_be_drawn_comes_back_from_fields_and_files(scene, camera, field
         np.testing.assert_allclose(jsecon.render_rgb(found, camera).features, drawn, atol=0.05)
 
 
+@pytest.mark.long
 def test_a_flat_gaussian_is_one_of_no_thickness_in_value_and_gradient(scene, camera):
+    """In every run a row of test_stability has log scales of minus infinity."""
     flat, thin = changed(scene, **FLAT), changed(scene, log_scales=[-1.5, -1.0, np.log(1e-6)])
     loss = jax.jit(jax.value_and_grad(lambda g: (jsecon.render_rgb(g, camera).features ** 2).sum(), allow_int=True))
     (value, gradient), (expected, slopes) = (loss(jax.tree.map(jnp.asarray, g)) for g in (flat, thin))

@@ -27,8 +27,10 @@ def test_images_are_the_brute_force_sum(scene, cameras, channels):
         assert np.abs(np.asarray(rendering.alpha) - alpha).max() < 1 / 255
 
 
-@pytest.mark.parametrize("channels", [3, pytest.param(16, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("channels", [3, 16])
 def test_several_devices_give_what_one_gives_to_the_last_bit(scene, camera, channels):
+    """In every run test_cores has an image of three devices."""
     features = np.random.default_rng(1).normal(size=(scene.count, channels)).astype(np.float32)
     one, two = (render(scene, camera, features, mesh=mesh) for mesh in (None, host_mesh()))
     np.testing.assert_array_equal(one.features, two.features)

@@ -70,6 +70,7 @@ def nan_pixels(image) -> np.ndarray:
     return wrong.any(-1)
 
 
+@pytest.mark.long
 def test_a_bad_feature_stays_where_it_is_seen_however_wide_and_in_its_own_set_under_vmap(touched):
     case, covered = touched
     sets = np.random.default_rng(0).normal(size=(2, 64, 12)).astype(np.float32)
@@ -90,7 +91,9 @@ def test_a_bad_feature_stays_where_it_is_seen_however_wide_and_in_its_own_set_un
     assert bool(jnp.isfinite(gradient).all())
 
 
+@pytest.mark.long
 def test_colour_and_depth_of_bad_gaussians(touched):
+    """In every run the rows have features of such Gaussians."""
     case, covered = touched
     coefficients = np.random.default_rng(1).normal(scale=0.2, size=(64, 4, 3)).astype(np.float32)
     means, sh = case.gaussians.means.copy(), coefficients.copy()

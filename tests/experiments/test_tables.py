@@ -52,7 +52,9 @@ def read(folder, name):
     return json.loads((place / "metrics.json").read_text()), (place / "table.md").read_text()
 
 
+@pytest.mark.long
 def test_table_1_and_its_resumption(folder, monkeypatch):
+    """.ci/run fills all tables; test_cells has what a cut line costs."""
     plan = with_gaussians(small(lerf.QUICK, folder, "lerf", methods=CHEAP, level="perfect"))
     lerf.main(plan)
     metrics, text = read(folder, "lerf")
