@@ -25,6 +25,9 @@ author = "the jsecon authors"
 copyright = "the jsecon authors, Apache-2.0"
 version = release = jsecon.__version__
 
+# The notebooks compile much and compute little: their kernels compile fast, as the tests do.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1")
+
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
 default_role = "literal"
