@@ -65,8 +65,8 @@ gc.set_threshold(20_000, 20, 20)
 
 # fmt: off
 LONGEST = (
-    "pipeline", "fit", "corrections", "rivals", "cores", "cli", "readme", "networks", "plan", "classes", "render",
-    "motion", "silhouette", "refinement", "synthetic", "tables", "codes", "autoencoder", "consensus",
+    "pipeline", "fit", "corrections", "views", "cores", "cli", "rivals", "readme", "networks", "classes", "render",
+    "motion", "silhouette", "viewer", "refinement", "synthetic", "tables", "codes", "autoencoder", "consensus",
     "scene_stages", "processes", "capacity", "distill",
 )
 # fmt: on
