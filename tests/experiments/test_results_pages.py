@@ -62,7 +62,7 @@ def test_tables_4_and_5_and_thresholds():
 
 
 def test_equal_rules():
-    readings, untrained, trained, published, fresh, high, _ = page("equal_rules")
+    readings, untrained, trained, published, fresh, high, shared, _ = page("equal_rules")
     assert readings[0][0] == "reading"
     chosen = metrics("fair") | metrics("fair_replica")
     fresh_runs = metrics("fair_fresh") | metrics("fair_fresh_replica")
@@ -89,6 +89,13 @@ def test_equal_rules():
         row = run[f"{names.get(method, method)}, {figure}"]
         mean, low, above = row["ahead"]
         assert (told, ahead) == (f"{row['mean']:.3f}", f"{mean:+.3f} [{low:+.3f}, {above:+.3f}]")
+    of_shared = metrics("fair_shared")["lerf shared"]
+    for method, *cells in shared[1:]:
+        runs = [of_shared[f"{method}, {figure}"] for figure in ("miou", "miou_vala")]
+        assert [cells[1].strip("*"), cells[3].strip("*")] == [f"{run['mean']:.3f}" for run in runs]
+        if not method.startswith("ours"):
+            assert cells[0] == f"{runs[0]['published']:.3f}"
+            assert [cells[2], cells[4]] == ["{:+.3f} [{:+.3f}, {:+.3f}]".format(*run["ahead"]) for run in runs]
     for method, *cells in published[1:]:
         runs = [chosen[f"{name} medium"][f"{method}, miou"]["published"] for name in TABLES]
         assert cells == [f"{value:.3f}" for value in runs]
