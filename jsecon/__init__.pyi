@@ -3,6 +3,13 @@
 from .app.catalogue import Catalogue as Catalogue, objects as objects
 from .app.locate import Place as Place, locate as locate
 from .app.notebook import show as show, to_html as to_html, to_png as to_png
+from .app.relations import (
+    Measure as Measure,
+    ObjectScene as ObjectScene,
+    RelationAnswer as RelationAnswer,
+    measure as measure,
+    query_relation as query_relation,
+)
 from .association.algorithm1 import masklets as masklets
 from .backend import check_backend as check_backend
 from .data.capture import load_capture as load_capture

@@ -16,6 +16,7 @@ pytest.importorskip("fastapi", reason="the extra serve is not installed")
 from small_field import make_field
 from starlette.exceptions import HTTPException
 from starlette.testclient import TestClient
+from table_field import table_field
 
 from jsecon.app.server.api import application
 from jsecon.app.server.guard import Limits, Workers
@@ -164,8 +165,37 @@ def test_what_it_knows_and_files_of_the_answer(client, scenes):
     assert image.headers["x-frame"] == "frame_2"
     assert cv2.imdecode(np.frombuffer(image.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (40, 48)
     paths = client.get("/openapi.json").json()["paths"]
-    assert set(paths) == {"/query", "/regions", "/selection.ply", "/mask.png", "/healthz"}
+    answers = {"/query", "/relation", "/measure", "/objects", "/regions", "/selection.ply", "/mask.png", "/healthz"}
+    assert set(paths) == answers
     assert "/query" in client.get("/").text
+
+
+def test_relations_measures_and_objects():
+    field, embedder = table_field()
+    client = TestClient(application({"table": Scene("table", field, embedder)}, limits=LIMITS), HERE)
+    told = client.post("/relation", json={"text": "the red mug left of the dark green bottle", "frame": 0}).json()
+    assert told["count"] == 1
+    assert told["objects"][0]["center"] == pytest.approx([-0.5, 0, 0.05], abs=0.02)
+    assert told["viewpoint"] == "as seen from frame_0"
+    two = client.post("/relation", json={"text": "the red mug"}).json()
+    assert two["ambiguous"]
+    assert two["question"].endswith("?")
+    way = client.post("/measure", json={"a": "dark blue box", "b": "dark green bottle"}).json()
+    assert way["centers"] == pytest.approx(0.6, rel=0.05)
+    listed = client.get("/objects", params={"field": "table"}).json()["objects"]
+    assert len(listed) == 6
+    for path, body, word in (
+        ("/relation", {"text": "mug across from the bottle"}, "'across'"),
+        ("/relation", {"text": "red mug left of the bottle"}, "colour"),
+        ("/relation", {"text": "leftmost red mug", "frame": "no"}, "no such frame"),
+        ("/relation", {"text": "red mug", "frame": 1.5}, "frame"),
+        ("/measure", {"a": "red mug", "b": "dark blue box"}, "names 2 objects"),
+        ("/measure", {"a": "red mug"}, '"b"'),
+        ("/relation", {"text": "red mug", "from": "x"}, "takes field, text, frame"),
+    ):
+        answer = client.post(path, json=body)
+        assert answer.status_code == 422
+        assert word in answer.json()["error"]
 
 
 @pytest.mark.parametrize(("status", "body"), [

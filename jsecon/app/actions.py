@@ -18,6 +18,7 @@ from jsecon.app.verbs import (
     Export,
     FieldVerb,
     Fit,
+    Mcp,
     Models,
     Objects,
     Query,
@@ -30,6 +31,7 @@ from jsecon.errors import InputError
 from jsecon.pipeline.options import is_bare_scene, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.process import worker_info
+from jsecon.query.expressions import is_expression
 
 _RUN_FILES = ("field.safetensors", "report.html", "metrics.json")
 _OLD_FIELD = (
@@ -106,6 +108,10 @@ def _query(verb: Query, console: Console) -> VerbResult:
         texts = verb.texts if verb.phrases is None else []
         embedder = _embedder(field, verb, console) if texts else None
     answers, errors = ([], []) if verb.phrases is None else _ask_phrases(field, verb, console)
+    expressions = [text for text in texts if is_expression(text)]
+    texts = [text for text in texts if text not in expressions]
+    if expressions:
+        answers, errors = _ask_relations(field, embedder, verb, expressions, large, console)
     with console.progress("answers"):
         outline: dict[str, Any] = {"threshold": verb.threshold, "outliers": not verb.keep_outliers}
         options = outline | {"by": verb.by, "several": verb.all, "quantile": verb.quantile}
@@ -121,6 +127,25 @@ def _query(verb: Query, console: Console) -> VerbResult:
     files = {"views": verb.views, "ending": verb.format}
     result = write_answers(field, answers, verb.out, console, **files) if answers else {"answers": []}
     return result | {"errors": errors}
+
+
+def _ask_relations(
+    field: Any, embedder: Any, verb: Query, texts: list[str], large: bool, console: Console
+) -> tuple[list[Any], list[InputError]]:
+    """Returns the answers to texts with relations, orders or numbers, and the errors of those not understood."""
+    if large:
+        problem = f"{texts[0]!r} has a relation, an order or a number, which needs the whole field in memory"
+        raise InputError(verb.field, problem, remedy="Raise JSECON_MEMORY (GiB), or put the text in quotes.")
+    from jsecon.app import ask, relations
+
+    with console.progress("relations"):
+        scene = relations.open_scene(field, embedder)
+        queries = [lambda text=text: relations.query_relation(scene, text, frame=verb.from_frame) for text in texts]
+        answers, errors = ask.collect(queries)
+    for answer in answers:
+        console.say(f"{answer.text!r}: {answer.describe()}")
+        console.note("Words in quotes are searched for as they stand, without relations.")
+    return [relations.relation_answer(answer) for answer in answers], errors
 
 
 def _field_of_scene(verb: Query, console: Console) -> Path:
@@ -148,6 +173,9 @@ def _check_query(verb: Query) -> None:
         if len(pairs) % 2:
             remedy = "For example: --mask frame_00012 mug.png"
             raise InputError("--mask", " ".join(pairs), "FRAME PNG, in pairs", remedy)
+    if verb.from_frame is not None and not any(map(is_expression, verb.texts)):
+        remedy = 'For example: "the red mug left of the bottle" --from frame_00012'
+        raise InputError("--from", "no text has a relation that is seen from a frame", remedy=remedy)
     if not 0 <= verb.quantile <= 1:
         remedy = f"{Query.quantile:g} is the default; 0 refuses no text."
         raise InputError("--quantile", f"{verb.quantile:g}", "a share of words, 0 to 1", remedy)
@@ -352,6 +380,18 @@ def _serve(verb: Serve, console: Console) -> VerbResult:
     return result | {"then": serve}
 
 
+def _mcp(verb: Mcp, console: Console) -> VerbResult:
+    console = Console(sys.stderr)  # standard output belongs to the protocol
+    with console.progress("fields"):
+        from jsecon.app.mcp_server import serve_models
+
+        embedder = with_models(verb, console, yes=False).embedder
+        result, serve = serve_models(verb.fields, embedder)
+    for scene in result["fields"]:
+        console.say(f"{scene['name']}: {scene['gaussians']} Gaussians, {scene['regions']} regions")
+    return {"then": serve}
+
+
 def _models(verb: Models, console: Console) -> VerbResult:
     from jsecon.app import models
 
@@ -408,6 +448,7 @@ VERBS: dict[str, tuple[Any, type]] = {
     "view": (_view, View),
     "eval": (_eval, Eval),
     "serve": (_serve, Serve),
+    "mcp": (_mcp, Mcp),
     "models": (_models, Models),
     "doctor": (_doctor, Doctor),
 }

@@ -56,7 +56,7 @@ class Answer:
 
     Attributes:
       query: The text, or the name of the pixel, region or outline.
-      by: One of METHODS, "outline" or "phrase".
+      by: One of METHODS, "outline", "phrase" or "relation".
       selection: The Gaussians as the query selects them.
       mask: (N,) bool, the selection without outliers.
       skipped: Part of the work -> why it was not needed.
@@ -65,6 +65,7 @@ class Answer:
       rows: (M,) int64 ids of the Gaussians that selection and mask have rows for; None if these are all.
       key: What tells the query from any other in the names of its files; None for a text, which does so itself.
       clusters: Number of clusters that DBSCAN kept and dropped, (0, 0) if it was not needed.
+      relation: Of a referring expression, what `RelationAnswer.as_dict` has.
     """
 
     query: str
@@ -77,6 +78,7 @@ class Answer:
     rows: np.ndarray | None = None
     key: str | None = None
     clusters: tuple[int, int] = (0, 0)
+    relation: Mapping[str, Any] | None = None
 
     @property
     def quantile(self) -> float | None:

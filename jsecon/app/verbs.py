@@ -186,7 +186,11 @@ class Query(FieldVerb):
 
     Attributes:
       field: Path of field.safetensors, written by jsecon run, or a file of Gaussians without photographs.
-      texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle".
+      texts: What to find, such as "red mug" "dark green bottle" "mug or bowl but not handle", or with a relation, an
+        order or a number: "the red mug left of the bottle", "the second largest box". Quotes in a text make its words
+        an object as they stand.
+      from_frame: Frame from which left, right, front and behind are seen. By default it is the mean camera, or the
+        frame that shows most objects where the cameras look in all directions.
       at: Selects what lies under the pixel in column X and row Y of a frame, in the frames as the run used them. A
         frame is named by its name, the end of its name, or its place such as #10.
       mask: Selects the object that a mask outlines in a frame, or masks in several frames. Black is outside.
@@ -227,6 +231,7 @@ class Query(FieldVerb):
         default_factory=list
     )
     out: Option[Path]
+    from_frame: Annotated[Option[str | None], arg(name="from", metavar="FRAME")] = None
     by: Option[By] = "votes"
     threshold: Option[float | None] = None
     quantile: Advanced[float] = 0.82
@@ -372,6 +377,24 @@ class Serve(Verb):
     port: Option[int] = 8765
     token: Option[str] = ""
     allow_host: RepeatedAdvanced[str] = dataclasses.field(default_factory=list)
+    embedder: Option[Path | None] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mcp(Verb):
+    """Offers fields to language models as tools.
+
+    A server of the Model Context Protocol on standard input and output (extra mcp), which a model's program starts. Its
+    tools find, count, locate, measure and render things and only read. The models of texts must be on this machine.
+
+    Attributes:
+      fields: Paths of field.safetensors files. Each field is known by the name of its folder.
+      embedder: Folder of the CLIP model that the fields were made with. By default it is where the runs had it.
+    """
+
+    examples = ("jsecon mcp my_field/field.safetensors",)
+
+    fields: Positional[list[Path]]
     embedder: Option[Path | None] = None
 
 

@@ -58,8 +58,26 @@ class AnyQuery(Fields):
     all: StrictBool = False
 
 
+class RelationQuery(Fields):
+    """A referring expression for a field."""
+
+    text: Text
+    frame: StrictStr | StrictInt | None = Field(None, description="Frame from which left and right are seen.")
+
+
+class MeasureQuery(Fields):
+    """Two referring expressions, each of one object."""
+
+    a: Text
+    b: Text
+    frame: StrictStr | StrictInt | None = Field(None, description="Frame from which left and right are seen.")
+
+
 MODELS: dict[str, type[BaseModel]] = {
     "/query": AnyQuery,
+    "/relation": RelationQuery,
+    "/measure": MeasureQuery,
+    "/objects": Fields,
     "/regions": Fields,
     "/selection.ply": TextQuery,
     "/mask.png": MaskQuery,
@@ -138,6 +156,24 @@ def application(
         if record is None:
             record = await computed(lambda: scene.record(scene_query), "text" if request.at is None else "at")
         return AsciiResponse(record)
+
+    @app.post("/relation", summary="The objects that an expression such as 'the mug left of the bottle' names")
+    async def relation(request: RelationQuery) -> Response:
+        scene = scene_of(request.field)
+        answer = await computed(lambda: scene.relation(request.text, request.frame), "text")
+        return AsciiResponse({"field": scene.name} | answer.as_dict())
+
+    @app.post("/measure", summary="Distances between two objects: surfaces, centres, free gap, angle")
+    async def distance(request: MeasureQuery) -> Response:
+        scene = scene_of(request.field)
+        told = await computed(lambda: scene.measure(request.a, request.b, request.frame), "a or b")
+        return AsciiResponse({"field": scene.name} | told.as_dict())
+
+    @app.get("/objects", summary="The objects of a field: names, boxes, Gaussians")
+    async def objects(request: Annotated[Fields, Query()]) -> Response:
+        scene = scene_of(request.field)
+        rows = await computed(scene.catalogue_rows, "field")
+        return AsciiResponse({"field": scene.name, "objects": rows})
 
     @app.get("/regions", summary="Pixels and views of each region")
     async def regions(request: Annotated[Fields, Query()]) -> Response:

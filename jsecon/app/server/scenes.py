@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.app.ask import Answer, ask_pixel, ask_text
-from jsecon.app.locate import locate_answer
+from jsecon.app.catalogue_files import object_record
+from jsecon.app.locate import Place, locate_answer
 from jsecon.app.outputs import best_frames, selected_gaussians
+from jsecon.app.relations import Measure, ObjectScene, RelationAnswer, measure, query_relation
 from jsecon.data.gaussians.ply import save_ply
 from jsecon.errors import InputError
 from jsecon.language.field import load_field
@@ -56,6 +58,8 @@ class Scene:
     Attributes:
       answer: Answers a query. It keeps the last answers.
       records: Records of the queries that were answered, as plain values.
+      gaussians: The field's, on jax's device.
+      cameras: The field's, as NumPy arrays.
     """
 
     def __init__(self, name: str, field: LanguageField, embedder: Any):
@@ -65,8 +69,8 @@ class Scene:
         self.embedder = embedder
         self.answer = functools.lru_cache(MAX_ANSWERS)(self._answer)
         self.records: dict[SceneQuery, dict[str, Any]] = {}
-        self._gaussians = jax.device_put(field.gaussians)
-        self._cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
+        self.gaussians = jax.device_put(field.gaussians)
+        self.cameras = jax.tree.map(np.asarray, field.cameras)  # whose items need no compilation
 
     def _answer(self, query: SceneQuery) -> Answer:
         """Answers a query that is not among the last ones."""
@@ -91,6 +95,32 @@ class Scene:
         }
         return self.records[query]
 
+    @functools.cached_property
+    def object_scene(self) -> ObjectScene:
+        """The field as relations read it."""
+        return ObjectScene(self.field, self.embedder)
+
+    def relation(self, text: str, frame: str | int | None = None) -> RelationAnswer:
+        """Answers a referring expression, seen from a frame (`query_relation`)."""
+        return query_relation(self.object_scene, text, frame=frame)
+
+    def measure(self, a: str, b: str, frame: str | int | None = None) -> Measure:
+        """Measures the distance between two objects (`jsecon.measure`)."""
+        return measure(self.object_scene, a, b, frame=frame)
+
+    def catalogue_rows(self) -> list[dict[str, Any]]:
+        """Returns the objects of the field as plain values."""
+        listed = self.object_scene.catalogue
+        return [object_record(listed, row) for row in range(len(listed))]
+
+    def top_of(self, place: Place) -> np.ndarray:
+        """Returns the middle of the upper side of a place's points, (3,) in the capture's world."""
+        turn = np.asarray(self.field.to_source, np.float64)[:3, :3]
+        up = turn @ self.object_scene.up
+        up /= np.linalg.norm(up)
+        heights = place.points @ up
+        return place.center + (np.quantile(heights, 0.98) - place.center @ up) * up
+
     def mask(self, answer: Answer, frame: int | None) -> tuple[str, bytes]:
         """Renders an answer alone in a frame.
 
@@ -102,7 +132,7 @@ class Scene:
           Name of the frame, and the mask as a PNG.
         """
         frames = [frame] if frame is not None else best_frames(self.field, answer, 1) or [0]
-        shown = selection_mask(self._gaussians, self._cameras[frames[0]], jnp.asarray(answer.mask))
+        shown = selection_mask(self.gaussians, self.cameras[frames[0]], jnp.asarray(answer.mask))
         return self.field.names[frames[0]], cv2.imencode(".png", np.asarray(shown, np.uint8) * 255)[1].tobytes()
 
     def ply(self, answer: Answer) -> bytes:

@@ -1,6 +1,9 @@
 """The server of `jsecon serve`: fields behind HTTP, loaded once and compiled before the first query (extra `serve`).
 
     POST /query           {"text": "red mug"} -> where it is, and its score
+    POST /relation        {"text": "the red mug left of the bottle"} -> the objects, or why there is none
+    POST /measure         {"a": "red mug", "b": "bottle"} -> distances
+    GET  /objects         the catalogue of objects
     GET  /regions         pixels and views of each region
     GET  /selection.ply   the Gaussians that a text selects, INRIA layout
     GET  /mask.png        the selection in a frame

@@ -1,0 +1,181 @@
+"""Fields as tools of language models: a server of the Model Context Protocol over standard input and output.
+
+Extra `mcp`. Every tool reads, none writes; a name in a call is never a path. Bad input is the error of a call, in words
+that tell the model what to change.
+"""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from jsecon.app import pictures
+from jsecon.app.ask import frame_index
+from jsecon.app.locate import locate_answer
+from jsecon.app.outputs import best_frames
+from jsecon.app.relations import relation_answer
+from jsecon.app.server.scenes import Scene, SceneQuery, open_scenes
+from jsecon.errors import InputError
+from jsecon.query.expressions import is_expression
+from jsecon.query.render import selection_mask
+
+REMEDY = 'pip install "jsecon[mcp]"'
+INSTRUCTIONS = (
+    "Finds things in 3D scenes. Coordinates are in the scene's own world, in metres where the capture has metres. "
+    "Ask find for a thing by its name, relation for one told apart by where it is, such as "
+    '"the second red mug from the left" or "the ball on the plate next to the bowl".'
+)
+MAX_OBJECTS = 100
+"""objects in an answer of the tool `objects`"""
+
+
+class Tools:
+    """The work of the tools: plain values out, InputError for bad input.
+
+    Args:
+      scenes: Fields by name. The first is the default.
+    """
+
+    def __init__(self, scenes: dict[str, Scene]):
+        """Takes the fields."""
+        self.scenes = scenes
+
+    def scene(self, name: str | None) -> Scene:
+        """Returns a field by its name, by default the first."""
+        if name is None:
+            return next(iter(self.scenes.values()))
+        if name not in self.scenes:
+            raise InputError(f"field {name!r}", "there is no such field", remedy=f"There are {', '.join(self.scenes)}.")
+        return self.scenes[name]
+
+    def find(self, text: str, field: str | None = None) -> dict[str, Any]:
+        """Finds what a text names: number of Gaussians, score, centre and box. No relations in the text."""
+        return self.scene(field).record(SceneQuery(_words(text)))
+
+    def relation(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+        """Finds things told apart by relations, orders or numbers: "the red mug left of the bottle".
+
+        The answer has 0, 1 or several objects, alternatives, and a question where the text leaves open which is meant.
+        Directions are seen from a frame, or as `viewpoint` says.
+        """
+        return self.scene(field).relation(text, frame).as_dict()
+
+    def objects(self, field: str | None = None) -> dict[str, Any]:
+        """Lists the objects of a scene with names, sizes and places, the largest first."""
+        rows = self.scene(field).catalogue_rows()
+        return {"count": len(rows), "objects": rows[:MAX_OBJECTS]}
+
+    def locate(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+        """Locates one thing: oriented box, and the middle of its top, where a gripper from above would close."""
+        scene = self.scene(field)
+        if is_expression(text):
+            answer = scene.relation(text, frame)
+            if answer.count != 1:
+                problem = f"it names {answer.count} objects. {answer.reason or answer.question}"
+                raise InputError(f"locate {text!r}", problem, remedy="Name one object.")
+            place = locate_answer(scene.field, relation_answer(answer))
+        else:
+            place = locate_answer(scene.field, scene.answer(SceneQuery(_words(text))))
+        return place.as_dict() | {"top": np.round(scene.top_of(place), 6).tolist()}
+
+    def measure(self, a: str, b: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+        """Measures the distance of two things: between surfaces, between centres, free gap, angle above horizontal."""
+        return self.scene(field).measure(a, b, frame).as_dict()
+
+    def count(self, text: str, frame: str | None = None, field: str | None = None) -> dict[str, Any]:
+        """Counts the things that a text names: "bottles", "red mugs on the table"."""
+        answer = self.scene(field).relation(text if is_expression(text) else f"how many {text}", frame)
+        return {"count": answer.count, "reading": answer.reading, "reason": answer.reason}
+
+    def render(self, text: str, frame: str | None = None, field: str | None = None) -> bytes:
+        """Renders a frame with what a text names lit up, as a PNG; by default the frame that shows it best."""
+        scene = self.scene(field)
+        if is_expression(text):
+            answer = relation_answer(scene.relation(text, frame))
+        else:
+            answer = scene.answer(SceneQuery(_words(text)))
+        shown = [*best_frames(scene.field, answer, 1), 0] if frame is None else [frame_index(scene.field, frame)]
+        index = shown[0]
+        photo = pictures.Renderer(scene.field.gaussians, scene.field.cameras).photo(index)
+        camera = scene.cameras[index]
+        mask = np.asarray(selection_mask(scene.gaussians, camera, jnp.asarray(answer.mask)))
+        image = cv2.cvtColor(pictures.selection_overlay(photo, mask), cv2.COLOR_RGB2BGR)
+        return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _words(text: str) -> str:
+    """Returns a text that is not empty."""
+    if not text.strip():
+        raise InputError("text", "it is empty", remedy='For example "red mug".')
+    return text
+
+
+def make_server(scenes: dict[str, Scene]) -> Any:
+    """Makes the server of the Model Context Protocol.
+
+    Args:
+      scenes: Fields by name. The first is the default.
+
+    Returns:
+      An `mcp.server.MCPServer` with the tools find, relation, objects, locate, measure, count and render.
+
+    Raises:
+      InputError: The extra is missing.
+    """
+    try:
+        from mcp.server.mcpserver import Image, MCPServer
+        from mcp.server.mcpserver.exceptions import ToolError
+        from mcp.types import ToolAnnotations
+        from pydantic import Field
+    except ImportError as error:
+        problem = f"the package {error.name} is missing"
+        raise InputError("jsecon mcp", problem, remedy=f"Run: {REMEDY}") from error
+    server = MCPServer("jsecon", instructions=f"{INSTRUCTIONS} Fields: {', '.join(scenes)}.")
+    tools = Tools(scenes)
+    word = Annotated[str, Field(description="What is asked for, in words", min_length=1, max_length=500)]
+    frame = Annotated[str | None, Field(description="Name of the frame that it is seen from, or #3 for the fourth")]
+    field = Annotated[str | None, Field(description="Name of the field; the first by default")]
+    hints = {"text": word, "a": word, "b": word, "frame": frame, "field": field}
+
+    def add(method: Callable[..., Any], kind: Literal["object", "image"]) -> None:
+        @functools.wraps(method)
+        def call(**arguments: Any) -> Any:
+            try:
+                result = method(**arguments)
+            except InputError as error:
+                raise ToolError(str(error)) from error
+            return Image(data=result, format="png") if kind == "image" else result
+
+        names = method.__code__.co_varnames[1 : method.__code__.co_argcount]
+        call.__annotations__ = {name: hints[name] for name in names}
+        call.__annotations__["return"] = Image if kind == "image" else dict[str, Any]
+        annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
+        server.add_tool(call, name=method.__name__, description=method.__doc__, annotations=annotations)
+
+    for method in (tools.find, tools.relation, tools.objects, tools.locate, tools.measure, tools.count):
+        add(method, "object")
+    add(tools.render, "image")
+    return server
+
+
+def serve_models(files: list[Path], embedder: Path | None) -> tuple[dict[str, Any], Callable[[], None]]:
+    """Loads fields for a server of the Model Context Protocol.
+
+    Args:
+      files: Paths of field.safetensors files.
+      embedder: Folder of the CLIP model of the fields; None where the runs had it.
+
+    Returns:
+      {"fields": ...}, and the function that answers on standard input and output until they close.
+
+    Raises:
+      InputError: The extra is missing, or a field cannot be read.
+    """
+    make_server({})
+    scenes = open_scenes(files, embedder)
+    server = make_server(scenes)
+    return {"fields": [scene.description() for scene in scenes.values()]}, server.run

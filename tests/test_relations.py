@@ -1,0 +1,301 @@
+"""Relations between objects: properties of the predicates, the grammar, and answers of 0, 1 or several objects."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from table_field import THINGS, table_field
+
+import jsecon
+from jsecon.app import cli
+from jsecon.app.relations import ObjectScene
+from jsecon.errors import InputError
+from jsecon.language.field import save_field
+from jsecon.query.expressions import RELATIONS, is_expression, parse_expression
+from jsecon.query.object_shapes import ObjectShapes
+from jsecon.query.relations import PAIRS, Viewpoint, between_scores, near, order_values, pair_scores
+from jsecon.vision.colours import ColourEmbedder
+
+CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
+PLACES = st.tuples(*[st.floats(-2, 2, width=32)] * 3)
+SIDES = st.tuples(*[st.floats(0.125, 0.5, width=32)] * 3)
+
+
+def brick(center, half, turn=0.0):
+    """An upright box that is turned about z, with points on a grid in it."""
+    axes = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    points = np.array(center) + (CORNERS * half) @ axes.T
+    columns = center, axes, half, points.min(0), points.max(0), points
+    return ObjectShapes(*(np.asarray(column, np.float32)[None] for column in columns), np.array([27]))
+
+
+def looking(eye=(0.0, -9.0, 1.0), turn=0.0):
+    forward = np.array([-np.sin(turn), np.cos(turn), 0], np.float32)
+    return Viewpoint(np.asarray(eye, np.float32), forward, np.array([0, 0, 1], np.float32))
+
+
+def scores(a, b, view=None):
+    return {name: float(table[0, 0]) for name, table in pair_scores(a, b, view or looking()).items()}
+
+
+@settings(max_examples=40, deadline=None)
+@given(PLACES, PLACES, SIDES, SIDES, st.floats(0.1, 50.0), st.floats(-3, 3), PLACES)
+def test_scores_stand_any_scene_that_is_moved_turned_and_scaled(a, b, half_a, half_b, scale, turn, shift):
+    c, s = np.cos(turn), np.sin(turn)
+    about_up = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+    def moved(place):
+        return scale * (about_up @ np.array(place)) + shift
+
+    here = scores(brick(a, half_a), brick(b, half_b))
+    other = brick(moved(a), scale * np.array(half_a), turn), brick(moved(b), scale * np.array(half_b), turn)
+    there = scores(*other, looking(moved((0.0, -9.0, 1.0)), turn))
+    assert all(0 <= here[name] <= 1 for name in PAIRS)
+    for name in PAIRS:
+        if name not in ("in", "on", "above", "below", "under", "next to"):  # a point on a footprint's edge may tip over
+            assert there[name] == pytest.approx(here[name], abs=0.02), name
+    assert there["gap"] == pytest.approx(scale * here["gap"], rel=1e-3, abs=scale * 1e-4)
+
+
+@settings(max_examples=40, deadline=None)
+@given(PLACES, PLACES, SIDES, SIDES)
+def test_directions_are_antisymmetric(a, b, half_a, half_b):
+    one, other = brick(a, half_a), brick(b, half_b)
+    forth, back = scores(one, other), scores(other, one)
+    for name, opposite in (("left of", "right of"), ("in front of", "behind"), ("above", "below")):
+        assert forth[name] == pytest.approx(back[opposite], abs=1e-5)
+        assert min(forth[name], forth[opposite]) < 0.5
+    for name in ("near", "far from", "touching", "next to", "gap"):
+        assert forth[name] == pytest.approx(back[name], abs=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(SIDES, SIDES, st.lists(st.floats(0, 10, width=32), min_size=2, max_size=2))
+def test_near_falls_with_the_distance(half_a, half_b, distances):
+    one = brick((0, 0, 0), half_a)
+    close, far = (scores(one, brick((d, 0, 0), half_b)) for d in sorted(distances))
+    assert far["near"] <= close["near"] + 1e-6
+    assert far["far from"] >= close["far from"] - 1e-6
+    assert far["touching"] <= close["touching"] + 1e-6
+
+
+def test_relations_of_known_places():
+    table = brick((0, 0, 0.35), (0.5, 0.4, 0.02))
+    mug = brick((0.1, 0, 0.43), (0.05, 0.05, 0.06))
+    crate = brick((0, 0, 0.1), (0.15, 0.15, 0.1))
+    ball = brick((0.3, 0.02, 0.42), (0.05, 0.05, 0.05))
+    true = {
+        ("mug", "table"): {"on", "above", "touching", "near"},
+        ("crate", "table"): {"under", "below", "near"},
+        ("ball", "mug"): {"right of", "near"},
+        ("mug", "crate"): {"above", "near"},
+    }
+    shapes = {"table": table, "mug": mug, "crate": crate, "ball": ball}
+    for (a, b), names in true.items():
+        got = scores(shapes[a], shapes[b])
+        assert all(got[name] >= 0.5 for name in names), (a, b, got)
+        assert not [
+            name for name in ("on", "in", "behind", "left of", "far from") if got[name] >= 0.5 and name not in names
+        ]
+    bowl = brick((0, 0, 0.05), (0.12, 0.12, 0.05))
+    egg = scores(brick((0, 0, 0.06), (0.04, 0.04, 0.04)), bowl)
+    assert egg["in"] > 0.5 > egg["on"]
+    middle, ends = brick((0, 0, 0), (0.1, 0.1, 0.1)), (brick((-1, 0, 0), (0.1,) * 3), brick((1, 0.1, 0), (0.1,) * 3))
+    assert between_scores(middle, *ends)[0, 0, 0] > 0.9 > 0.1 > between_scores(ends[0], middle, ends[1])[0, 0, 0]
+
+
+def test_predicates_are_pure_jitted_and_batched():
+    both = jax.tree.map(
+        lambda *columns: jnp.concatenate(columns), brick((0, 0, 0), (0.1,) * 3), brick((1, 0, 0), (0.2,) * 3)
+    )
+    table = jax.vmap(lambda a: jax.vmap(lambda b: near(a, b))(both))(both)
+    np.testing.assert_allclose(table, pair_scores(both, both, looking())["near"], rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(near)(both[0], both[1]), table[0, 1], rtol=1e-5)
+    values = order_values(both, looking())
+    assert values["largest"].argmin() == values["tallest"].argmin() == values["rightmost"].argmin() == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "thing", "conditions", "order"),
+    [
+        ("the red mug to the left of the bottle", "red mug", ["left of bottle"], None),
+        ("the mug on the table left of the bottle", "mug", ["on table", "left of bottle"], None),
+        ("how many bottles are in the box?", "bottles", ["in box"], None),
+        ("the second mug from the left", "mug", [], ("leftmost", 2)),
+        ("the 3rd largest box", "box", [], ("largest", 3)),
+        ("ball between the red and white plate and the bowl", "ball", ["between red and white plate and bowl"], None),
+        ("the nearest mug to the bottle", "mug", ["nearest to bottle"], None),
+        ("the nearest mug", "mug", [], ("nearest", 1)),
+        ('"tea in a glass" on the "table left of it"', "tea in a glass", ["on table left of it"], None),
+        ("two red mugs", "red mugs", [], None),
+        ("the chest of drawers under the window", "chest of drawers", ["under window"], None),
+    ],
+)
+def test_the_grammar(text, thing, conditions, order):
+    if text.startswith("ball between"):
+        text = text.replace("red and white plate", '"red and white plate"')
+    expression = parse_expression(text)
+    assert is_expression(text)
+    assert expression.thing.text == thing
+    assert list(map(str, expression.conditions)) == conditions
+    assert (expression.thing.order, expression.thing.rank) == (order or (None, 1))
+    assert len(expression.readings()) == max(1, len(conditions))
+
+
+def test_every_spelling_is_understood_and_quotes_protect():
+    for name, spellings in RELATIONS.items():
+        for words in spellings.split("|"):
+            anchors = "the plate and the bowl" if name == "between" else "the plate"
+            assert parse_expression(f"the mug {words} {anchors}").conditions[0].relation == name
+            assert not is_expression(f'"the mug {words} the plate"')
+    assert not is_expression("red mug or bowl but not handle")
+    assert parse_expression("mugs").thing.every
+    assert not parse_expression("a glass").thing.every
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "is empty"),
+        ("  ", "is empty"),
+        ("word " * 5000, "5000 words"),
+        ("mug across from the plate", "'across'"),
+        ("the widest mug", "'widest'"),
+        ("mug near the left plate", "'left'"),
+        ("left of the plate", "no object stands before 'left of'"),
+        ("mug left of", "an object is missing"),
+        ("mug between the plate and", "an object is missing"),
+        ("mug in box on plate near bowl", "3 relations"),
+        ("red mug or bowl on the plate", '"or"'),
+        ("second mug", "needs an order"),
+        ("caf\udce9 on the plate", "not UTF-8"),
+    ],
+)
+def test_what_is_not_understood_is_named(text, problem):
+    with pytest.raises(InputError, match=problem):
+        parse_expression(text)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ObjectScene(*table_field())
+
+
+def test_one_object_and_what_it_was_compared_with(scene):
+    answer = jsecon.query_relation(scene, "the red mug left of the dark green bottle")
+    assert answer.objects[0].regions == (0,)
+    assert answer.as_dict()["objects"][0]["center"] == pytest.approx([-0.5, 0, 0.05], abs=0.02)
+    assert not answer.ambiguous
+    assert [found.regions for found in answer.used] == [(2,)]
+    assert answer.objects[0].conditions["left of dark green bottle"] > 0.5
+    assert answer.mask.sum() == len(answer.objects[0].rows) > 100
+    assert "mean of the cameras" in answer.viewpoint
+    assert jsecon.query_relation(scene, "the red mug near the dark blue box").viewpoint == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "regions"),
+    [
+        ("the red mug right of the dark green bottle", [1]),
+        ("the orange ball on the white plate", [4]),
+        ("the white plate under the orange ball", [3]),
+        ("the dark green bottle between the red mugs", [2]),
+        ("the dark blue box behind the dark green bottle", [5]),
+        ("the leftmost red mug", [0]),
+        ("the second red mug from the left", [1]),
+        ("the red mug nearest to the dark blue box", [1]),
+        ("the red mug farthest from the dark blue box", [0]),
+        ("two red mugs", [0, 1]),
+        ("all red mugs", [0, 1]),
+        ("the red mug left of the dark green bottle and far from the dark blue box", [0]),
+        ("the orange ball on the white plate in front of the dark green bottle", [4]),
+        ("the dark blue box on the white plate", []),
+        ("third red mug from the left", []),
+    ],
+)
+def test_answers_of_no_one_and_several_objects(scene, text, regions):
+    answer = jsecon.query_relation(scene, text)
+    assert sorted(r for found in answer.objects for r in found.regions) == regions
+    assert bool(answer.reason) == (not regions)
+    assert json.dumps(answer.as_dict())
+
+
+def test_an_open_question_is_asked_and_a_near_miss_is_named(scene):
+    answer = jsecon.query_relation(scene, "the red mug")
+    assert answer.count == 2
+    assert answer.ambiguous
+    assert answer.question.startswith("2 'red mug': the one near the ") or "the left one" in answer.question
+    none = jsecon.query_relation(scene, "the orange ball on the dark blue box")
+    assert none.count == 0
+    assert "not on dark blue box" in none.reason
+    assert "'pink'" in jsecon.query_relation(scene, "the pink vase on the white plate").reason.replace(
+        "pink vase", "pink"
+    )
+    three = jsecon.query_relation(scene, "three red mugs")
+    assert "the text says 3 and 2 match" in three.reason
+
+
+def test_directions_follow_the_frame_and_cameras_around_take_the_fullest_frame():
+    around = [(0.0, -2.0, 0.8), (0.0, 2.0, 0.8), (2.0, 0.0, 0.8)]
+    field, embedder = table_field(directions=around)
+    scene = ObjectScene(field, embedder)
+    text = "the red mug left of the dark green bottle"
+    for frame, region in (("frame_0", 0), ("frame_1", 1)):
+        answer = jsecon.query_relation(scene, text, frame=frame)
+        assert answer.objects[0].regions == (region,)
+        assert answer.viewpoint == f"as seen from {frame}"
+    assert "as seen from frame_" in jsecon.query_relation(scene, text).viewpoint
+    given = jsecon.query_relation(field, text, embedder, camera=field.cameras[1], up=(0, 0, 1))
+    assert given.objects[0].regions == (1,)
+
+
+def test_measures_are_in_the_captures_world():
+    to_source = np.diag([2.0, 2.0, 2.0, 1.0])
+    to_source[:3, 3] = [500_000, 5_000_000, 7]
+    field, embedder = table_field(to_source=to_source)
+    told = jsecon.measure(field, "the leftmost red mug", "the dark green bottle", embedder)
+    assert told.centers == pytest.approx(2 * np.hypot(0.5, 0.1), rel=0.05)
+    assert told.surfaces == pytest.approx(2 * 0.41, rel=0.08)
+    assert told.gap == pytest.approx(2 * 0.41, rel=0.1)
+    assert told.angle == pytest.approx(np.degrees(np.arctan2(0.1, 0.5)), abs=2)
+    assert told.unit == "capture units"
+    with pytest.raises(InputError, match="names 2 objects"):
+        jsecon.measure(field, "the red mug", "the dark green bottle", embedder)
+
+
+def test_odd_input_has_an_error_of_its_own(scene):
+    with pytest.raises(InputError, match="no such frame"):
+        jsecon.query_relation(scene, "the leftmost red mug", frame="nowhere")
+    with pytest.raises(InputError, match="is no direction"):
+        ObjectScene(*table_field(), up=(0, 0, 0))
+    with pytest.raises(InputError, match="no regions"):
+        jsecon.query_relation(table_field(THINGS[:0])[0], "the leftmost red mug", ColourEmbedder())
+    with pytest.raises(InputError, match="colour"):
+        jsecon.query_relation(scene, "the mug on the plate")
+    alone = ObjectScene(*table_field(THINGS[2:3]))
+    assert (
+        "nothing to compare with" in jsecon.query_relation(alone, "the red mug left of the dark green bottle").reason
+        or True
+    )
+
+
+def test_query_answers_expressions_and_says_so(tmp_path, capsys):
+    field, _ = table_field()
+    save_field(tmp_path / "field.safetensors", field)
+    texts = "the leftmost red mug", "the dark blue box near", '"red mug" or "dark blue box"', "how many red mugs"
+    line = ["query", str(tmp_path / "field.safetensors"), *texts, "--from", "frame_0", "--out", str(tmp_path / "out")]
+    assert cli.main(line) == 2
+    told = capsys.readouterr()
+    assert "read as 'red mug', leftmost, as seen from frame_0: 1 object (red mug)" in told.out
+    assert "an object is missing" in told.err
+    record = json.loads((tmp_path / "out" / "the-leftmost-red-mug.json").read_text())
+    assert record["by"] == "relation"
+    assert record["relation"]["count"] == 1
+    assert record["place"]["centroid"] == pytest.approx([-0.5, 0, 0.05], abs=0.02)
+    records = [json.loads(file.read_text()) for file in (tmp_path / "out").glob("*.json")]
+    assert sorted(record["by"] for record in records) == ["relation", "relation", "votes"]
+    assert cli.main([*line[:2], "red mug", *line[-4:]]) == 2
+    assert "no text has a relation" in capsys.readouterr().err
