@@ -1,5 +1,6 @@
 """Relations between objects: properties of the predicates, the grammar, and answers of 0, 1 or several objects."""
 
+import dataclasses
 import json
 
 import jax
@@ -17,7 +18,7 @@ from jsecon.language.field import save_field
 from jsecon.query.expressions import RELATIONS, is_expression, parse_expression
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.relations import PAIRS, Viewpoint, between_scores, near, order_values, pair_scores
-from jsecon.vision.colours import ColourEmbedder
+from jsecon.types import Regions
 
 CORNERS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 3)] * 3), -1).reshape(-1, 3)
 PLACES = st.tuples(*[st.floats(-2, 2, width=32)] * 3)
@@ -181,7 +182,7 @@ def test_what_is_not_understood_is_named(text, problem):
 
 @pytest.fixture(scope="module")
 def scene():
-    return ObjectScene(*table_field())
+    return ObjectScene(*table_field(), up=(0, 0, 1))  # one camera that looks down does not tell
 
 
 def test_one_object_and_what_it_was_compared_with(scene):
@@ -272,7 +273,9 @@ def test_odd_input_has_an_error_of_its_own(scene):
     with pytest.raises(InputError, match="is no direction"):
         ObjectScene(*table_field(), up=(0, 0, 0))
     with pytest.raises(InputError, match="no regions"):
-        jsecon.query_relation(table_field(THINGS[:0])[0], "the leftmost red mug", ColourEmbedder())
+        field, embedder = table_field()
+        none = Regions(np.zeros((0, embedder.dim), np.float32), np.zeros((0, 1), np.int32))
+        jsecon.query_relation(dataclasses.replace(field, regions=none), "the leftmost red mug", embedder)
     with pytest.raises(InputError, match="colour"):
         jsecon.query_relation(scene, "the mug on the plate")
     alone = ObjectScene(*table_field(THINGS[2:3]))

@@ -4,10 +4,10 @@ Extra `mcp`. Every tool reads, none writes; a name in a call is never a path. Ba
 that tell the model what to change.
 """
 
-import functools
+import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import cv2
 import jax.numpy as jnp
@@ -141,24 +141,32 @@ def make_server(scenes: dict[str, Scene]) -> Any:
     field = Annotated[str | None, Field(description="Name of the field; the first by default")]
     hints = {"text": word, "a": word, "b": word, "frame": frame, "field": field}
 
-    def add(method: Callable[..., Any], kind: Literal["object", "image"]) -> None:
-        @functools.wraps(method)
+    def add(method: Callable[..., Any], *, image: bool = False) -> None:
         def call(**arguments: Any) -> Any:
             try:
                 result = method(**arguments)
             except InputError as error:
                 raise ToolError(str(error)) from error
-            return Image(data=result, format="png") if kind == "image" else result
+            return Image(data=result, format="png") if image else result
 
-        names = method.__code__.co_varnames[1 : method.__code__.co_argcount]
-        call.__annotations__ = {name: hints[name] for name in names}
-        call.__annotations__["return"] = Image if kind == "image" else dict[str, Any]
+        signature = inspect.signature(method)
+        parameters = [p.replace(annotation=hints[name]) for name, p in signature.parameters.items()]
+        answer = Image if image else dict[str, Any]
+        tool: Any = call
+        tool.__signature__ = signature.replace(parameters=parameters, return_annotation=answer)
+        tool.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": answer}
         annotations = ToolAnnotations(read_only_hint=True, open_world_hint=False, idempotent_hint=True)
-        server.add_tool(call, name=method.__name__, description=method.__doc__, annotations=annotations)
+        server.add_tool(
+            tool,
+            name=method.__name__,
+            description=inspect.getdoc(method),
+            annotations=annotations,
+            structured_output=not image,
+        )
 
     for method in (tools.find, tools.relation, tools.objects, tools.locate, tools.measure, tools.count):
-        add(method, "object")
-    add(tools.render, "image")
+        add(method)
+    add(tools.render, image=True)
     return server
 
 
