@@ -272,9 +272,9 @@ def test_odd_input_has_an_error_of_its_own(scene):
         jsecon.query_relation(scene, "the leftmost red mug", frame="nowhere")
     with pytest.raises(InputError, match="is no direction"):
         ObjectScene(*table_field(), up=(0, 0, 0))
+    field, embedder = table_field()
+    none = Regions(np.zeros((0, embedder.dim), np.float32), np.zeros((0, 1), np.int32))
     with pytest.raises(InputError, match="no regions"):
-        field, embedder = table_field()
-        none = Regions(np.zeros((0, embedder.dim), np.float32), np.zeros((0, 1), np.int32))
         jsecon.query_relation(dataclasses.replace(field, regions=none), "the leftmost red mug", embedder)
     with pytest.raises(InputError, match="colour"):
         jsecon.query_relation(scene, "the mug on the plate")
