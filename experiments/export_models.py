@@ -5,8 +5,9 @@
 
 Without weights the true architectures are written with random ones in every parameter, which is what a check needs:
 every graph's outputs. SigLIP, SigLIP 2 and MobileCLIP are put through jsecon's embedder too, from texts and crops to
-embeddings; `siglip` and `sam_images` (SAM 2.1 for transformers.js) also against transformers. `--only` takes some of
-the parts; figures of the others are kept.
+embeddings; `siglip` and `sam_images` (SAM 2.1 and EdgeTAM for transformers.js) also against transformers. `sam2_video`
+tracks a clip by jsecon over the five graphs of SAM 2.1 with memory, and by PyTorch. `--only` takes some of the parts;
+figures of the others are kept.
 """
 
 import argparse
@@ -21,7 +22,7 @@ TOLERANCE = 1e-3
 """of every output, masks as logits"""
 SAME_PIXELS = 0.999
 """of a mask"""
-PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images")
+PARTS = ("clip", "siglip", "mobileclip", "sam", "sam_images", "sam2_video")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +41,10 @@ class Options:
     mobileclip: tuple[str, ...] = ("MobileCLIP-S1",)
     """of open_clip; random weights."""
     sam: str = "vit_b"
+    """vit_b, vit_l, vit_h, or slimsam."""
     sam_weights: str | None = None
+    sam_images: tuple[str, ...] = ("sam2.1-hiera-tiny", "edgetam")
+    """of transformers, in the layout of transformers.js; random weights."""
     seed: int = 0
     threads: int = 1
 
@@ -99,15 +103,27 @@ def _sam(options: Options) -> list[dict]:
 
     weights = None if options.sam_weights is None else Path(options.sam_weights)
     model = sam.official(options.sam, weights, seed=options.seed)
-    return _rows(sam.export(model, Path(options.out) / "sam", seed=options.seed, threads=options.threads))
+    folder = Path(options.out) / ("sam" if options.sam == "vit_b" else options.sam)
+    return _rows(sam.export(model, folder, seed=options.seed, threads=options.threads))
 
 
 def _sam_images(options: Options) -> dict[str, dict]:
     from experiments.export import sam_images
 
-    name = "sam2.1-hiera-tiny"
-    model = sam_images.official(options.seed)
-    return {name: sam_images.export(model, Path(options.out) / name, seed=options.seed, threads=options.threads)}
+    exported = {}
+    for name in options.sam_images:
+        model = sam_images.official(name, options.seed)
+        folder = Path(options.out) / name
+        exported[name] = sam_images.export(model, folder, seed=options.seed, threads=options.threads)
+    return exported
+
+
+def _sam2_video(options: Options) -> dict[str, dict]:
+    from experiments.export import sam2_video
+
+    folder = Path(options.out) / "sam2.1-tiny-video"
+    model = sam2_video.official(options.seed)
+    return {folder.name: sam2_video.export(model, folder, seed=options.seed, threads=options.threads)}
 
 
 def _rows(agreements) -> list[dict]:
@@ -131,7 +147,8 @@ def table(metrics: dict) -> str:
     for part in ("siglip", "mobileclip"):
         groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
     groups |= {"sam": metrics.get("sam", [])}
-    groups |= {name: found["graphs"] for name, found in metrics.get("sam_images", {}).items()}
+    for part in ("sam_images", "sam2_video"):
+        groups |= {name: found["graphs"] for name, found in metrics.get(part, {}).items()}
     for model, graphs in groups.items():
         for graph in graphs:
             worst = max(graph["outputs"].values())
@@ -148,6 +165,7 @@ _MADE = {
     "mobileclip": _mobileclip,
     "sam": _sam,
     "sam_images": _sam_images,
+    "sam2_video": _sam2_video,
 }
 
 

@@ -12,6 +12,7 @@ import dataclasses
 import itertools
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,20 @@ from experiments.simulated_vision.exact_sam import ExactSam, found_shares, level
 from jsecon.demo.capture import room_cameras
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import crowded_room
-from jsecon.networks.sam import Level, Prompts, SamSettings
+from jsecon.networks.clip import ClipEmbedder, find_clip
+from jsecon.networks.hub import SUFFIXES, Precision, Role
+from jsecon.networks.sam import ENCODER, Level, Prompts, SamGraphs, SamSettings, find_sam
+from jsecon.networks.sam2 import FrameEncoder, Prompt, follow, open_sam2
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
 LEAST_PX = 100
 """px of a true mask that counts: SAM's generator drops smaller ones"""
 GRID = 1024
 """prompts of SAM's grid"""
+GUIDED = 70
+"""guided prompts of a frame"""
+REGIONS = 40
+"""regions of a frame that are embedded"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +46,10 @@ class Options:
 
     graphs: str | None = None
     """folder with models of true size; None counts masks instead"""
+    roles: tuple[str, ...] = ("segmenter", "embedder", "tracker")
+    """which of them are timed"""
+    prepare: bool = False
+    """Writes the graphs in lower precisions first, and times nothing."""
     results: str = str(results.HOME / "results" / "vision_speed")
     rooms: tuple[int, ...] = (0, 1, 2)
     """seeds, of crowded and of plain rooms each"""
@@ -53,8 +65,11 @@ def main(options: Options) -> dict:
     metrics = json.loads(kept.read_text()) if kept.exists() else {}
     if options.graphs is None:
         metrics["masks"] = count_masks(options)
+    elif options.prepare:
+        write_precisions(Path(options.graphs))
+        return {}
     else:
-        metrics["seconds"] = time_models(Path(options.graphs), options)
+        metrics["seconds"] = metrics.get("seconds", {}) | time_models(Path(options.graphs), options)
     results.save(folder, options, metrics, table(metrics))
     print(table(metrics))
     return metrics
@@ -103,7 +118,122 @@ def _count_frame(row: dict[str, Any], frame: np.ndarray, labels: dict[str, np.nd
 
 
 def time_models(folder: Path, options: Options) -> dict[str, Any]:
-    raise NotImplementedError
+    """Times the graphs of each model in a folder, and compares lower precisions with full precision."""
+    kinds = {"segmenter": _time_segmenter, "embedder": _time_embedder, "tracker": _time_tracker}
+    frame = render_views(crowded_room(0), room_cameras(crowded_room(0), views=1, width=400, height=300))[0][0]
+    measured: dict[str, Any] = {}
+    for model in sorted(path for path in folder.iterdir() if path.is_dir()):
+        role = role_of(model)
+        if role in options.roles:
+            for precision in precisions_of(model):
+                measured.setdefault(model.name, {"role": role})[precision] = kinds[role](model, precision, frame)
+                print(model.name, precision, measured[model.name][precision], flush=True)
+    return measured
+
+
+def role_of(model: Path) -> Role:
+    """Returns what a folder of a model is for, by its files."""
+    if (model / "onnx" / "memory_encoder.onnx").is_file():
+        return "tracker"
+    return "segmenter" if (model / "onnx" / ENCODER).is_file() else "embedder"
+
+
+def precisions_of(model: Path) -> list[Precision]:
+    """Returns the precisions of the graphs in a folder."""
+    return [p for p, suffix in SUFFIXES.items() if any(model.rglob(f"{_first_graph(model)}{suffix}.onnx"))]
+
+
+def _first_graph(model: Path) -> str:
+    return "model" if role_of(model) == "embedder" else Path(ENCODER).stem
+
+
+def write_precisions(folder: Path) -> None:
+    """Writes the graphs of every model in half and in 8-bit precision beside the full ones, as public exports do."""
+    import onnx
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+
+    full = [path for path in sorted(folder.rglob("*.onnx")) if not path.stem.endswith(("_fp16", "_quantized"))]
+    for path in full:
+        if role_of(path.parents[1]) == "tracker":
+            continue
+        half = path.with_name(f"{path.stem}_fp16.onnx")
+        if not half.exists():
+            onnx.save(convert_float_to_float16(onnx.load(str(path)), keep_io_types=True), str(half))
+        eight = path.with_name(f"{path.stem}_quantized.onnx")
+        if not eight.exists():
+            quantize_dynamic(path, eight, weight_type=QuantType.QUInt8)
+        print(path, flush=True)
+
+
+def _best_seconds(call: Callable[[], Any], repeats: int = 2) -> float:
+    """Seconds of a call: the least of some, after one that is not counted."""
+    call()
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - started)
+    return min(seconds)
+
+
+def _time_segmenter(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
+    graphs = SamGraphs(find_sam(model, precision))
+    encoder = _best_seconds(lambda: graphs.encode(frame))
+    encoded = graphs.encode(frame)
+    points = np.random.default_rng(0).uniform(0, 300, (16, 2)).astype(np.float32)
+    list(graphs.decode(encoded, points[:2]))  # tries several prompts a run
+    together = graphs.batch > 1
+    decoder = {}
+    for batch in (1, 4, 16) if together else (1,):
+        graphs.batch = batch
+        decoder[batch] = _best_seconds(lambda: list(graphs.decode(encoded, points)), 1) / len(points)
+    reference = SamGraphs(find_sam(model, "fp32")).encode(frame).features if precision != "fp32" else encoded.features
+    cosines = [_cosine(encoded.features[name], reference[name]) for name in reference]
+    prompt = min(decoder.values())
+    frames = {"guided": encoder + GUIDED * prompt, "grid": encoder + GRID * prompt}
+    return {"encoder": encoder, "prompt": decoder, "frame": frames, "least_cosine": min(cosines)}
+
+
+def _time_embedder(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
+    masks = np.zeros((16, *frame.shape[:2]), bool)
+    for n, mask in enumerate(masks):
+        mask[20 + 60 * (n // 4) : 80 + 60 * (n // 4), 20 + 90 * (n % 4) : 100 + 90 * (n % 4)] = True
+    crop = {}
+    for batch in (1, 4, 16):
+        embedder = ClipEmbedder(find_clip(model, precision), batch=batch)
+        crop[batch] = _best_seconds(lambda embedder=embedder: embedder.embed_regions(frame, masks[:8]), 1) / 8
+        embedder.close()
+    embedder = ClipEmbedder(find_clip(model, precision))
+    rows = embedder.embed_regions(frame, masks)
+    reference = rows
+    if precision != "fp32":
+        reference = ClipEmbedder(find_clip(model, "fp32")).embed_regions(frame, masks)
+    text = _best_seconds(lambda: embedder.embed_text(["red mug"]))
+    frame_seconds = REGIONS * min(crop.values())
+    cosine = float((rows * reference).sum(1).min())
+    return {"crop": crop, "text": text, "frame": frame_seconds, "least_cosine": cosine}
+
+
+def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
+    graphs = open_sam2(model)
+    frames = np.stack([np.roll(frame, 3 * t, 1) for t in range(3)])
+    prompt = Prompt(points=np.array([[200.0, 150.0]], np.float32), labels=np.array([1], np.int32))
+    seconds = []
+    encode = FrameEncoder(graphs, keep=3)
+    encoder = _best_seconds(lambda: FrameEncoder(graphs)(frames[0]))
+    for each in frames:
+        encode(each)
+    started = time.perf_counter()
+    for _ in follow(graphs, frames, 0, [prompt], encode=encode):
+        seconds.append(time.perf_counter() - started)
+        started = time.perf_counter()
+    return {"encoder": encoder, "object": min(seconds[1:]), "frame": encoder + min(seconds[1:])}
+
+
+def _cosine(one: np.ndarray, other: np.ndarray) -> float:
+    one, other = one.astype(np.float64).ravel(), other.astype(np.float64).ravel()
+    return float(one @ other / np.linalg.norm(one) / np.linalg.norm(other))
 
 
 def table(metrics: dict) -> str:
@@ -119,6 +249,21 @@ def table(metrics: dict) -> str:
                     count = mine["prompts"] / row["frames"]
                     rows.append((kind, level, prompts, f"{count:.0f}", row["true"], *mine["found"]))
         parts.append(results.table(header, rows))
+    header = ("model", "precision", "encoder, s", "prompt or crop, s", "frame, s", "by the grid, s", "least cosine")
+    rows = []
+    for model, found in metrics.get("seconds", {}).items():
+        for precision, row in found.items():
+            if precision != "role":
+                each = row.get("prompt", row.get("crop", {"": row.get("object")}))
+                batch = min(each, key=each.get)
+                single = f"{each[batch]:.3f}{f' (batch {batch})' if batch else ''}"
+                frame = row["frame"] if isinstance(row["frame"], dict) else {"guided": row["frame"]}
+                grid = f"{frame['grid']:.0f}" if "grid" in frame else "-"
+                encoder = f"{row['encoder']:.2f}" if "encoder" in row else "-"
+                cosine = f"{row['least_cosine']:.5f}" if "least_cosine" in row else "-"
+                rows.append((model, precision, encoder, single, f"{frame['guided']:.1f}", grid, cosine))
+    if rows:
+        parts.append(results.table(header, rows))
     return "\n\n".join(parts)
 
 
@@ -128,9 +273,11 @@ def parsed(arguments: list[str] | None = None) -> Options:
     parser.add_argument("--graphs", default=None)
     parser.add_argument("--results", default=Options.results)
     parser.add_argument("--rooms", nargs="+", type=int, default=list(Options.rooms))
+    parser.add_argument("--roles", nargs="+", default=list(Options.roles), choices=Options.roles)
+    parser.add_argument("--prepare", action="store_true")
     parser.add_argument("--views", type=int, default=Options.views)
     values = vars(parser.parse_args(arguments))
-    return Options(**values | {"rooms": tuple(values["rooms"])})
+    return Options(**values | {"rooms": tuple(values["rooms"]), "roles": tuple(values["roles"])})
 
 
 if __name__ == "__main__":
