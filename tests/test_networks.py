@@ -22,6 +22,7 @@ from jsecon.data.gaussians.ply import load_ply, save_ply
 from jsecon.errors import InputError
 from jsecon.fit.start import starting_gaussians
 from jsecon.language.field import load_field, save_field
+from jsecon.networks.hub import catalogue
 from jsecon.networks.sam import SamSegmenter, SamSettings
 from jsecon.networks.sam2 import Sam2Tracker
 from jsecon.pipeline import networks, run as pipeline
@@ -307,6 +308,11 @@ def test_models_are_listed_fetched_checked_and_removed_by_name(hub, tmp_path, mo
         row["name"]: row["cached"] for row in json.loads(capsys.readouterr().out)["models"] if row["role"] == "embedder"
     }
     assert rows == {"clip": [], "siglip2": ["fp32"], "mobileclip": []}
+    assert cli.main(["models", "list"]) == 0
+    assert "s/frame" in (listed := capsys.readouterr().out)
+    assert cli.main(["run", "--help-all"]) == 0
+    helped = capsys.readouterr().out
+    assert all(row.purpose in listed and row.purpose in helped for row in catalogue())
     assert cli.main(["models", "check", "siglip2"]) == 0
     assert "CLIP: usable" in capsys.readouterr().out
     assert cli.main(["models", "remove", "siglip2"]) == 0

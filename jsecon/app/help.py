@@ -13,6 +13,8 @@ from typing import Any, get_type_hints
 
 import docstring_parser
 
+from jsecon.app.models import help_table
+from jsecon.app.verbs import Run
 from jsecon.pipeline.options import ADVANCED
 
 MAX_WIDTH = 100
@@ -32,7 +34,9 @@ def description(kind: Any, *, whole: bool) -> str:
     filled = [textwrap.fill(" ".join(paragraph.split()), width) for paragraph in paragraphs if paragraph]
     examples = "\n".join(["examples", *(f"  {line}" for line in kind.examples)])
     verb = kind.examples[0].split()[1]
-    more = [] if whole else [f"jsecon {verb} --help-all describes every option."]
+    more = [help_table()] if whole and kind is Run else []
+    if not whole:
+        more = [f"jsecon {verb} --help-all describes every option."]
     return "\n\n".join([*filled, examples, *more])
 
 
