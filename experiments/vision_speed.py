@@ -24,10 +24,11 @@ from experiments.simulated_vision.exact_sam import ExactSam, found_shares, level
 from jsecon.demo.capture import room_cameras
 from jsecon.demo.raycast import render_views
 from jsecon.demo.room import crowded_room
-from jsecon.networks.clip import ClipEmbedder, find_clip
+from jsecon.networks.clip import find_clip, masked_crop
 from jsecon.networks.hub import SUFFIXES, Precision, Role
 from jsecon.networks.sam import ENCODER, Level, Prompts, SamGraphs, SamSettings, find_sam
 from jsecon.networks.sam2 import FrameEncoder, Prompt, follow, open_sam2
+from jsecon.networks.session import Graph
 
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9)
 LEAST_PX = 100
@@ -148,7 +149,10 @@ def _first_graph(model: Path) -> str:
 
 
 def write_precisions(folder: Path) -> None:
-    """Writes the graphs of every model in half and in 8-bit precision beside the full ones, as public exports do."""
+    """Writes the graphs of every model in half and in 8-bit precision beside the full ones, as public exports do.
+
+    Graphs of texts stay in full precision under those names: a question is one text.
+    """
     import onnx
     from onnxruntime.quantization import QuantType, quantize_dynamic
     from onnxruntime.transformers.float16 import convert_float_to_float16
@@ -158,9 +162,14 @@ def write_precisions(folder: Path) -> None:
         if role_of(path.parents[1]) == "tracker":
             continue
         half = path.with_name(f"{path.stem}_fp16.onnx")
+        eight = path.with_name(f"{path.stem}_quantized.onnx")
+        if path.parent.name == "textual":
+            for variant in (half, eight):
+                variant.unlink(missing_ok=True)
+                variant.hardlink_to(path)
+            continue
         if not half.exists():
             onnx.save(convert_float_to_float16(onnx.load(str(path)), keep_io_types=True), str(half))
-        eight = path.with_name(f"{path.stem}_quantized.onnx")
         if not eight.exists():
             quantize_dynamic(path, eight, weight_type=QuantType.QUInt8)
         print(path, flush=True)
@@ -199,20 +208,20 @@ def _time_embedder(model: Path, precision: Precision, frame: np.ndarray) -> dict
     masks = np.zeros((16, *frame.shape[:2]), bool)
     for n, mask in enumerate(masks):
         mask[20 + 60 * (n // 4) : 80 + 60 * (n // 4), 20 + 90 * (n % 4) : 100 + 90 * (n % 4)] = True
+    files = find_clip(model, precision)
+    graph = Graph(files.visual)
+    name, output = next(iter(graph.inputs)), next(iter(graph.outputs))
+    size = files.size or graph.inputs[name].fixed(3) or 224
+    crops = np.stack([masked_crop(frame, mask, size) for mask in masks]).astype(np.float32) / 255
+    images = ((crops - np.float32(files.mean)) / np.float32(files.std)).transpose(0, 3, 1, 2)
     crop = {}
     for batch in (1, 4, 16):
-        embedder = ClipEmbedder(find_clip(model, precision), batch=batch)
-        crop[batch] = _best_seconds(lambda embedder=embedder: embedder.embed_regions(frame, masks[:8]), 1) / 8
-        embedder.close()
-    embedder = ClipEmbedder(find_clip(model, precision))
-    rows = embedder.embed_regions(frame, masks)
-    reference = rows
-    if precision != "fp32":
-        reference = ClipEmbedder(find_clip(model, "fp32")).embed_regions(frame, masks)
-    text = _best_seconds(lambda: embedder.embed_text(["red mug"]))
-    frame_seconds = REGIONS * min(crop.values())
-    cosine = float((rows * reference).sum(1).min())
-    return {"crop": crop, "text": text, "frame": frame_seconds, "least_cosine": cosine}
+        part = images[:batch]
+        crop[batch] = _best_seconds(lambda part=part: graph.run({name: part}, [output]), 1) / batch
+    rows = graph.run({name: images}, [output])[output]
+    same = rows if precision == "fp32" else Graph(find_clip(model, "fp32").visual).run({name: images}, [output])[output]
+    cosine = min(_cosine(one, other) for one, other in zip(rows, same))
+    return {"crop": crop, "frame": REGIONS * min(crop.values()), "least_cosine": cosine}
 
 
 def _time_tracker(model: Path, precision: Precision, frame: np.ndarray) -> dict[str, Any]:
