@@ -27,9 +27,8 @@ def write_encoder(path: Path, side: int, outputs: tuple[str, ...] = ("image_embe
     return write_graph(path, nodes, {"pixel_values": ("float32", [1, 3, side, side])}, declared, constants)
 
 
-def write_decoder(path: Path, side: int, kind: str, batch: int | str, *, masks: int = 3, mixed: bool = False) -> Path:
-    """Kinds: "sam", and "sam2" with the frame at three scales and boxes. Of a mixed one every prompt of a run has the
-    mean of their colours."""
+def write_decoder(path: Path, side: int, kind: str, batch: int | str, *, masks: int = 3) -> Path:
+    """Kinds: "sam", and "sam2" with the frame at three scales and boxes."""
     grid, low, boxed = side // 16, side // 4, kind == "sam2"
     embedding = "image_embeddings.2" if boxed else "image_embeddings"
     coords, labels, scores, logits = "input_points", "input_labels", "iou_scores", "pred_masks"
@@ -66,8 +65,7 @@ def write_decoder(path: Path, side: int, kind: str, batch: int | str, *, masks: 
         node("Reshape", [embedding, "flat"], ["colours"]),
         node("Gather", ["colours", "at"], ["own_columns"], axis=1),  # (C, B)
         node("Transpose", ["own_columns"], ["own"], perm=[1, 0]),
-        *_averaged(mixed),
-        node("Unsqueeze", ["own_of_each", "two"], ["own_here"]),  # (B, C, 1)
+        node("Unsqueeze", ["own", "two"], ["own_here"]),  # (B, C, 1)
         node("Unsqueeze", ["colours", "zero"], ["all"]),  # (1, C, G^2)
         node("Sub", ["all", "own_here"], ["difference"]),
         node("Mul", ["difference", "difference"], ["squares"]),
@@ -95,14 +93,6 @@ def write_decoder(path: Path, side: int, kind: str, batch: int | str, *, masks: 
     else:
         inputs["image_positional_embeddings"] = ("float32", [1, CHANNELS, grid, grid])
     return write_graph(path, nodes, inputs, outputs, constants)
-
-
-def _averaged(mixed: bool) -> list:
-    """Nodes from the colours (B, C) of the prompts to those that they are answered by."""
-    if not mixed:
-        return [node("Identity", ["own"], ["own_of_each"])]
-    mean = node("ReduceMean", ["own"], ["mean_own"], axes=[0], keepdims=1)
-    return [mean, node("Mul", ["own", "least"], ["nothing"]), node("Add", ["nothing", "mean_own"], ["own_of_each"])]
 
 
 def write_sam(folder: Path, kind: str = "sam", *, side: int = 256, batch: int | str = "batch") -> Path:

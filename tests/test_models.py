@@ -24,7 +24,7 @@ def folders(tmp_path_factory):
 
 @pytest.mark.parametrize(("model", "words"), [
     ("CLIP", ["images of 32x32 px", "3 numbers", "layout immich", "--embedder"]),
-    ("SAM", ["decoder of SAM, 64 prompts per run", "images of 256 px", "--segmenter"]),
+    ("SAM", ["decoder of SAM, 4 prompts per run", "images of 256 px", "--segmenter"]),
     ("SAM 2", ["images of 64 px", "--tracker"]),
     ("SAM 3", ["a phrase of 32 tokens", "raw decoder, images of 112 px", "--phrases"]),
 ])  # fmt: skip

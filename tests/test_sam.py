@@ -3,7 +3,6 @@ and a message that names the tensor for a graph of another kind."""
 
 import dataclasses
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy import ndimage
 
 from jsecon.errors import InputError
 from jsecon.networks.sam import (
-    DECODER,
     MEAN_STD,
     TOKENS,
     SamFiles,
@@ -120,22 +118,6 @@ def test_every_dialect_and_batch_finds_the_same_things(folders, frame, segmenter
         np.testing.assert_array_equal(masks, segmenter(frame, 0))
 
 
-@pytest.mark.parametrize("together", [True, False, None])
-def test_prompts_share_a_run_only_where_each_is_answered_as_if_alone(folders, frame, tmp_path, together):
-    folder = shutil.copytree(folders["sam2", "batch"], tmp_path / "sam2")
-    if together is not True:  # answers by the mean of its prompts, or takes none but one
-        write_decoder(folder / "onnx" / DECODER, 256, "sam2", "batch" if together is False else 1, mixed=True)
-    graphs = SamGraphs(find_sam(folder), threads=1)
-    points = np.float32([[40, 40], [120, 80], [5, 5]])
-    encoded = graphs.encode(frame)
-    answers = list(graphs.decode(encoded, points))
-    assert graphs.batch == (64 if together else 1)
-    assert len(answers) == (1 if together else 3)
-    alone = [next(graphs.decode(encoded, point[None])) for point in points]
-    for kind in (0, 1):
-        np.testing.assert_allclose(np.concatenate([a[kind] for a in answers]), np.concatenate([a[kind] for a in alone]))
-
-
 def test_guided_prompts_find_the_things_of_the_grid_with_a_tenth_of_the_points(folders, frame, segmenter, monkeypatch):
     asked = []
     decode = SamGraphs.decode
@@ -149,13 +131,15 @@ def test_guided_prompts_find_the_things_of_the_grid_with_a_tenth_of_the_points(f
         assert max((mask & other).sum() / (mask | other).sum() for other in guided) > 0.9
 
 
-def test_sam_2_takes_a_frame_stretched_to_a_square(folders, frame):
+def test_sam_2_takes_a_frame_stretched_to_a_square_and_one_prompt_a_run(folders, frame):
     graphs = SamGraphs(find_sam(folders["sam2", "batch"]), threads=1)
-    assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)  # several prompts a run are not tried yet
+    assert (graphs.batch, graphs.side, graphs.stretched) == (1, 256, True)
     encoded = graphs.encode(frame)
     assert encoded.scaled == (256, 256)
     cells = encoded.features["image_embeddings.2"][0, :3] * MEAN_STD[1][:, None, None] + MEAN_STD[0][:, None, None]
     np.testing.assert_allclose(cells[:, 5, 5], frame[40, 50], atol=1)  # (5.5 / 16) of height and width
+    found = list(graphs.decode(encoded, np.float32([[40, 40], [120, 80], [5, 5]])))
+    assert [masks.shape for masks, _ in found] == [(1, 3, 64, 64)] * 3
 
 
 def test_sam_3_scales_colours_as_its_configuration_says(frame, tmp_path):

@@ -97,8 +97,8 @@ class NamedModel:
       megabytes: Size of the files by precision. Precisions that are missing are not offered.
       licence: Licence of the weights.
       purpose: What it is good for, in one sentence.
-      seconds: Seconds of a frame by precision, on two cores of a Xeon with AVX-512: of a segmenter with guided prompts,
-        of an embedder for 40 regions, of a tracker for one object.
+      seconds: Seconds of a frame by precision, on two cores of a Xeon with AVX-512: of a segmenter with 70 guided
+        prompts, of an embedder for 40 regions, of a tracker for one object. Those not measured are missing.
       precision: Precision that is taken unless the user asks for another.
       sha256: File -> hash of the content, where it is known from elsewhere than the hub.
       refused: Precision -> why it is not offered.

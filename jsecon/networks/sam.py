@@ -12,8 +12,7 @@ The decoder takes input_points (1, B, P, 2) and input_labels (1, B, P) and gives
 two kinds, which differ in the decoder's other inputs:
     SAM      image_embeddings of a frame that is scaled by its longer side and padded; a batch of prompts in one run
     SAM 2    image_embeddings.0, .1 and .2 of a frame that is stretched to a square, as EdgeTAM, SAM 2.1 and SAM 3 have;
-             input_boxes (1, 0, 4), with which some exports take one prompt a run, so that this is tried first;
-             preprocessor_config.json states how colours are scaled
+             input_boxes (1, 0, 4), so one prompt a run; preprocessor_config.json states how colours are scaled
 """
 
 import dataclasses
@@ -51,8 +50,9 @@ PUBLISHED = (
 )
 _TOGETHER = "Take encoder and decoder from one export."
 
-SAME_LOGITS = 1e-2
-"""largest difference, as a share of the largest logit, between a prompt's masks alone and among others"""
+BATCH = 4
+"""prompts of one run, if the decoder does not fix it: of EdgeTAM's decoder on two cores, 8 take 42 ms each, one alone
+34 ms; 64 of SAM's take more than 1 GiB"""
 
 Level = Literal["default", "s", "m", "l"]
 Prompts = Literal["guided", "grid"]
@@ -133,7 +133,7 @@ class SamGraphs:
       threads: Number of cores of one run, as for `Graph`.
 
     Attributes:
-      batch: Largest number of prompts of one run; 1 also for a graph with input_boxes until `decode` has tried more.
+      batch: Number of prompts of one run.
       side: Side of the encoder's square image in px.
       stretched: Whether frames are stretched to a square (SAM 2), else scaled and padded (SAM).
 
@@ -141,7 +141,7 @@ class SamGraphs:
       InputError: A graph has other tensors than SAM.
     """
 
-    def __init__(self, files: SamFiles, *, batch: int = 64, threads: int | None = None):
+    def __init__(self, files: SamFiles, *, batch: int = BATCH, threads: int | None = None):
         """Opens the two graphs of a model."""
         self.files = files
         self._encoder = Graph(files.encoder, threads=threads)
@@ -159,9 +159,8 @@ class SamGraphs:
         masks = self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
         if masks.fixed(2) not in (None, 3, 4):
             raise self._not_three_masks(str(masks))
-        self._fixed_batch = points.fixed(1)
-        self._untried = None if self._fixed_batch or "input_boxes" not in inputs else batch
-        self.batch = self._fixed_batch or (batch if self._untried is None else 1)
+        self._fixed_batch = 1 if "input_boxes" in inputs else points.fixed(1)
+        self.batch = self._fixed_batch or batch
         self.side = image.fixed(3) or (files.side if self.stretched else None) or IMAGE_SIDE
         self._links = self._checked_links()
         self._mean, self._std = MEAN_STD if files.colours is None else np.multiply(files.colours, 255).astype("f4")
@@ -216,9 +215,6 @@ class SamGraphs:
           Mask logits (B, 3, L, L) from part to whole, and predicted IoUs (B, 3).
         """
         scaled = points * np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
-        if self._untried is not None and len(points) > 1:
-            self.batch = self._untried if self._takes_several(encoded, scaled[:2]) else 1
-            self._untried = None
         for part, count in batches(scaled, self._fixed_batch, self.batch):
             masks, scores = self._run_decoder(encoded, part)
             yield masks[:count], scores[:count]
@@ -234,16 +230,6 @@ class SamGraphs:
         if masks.shape[:2] != scores.shape or masks.shape[1] not in (3, 4):
             raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
         return masks[:, -3:].astype(np.float32), scores[:, -3:].astype(np.float32)  # of 4, the first is SAM's best
-
-    def _takes_several(self, encoded: EncodedFrame, points: np.ndarray) -> bool:
-        """Whether a run with several points answers each as a run with that point alone does."""
-        alone = np.concatenate([self._run_decoder(encoded, point[None])[0] for point in points])
-        try:
-            together = self._run_decoder(encoded, points)[0]
-        except InputError:  # how graphs that take one prompt a run refuse two is up to them
-            return False
-        difference = np.abs(together - alone).max() if together.shape == alone.shape else np.inf
-        return bool(difference <= SAME_LOGITS * np.abs(alone).max())
 
     def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: EncodedFrame) -> Float32[np.ndarray, "h w"]:
         """Resizes the logits of a mask (L, L) to the frame (H, W), bilinearly, through the encoder's square as SAM."""
@@ -345,7 +331,7 @@ class SamSegmenter:
         model: str | Path | SamFiles,
         settings: SamSettings | None = None,
         *,
-        batch: int = 64,
+        batch: int = BATCH,
         threads: int | None = None,
     ):
         """Prepares the generator of masks."""
