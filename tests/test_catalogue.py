@@ -82,16 +82,34 @@ def test_each_region_is_an_object_with_its_gaussians_and_its_colour(field):
     assert catalogue.frames[0, 0] == seen.argmax()
 
 
+def in_a_row(field, gap, same):
+    """The slabs as bricks of length 1 in a row with gaps, of which those of the ids `same` look the same."""
+    own = true_regions(field.gaussians)
+    embeddings, means = np.array(field.regions.embeddings), np.zeros((len(own), 3), np.float32)
+    embeddings[list(same)] = embeddings[same[0]]
+    for r in range(REGIONS):
+        k = np.arange((own == r).sum())
+        means[own == r] = np.stack([r * (1 + gap) + k / k.max(), 0.05 * (-1.0) ** k, 0.05 * (-1.0) ** (k // 2)], axis=1)
+    small = np.full_like(field.gaussians.log_scales, -5)
+    gaussians = dataclasses.replace(field.gaussians, means=means, log_scales=small)
+    regions = dataclasses.replace(field.regions, embeddings=embeddings)
+    return dataclasses.replace(field, gaussians=gaussians, regions=regions)
+
+
 def test_pieces_are_joined_and_two_of_a_kind_are_not(field):
-    alike = np.array(field.regions.embeddings)
-    alike[1] = alike[0]
-    field = dataclasses.replace(field, regions=dataclasses.replace(field.regions, embeddings=alike))
+    field = in_a_row(field, 0.4, (0, 2))
     apart = jsecon.objects(field)
     assert len(set(apart.regions)) == REGIONS
-    joined = jsecon.objects(with_overlap(field, pair(0, 1, 0.4)))
-    assert joined.regions[0] == joined.regions[1]
+    joined = jsecon.objects(with_overlap(field, pair(0, 2, 0.4)))
+    assert joined.regions[0] == joined.regions[2]
     assert len(joined) == len(apart) - 1
-    np.testing.assert_array_equal(joined.mask(int(joined.regions[0])), shares(field, [0, 1]) >= 0.5)
+    np.testing.assert_array_equal(joined.mask(joined.regions[0]), shares(field, [0, 2]) >= 0.5)
+
+
+@pytest.mark.parametrize(("gap", "count"), [(0.02, 1), (0.4, 2)])
+def test_two_that_look_the_same_and_touch_are_one(field, gap, count):
+    catalogue = jsecon.objects(in_a_row(field, gap, (0, 1)))
+    assert len(set(catalogue.regions[:2])) == count
 
 
 def test_a_region_inside_another_is_a_part_and_its_gaussians_are_those_of_the_whole(field):

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jsecon.errors import InputError
 from jsecon.language.columns import vote_blocks
-from jsecon.language.membership import membership_probability, vote_shares
+from jsecon.language.membership import SHARE_THRESHOLD, membership_probability, vote_shares
 from jsecon.numerics import normalize
 from jsecon.query.groups import containment, objects_of_gaussians, same_object
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes, scene_up
@@ -29,6 +29,11 @@ FRAMES = 3
 PART_CONTAINMENT = 0.4
 """Share of a region inside another one from which it is a part of it. A handle that half of the views take for a part
 of its mug lies in the mug by one half."""
+TOUCHING = 0.1
+"""Largest gap from one piece's box to another piece that looks the same, in diagonals of the smaller box. Two mugs side
+by side are farther apart."""
+FILLED = 0.7
+"""Share of the volume of their common box that these two fill at least."""
 SOFTMAX_SCALE = 100.0
 """Scale of cosines in CLIP's softmax over texts, to which its training is clipped (arXiv 2103.00020)."""
 # fmt: off
@@ -115,7 +120,8 @@ class _Names(NamedTuple):
 def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embedder: Any = None) -> Catalogue:
     """Lists the objects of a field.
 
-    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`). An
+    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`), and
+    so are two that look the same, touch, and fill a common box, such as the ends of a beam whose middle is hidden. An
     object most of which lies in another one's masks is a part of it. Every Gaussian belongs to one whole at most.
 
     Args:
@@ -131,12 +137,8 @@ def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embed
       InputError: The vocabulary is empty, or the embedder cannot represent a name.
     """
     names = _vocabulary(field, vocabulary, embedder)
-    count = field.regions.count
-    groups = connected_components(np.asarray(same_object(field)))[1] if count else np.zeros(0, int)
-    size = np.zeros(count)
-    for votes in vote_blocks(field.votes):
-        shares, regions = np.nan_to_num(np.asarray(vote_shares(votes))), np.asarray(votes.regions)
-        size += np.bincount(regions[regions >= 0], shares[regions >= 0], count)[:count]
+    size, main = _sizes(field)
+    groups = _groups(field, main)
     members = np.arange(groups.max(initial=-1) + 1)[:, None] == groups  # (G, R)
     pixels = np.asarray(field.regions.pixels, np.float64)
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
@@ -229,6 +231,45 @@ def _name(embeddings: np.ndarray, names: _Names) -> tuple[Int[np.ndarray, "k m"]
     missing = ((0, 0), (0, NAMES - order.shape[1]))
     best = np.pad(np.take_along_axis(probability, order, axis=1), missing)
     return np.pad(order, missing, constant_values=len(names.texts)), best
+
+
+def _sizes(field: LanguageField) -> tuple[Float[np.ndarray, " r"], Int[np.ndarray, " n"]]:
+    """Returns the sum of each region's shares, and the region that has at least half of each Gaussian, or -1."""
+    size = np.zeros(field.regions.count)
+    main = []
+    for votes in vote_blocks(field.votes):
+        shares, regions = np.nan_to_num(np.asarray(vote_shares(votes))), np.asarray(votes.regions)
+        size += np.bincount(regions[regions >= 0], shares[regions >= 0], len(size))[: len(size)]
+        best = shares.argmax(1)
+        rows = np.arange(len(best))
+        main.append(np.where(shares[rows, best] >= SHARE_THRESHOLD, regions[rows, best], -1))
+    return size, np.concatenate(main)
+
+
+def _groups(field: LanguageField, main: np.ndarray) -> Int[np.ndarray, " r"]:
+    """Returns the group of each region: those that show one object have the same one."""
+    joined, alike = map(np.array, same_object(field))
+    if not len(joined):
+        return np.zeros(0, int)
+    up = scene_up(field.cameras)
+    for first, second in np.argwhere(np.triu(alike & ~joined, 1)):
+        rows = [np.flatnonzero(main == region) for region in (first, second)]
+        joined[first, second] = min(map(len, rows)) >= MIN_SAMPLES and _is_continued(field, *rows, up)
+    return connected_components(joined, directed=False)[1]
+
+
+def _is_continued(field: LanguageField, first: np.ndarray, second: np.ndarray, up: np.ndarray) -> bool:
+    """Whether the Gaussians of two rows touch and fill a common upright box."""
+    chosen = np.concatenate([first, second, first, second])
+    own = np.repeat([0, 1, 2], [len(first), len(second), len(first) + len(second)])
+    gaussians = dataclasses.replace(field.gaussians, sh=None)
+    spreads = gaussian_spreads(jax.tree.map(lambda column: np.asarray(column)[chosen], gaussians))
+    shapes = object_shapes(np.asarray(field.gaussians.means)[chosen], own, up, spreads=spreads)
+    local = [np.abs((shapes.points[1 - k] - shapes.center[k]) @ shapes.axes[k]) for k in (0, 1)]
+    gap = min(np.linalg.norm(np.maximum(local[k] - shapes.half_size[k], 0), axis=1).min() for k in (0, 1))
+    volume = np.prod(shapes.half_size, axis=1)
+    size = 2 * np.linalg.norm(shapes.half_size[:2], axis=1).min()
+    return bool(gap <= TOUCHING * size and volume[0] + volume[1] >= FILLED * volume[2])
 
 
 def _wholes(

@@ -1,6 +1,8 @@
 """Regions that are one object, regions that are parts of another, and the object of each Gaussian. Pure functions."""
 
+import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,25 +14,37 @@ from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
 from jsecon.types import Array, LanguageField, Votes
 
 
-def same_object(field: LanguageField, rules: QueryRules = RULES) -> Bool[Array, "r r"]:
-    """Finds the pairs of regions that show one object.
+class SameObject(NamedTuple):
+    """Which pairs of R regions may show one object. Both are symmetric, and true on the diagonal."""
 
-    A query with either region as its text would add the other: as a piece of the same object, or as alike
-    (`match_region`). Both also overlap by MIN_PIECE_OVERLAP, since two objects of a kind are alike as well.
+    joined: Bool[Array, "r r"]
+    """A query with either region as its text would add the other (`match_region`), and they overlap."""
+    alike: Bool[Array, "r r"]
+    """They look the same, as two pieces or two objects of a kind do (`alike_threshold`)."""
+
+
+def same_object(field: LanguageField, rules: QueryRules = RULES) -> SameObject:
+    """Finds the pairs of regions that show one object by the rules of queries, and those that look as if they did.
 
     Args:
       field: Field of R regions.
       rules: `piece_threshold` and `alike_threshold` are read.
 
     Returns:
-      (R, R) symmetric, true on the diagonal. Without `Votes.overlap` no other pair.
+      The pairs. Without `Votes.overlap` no two regions are joined.
     """
     ids = jnp.arange(field.regions.count)
     itself = ids[:, None] == ids
-    if field.votes.overlap is None or not len(ids):
-        return itself
+    if not len(ids):
+        return SameObject(itself, itself)
+    alike_rules = dataclasses.replace(rules, piece_threshold=None)
+    alike = jax.vmap(lambda region: match_region(field, region, alike_rules).chosen)(ids)
+    alike = itself | (alike & alike.T)
+    if field.votes.overlap is None:
+        return SameObject(itself, alike)
     joins = jax.vmap(lambda region: match_region(field, region, rules).chosen)(ids)
-    return itself | (joins & joins.T & (jnp.asarray(field.votes.overlap) >= MIN_PIECE_OVERLAP))
+    overlaps = jnp.asarray(field.votes.overlap) >= MIN_PIECE_OVERLAP
+    return SameObject(itself | (joins & joins.T & overlaps), alike)
 
 
 @jax.jit
