@@ -89,7 +89,8 @@ def in_a_row(field, gap, same):
     embeddings[list(same)] = embeddings[same[0]]
     for r in range(REGIONS):
         k = np.arange((own == r).sum())
-        means[own == r] = np.stack([r * (1 + gap) + k / k.max(), 0.05 * (-1.0) ** k, 0.05 * (-1.0) ** (k // 2)], axis=1)
+        along = k // 2 / (k.max() // 2)  # two at each end, so that none is a stray
+        means[own == r] = np.stack([r * (1 + gap) + along, 0.05 * (-1.0) ** k, 0.05 * (-1.0) ** (k // 2)], axis=1)
     small = np.full_like(field.gaussians.log_scales, -5)
     gaussians = dataclasses.replace(field.gaussians, means=means, log_scales=small)
     regions = dataclasses.replace(field.regions, embeddings=embeddings)

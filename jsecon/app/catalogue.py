@@ -34,6 +34,8 @@ TOUCHING = 0.1
 by side are farther apart."""
 FILLED = 0.7
 """Share of the volume of their common box that these two fill at least."""
+SIZE_RATIO = 3.0
+"""Largest ratio of their volumes: a large thing alone fills its box and that of a small thing at its side."""
 SOFTMAX_SCALE = 100.0
 """Scale of cosines in CLIP's softmax over texts, to which its training is clipped (arXiv 2103.00020)."""
 # fmt: off
@@ -120,8 +122,8 @@ class _Names(NamedTuple):
 def objects(field: LanguageField, vocabulary: Sequence[str] | None = None, embedder: Any = None) -> Catalogue:
     """Lists the objects of a field.
 
-    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`), and
-    so are two that look the same, touch, and fill a common box, such as the ends of a beam whose middle is hidden. An
+    Regions that show one object are joined by the rules that queries use for pieces and duplicates (`same_object`). So
+    are two of like size that look the same, touch, and fill a common box: the ends of a beam whose middle is hidden. An
     object most of which lies in another one's masks is a part of it. Every Gaussian belongs to one whole at most.
 
     Args:
@@ -259,7 +261,7 @@ def _groups(field: LanguageField, main: np.ndarray) -> Int[np.ndarray, " r"]:
 
 
 def _is_continued(field: LanguageField, first: np.ndarray, second: np.ndarray, up: np.ndarray) -> bool:
-    """Whether the Gaussians of two rows touch and fill a common upright box."""
+    """Whether the Gaussians of two lists of rows touch, are of like size and fill a common upright box."""
     chosen = np.concatenate([first, second, first, second])
     own = np.repeat([0, 1, 2], [len(first), len(second), len(first) + len(second)])
     gaussians = dataclasses.replace(field.gaussians, sh=None)
@@ -269,7 +271,8 @@ def _is_continued(field: LanguageField, first: np.ndarray, second: np.ndarray, u
     gap = min(np.linalg.norm(np.maximum(local[k] - shapes.half_size[k], 0), axis=1).min() for k in (0, 1))
     volume = np.prod(shapes.half_size, axis=1)
     size = 2 * np.linalg.norm(shapes.half_size[:2], axis=1).min()
-    return bool(gap <= TOUCHING * size and volume[0] + volume[1] >= FILLED * volume[2])
+    comparable = volume[:2].max() <= SIZE_RATIO * volume[:2].min()
+    return bool(comparable and gap <= TOUCHING * size and volume[0] + volume[1] >= FILLED * volume[2])
 
 
 def _wholes(
