@@ -1,6 +1,6 @@
 """Runs experiments in small, one after the other in this process: python .ci/tables.py FOLDER NAME ...
 
-They compile much and compute little. So they share imports and programs, which are compiled as those of the tests.
+They share imports and programs, which are compiled fast as those of the tests, unless XLA_FLAGS says how.
 Each leaves its results in FOLDER/NAME and its output in FOLDER/NAME.log.
 """
 
@@ -16,7 +16,7 @@ sys.path[:0] = [str(HOME), str(HOME / "tests")]
 
 import compiling  # noqa: E402
 
-os.environ["XLA_FLAGS"] = compiling.ENVIRONMENT
+os.environ.setdefault("XLA_FLAGS", compiling.ENVIRONMENT)
 compiling.install()
 
 folder, names = Path(sys.argv[1]), sys.argv[2:]

@@ -36,6 +36,11 @@ READ = ("relevancy, threshold", *(f"{rule}, threshold{way}" for rule in _RULES f
 READ += tuple(
     f"{rule}, {kind} silhouette{way}" for rule in _RULES for kind in ("strict", "lenient") for way in ("", SHARP)
 )
+QUICK_READ = (
+    *("relevancy, threshold", "apart, threshold", "apart, threshold, all"),
+    *("apart, strict silhouette", f"contrast, lenient silhouette{SHARP}"),
+)
+"""of a quick run: each rule and each way of choosing Gaussians once"""
 READ_TRAINED = (*READ, fair.PUBLISHED, "one mask", "cosine, threshold")
 """of methods that train; with any of their own constants ("16 roots", "one mask", 0.98)"""
 LEFT_OUT = "ours, outspoken views", WITH_PARTS
@@ -87,7 +92,7 @@ def plan_of(level: str, size: dict, asked: Asked, processes: int, trained: bool)
     return dataclasses.replace(
         table,
         data=dataclasses.replace(data, seeds=seeds, scenes=data.scenes if asked.quick else scenes, size=options),
-        methods=tuple(row for row in rows_of(points=False) if is_read(row, trained)),
+        methods=tuple(row for row in rows_of(points=False) if is_read(row, trained, asked.quick)),
         level=level,
         sweep=(),
         processes=processes,
@@ -96,11 +101,11 @@ def plan_of(level: str, size: dict, asked: Asked, processes: int, trained: bool)
     )
 
 
-def is_read(row: str, trained: bool) -> bool:
+def is_read(row: str, trained: bool, quick: bool = False) -> bool:
     """Whether a row of `experiments.fair` is one of these tables."""
     method, way = row.split(": ")
     if not trained:
-        return way in READ and method not in (*LEFT_OUT, *TRAINED)
+        return way in (QUICK_READ if quick else READ) and method not in (*LEFT_OUT, *TRAINED)
     return method in TRAINED and fair.reading_of(row) in READ_TRAINED
 
 

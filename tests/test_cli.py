@@ -153,7 +153,10 @@ def masks_of_all(room):
 
 def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, capsys):
     _, out = room_run
-    assert _run("eval", out / "field.safetensors", "--labels", room / "label", "--out", tmp_path) == 0
+    (tmp_path / "one").mkdir()
+    shutil.copy(sorted((room / "label").glob("*.json"))[0], tmp_path / "one")
+    asked = "eval", out / "field.safetensors", "--labels", tmp_path / "one", "--out", tmp_path
+    assert _run(*asked) == 0
     told = capsys.readouterr().out
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert set(found) == {"anchored", "silhouette", "all", "anchored_code", "one_step", "canonical"}
@@ -163,9 +166,7 @@ def test_eval_prints_the_table_and_writes_every_pair(room_run, room, tmp_path, c
         assert summary["miou"] == pytest.approx(np.mean([row["iou"] for row in summary["rows"]]), abs=1e-3)
     assert "mAcc@0.25" in told
     assert "alpha > 0.7" in told
-    (tmp_path / "one").mkdir()
-    shutil.copy(sorted((room / "label").glob("*.json"))[0], tmp_path / "one")
-    told, _ = _object(capsys, "eval", out / "field.safetensors", "--labels", tmp_path / "one", "--out", tmp_path)
+    told, _ = _object(capsys, *asked)
     assert 0 <= told["anchored"]["miou"] <= 1
 
 
