@@ -164,7 +164,7 @@ class ModelOptions:
     crop_layers: Advanced[int] = 0
     tracker: Advanced[Path | None] = None
     embedder: Option[Path | None] = None
-    vision_frames: Option[int | None] = None
+    vision_frames: Advanced[int | None] = None
     precision: Advanced[Precision | None] = None
     features: Advanced[Path | None] = None
 
