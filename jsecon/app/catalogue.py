@@ -254,9 +254,16 @@ def _groups(field: LanguageField, main: np.ndarray) -> Int[np.ndarray, " r"]:
     if not len(joined):
         return np.zeros(0, int)
     up = scene_up(field.cameras)
-    for first, second in np.argwhere(np.triu(alike & ~joined, 1)):
-        rows = [np.flatnonzero(main == region) for region in (first, second)]
-        joined[first, second] = min(map(len, rows)) >= MIN_SAMPLES and _is_continued(field, *rows, up)
+    pairs = np.argwhere(np.triu(alike & ~joined, 1))
+    rows = {region: np.flatnonzero(main == region) for region in np.unique(pairs)}
+    means = np.asarray(field.gaussians.means, np.float64)
+    centers = {region: means[own].mean(0) for region, own in rows.items() if len(own) >= MIN_SAMPLES}
+    reach = {region: np.linalg.norm(means[rows[region]] - c, axis=1).max() for region, c in centers.items()}
+    for first, second in pairs:
+        if first in centers and second in centers:
+            distance = np.linalg.norm(centers[first] - centers[second])
+            near = distance <= 1.5 * (reach[first] + reach[second])  # before the boxes, which cost more
+            joined[first, second] = near and _is_continued(field, rows[first], rows[second], up)
     return connected_components(joined, directed=False)[1]
 
 
