@@ -208,7 +208,7 @@ def test_given_cameras_take_the_place_of_planned_views(object_alone, around, tmp
     out = tmp_path / "field"
     assert main(["run", str(tmp_path / "scene.ply"), "--cameras", str(cameras), "--out", str(out)]) == 0
     field = jsecon.load_field(out / "field.safetensors")
-    assert field.names == ("a0.png", "a1.png", "a2.png", "a3.png")
+    assert field.names == ("a0", "a1", "a2", "a3")
     mine = jsecon.render_rgb(field.gaussians, field.cameras[1]).alpha
     assert np.abs(mine - jsecon.render_rgb(object_alone, planned[1]).alpha).mean() < 0.01
 
