@@ -439,7 +439,7 @@ class Options:
 
 def main(options: Options = Options()) -> dict:
     """Asks all rooms, writes the table and returns the figures."""
-    out = Path(options.out) / options.vision
+    out = Path(f"{options.out}_{options.vision}")
     file = out / "run" / "cells.jsonl"
     rows: list = []
     for seed in options.seeds:

@@ -253,6 +253,13 @@ def test_directions_follow_the_frame_and_cameras_around_take_the_fullest_frame()
     assert given.objects[0].regions == (1,)
 
 
+def test_the_ground_tells_what_is_up_where_cameras_look_one_way_and_down():
+    field, embedder = table_field((*THINGS, ("light grey floor", (0.0, 0.0, -0.01), (1.5, 1.5, 0.001))))
+    np.testing.assert_allclose(ObjectScene(field, embedder).up, [0, 0, 1], atol=0.02)
+    around = table_field(directions=[(0.0, -2.0, 0.8), (2.0, 0.0, 0.8)])
+    np.testing.assert_allclose(ObjectScene(*around).up, [0, 0, 1], atol=1e-3)
+
+
 def test_measures_are_in_the_captures_world():
     to_source = np.diag([2.0, 2.0, 2.0, 1.0])
     to_source[:3, 3] = [500_000, 5_000_000, 7]

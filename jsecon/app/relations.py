@@ -5,6 +5,7 @@ joined, and the soft predicates of query/relations are compared with SATISFIED. 
 several objects, with what came nearest or what would settle which is meant.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -26,7 +27,7 @@ from jsecon.language.membership import SHARE_THRESHOLD
 from jsecon.pipeline.sources import locate_sources
 from jsecon.query.expressions import ANCHORED_ORDERS, Condition, Thing, parse_expression
 from jsecon.query.match import RegionMatch, match_regions
-from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes, scene_up
+from jsecon.query.object_shapes import PARALLEL, ObjectShapes, gaussian_spreads, object_shapes, scene_up
 from jsecon.query.outliers import split_outliers
 from jsecon.query.relations import (
     SATISFIED,
@@ -41,6 +42,7 @@ from jsecon.query.rules import MIN_PIECE_OVERLAP, QueryRules
 from jsecon.query.select import select_by_share
 from jsecon.query.similarity import Number
 from jsecon.types import Array, Camera, LanguageField, Selection, Votes
+from jsecon.views.frame import scene_frame, surface_points
 
 WITHIN_REACH = 0.2
 """score from which an object that was not chosen is an alternative"""
@@ -50,6 +52,8 @@ CLOSE_ANGLE = 0.02
 """the same of directions, radians"""
 ONE_WAY = 0.5
 """length of the mean of the cameras' horizontal directions from which they look one way"""
+SAME_WAY = 0.7
+"""cosine of the ground's normal with the cameras' up axis from which it is the same way up"""
 BLOCK = 8
 """objects of each side that are scored at once: one program for all sizes"""
 SEEN = ("left of", "right of", "in front of", "behind", "leftmost", "rightmost", "nearest", "farthest")
@@ -164,7 +168,7 @@ class ObjectScene:
     Args:
       field: The field.
       embedder: Its embedder.
-      up: (3,) up axis in the capture's world; None takes it from the cameras (`scene_up`).
+      up: (3,) up axis in the capture's world; None takes it from the cameras, or from the ground.
 
     Raises:
       InputError: `up` has no direction.
@@ -176,7 +180,7 @@ class ObjectScene:
         self.embedder = embedder
         self.to_source = np.asarray(field.to_source, np.float64)
         self.scale = float(np.cbrt(abs(np.linalg.det(self.to_source[:3, :3]))))
-        self.up = scene_up(field.cameras) if up is None else self._own_direction(up)
+        self.up = _up_of(field) if up is None else self._own_direction(up)
         self.rules = QueryRules(all_of_kind=True, logits=getattr(embedder, "logits", None))
         self.origin = np.asarray(field.cameras.centres, np.float64).mean(0)
         self._votes = jax.tree.map(jnp.asarray, field.votes)
@@ -281,6 +285,21 @@ class ObjectScene:
         return "metres" if capture is not None and may_have_depth(Path(capture)) else "capture units"
 
 
+def _up_of(field: LanguageField) -> np.ndarray:
+    """Finds the up axis (3,): that of the cameras; of cameras that all look one way, the ground's if it is sure.
+
+    Such cameras tell the up axis only up to how far they are tilted.
+    """
+    up = scene_up(field.cameras)
+    right = np.asarray(field.cameras.world_to_camera, np.float64)[:, 0, :3]
+    if np.linalg.eigvalsh(right.T @ right / len(right))[1] < PARALLEL:
+        with contextlib.suppress(InputError):  # a scene without a surface has no ground
+            ground = scene_frame(surface_points(field.gaussians))
+            if ground.sure and ground.axes[2] @ up >= SAME_WAY:
+                up = ground.axes[2]
+    return up
+
+
 @jax.jit
 def _select(votes: Votes, chosen: Bool[Array, " r"], region: Array, threshold: Number) -> Selection:
     return select_by_share(votes, RegionMatch(chosen, region, jnp.asarray(1.0)), threshold)
@@ -313,7 +332,7 @@ def query_relation(
       frame: Frame from which directions are seen, its name or index. Without frame and camera they are seen from the
         mean camera, or from the frame that shows most objects where the cameras look in all directions.
       camera: Camera from which directions are seen, in the field's world.
-      up: Up axis in the capture's world; None takes it from the cameras.
+      up: Up axis in the capture's world; None takes it from the cameras, or from the ground where these look one way.
 
     Returns:
       The answer: 0, 1 or several objects.
@@ -540,7 +559,8 @@ def relation_answer(answer: RelationAnswer) -> Answer:
     """Returns the Gaussians of an expression as an `Answer`, for files and pictures."""
     region = answer.objects[0].regions[0] if len(answer.objects) == 1 else -1
     score = answer.objects[0].score if answer.objects else 0.0
-    selection = Selection(answer.mask, answer.mask.astype(np.float32), np.int32(region), np.float32(score))
+    best = np.asarray(region, np.int32), np.asarray(score, np.float32)
+    selection = Selection(answer.mask, answer.mask.astype(np.float32), *best)
     return Answer(answer.text, "relation", selection, answer.mask, {}, relation=answer.as_dict())
 
 
@@ -587,5 +607,5 @@ def measure(
     reach = [float(np.min(np.asarray(s.half_size[0]) / np.maximum(np.abs(s.axes[0].T @ way), 1e-12)))
              for s in (one.shape, other.shape)]  # fmt: skip
     angle = float(np.degrees(np.arcsin(np.clip(way @ scene.up, -1, 1))))
-    lengths = [scene.scale * x for x in (surfaces, centers, max(centers - sum(reach), 0.0))]
-    return Measure(a, b, *lengths, angle, scene.unit)
+    surfaces, centers, free = (scene.scale * x for x in (surfaces, centers, max(centers - sum(reach), 0.0)))
+    return Measure(a, b, surfaces, centers, free, angle, scene.unit)
