@@ -84,7 +84,9 @@ def objects_of_gaussians(
     best_share = jnp.zeros(votes.total.shape, votes.weights.dtype)
     best = jnp.full(votes.total.shape, -1, jnp.int32)
     for owner in owners:
-        weight = sum(jnp.where(other == owner, columns[k][1], 0.0) for k, other in enumerate(owners))
+        weight = functools.reduce(
+            jnp.add, (jnp.where(other == owner, columns[k][1], 0.0) for k, other in enumerate(owners))
+        )
         seen = functools.reduce(
             jnp.maximum, (jnp.where(other == owner, columns[k][2], 0.0) for k, other in enumerate(owners))
         )

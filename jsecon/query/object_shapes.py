@@ -96,10 +96,10 @@ def object_shapes(
     for rows in np.split(order, np.cumsum(count)[:-1]) if len(count) else ():
         own = np.zeros((len(rows), 3, 3)) if spreads is None else np.asarray(spreads, np.float64)[rows]
         shapes.append(_measure(means[rows], own, up, points))
-    if not shapes:
-        sizes = ((3,), (3, 3), (3,), (3,), (3,), (points, 3))
-        return ObjectShapes(*(np.zeros((0, *size)) for size in sizes), count)
-    return ObjectShapes(*map(np.stack, zip(*shapes)), count)
+    sizes = ((3,), (3, 3), (3,), (3,), (3,), (points, 3))
+    columns = [np.stack(column) for column in zip(*shapes)] if shapes else [np.zeros((0, *size)) for size in sizes]
+    center, axes, half_size, low, high, spaced = columns
+    return ObjectShapes(center, axes, half_size, low, high, spaced, count)
 
 
 def _measure(points: np.ndarray, spreads: np.ndarray, up: np.ndarray | None, count: int) -> tuple[np.ndarray, ...]:

@@ -563,7 +563,7 @@ def save_ply(
         file.write("\n".join(header).encode())
         for rows, block in usable_blocks(path, gaussians, similarity):
             sh = block.sh if rgb is None else ((np.asarray(rgb[rows], np.float64) - 0.5) / C0)[:, None]
-            ids = None if object_ids is None else object_ids[rows]
+            ids = None if object_ids is None else np.asarray(object_ids[rows])
             file.write(_table(block, np.asarray(sh, np.float32), double, ids).tobytes())  # tofile hides a full disk
 
 
