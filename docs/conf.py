@@ -36,6 +36,7 @@ myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = os.environ.get("JSECON_NOTEBOOKS", "cache")
 nb_execution_timeout = 170
+nb_merge_streams = True
 nb_execution_raise_on_error = True
 
 autodoc_member_order = "bysource"
