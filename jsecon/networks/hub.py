@@ -207,7 +207,7 @@ def parse_model(text: str, role: Role, precision: Precision | None = None) -> Hu
         if address is None:
             raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
         row = next((row for row in catalogue() if (row.role, row.repository) == (role, address[1])), None)
-        if row is not None and precision in row.refused:
+        if row is not None and precision is not None and precision in row.refused:
             raise _refused(row, precision)
         return HubModel(role, address[1], address[2] or "main", precision or "fp32")
     if Path(text).exists():
