@@ -68,7 +68,7 @@ HOST = {
     *("save_gaussians", "load_ply", "save_ply", "codes_in_blocks", "region_votes_in_blocks", "check_field"),
     "finish_votes_in_blocks",
     *("load_field", "save_field", "region_embeddings", "host_mesh", "query_in_blocks", "lift", "remove_outliers"),
-    *("region_at", "plan_capacity", "objects", "object_shapes"),
+    *("region_at", "plan_capacity", "objects", "object_shapes", "measure", "query_relation"),
 }
 """public functions that read files or need numbers, as they say"""
 

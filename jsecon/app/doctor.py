@@ -37,6 +37,7 @@ PACKAGES = (
     "tqdm",
     "tyro",
     "shtab",
+    "docstring_parser",
     "lazy_loader",
     "huggingface_hub",
 )
@@ -46,6 +47,8 @@ EXTRAS = {
     "formats": (("gsply", "pillow_heif"), ".sog, .spz of version 4, HEIC photographs"),
     "serve": (("fastapi", "uvicorn"), "jsecon serve"),
     "viewer": (("viser",), "jsecon view"),
+    "mcp": (("mcp",), "jsecon mcp"),
+    "docs": (("sphinx", "myst_nb", "furo"), "building the documentation"),
     "figures": (("matplotlib",), "jsecon.show, figures of the experiments"),
     "words": (("ai_edge_litert",), "the experiment on real words"),
     "export": (("torch", "open_clip", "segment_anything", "sam2", "onnx"), "SAM, SAM 2 and CLIP from checkpoints"),
