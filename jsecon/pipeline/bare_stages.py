@@ -105,7 +105,7 @@ def _read_scene(stage: StageInput) -> StageResult:
 def no_photographs() -> Stage:
     """Plans the stage "held_out" of a bare scene, whose frames are its own renders: the quality of no frame."""
 
-    def none(stage):
+    def quality_of_no_frame(stage):
         return StageResult(Quality(np.zeros(0, int), np.zeros(0), np.zeros(0)))
 
-    return Stage("held_out", "no photograph to compare with", none)
+    return Stage("held_out", "no photograph to compare with", quality_of_no_frame)
