@@ -28,7 +28,7 @@ from jsecon.fit.growth import pad_with_free_rows, padded_row_count
 from jsecon.fit.photometric import l1, photometric_loss
 from jsecon.fit.schedule import LearningRates
 from jsecon.fit.start import starting_gaussians
-from jsecon.fit.step import StepConfig, StepRunner, TrainingViews, TrainState, put_on_devices
+from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import MESH_OPTIONS, host_mesh, map_rows
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.render import render, render_rgb
@@ -63,12 +63,10 @@ def main() -> None:
 
     zeros = jax.tree.map(np.zeros_like, gaussians)
     current = put_on_devices(TrainState(gaussians, zeros, zeros, zeros.opacity_logits, None), mesh)
-    views = TrainingViews(dataclasses.replace(capture, held_out=np.arange(9) != 4))
-    steps = StepRunner(views, mesh)
-    ways = [StepConfig(3, count_votes, LearningRates(), None) for count_votes in (True, False)]
-    voting, plain_step = (functools.partial(steps.take, current, 0, 0, 0.0, way) for way in ways)
+    steps = StepRunner(dataclasses.replace(capture, held_out=np.arange(9) != 4), mesh)
+    whole_step = functools.partial(steps.take, current, 1.0, 0, 0, 0.0, StepConfig(3, LearningRates(), None))
     reference = functools.partial(jax.jit(jax.value_and_grad(absolute), **options), current[0], camera, frame)
-    runs = {"l1": reference, "step": plain_step, "step_with_votes": voting}
+    runs = {"l1": reference, "step": whole_step}
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for run in runs.values():
         jax.block_until_ready(run())
@@ -86,7 +84,7 @@ def main() -> None:
         "ms": ms,
         "to_l1": {name: ms[name] / ms["l1"] for name in ms},
     }
-    print(json.dumps(told | {"loss_error": abs(float(plain_step()[1]) - plain)}))
+    print(json.dumps(told | {"loss_error": abs(float(whole_step()[1]) - plain)}))
 
 
 if __name__ == "__main__":

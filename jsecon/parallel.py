@@ -41,12 +41,15 @@ _PIECE = 1 << 26
 """bytes of one exchange of `allgather_bytes`"""
 
 
-def host_mesh() -> Mesh | None:
+def host_mesh(most: int | None = None) -> Mesh | None:
     """Returns a mesh of this process's devices for the strips of one view, or None for a single device.
 
     It is a constant to jit.
+
+    Args:
+      most: Maximum number of devices, by default all.
     """
-    devices = jax.local_devices()
+    devices = jax.local_devices()[:most]
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None
 
 

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.few_steps
 TESTS = Path(__file__).resolve().parent
 PARTS = "votes", "image", "fit", "query"
 VOTES = "regions", "weights", "labelled", "total", "peak", "views", "by_view"
-VIEWS, HEIGHT, WIDTH = 5, 43, 50
-"""fewer views than some numbers of devices; rows of pixels that no number of devices divides"""
+VIEWS, HEIGHT, WIDTH = 5, 235, 50
+"""fewer views than some numbers of devices; a strip for each of up to 8, and rows of pixels that few numbers divide"""
 
 
 def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
@@ -43,7 +43,7 @@ def work(out: str, field: str, word: str, parts: tuple[str, ...]) -> None:
         sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
     )
     poses = np.stack([look_at((2.5 * np.sin(a), -2.5 * np.cos(a), 0.7), np.zeros(3)) for a in np.linspace(0, 1, VIEWS)])
-    lens = (np.full(VIEWS, value, np.float32) for value in (45, 43, 25.5, 21))
+    lens = (np.full(VIEWS, value, np.float32) for value in (45, 43, 25.5, 117))
     cameras = jsecon.Camera(poses, *lens, width=WIDTH, height=HEIGHT)
     labels = rng.integers(-1, 7, (VIEWS, HEIGHT, WIDTH))
     found = {}

@@ -194,7 +194,7 @@ def test_without_corrections_a_fit_is_what_it_was(capture, truth):
     off = RefineOptions(poses=False, exposure=False)
     plain, losses = fit_gaussians(capture, start=truth, steps=10, **GIVEN)
     still, others = fit_gaussians(capture, start=truth, steps=10, refine=off, **GIVEN)
-    np.testing.assert_allclose(losses, others, rtol=1e-5)
+    np.testing.assert_allclose(losses, others, rtol=3e-4)
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(still), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)
     assert init_fit_state(truth).corrections is None
@@ -219,7 +219,7 @@ def test_a_settled_capture_is_nearer_to_the_truth_and_its_held_out_frames_have_n
     start = dataclasses.replace(truth, opacity_logits=np.zeros(40, np.float32))
     better = refine_capture(told, start, key=KEY, visits=15, probes=2)
     assert "poses refined" in " ".join(better.notes)
-    assert "held out" in better.notes[-1]
+    assert "held-out" in better.notes[-1]
     assert same(better.cameras.fx, told.cameras.fx)
     assert evaluate_psnr(truth, better)[0] > evaluate_psnr(truth, told)[0] + 2.5
     frames = told.frames.copy()
@@ -334,10 +334,11 @@ def test_depths_and_masks_are_made_smaller_without_mixing(capture):
     ignored = np.zeros(capture.frames.shape[:3], bool)
     ignored[:, 5, 7] = True
     depths = np.tile(slope.astype(np.float32), (VIEWS, 1, 1))
-    views = TrainingViews(dataclasses.replace(capture, ignored=ignored, depths=depths))
+    capture = dataclasses.replace(capture, ignored=ignored, depths=depths)
+    views = TrainingViews(capture)
     np.testing.assert_array_equal(views[0].depth, depths[0])
     assert np.array_equal(views[0].ignored, ignored[views.frame_indices[0]])
-    views.set_size(0.5)
+    views = TrainingViews(capture, 0.5)
     depth = views[0].depth
     assert depth.shape == views[0].ignored.shape == views[0].frame.shape[:2] == (12, 16)
     mean = slope.reshape(12, 2, 16, 2).mean(axis=(1, 3))

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from jsecon.association.atoms import MIN_ATOM_PX, Sparse, atom_coverage, atom_votes, image_atoms
 from jsecon.errors import require
-from jsecon.parallel import map_over_processes
+from jsecon.parallel import LANES, map_over_processes
 from jsecon.process import cores
 from jsecon.types import Camera, Gaussians
 
@@ -84,25 +84,21 @@ class SceneViews:
         self.shared = np.zeros((0, 0), np.float32)
         """(T, T) overlap of two frames: the cosine of their visible cross-sections of all Gaussians. Set by `all`."""
 
-    def _cut(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple[np.ndarray, np.ndarray]:
-        """Atoms (H, W), and the share (M, A) of each atom in each proposal."""
+    def _view(self, frame: UInt8[np.ndarray, "h w 3"], t: int) -> tuple:
+        """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
         atoms = image_atoms(frame, masks, count=self.atoms_per_frame)
-        return atoms, atom_coverage(atoms, masks, int(atoms.max()) + 1)
+        within = atom_coverage(atoms, masks, int(atoms.max()) + 1)
+        votes = atom_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
+        seen = np.flatnonzero(np.diff(votes.indptr))
+        votes = votes[seen]
+        return atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
 
-    def _votes(self, frames: UInt8[np.ndarray, "t h w 3"], indices: Sequence[int]) -> Iterator[tuple]:
-        """Atoms, visible Gaussians, arrays and shape of the votes, and proposals of each frame of `indices`.
-
-        While votes of one frame are added up, other frames are segmented on all cores.
-        """
-        pool = ThreadPoolExecutor(cores())
+    def _views_of(self, frames: UInt8[np.ndarray, "t h w 3"], indices: Sequence[int]) -> Iterator[tuple]:
+        """Result of `_view` for each frame of `indices`; a thread of each core works on a frame of its own."""
+        pool = ThreadPoolExecutor(min(cores(), LANES))
         try:
-            cuts = pool.map(self._cut, (frames[t] for t in indices), indices)
-            for t, (atoms, within) in zip(indices, cuts):
-                votes = atom_votes(self.gaussians, self.cameras[t], atoms, centre=self.centre)
-                seen = np.flatnonzero(np.diff(votes.indptr))
-                votes = votes[seen]
-                yield atoms, seen, [votes.data, votes.indices, votes.indptr], votes.shape, within
+            yield from pool.map(self._view, (frames[t] for t in indices), indices)
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -130,7 +126,7 @@ class SceneViews:
                     atoms, seen, sparse.csr_matrix((*votes,), shape=shape), within, np.ones(len(seen), np.float32)
                 )
                 for atoms, seen, votes, shape, within in map_over_processes(
-                    len(frames), lambda indices: self._votes(frames, indices), progress
+                    len(frames), lambda indices: self._views_of(frames, indices), progress
                 )
             ]
             cross_sections = np.zeros((len(views), self.count), np.float32)

@@ -17,8 +17,9 @@ from jsecon.errors import InputError, require
 from jsecon.fit.corrections import CorrectionState, RefineOptions, init_corrections
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows, padded_row_count
 from jsecon.fit.schedule import LearningRates, Schedule
-from jsecon.fit.step import StepConfig, StepRunner, TrainingViews, TrainState, put_on_devices, to_host
+from jsecon.fit.step import StepConfig, StepRunner, TrainState, put_on_devices, to_host
 from jsecon.parallel import host_mesh
+from jsecon.splat.tiles import most_strips
 from jsecon.types import Array, Capture, Gaussians, record
 
 _RATES, _SCHEDULE = LearningRates(), Schedule()
@@ -161,8 +162,9 @@ def fit_gaussians(
     exclusive = (start is None) != (state is None)
     got = start is not None, state is not None
     require(exclusive, "start, state", got, "exactly one of the two", "Pass state to resume a fit.")
-    views, mesh = TrainingViews(capture), host_mesh()
-    runner = StepRunner(views, mesh)
+    mesh = host_mesh(most_strips(capture.cameras.height))
+    runner = StepRunner(capture, mesh)
+    frames = len(runner.views(1.0).frame_indices)
     if start is not None:
         divisor = 1 if schedule.max_gaussians <= ALLOCATED_AT_START else 2
         min_rows = schedule.max_gaussians // divisor if schedule.grows(start.count) else 0
@@ -176,13 +178,16 @@ def fit_gaussians(
         pace = 1 / steps if steps is not None else float(state.pace) or 1e-4
         # A resumed fit has the same chunks.
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
-        views.set_size(schedule.size(done))
-        order = view_order(key, len(views.frame_indices), first, first + count)
-        count_votes = schedule.grows(int(state.started)) and done <= schedule.growth_end
-        config = StepConfig(schedule.degree(done), count_votes, rates, refine)
-        runner.compile(train_state, int(order[0]), first, done, config)  # not counted as time of the fit
+        size, order = schedule.size(done), view_order(key, frames, first, first + count)
+        config = StepConfig(schedule.degree(done), rates, refine)
+        runner.compile(train_state, size, config).result()  # not counted as time of the fit
+        later = schedule.next_size(done)
+        has_all_rows = train_state.gaussians.count >= schedule.max_gaussians
+        if later is not None and has_all_rows and steps is not None:
+            runner.compile(train_state, later, config)  # while steps run: a fit with a time limit would lose steps
         began = time.monotonic()
-        train_state, new_losses = _run_chunk(train_state, runner, order, first, done + pace * np.arange(count), config)
+        shares = done + pace * np.arange(count)
+        train_state, new_losses = _run_chunk(train_state, runner, size, order, first, shares, config)
         losses = np.concatenate([state.losses, np.asarray(new_losses, np.float32)])
         host = to_host(train_state, state.gaussians.count)
         # A Gaussian that is not finite is invisible: the loss alone does not show it.
@@ -232,13 +237,19 @@ def _train_state(state: FitState) -> TrainState:
 
 
 def _run_chunk(
-    state: TrainState, runner: StepRunner, order: np.ndarray, first: int, done: np.ndarray, config: StepConfig
+    state: TrainState,
+    runner: StepRunner,
+    size: float,
+    order: np.ndarray,
+    first: int,
+    done: np.ndarray,
+    config: StepConfig,
 ) -> tuple[TrainState, list]:
     """Takes a step on each view of `order`, repeated with more capacity if one overflowed; and returns their losses."""
     while True:
         after, losses, overflow = state, [], []
         for n, view in enumerate(order):
-            after, loss, missing = runner.take(after, int(view), first + n, float(done[n]), config)
+            after, loss, missing = runner.take(after, size, int(view), first + n, float(done[n]), config)
             losses.append(loss)
             overflow.append(missing)
             if n >= MAX_PENDING_STEPS:
@@ -246,7 +257,7 @@ def _run_chunk(
         most = int(max(jax.device_get(overflow)))
         if not most:
             return after, jax.device_get(losses)
-        runner.widen(state, most)
+        runner.widen(state, size, most)
 
 
 def _densify(state: TrainState, schedule: Schedule, target: int, seed: list[int]) -> TrainState:

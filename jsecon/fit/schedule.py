@@ -4,6 +4,7 @@ Time is the share of the fit that is done, in [0, 1], so that fits limited by st
 """
 
 import dataclasses
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -89,6 +90,10 @@ class Schedule:
     def size(self, done: float) -> float:
         """Returns the size of the frames as a share of their full size."""
         return next(size for size, end in self.sizes if done < end or end == 1.0)
+
+    def next_size(self, done: float) -> float | None:
+        """Returns the size that follows the one at that share of the fit, or None."""
+        return next((later for (_, end), (later, _) in pairwise(self.sizes) if done < end), None)
 
     def degree(self, done: float) -> int:
         """Returns the highest degree of the spherical harmonics that learns."""

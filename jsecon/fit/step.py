@@ -1,5 +1,6 @@
 """One optimisation step of a fit: training view, loss, gradients and Adam, on all devices of this process."""
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple, cast
 
 import cv2
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.tree_util import PyTreeDef
 
 from jsecon.errors import InputError
 from jsecon.fit.corrections import (
@@ -53,14 +55,14 @@ class TrainingView:
 
 
 class TrainingViews:
-    """Training frames of a capture, read one at a time at the current size. Host code.
+    """Training frames of a capture at one size, read one at a time. Host code."""
 
-    Raises:
-      InputError: Every frame is held out.
-    """
-
-    def __init__(self, capture: Capture):
+    def __init__(self, capture: Capture, size: float = 1.0):
         """Takes the training frames of a capture.
+
+        Args:
+          capture: Frames, cameras, depths and ignored pixels.
+          size: Size of the frames, as a share of their full size.
 
         Raises:
           InputError: Every frame is held out.
@@ -68,16 +70,11 @@ class TrainingViews:
         self.frame_indices = np.flatnonzero(~np.asarray(capture.held_out))
         if not len(self.frame_indices):
             raise InputError("capture", "every frame held out", "frames to fit to", "Hold out fewer frames.")
-        self._capture, self.size = capture, 1.0
+        self._capture = capture
         # NumPy arrays: indexing them compiles no program.
-        self._full_size = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.frame_indices])
-        self.cameras = self._full_size
-        self.extent = np.asarray(cameras_extent(self._full_size), np.float32)
-
-    def set_size(self, size: float) -> None:
-        """Sets the size of the frames, as a share of their full size."""
-        if size != self.size:
-            self.size, self.cameras = size, scale_cameras(self._full_size, size)
+        cameras = jax.tree.map(lambda a: np.asarray(a, np.float32), capture.cameras[self.frame_indices])
+        self.extent = np.asarray(cameras_extent(cameras), np.float32)
+        self.cameras = cameras if size == 1.0 else scale_cameras(cameras, size)
 
     def __getitem__(self, index: int) -> TrainingView:
         """Returns a view by its position among the training frames."""
@@ -136,7 +133,7 @@ def view_loss(
     Args:
       gaussians: Scene of N Gaussians.
       vote_channel: (N, 1) zeros. Its gradient is the votes: the weights alpha T of each Gaussian times the mean
-        absolute error of the pixels. (N, 0) if they are not needed.
+        absolute error of the pixels.
       correction: Corrections of this view, or None.
       view: Camera, frame, depth and ignored pixels.
       extent: () cameras' extent, world units.
@@ -151,7 +148,7 @@ def view_loss(
     # The votes are the gradient of a fourth channel of zeros: they need no separate pass.
     features = jnp.concatenate([colours, vote_channel], axis=1)
     rendering = render(gaussians, camera, features, capacity=capacity, mesh=mesh, depth=view.depth is not None)
-    image, votes = rendering.features[..., :3], rendering.features[..., 3:].sum(-1)
+    image, votes = rendering.features[..., :3], rendering.features[..., 3]
     image = image if correction is None else apply_exposure(image, correction.colours)
     target = view.frame.astype(image.dtype) / 255.0
     if view.ignored is not None:  # both show the rendering there: exact, as SSIM's windows reach across the border
@@ -185,8 +182,6 @@ class StepConfig(NamedTuple):
 
     degree: int
     """Highest degree of the spherical harmonics that learns."""
-    count_votes: bool
-    """Whether the step adds up the votes that growth follows."""
     rates: LearningRates
     refine: RefineOptions | None
 
@@ -211,7 +206,7 @@ class StepInputs(NamedTuple):
 
 
 def step(
-    state: TrainState, view: TrainingView, inputs: StepInputs, capacity: int, mesh: Mesh | None, count_votes: bool
+    state: TrainState, view: TrainingView, inputs: StepInputs, capacity: int, mesh: Mesh | None
 ) -> tuple[TrainState, Array, Array]:
     """Takes one Adam step on one view. Pure.
 
@@ -223,13 +218,13 @@ def step(
       inputs: Numbers of this step.
       capacity: As for `render`.
       mesh: As for `render`.
-      count_votes: Whether to add up votes.
 
     Returns:
       The state after the step, the loss before it, and the number of pairs that overflowed.
     """
     gaussians, first, second, votes, corrections = state
-    vote_channel = jnp.zeros((gaussians.count, 1 if count_votes else 0))
+    # Always counted: a program without them would save 5 % of a step and cost its own compilation.
+    vote_channel = jnp.zeros((gaussians.count, 1))
     correction = None if corrections is None else jax.tree.map(lambda a: a[inputs.frame], corrections.current)
 
     def loss(gaussians, vote_channel, correction):
@@ -252,16 +247,20 @@ def step(
         corrections = update_corrections(
             corrections, inputs.frame, correction_gradient, inputs.visits, inputs.correction_rates
         )
-    after = TrainState(gaussians, first, second, votes + vote_gradient.sum(1), corrections)
+    after = TrainState(gaussians, first, second, votes + vote_gradient[:, 0], corrections)
     if mesh is not None:  # the same shardings as before: one program serves every step
         after = TrainState(*map(jax.lax.with_sharding_constraint, after, _shardings(mesh)))
     return after, value, overflow
 
 
+def _step_of_leaves(leaves: list[Array], treedef: PyTreeDef, capacity: int, mesh: Mesh | None):
+    """`step` of a tree that is taken apart: jax fills lowered trees with other things than arrays."""
+    return step(*jax.tree.unflatten(treedef, leaves), capacity, mesh)
+
+
 # of one device, and over a mesh
-step_compiled = [
-    jax.jit(step, static_argnames=("capacity", "mesh", "count_votes"), compiler_options=options)
-    for options in (None, MESH_OPTIONS)
+_step_compiled = [
+    jax.jit(_step_of_leaves, static_argnums=(1, 2, 3), compiler_options=options) for options in (None, MESH_OPTIONS)
 ]
 
 
@@ -293,24 +292,49 @@ def to_host(state: TrainState, rows: int) -> TrainState:
 
 
 class StepRunner:
-    """Runs steps on the views of a capture; keeps track of compiled programs and of the capacity of each size."""
+    """Runs steps on the training frames of a capture.
 
-    def __init__(self, views: TrainingViews, mesh: Mesh | None):
-        """Prepares steps on `mesh`; each size of the scene is compiled at its first step."""
-        self.views, self.mesh = views, mesh
+    Each number of rows and size of the frames has a program of its own and its own capacity of the tile lists.
+    """
+
+    def __init__(self, capture: Capture, mesh: Mesh | None):
+        """Prepares steps on `mesh`."""
+        self._capture, self._mesh = capture, mesh
+        self._views: dict[float, TrainingViews] = {}
         self._capacity: dict[tuple[int, float], int] = {}
-        self._compiled: set[tuple] = set()
+        self._programs: dict[tuple[int, float, int], Future] = {}
+        self._compiler = ThreadPoolExecutor(1)
 
-    def _shape(self, state: TrainState) -> tuple[int, float]:
-        return state.gaussians.count, self.views.size
+    def views(self, size: float) -> TrainingViews:
+        """Returns the training frames at a size, as a share of their full size."""
+        return self._views.setdefault(size, TrainingViews(self._capture, size))
+
+    def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
+        """Starts to compile the program of steps at that size in another thread, unless that has begun.
+
+        Returns:
+          The program, once it is compiled.
+        """
+        count, cameras = state.gaussians.count, self.views(size).cameras
+        strips = 1 if self._mesh is None else self._mesh.size
+        initial = default_capacity(count, cameras.width, cameras.height, strips=strips)
+        capacity = self._capacity.setdefault((count, size), initial)
+        program = count, size, capacity
+        if program not in self._programs:
+            tree = jax.tree.flatten((state, *self._arguments(size, 0, 0, 0.0, config)))
+            jitted = _step_compiled[self._mesh is not None]
+            self._programs[program] = self._compiler.submit(lambda: jitted.lower(*tree, capacity, self._mesh).compile())
+        return self._programs[program]
 
     def take(
-        self, state: TrainState, view: int, index: int, done: float, config: StepConfig
+        self, state: TrainState, size: float, view: int, index: int, done: float, config: StepConfig
     ) -> tuple[TrainState, Array, Array]:
         """Takes step number `index` on the view at that position; see `step`."""
-        views, cameras, strips = self.views, self.views.cameras, 1 if self.mesh is None else self.mesh.size
-        initial = default_capacity(state.gaussians.count, cameras.width, cameras.height, strips=strips)
-        capacity = self._capacity.setdefault(self._shape(state), initial)
+        program = self.compile(state, size, config).result()
+        return program(jax.tree.leaves((state, *self._arguments(size, view, index, done, config))))
+
+    def _arguments(self, size: float, view: int, index: int, done: float, config: StepConfig) -> tuple:
+        views = self.views(size)
         inputs = StepInputs(
             step=np.int32(index),
             frame=np.int32(views.frame_indices[view]),
@@ -321,19 +345,10 @@ class StepRunner:
             rates=config.rates,
             correction_rates=None if config.refine is None else config.refine.rates(done, float(views.extent)),
         )
-        sharding = None if self.mesh is None else NamedSharding(self.mesh, PartitionSpec())
-        arguments = jax.device_put((views[view], inputs), sharding)
-        run = step_compiled[self.mesh is not None]
-        return run(state, *arguments, capacity=capacity, mesh=self.mesh, count_votes=config.count_votes)
+        sharding = None if self._mesh is None else NamedSharding(self._mesh, PartitionSpec())
+        return jax.device_put((views[view], inputs), sharding)
 
-    def compile(self, state: TrainState, view: int, index: int, done: float, config: StepConfig) -> None:
-        """Compiles the program of such a step unless it exists."""
-        program = *self._shape(state), config.count_votes
-        if program not in self._compiled:
-            jax.block_until_ready(self.take(state, view, index, done, config))
-            self._compiled.add(program)
-
-    def widen(self, state: TrainState, overflow: int) -> None:
+    def widen(self, state: TrainState, size: float, overflow: int) -> None:
         """Raises the capacity of views of this size by `overflow` pairs."""
-        shape = self._shape(state)
+        shape = state.gaussians.count, size
         self._capacity[shape] = enough_capacity(self._capacity[shape], np.array([overflow]))

@@ -63,6 +63,11 @@ def tile_grid(width: int, height: int, tile: int) -> tuple[int, int]:
     return -(-width // tile), -(-height // tile)
 
 
+def most_strips(height: int) -> int:
+    """Returns the largest number of strips of an image of that height in px of which none is empty."""
+    return tile_grid(1, height, BLOCK * TILE)[1]
+
+
 def _rectangles(projection: Projection, width: int, height: int, edge: int, strip: Strip):
     """Computes the range (x0, x1, y0, y1) of the strip's blocks of `edge` px that each splat's box touches.
 
