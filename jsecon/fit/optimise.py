@@ -180,11 +180,11 @@ def fit_gaussians(
         count = max(1, min(chunk - first % chunk, math.ceil((1 - done) / pace - 1e-6)))
         size, order = schedule.size(done), view_order(key, frames, first, first + count)
         config = StepConfig(schedule.degree(done), rates, refine)
-        runner.compile(train_state, size, config).result()  # not counted as time of the fit
-        later = schedule.next_size(done)
+        program, later = runner.compile(train_state, size, config), schedule.next_size(done)
         has_all_rows = train_state.gaussians.count >= schedule.max_gaussians
-        if later is not None and has_all_rows and steps is not None:
-            runner.compile(train_state, later, config)  # while steps run: a fit with a time limit would lose steps
+        if later is not None and has_all_rows and steps is not None:  # a fit with a time limit would lose steps
+            runner.compile(train_state, later, config)
+        program.result()  # compilation is not counted as time of the fit
         began = time.monotonic()
         shares = done + pace * np.arange(count)
         train_state, new_losses = _run_chunk(train_state, runner, size, order, first, shares, config)

@@ -303,14 +303,14 @@ class StepRunner:
         self._views: dict[float, TrainingViews] = {}
         self._capacity: dict[tuple[int, float], int] = {}
         self._programs: dict[tuple[int, float, int], Future] = {}
-        self._compiler = ThreadPoolExecutor(1)
+        self._compiler = ThreadPoolExecutor(2)
 
     def views(self, size: float) -> TrainingViews:
         """Returns the training frames at a size, as a share of their full size."""
         return self._views.setdefault(size, TrainingViews(self._capture, size))
 
     def compile(self, state: TrainState, size: float, config: StepConfig) -> Future:
-        """Starts to compile the program of steps at that size in another thread, unless that has begun.
+        """Starts to compile the program of steps at that size in a thread of its own, unless that has begun.
 
         Returns:
           The program, once it is compiled.

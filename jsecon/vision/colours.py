@@ -6,7 +6,6 @@ which has the basic colour terms (Berlin & Kay 1969) and common mixed ones.
 
 import itertools
 import re
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -14,7 +13,6 @@ from jaxtyping import Bool, Float32, UInt8
 from scipy.optimize import nnls
 
 from jsecon.errors import InputError, require_shape
-from jsecon.process import cores
 
 # sRGB of a typical matt object of each name. A name of two words is a variant of the basic term in it.
 # fmt: off
@@ -146,8 +144,8 @@ class ColourEmbedder:
                 colour = self._mean(_without_shadow_and_shine(pixels))
                 row[:] = _joined(colour, np.count_nonzero(mask) / mask.size / EXTENT_FULL)
 
-        with ThreadPoolExecutor(cores()) as pool:
-            list(pool.map(embed, out, masks.astype(bool)))
+        for row, mask in zip(out, masks.astype(bool)):
+            embed(row, mask)
         return out
 
     def embed_text(self, texts: list[str]) -> Float32[np.ndarray, "q e"]:
