@@ -24,7 +24,6 @@ PACKAGES = (
     "filelock",
     "psutil",
     "scipy",
-    "sklearn",
     "cv2",
     "PIL",
     "jaxtyping",
