@@ -7,8 +7,10 @@ Gaussian is the one with most of its weight in the true masks of these frames, o
 Found: an object and a whole of the catalogue overlap by an IoU of at least 0.5 of their Gaussians. One row: of the
 objects to which most Gaussians of any row belong, those with exactly one such row. The true boxes are those of the
 solids. Box: along the axes of the world; upright: the box of the catalogue and the one along the object's own axes.
-Named: the best name of a found object is the colour that it was made with; objects without a name do not count. Seeds
-20 to 22 chose the constants.
+Named: the best name of a found object is the colour that it was made with; objects without a name do not count.
+Located: of the objects with a name of their own, those for which the `center` of `jsecon.locate` lies in the true box;
+centre and grasp are its median distances to the middle and to the middle of the upper side, mm. Seeds 20 to 22 chose
+the constants.
 """
 
 import argparse
@@ -28,6 +30,7 @@ from jsecon.data.masks import load_labels
 from jsecon.demo import write_room
 from jsecon.demo.room import Room, RoomObject, crowded_room
 from jsecon.demo.shapes import contains
+from jsecon.errors import InputError
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Listener
@@ -65,6 +68,9 @@ class Figures:
     box: float
     upright: float
     named: float
+    located: float
+    centre: float
+    grasp: float
     surroundings: float
     """Share of the found objects that are taken for surroundings."""
     seconds: float
@@ -134,7 +140,29 @@ def upright_iou(catalogue: Catalogue, row: int, item: RoomObject, points: np.nda
     return float(both / (np.prod(2 * shape.half_size) + np.prod(size) - both))
 
 
-def compare(catalogue: Catalogue, truth: Int[np.ndarray, " n"], room: Room, seconds: float) -> Figures:
+def located(field: LanguageField, room: Room) -> tuple[float, float, float]:
+    """Share of the objects with a name of their own that are located, and the median errors of centre and grasp, mm."""
+    names = [item.name for item in room.objects]
+    inside, centres, grasps = [], [], []
+    for item in (item for item in room.objects if item.name and names.count(item.name) == 1):
+        points = true_points(item)
+        low, high = points.min(0), points.max(0)
+        middle, top = (low + high) / 2, np.array([*(low + high)[:2] / 2, high[2]])
+        try:
+            place = jsecon.locate(field, item.name)
+        except InputError as error:
+            print(f"  not located: {item.name}: {error}")
+            inside.append(False)
+            continue
+        inside.append(bool(((place.center >= low) & (place.center <= high)).all()))
+        centres.append(1000 * np.linalg.norm(place.center - middle))
+        grasps.append(1000 * np.linalg.norm([*place.center[:2], place.high[2]] - top))
+    return float(np.mean(inside)), float(np.median(centres)), float(np.median(grasps))
+
+
+def compare(
+    catalogue: Catalogue, field: LanguageField, truth: Int[np.ndarray, " n"], room: Room, seconds: float
+) -> Figures:
     """Compares a catalogue with the objects of a room."""
     wholes = np.flatnonzero(catalogue.parent < 0)
     count = len(room.objects)
@@ -160,6 +188,7 @@ def compare(catalogue: Catalogue, truth: Int[np.ndarray, " n"], room: Room, seco
     for k in np.flatnonzero(seen & (iou.max(0) < FOUND)):
         name = room.objects[k].name or "clutter"
         print(f"  not found: {name}, {table[:, k].sum()} Gaussians, IoU {iou[:, k].max():.2f}")
+    share, centre, grasp = located(field, room)
     return Figures(
         objects=int(seen.sum()),
         rows=int((~catalogue.surroundings[wholes]).sum()),
@@ -169,6 +198,9 @@ def compare(catalogue: Catalogue, truth: Int[np.ndarray, " n"], room: Room, seco
         box=float(np.median(boxes)),
         upright=float(np.median(upright)),
         named=float(np.mean(named)),
+        located=share,
+        centre=centre,
+        grasp=grasp,
         surroundings=float(catalogue.surroundings[wholes[best[found]]].mean()),
         seconds=seconds,
     )
@@ -184,7 +216,7 @@ def main(options: Options) -> str:
         started = time.perf_counter()
         catalogue = jsecon.objects(field)
         seconds = time.perf_counter() - started
-        figures = compare(catalogue, true_objects(field, folder / "capture"), crowded_room(seed), seconds)
+        figures = compare(catalogue, field, true_objects(field, folder / "capture"), crowded_room(seed), seconds)
         metrics[f"seed {seed}"] = dataclasses.asdict(figures)
         print(seed, figures, flush=True)
     names = list(next(iter(metrics.values())))
