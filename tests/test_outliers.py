@@ -4,17 +4,8 @@ import time
 
 import numpy as np
 import pytest
-from sklearn.cluster import DBSCAN
 
-from jsecon.query.outliers import dbscan, default_eps, one_component, remove_outliers
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_labels_are_those_of_scikit_learn(seed):
-    draw = np.random.default_rng(seed)
-    points = draw.normal(size=(int(draw.integers(1, 400)), 3)) * draw.choice([1, 0.1])
-    eps, least = float(draw.uniform(0.02, 0.8)), int(draw.integers(1, 15))
-    np.testing.assert_array_equal(dbscan(points, eps, least), DBSCAN(eps=eps, min_samples=least).fit(points).labels_)
+from jsecon.query.outliers import default_eps, one_component, remove_outliers
 
 
 def test_one_component_is_seen_where_points_are_dense():

@@ -24,6 +24,7 @@ PACKAGES = (
     "filelock",
     "psutil",
     "scipy",
+    "sklearn",
     "cv2",
     "PIL",
     "jaxtyping",

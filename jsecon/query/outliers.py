@@ -1,4 +1,4 @@
-"""Selected Gaussians that lie apart from the rest: DBSCAN on their centres (the paper's last step).
+"""Selected Gaussians that lie apart from the rest: scikit-learn's DBSCAN on their centres (the paper's last step).
 
 Host code. DBSCAN lists all neighbours of every point. Where thousands of splats lie within eps of each other, those
 lists are quadratic in time and memory. A large selection is therefore clustered by voxels: one point for each, with the
@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from jsecon.errors import require, require_one_of, require_shape
@@ -26,9 +24,7 @@ MIN_CLUSTER_SUPPORT = 0.1
 KEEP = ("largest", "supported", "all")
 """Which clusters stay: the one with most Gaussians (the paper), those that the views support, or every one."""
 _EXACT_POINTS = 5_000
-"""Up to so many points are clustered one by one."""
-_EXACT_NEIGHBOURS = 2_000_000
-"""Unless all of them together have more neighbours than this: the lists of 5,000 on a surface have half a million."""
+"""Up to so many points are clustered one by one: their lists of neighbours have at most 25 million entries."""
 _VOXELS_PER_EPS = 3.0
 """Voxels along eps. A splat lies about half a voxel from the mean of its voxel, so gaps are measured to about a third
 of eps. 4 takes three times as long for a million splats."""
@@ -107,9 +103,8 @@ def split_outliers(
     if len(chosen) < min_samples:
         return OutlierResult(mask, f"fewer than {min_samples} Gaussians are selected", 0, 0)
     eps = default_eps(points) if eps is None else eps
-    near = _neighbours(points, eps)
-    labels = _clusters(near, min_samples)
-    if (labels == 0).all() or (_clusters(near, 1) == 0).all():
+    labels = dbscan(points, eps, min_samples)
+    if (labels == 0).all() or one_component(points, eps):
         return OutlierResult(mask, "the selection is one component", 1, 0)
     if labels.max() < 0:
         return OutlierResult(mask, "", 0, 0)
@@ -146,49 +141,21 @@ def default_eps(points: Float[Array, "m 3"], *, spacings: float = EPS_SPACINGS) 
 def dbscan(points: Float[Array, "m 3"], eps: float, min_samples: int) -> Int[np.ndarray, " m"]:
     """Cluster of each of the points (M, 3), counted from 0 in the order of their first core point; -1 = noise.
 
-    Where these are many, those of one voxel have one label: that of the voxel's mean, which counts as often as it has
-    points.
+    Above `_EXACT_POINTS` points, those of one voxel have one label: that of the voxel's mean, which counts as often as
+    it has points.
     """
-    return _clusters(_neighbours(np.asarray(points, np.float64), eps), min_samples)
+    from sklearn.cluster import DBSCAN
 
-
-class _Neighbours(NamedTuple):
-    """V places of M points, and which of them are within eps of each other."""
-
-    place: Int[np.ndarray, " m"]
-    count: Int[np.ndarray, " v"]
-    """points at each place"""
-    pairs: Int[np.ndarray, "p 2"]
-
-
-def _neighbours(points: Float[np.ndarray, "m 3"], eps: float) -> _Neighbours:
-    """Finds which points, or where these are many which means of voxels, are within eps of each other."""
-    place, count = np.arange(len(points)), np.ones(len(points), int)
+    points = np.asarray(points, np.float64)
     if not len(points):
-        return _Neighbours(place, count, np.zeros((0, 2), int))
-    tree = KDTree(points[:_EXACT_POINTS])
-    if len(points) > _EXACT_POINTS or tree.count_neighbors(tree, eps) > _EXACT_NEIGHBOURS:
-        place, count = _voxels(points, eps / _VOXELS_PER_EPS)
-        tree = KDTree(np.stack([np.bincount(place, axis) for axis in points.T], axis=1) / count[:, None])
-    return _Neighbours(place, count, tree.query_pairs(eps, output_type="ndarray"))
-
-
-def _clusters(near: _Neighbours, min_samples: int) -> Int[np.ndarray, " m"]:
-    """Labels points by DBSCAN. A point within eps of core points of several clusters belongs to the first of these."""
-    first, second = near.pairs.T
-    size = len(near.count)
-    samples = near.count + np.bincount(first, near.count[second], size) + np.bincount(second, near.count[first], size)
-    core = samples >= min_samples
-    both = core[first] & core[second]
-    graph = coo_array((np.ones(both.sum(), bool), (first[both], second[both])), shape=(size, size))
-    component = connected_components(graph, directed=False)[1]
-    _, start, cluster = np.unique(component[core], return_index=True, return_inverse=True)
-    labels = np.full(size, size)
-    labels[core] = np.argsort(np.argsort(start))[cluster]
-    for point, other in ((first, second), (second, first)):
-        border = core[other] & ~core[point]
-        np.minimum.at(labels, point[border], labels[other[border]])
-    return np.where(labels < size, labels, -1)[near.place]
+        return np.full(0, -1)
+    search = DBSCAN(eps=eps, min_samples=min_samples)
+    if len(points) <= _EXACT_POINTS:
+        return search.fit(points).labels_
+    voxel, count = _voxels(points, eps / _VOXELS_PER_EPS)
+    sums = [np.bincount(voxel, axis) for axis in points.T]
+    labels = search.fit(np.stack(sums, axis=1) / count[:, None], sample_weight=count).labels_
+    return labels[voxel]
 
 
 def one_component(points: Float[Array, "m 3"], eps: float) -> bool:
