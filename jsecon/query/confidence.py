@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 from jsecon.types import Array
 
 OFFSET, SLOPE = -5.6, 3.5
-"""of the logistic curve: an answer that stands out like that of an unrelated word is right in 1 of 9 cases, at 1.6 times
-its height in half of them. Fitted to answers on simulated rooms where half of the texts name something that is there, by
-regions of a tracker and by consensus (experiments/calibration.py). Expected calibration error in other such rooms: 0.04
-(tracks) and 0.07 (consensus); on real words about 0.24 (given masks) and 0.43 (jsecon's own)"""
+"""of the logistic curve: an answer that stands out like that of an unrelated word is right in 1 of 9 cases, at 1.6
+times its height in half of them. Fitted to answers on simulated rooms where half of the texts name something that is
+there, by regions of a tracker and by consensus (experiments/calibration.py). Expected calibration error in other such
+rooms: 0.04 (tracks) and 0.07 (consensus); on real words about 0.24 (given masks) and 0.43 (jsecon's own)"""
 
 
 def answer_confidence(
